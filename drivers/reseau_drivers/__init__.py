@@ -1,0 +1,1 @@
+"""Drivers: what talks to hardware. The first ones arrive with the instruments they drive."""

@@ -1,0 +1,1 @@
+"""Simulators: what behaves like hardware, drawn from one shared `World`."""

@@ -1,0 +1,8 @@
+"""Acquisition and calibration of measuring cameras and imaging instruments.
+
+The packages, from the ground up: :mod:`reseau.adjust` (least squares), :mod:`reseau.optics` (image
+formation), :mod:`reseau.refine` (one frame to refined image coordinates), :mod:`reseau.procedures` (one
+module per published procedure), :mod:`reseau.report` (pages and figures).
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,134 @@
+"""What is passed between the packages: a frame, and image coordinates in columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import ImageError, UsageError
+
+__all__ = ["Array", "Frame", "ImagePoints", "Mask"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One grey image as it came from an instrument or a file.
+
+    Parameters
+    ----------
+    pixels : ndarray (height, width)
+        Grey values, unsigned integers or floats, never rescaled. Pixel coordinates have their origin at the
+        centre of the top-left pixel, x right, y down.
+    full_scale : float
+        The grey value at which the sensor or the file saturates: 255 for 8 bits.
+    name : str
+        What the frame is called in messages and results, a file name as a rule.
+    sha256 : str
+        Hash of the bytes it was read from; of the pixels where there was no file.
+
+    Raises
+    ------
+    ImageError
+        When the pixels are no grey image of at least 2×2, or hold values that are not finite.
+    """
+
+    pixels: NDArray[Any]
+    full_scale: float
+    name: str = "frame"
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or min(self.pixels.shape) < 2:
+            raise ImageError(f"has the shape {self.pixels.shape}, not that of a grey image", where=self.name)
+        if self.pixels.dtype.kind == "f" and not np.isfinite(self.pixels).all():
+            raise ImageError("holds grey values that are not finite", where=self.name)
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return int(self.pixels.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Number of rows."""
+        return int(self.pixels.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePoints:
+    """Named points in a plane with their covariances, in columns.
+
+    Parameters
+    ----------
+    names : tuple of str (n,)
+        Unique names.
+    xy : ndarray (n, 2)
+        Coordinates: pixels in an image, millimetres for photo-coordinates.
+    cov : ndarray (n, 2, 2)
+        Covariance matrices of the points, in the squared unit of `xy`.
+
+    Raises
+    ------
+    UsageError
+        When the columns differ in length or a name stands twice.
+
+    Examples
+    --------
+    >>> points = ImagePoints.with_sigma(["a", "b"], [[1.0, 2.0], [3.0, 4.0]], 0.02)
+    >>> points.select(["b"]).xy
+    array([[3., 4.]])
+    """
+
+    names: tuple[str, ...]
+    xy: Array
+    cov: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if self.xy.shape != (n, 2) or self.cov.shape != (n, 2, 2):
+            raise UsageError(f"{n} names with coordinates {self.xy.shape} and covariances {self.cov.shape}")
+        if len(set(self.names)) != n:
+            twice = next(name for i, name in enumerate(self.names) if name in self.names[:i])
+            raise UsageError("stands twice among the points", where=twice)
+
+    @classmethod
+    def with_sigma(cls, names: Iterable[str], xy: ArrayLike, sigma: ArrayLike) -> Self:
+        """Points with uncorrelated coordinates; `sigma` broadcasts to (n, 2)."""
+        names, points = tuple(names), np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+        cov = np.zeros((len(points), 2, 2))
+        cov[:, [0, 1], [0, 1]] = np.broadcast_to(np.asarray(sigma, dtype=np.float64) ** 2, points.shape)
+        return cls(names, points, cov)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the coordinates, (n, 2)."""
+        sigma: Array = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+        return sigma
+
+    def select(self, keep: Sequence[str] | Mask) -> ImagePoints:
+        """The points of these names, in their order, or those of a mask (n,).
+
+        Raises
+        ------
+        UsageError
+            When a name is not among the points.
+        """
+        if isinstance(keep, np.ndarray) and keep.dtype == bool:
+            rows = np.flatnonzero(keep)
+        else:
+            row_of = {name: i for i, name in enumerate(self.names)}
+            missing = [str(name) for name in keep if name not in row_of]
+            if missing:
+                raise UsageError("is not among the points", where=", ".join(missing[:5]))
+            rows = np.array([row_of[name] for name in keep], dtype=np.intp)
+        return ImagePoints(tuple(self.names[i] for i in rows), self.xy[rows], self.cov[rows])
