@@ -69,14 +69,10 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], float]:
         with tifffile.TiffFile(path) as tiff:
             page = tiff.pages.first
             _too_large(path, page.imagewidth, page.imagelength)
-            if page.photometric.name not in ("MINISBLACK", "MINISWHITE", "RGB"):
-                raise ImageError(
-                    f"is a TIFF of colour kind {page.photometric.name}",
-                    where=path,
-                    do="convert it to grey or RGB",
-                )
+            colour = tifffile.PHOTOMETRIC(page.photometric).name
+            if colour not in ("MINISBLACK", "MINISWHITE", "RGB"):
+                raise ImageError(f"is a TIFF of colour {colour}", where=path, do="convert it to grey or RGB")
             pixels = page.asarray()
-            white_is_zero = page.photometric.name == "MINISWHITE"
     except ImageError:
         raise
     except Exception as error:  # tifffile and its codecs raise of every kind on damaged files
