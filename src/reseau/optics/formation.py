@@ -1,15 +1,15 @@
 r"""The image of plane shapes, formed exactly: any smooth mapping, point-spread function, pixel integration.
 
 A shape is known by its outline. With the pixel response :math:`h` along an axis (a Gaussian point-spread
-function folded with the light-sensitive width of the pixel) and :math:`H` its integral, the share of a pixel's
-light that falls on the shape R is, by Green's theorem, an integral along the outline alone,
+function folded with the light-sensitive width of the pixel) and :math:`H` its integral, the share of a
+pixel's light that falls on the shape R is, by Green's theorem, an integral along the outline alone,
 
 .. math:: a(p) = \iint_R h(p_x - q_x)\,h(p_y - q_y)\,dq = -\oint H(p_x - q_x)\,h(p_y - q_y)\,dq_y ,
 
 so that Gauss–Legendre nodes on the outline give all pixels of a patch as one product of two small matrices.
 Nothing is sampled in the image plane: a shift of the shape by 1/1000 px is a shift of its image by 1/1000 px.
-The derivative for a motion :math:`v` of the outline is :math:`\oint h\,h\,(v_x dq_y - v_y dq_x)`, and that for the
-width of the Gaussian follows from the equation of heat, :math:`\partial a/\partial s = s\,\nabla^2 a`.
+The derivative for a motion :math:`v` of the outline is :math:`\oint h\,h\,(v_x dq_y - v_y dq_x)`, and that
+for the width of the Gaussian follows from the equation of heat, :math:`\partial a/\partial s = s\,\nabla^2 a`.
 
 The simulators draw with this module what the measurement matches against.
 """
@@ -114,8 +114,9 @@ def mark_outline(
     Parameters
     ----------
     shape : {"cross", "disk", "rod", "square", "line-grid"}
-        As in ``reseau-design/1``: `size` is the tip-to-tip length of a cross, the diameter of a disk or a rod, the
-        side of a square; a crossing of a line grid has no size but arms of `line_width` that run out to `reach`.
+        As in ``reseau-design/1``: `size` is the tip-to-tip length of a cross, the diameter of a disk or a
+        rod, the side of a square; a crossing of a line grid has no size but arms of `line_width` that run out
+        to `reach`.
     spacing : float
         Largest distance of two nodes of the quadrature.
 
@@ -141,7 +142,7 @@ def mark_outline(
 
 @dataclass(frozen=True)
 class PixelResponse:
-    """How a pixel answers to light along an axis: a Gaussian folded with the light-sensitive part of the pixel.
+    """How a pixel answers to light along an axis: a Gaussian folded with its light-sensitive part.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ class PixelResponse:
             z = edge / sigma
             step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
             found = [edge * step + sigma * bell, step]
-            # Derivatives of the Gaussian by the recursion of Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
+            # Derivatives of a Gaussian: Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
             before, hermite = np.zeros_like(z), np.ones_like(z)
             for k in range(highest):
                 found.append(hermite * bell / (-sigma) ** k / sigma)
@@ -188,7 +189,7 @@ def coverage(
     columns: Array,
     rows: Array,
     sigma: Array | float,
-    response: PixelResponse = PixelResponse(),  # noqa: B008 - frozen
+    response: PixelResponse = PixelResponse(),
 ) -> Array:
     """Share of each pixel's light that falls on the shape, 0 to 1.
 
@@ -217,7 +218,7 @@ def coverage_derivatives(
     columns: Array,
     rows: Array,
     sigma: Array | float,
-    response: PixelResponse = PixelResponse(),  # noqa: B008 - frozen
+    response: PixelResponse = PixelResponse(),
     motions: Array | None = None,
 ) -> tuple[Array, Array]:
     """Compute the share of light and its derivatives with respect to position, width and form.
@@ -257,7 +258,7 @@ def draw(
     outline: Outline,
     shape: tuple[int, int],
     sigma: float,
-    response: PixelResponse = PixelResponse(),  # noqa: B008 - frozen
+    response: PixelResponse = PixelResponse(),
     row_shifts: Array | None = None,
 ) -> Array:
     """Draw many disjoint shapes into one frame.
