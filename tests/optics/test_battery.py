@@ -1,0 +1,356 @@
+"""One battery for every plane mapping: derivatives, inverse, values, files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reseau.data import Array
+from reseau.errors import FormatError, UsageError
+from reseau.optics import Chain, Identity, Inverted, Mapping, PlaneMapping, RationalPolynomial, Similarity
+
+
+class Case(NamedTuple):
+    """A model at a realistic place.
+
+    `extent` is half the side of the square of points it is used on.
+    """
+
+    mapping: PlaneMapping
+    extent: float
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def points(self, n: int = 40, seed: int = 7) -> Array:
+        spread = np.random.default_rng(seed).uniform(-1, 1, (n, 2))
+        return np.asarray(self.centre) + self.extent * spread
+
+
+def _camera() -> RationalPolynomial:
+    # Millimetres on a Polaroid, reseau system: tilt of some minutes, barrel distortion of 1 mm at the corner.
+    return RationalPolynomial.camera().with_values(
+        [1.01, 0.003, 0.4, -0.002, 0.99, -0.3, 2e-4, -1e-4, 1e-5, -2e-5, 8e-6, -2e-8, 3e-8]
+    )
+
+
+def _ultrasonic() -> RationalPolynomial:
+    a = [0.3, 1.02, -0.01, 2e-4, -1e-4, 5e-5, 4e-6, 2e-8]
+    b = [-0.2, 0.98, 0.02, -1e-4, 2e-4, 1e-4, 3e-6, -1e-8]
+    return RationalPolynomial.ultrasonic().with_values([*a, *b])
+
+
+def _seventh() -> RationalPolynomial:
+    mapping = RationalPolynomial.polynomial(7, offset=(511.5, 383.5), scale=512.0)
+    noise = np.random.default_rng(3).normal(0, 0.5, len(mapping.names))
+    return mapping.with_values(mapping.values + noise)
+
+
+def _projective() -> RationalPolynomial:
+    return RationalPolynomial.projective().with_values([0.9, 0.2, 30.0, -0.1, 1.1, -12.0, 2e-4, -3e-4])
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "identity": lambda: Case(Identity(), 500),
+    "similarity": lambda: Case(Similarity([3.0, -4.0, 0.8, 0.6]), 500),
+    "similarity-mirrored": lambda: Case(Similarity([3.0, -4.0, 0.8, 0.6], mirrored=True), 500),
+    "polynomial-similarity": lambda: Case(
+        RationalPolynomial.similarity().with_values([3, -4, 0.8, 0.6]), 500
+    ),
+    "affine": lambda: Case(RationalPolynomial.affine().with_values([1.1, 0.2, 3, -0.1, 0.9, 7]), 500),
+    "bilinear": lambda: Case(
+        RationalPolynomial.bilinear().with_values([1.1, 0.2, 3, -0.1, 0.9, 7, 1e-5, -2e-5]), 500
+    ),
+    "projective": lambda: Case(_projective(), 400, (500.0, 400.0)),
+    "camera": lambda: Case(_camera(), 50),
+    "ultrasonic": lambda: Case(_ultrasonic(), 50),
+    "ultrasonic-reduced": lambda: Case(
+        RationalPolynomial.ultrasonic(reduced=True).with_values(
+            [0.3, 1.02, 4e-6, 2e-8, -0.2, 0.98, 0.02, 3e-6, -1e-8]
+        ),
+        50,
+    ),
+    "polynomial-7": lambda: Case(_seventh(), 512, (511.5, 383.5)),
+    "chain": lambda: Case(Chain(_camera(), _ultrasonic()), 50),
+    "chain-labelled": lambda: Case(Chain(_camera(), _camera(), ("first.", "second.")), 50),
+    "inverted": lambda: Case(Inverted(_camera()), 45),
+}
+EVERY = pytest.mark.parametrize("case", [pytest.param(make(), id=name) for name, make in CASES.items()])
+
+
+def numeric_by_point(case: Case, points: Array) -> Array:
+    """Central differences of fourth order: exact to about 1e-10 of the derivative."""
+    h = 1e-3 * case.extent
+    columns = []
+    for unit in np.eye(2) * h:
+        near = case.mapping(points + unit) - case.mapping(points - unit)
+        far = case.mapping(points + 2 * unit) - case.mapping(points - 2 * unit)
+        columns.append((8 * near - far) / (12 * h))
+    return np.stack(columns, axis=2)
+
+
+def steps(case: Case, points: Array) -> Array:
+    """For each parameter the change that moves some point by a thousandth of the extent."""
+    effect = np.abs(case.mapping.derivatives(points).d_parameters).max(axis=(0, 1))
+    assert (effect > 0).all(), "a parameter without any effect"
+    return 1e-3 * case.extent / effect
+
+
+def numeric_by_parameter(case: Case, points: Array) -> Array:
+    mapping, columns = case.mapping, []
+    for k, h in enumerate(steps(case, points)):
+        unit = np.zeros(len(mapping.names))
+        unit[k] = h
+
+        def moved(times: float, unit: Array = unit) -> Array:
+            return mapping.with_values(mapping.values + times * unit)(points)
+
+        columns.append((8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * h))
+    return np.stack(columns, axis=2) if columns else np.zeros((len(points), 2, 0))
+
+
+@EVERY
+def test_is_a_mapping(case: Case) -> None:
+    assert isinstance(case.mapping, Mapping)
+    assert len(set(case.mapping.names)) == len(case.mapping.names) == len(case.mapping.values)
+
+
+@EVERY
+def test_value_of_derivatives_is_that_of_the_call(case: Case) -> None:
+    points = case.points()
+    np.testing.assert_allclose(
+        case.mapping.derivatives(points).value, case.mapping(points), rtol=1e-13, atol=1e-11
+    )
+
+
+@EVERY
+def test_derivative_by_the_point_equals_the_numeric_one(case: Case) -> None:
+    points = case.points()
+    analytic, numeric = case.mapping.derivatives(points).d_xy, numeric_by_point(case, points)
+    np.testing.assert_allclose(analytic, numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())
+
+
+@EVERY
+def test_derivative_by_every_parameter_equals_the_numeric_one(case: Case) -> None:
+    points = case.points()
+    analytic, numeric = case.mapping.derivatives(points).d_parameters, numeric_by_parameter(case, points)
+    assert analytic.shape == (len(points), 2, len(case.mapping.names))
+    # In units of the image: a step h·derivative is off by less than 1e-8 of the extent.
+    scale = steps(case, points) / (1e-3 * case.extent)
+    np.testing.assert_allclose(analytic * scale, numeric * scale, rtol=0, atol=1e-8)
+
+
+@EVERY
+def test_differential_holds_for_every_set_of_free_parameters(case: Case) -> None:
+    """A joint change of any free set is predicted by its own columns (all pairs; each alone is above)."""
+    points, mapping = case.points(8), case.mapping
+    columns, h = mapping.derivatives(points).d_parameters, 1e-3 * steps(case, points)
+    for free in list(combinations(range(len(h)), 2))[:120]:
+        change = np.zeros(len(h))
+        change[list(free)] = h[list(free)]
+        difference = mapping.with_values(mapping.values + change)(points) - mapping.with_values(
+            mapping.values - change
+        )(points)
+        np.testing.assert_allclose(columns @ change, difference / 2, rtol=0, atol=1e-9 * case.extent)
+
+
+@EVERY
+def test_inverse_returns_to_the_point(case: Case) -> None:
+    points = case.points(2000)
+    assert np.abs(case.mapping.inverse(case.mapping(points)) - points).max() < 1e-9
+
+
+@EVERY
+def test_forward_of_inverse_returns_to_the_image(case: Case) -> None:
+    images = case.mapping(case.points(500, seed=11))
+    assert np.abs(case.mapping(case.mapping.inverse(images)) - images).max() < 1e-9
+
+
+@EVERY
+def test_is_finite_at_the_origin_and_at_its_centre(case: Case) -> None:
+    for part in case.mapping.derivatives([[0.0, 0.0], case.centre]):
+        assert np.isfinite(part).all()
+
+
+@EVERY
+def test_takes_no_points_at_all(case: Case) -> None:
+    none = np.zeros((0, 2))
+    assert case.mapping(none).shape == case.mapping.inverse(none).shape == (0, 2)
+    assert case.mapping.derivatives(none).d_parameters.shape == (0, 2, len(case.mapping.names))
+
+
+@EVERY
+def test_is_one_to_one_where_it_is_used(case: Case) -> None:
+    assert case.mapping.one_to_one(case.points(500)).all()
+
+
+@EVERY
+def test_answers_nan_for_what_is_not_finite(case: Case) -> None:
+    assert np.isnan(case.mapping.inverse([[np.nan, 0.0], [np.inf, 1.0]])).any(axis=1).all()
+
+
+@EVERY
+def test_with_values_changes_values_and_nothing_else(case: Case) -> None:
+    mapping = case.mapping
+    zero = mapping.with_values(np.zeros(len(mapping.names)))
+    assert type(zero) is type(mapping)
+    assert not zero.values.any()
+    back = zero.with_values(dict(zip(mapping.names, mapping.values, strict=True)))
+    np.testing.assert_array_equal(back(case.points()), mapping(case.points()))
+
+
+@EVERY
+def test_values_cannot_be_changed_behind_its_back(case: Case) -> None:
+    before = case.mapping.values.copy()
+    given = before.copy()
+    mapping = case.mapping.with_values(given)
+    given += 1.0
+    np.testing.assert_array_equal(mapping.values, before)
+
+
+@EVERY
+def test_refuses_unknown_names_wrong_numbers_and_other_shapes(case: Case) -> None:
+    with pytest.raises(UsageError, match="nonsense"):
+        case.mapping.with_values({"nonsense": 1.0})
+    with pytest.raises(UsageError):
+        case.mapping.with_values(np.zeros(len(case.mapping.names) + 1))
+    with pytest.raises(UsageError, match="shape"):
+        case.mapping([1.0, 2.0])
+
+
+@EVERY
+def test_inverted_derivatives_are_the_inverse_matrices(case: Case) -> None:
+    points = case.points(20)
+    forward = case.mapping.derivatives(points)
+    backward = Inverted(case.mapping).derivatives(forward.value)
+    np.testing.assert_allclose(
+        backward.d_xy @ forward.d_xy, np.broadcast_to(np.eye(2), (20, 2, 2)), atol=1e-9
+    )
+
+
+POLYNOMIALS = [name for name, make in CASES.items() if isinstance(make().mapping, RationalPolynomial)]
+
+
+@pytest.mark.parametrize("name", POLYNOMIALS)
+def test_polynomial_comes_back_from_its_dictionary(name: str) -> None:
+    case = CASES[name]()
+    mapping = case.mapping
+    assert isinstance(mapping, RationalPolynomial)
+    content = mapping.to_dict()
+    again = RationalPolynomial.from_dict(content)
+    assert again.to_dict() == content
+    np.testing.assert_array_equal(again(case.points()), mapping(case.points()))
+    bare = RationalPolynomial.from_dict(mapping.to_dict(values=False))
+    assert bare.names == mapping.names
+    assert not bare.values.any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-1, 1), min_size=13, max_size=13),
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=20),
+)
+def test_inverse_of_any_plausible_camera_is_right_or_nan(
+    turns: list[float], points: list[tuple[float, float]]
+) -> None:
+    size = [0.2, 0.2, 5, 0.2, 0.2, 5, 2e-3, 2e-3, 1e-3, 1e-3, 1e-4, 1e-6, 1e-6]
+    camera = RationalPolynomial.camera()
+    camera = camera.with_values(camera.values + np.array(turns) * size)
+    found = camera.inverse(camera(points))
+    known = np.isfinite(found).all(axis=1)
+    assert np.abs(camera(found[known]) - camera(np.array(points))[known]).max(initial=0) < 1e-7
+    # Within the region around the centre there is one such point only, and it is the one we began with.
+    inside = known & camera.one_to_one(points)
+    assert np.abs(found[inside] - np.array(points)[inside]).max(initial=0) < 1e-6
+
+
+def test_camera_is_wishahy_equation_5() -> None:
+    v = _camera()
+    p = {name: v.value_of(name) for name in v.names}
+    x, y = 31.0, -17.0
+    d = p["a0"] * x + p["b0"] * y + 1
+    expected = [
+        (p["a1"] * x + p["b1"] * y + p["c1"]) / d
+        + p["d1"] * x * y
+        + p["k"] * (x**3 + x * y**2)
+        + p["h1"] * x**4,
+        (p["a2"] * x + p["b2"] * y + p["c2"]) / d
+        + p["d2"] * x * y
+        + p["k"] * (y**3 + y * x**2)
+        + p["h2"] * y**4,
+    ]
+    np.testing.assert_allclose(v([[x, y]]), [expected], rtol=1e-14)
+    assert v.names == ("a1", "b1", "c1", "a2", "b2", "c2", "a0", "b0", "d1", "d2", "k", "h1", "h2")
+
+
+def test_ultrasonic_is_wishahy_equation_7() -> None:
+    a, b = _ultrasonic().values[:8], _ultrasonic().values[8:]
+    x, y = 31.0, -17.0
+    r4 = (x**2 + y**2) ** 2
+    expected = [
+        a @ [1, x, y, x * y, x**2, y**2, x**3 + x * y**2, r4],
+        b @ [1, y, x, x * y, y**2, x**2, y**3 + y * x**2, r4],
+    ]
+    np.testing.assert_allclose(_ultrasonic()([[x, y]]), [expected], rtol=1e-14)
+
+
+def test_reduced_model_lacks_the_named_parameters_and_keeps_the_rest() -> None:
+    reduced = _camera().without("h1", "h2", "k")
+    assert reduced.names == _camera().names[:10]
+    full = _camera().with_values({"h1": 0.0, "h2": 0.0, "k": 0.0})
+    points = CASES["camera"]().points()
+    np.testing.assert_allclose(reduced(points), full(points), rtol=1e-14)
+    with pytest.raises(UsageError, match="h3"):
+        reduced.without("h3")
+
+
+def test_inverse_is_nan_where_the_polynomial_has_folded() -> None:
+    barrel = RationalPolynomial({"k": {"X": "x3 + xy2", "Y": "y3 + yx2"}}, [-1e-6], {"X": "x", "Y": "y"})
+    fold = (1 / 3e-6) ** 0.5  # 577.35: radius at which r − 1e-6 r³ turns back
+    assert np.isfinite(barrel.inverse(barrel([[fold * 0.999, 0.0], [0.0, -fold * 0.999]]))).all()
+    beyond = barrel([[fold * 1.3, 0.0]])  # has a second origin, inside
+    back = barrel.inverse(beyond)
+    assert np.hypot(*back[0]) < fold
+    np.testing.assert_allclose(barrel(back), beyond, atol=1e-9)
+    assert np.isnan(barrel.inverse([[fold * 2 / 3 + 1.0, 0.0]])).all()  # larger than any image
+    assert np.isnan(barrel.inverse([[-1000.0, 0.0]])).all()  # has an origin beyond the fold only
+
+
+def test_inverse_does_not_cross_the_horizon_of_a_projectivity() -> None:
+    strong = RationalPolynomial.projective().with_values({"a0": 0.01})
+    across = strong([[-150.0, 20.0]])  # 1 + D = −0.5
+    assert np.isnan(strong.inverse(across)).all()
+
+
+@pytest.mark.parametrize("text", ["x3 ++ y", "z", "x3 y + ", "", "2..x"])
+def test_unreadable_terms_are_refused(text: str) -> None:
+    if not text:
+        assert RationalPolynomial({"k": {"X": text}})([[1.0, 2.0]]).tolist() == [[0.0, 0.0]]
+        return
+    with pytest.raises(FormatError, match="monomials"):
+        RationalPolynomial({"k": {"X": text}})
+
+
+def test_models_of_a_file_that_are_none_are_refused() -> None:
+    for content in ({}, {"terms": {"k": "x"}}, {"terms": {"k": {"Q": "x"}}}, {"terms": {}, "more": 1}):
+        with pytest.raises(FormatError):
+            RationalPolynomial.from_dict(content)
+
+
+def test_common_system_has_its_origin_and_axis_in_the_two_marks() -> None:
+    o, s = np.array([30.0, 40.0]), np.array([130.0, 90.0])
+    for mirrored in (False, True):
+        system = Similarity.common_system(o, s, mirrored=mirrored)
+        np.testing.assert_allclose(system([o, s]), [[0, 0], [np.hypot(100, 50), 0]], atol=1e-12)
+        assert np.linalg.det(system.derivatives([o]).d_xy[0]) == pytest.approx(-1 if mirrored else 1)
+    with pytest.raises(UsageError, match="coincide"):
+        Similarity.common_system(o, o)
+
+
+def test_chain_tells_of_a_name_that_stands_twice() -> None:
+    with pytest.raises(UsageError, match="a1"):
+        Chain(_camera(), _camera())
