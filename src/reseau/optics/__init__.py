@@ -2,6 +2,7 @@
 
 from .cameras import Brown, OpenCV, PixelGrid
 from .composition import Chain, Identity, Inverted, Similarity
+from .displays import DecenteredDisplay, wong_display
 from .distortions import BrownDistortion
 from .mapping import Derivatives, Mapping, PlaneMapping
 from .polynomials import RationalPolynomial
@@ -15,11 +16,13 @@ from .poses import (
     rotate,
     rotation_matrix,
 )
+from .sensor import Sensor, illumination, jpeg, sigma_of_snr, snr_db
 
 __all__ = [
     "Brown",
     "BrownDistortion",
     "Chain",
+    "DecenteredDisplay",
     "Derivatives",
     "Identity",
     "Inverted",
@@ -30,11 +33,17 @@ __all__ = [
     "Pose",
     "Projection",
     "RationalPolynomial",
+    "Sensor",
     "Similarity",
     "angles_to_matrix",
+    "illumination",
+    "jpeg",
     "matrix_to_angles",
     "matrix_to_vector",
     "project",
     "rotate",
     "rotation_matrix",
+    "sigma_of_snr",
+    "snr_db",
+    "wong_display",
 ]

@@ -1,0 +1,125 @@
+"""Displays: a cathode-ray tube as Wong models it, with the beam of an ultrasonic instrument before it.
+
+The model is a sum of corrections to the displayed point::
+
+    X = x + (Δx)s + (Δx)d + (Δx)o + (Δx)ε        Y = y + (Δy)s + (Δy)d + (Δy)o
+
+    symmetric     (Δx)s = x(k0 + k1r² + k2r⁴ + k3r⁶)          (Δy)s = y(k0 + k1r² + k2r⁴ + k3r⁶)
+    decentering   (Δx)d = −(g1r² + g2r⁴ + g3r⁶) sin θ         (Δy)d = (g1r² + g2r⁴ + g3r⁶) cos θ
+    orientation   (Δx)o = P0 + P1xy + P2x² − P3y              (Δy)o = P4 + P2xy + P3x + P1y²
+    beam          (Δx)ε = m1x + m2y
+
+(Wong 1975, Mathematical formulation and digital analysis in close-range photogrammetry; Wishahy, section B.)
+
+Where Wishahy's printed formulas disagree, the components above are taken and not their expansion:
+
+- The Δ are called distortions but are added to the measured point: they are corrections, and are that here.
+- (6a, b) print h1 and h3 without the prime at x² and y², the list after (7) prints h1, h2, h3, h4 without it:
+  all mean the h' of the decentering. With it the signs of (6) follow from the components.
+- The beam's (Δx)ε is (Δx)e in the sum.
+- In (7) all sixteen coefficients are free, but the thirteen parameters of (6) leave three conditions:
+  A4 − A5 = B3 (both P2), B4 − B5 = A3 (both P1) and A6 = B6 (both k1). (7) is
+  :meth:`RationalPolynomial.ultrasonic`; a display fitted instead keeps the conditions.
+- h'1 = g1 sin θ … h'4 = g2 cos θ are four numbers from three: (6) and (7) drop h'1·h'4 = h'2·h'3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..data import Array, Mask
+from .mapping import Derivatives, PlaneMapping, as_values
+from .polynomials import RationalPolynomial
+
+__all__ = ["DecenteredDisplay", "wong_display"]
+
+_RADII = ["x2 + y2", "x4 + 2x2y2 + y4", "x6 + 3x4y2 + 3x2y4 + y6"]
+_X_RADII = ["x", "x3 + xy2", "x5 + 2x3y2 + xy4", "x7 + 3x5y2 + 3x3y4 + xy6"]
+_Y_RADII = ["y", "y3 + yx2", "y5 + 2x2y3 + x4y", "y7 + 3x2y5 + 3x4y3 + x6y"]
+_SYMMETRIC = {f"k{i}": {"X": x, "Y": y} for i, (x, y) in enumerate(zip(_X_RADII, _Y_RADII, strict=True))}
+_ORIENTATION = {
+    "P0": {"X": "1"},
+    "P1": {"X": "xy", "Y": "y2"},
+    "P2": {"X": "x2", "Y": "xy"},
+    "P3": {"X": "-y", "Y": "x"},
+    "P4": {"Y": "1"},
+}
+_BEAM = {"m1": {"X": "x"}, "m2": {"X": "y"}}
+_UNCHANGED = {"X": "x", "Y": "y"}
+
+
+def _negative(terms: str) -> str:
+    return "-" + terms.replace("+", "-")
+
+
+def wong_display() -> RationalPolynomial:
+    """Wong's display, linear in its parameters: decentering by h'1 … h'4; begins as the identity.
+
+    Parameters k0 … k3, h'1 and h'2 (−r², −r⁴ in X), h'3 and h'4 (r², r⁴ in Y), P0 … P4, m1, m2: 15 in all.
+    With k2 = k3 = 0 it is Wishahy's eq. (6a, b).
+    """
+    decentering = {
+        "h'1": {"X": _negative(_RADII[0])},
+        "h'2": {"X": _negative(_RADII[1])},
+        "h'3": {"Y": _RADII[0]},
+        "h'4": {"Y": _RADII[1]},
+    }
+    return RationalPolynomial(_SYMMETRIC | decentering | _ORIENTATION | _BEAM, fixed=_UNCHANGED)
+
+
+# The display with the decentering as six numbers, linear: g_i sin θ and g_i cos θ.
+_LINEAR = (
+    _SYMMETRIC
+    | {f"s{i + 1}": {"X": _negative(terms)} for i, terms in enumerate(_RADII)}
+    | {f"c{i + 1}": {"Y": terms} for i, terms in enumerate(_RADII)}
+    | _ORIENTATION
+    | _BEAM
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DecenteredDisplay(PlaneMapping):
+    """Wong's display with the decentering as Wong has it: profile g1, g2, g3 and the direction θ of its axis.
+
+    Unlike :func:`wong_display` it is not linear in θ, and θ is undetermined where all g are zero.
+
+    Parameters
+    ----------
+    values : array_like (15,)
+        k0 … k3, g1, g2, g3, theta (radians), P0 … P4, m1, m2; default the identity.
+    """
+
+    names: ClassVar[tuple[str, ...]] = (*_SYMMETRIC, "g1", "g2", "g3", "theta", *_ORIENTATION, *_BEAM)
+    values: Array = field(default_factory=lambda: np.zeros(15))
+
+    def __post_init__(self) -> None:
+        values = as_values(self.names, self.values)
+        object.__setattr__(self, "values", values)
+        symmetric, g, theta, others = values[:4], values[4:7], values[7], values[8:]
+        linear = np.concatenate([symmetric, g * np.sin(theta), g * np.cos(theta), others])
+        object.__setattr__(self, "_polynomial", RationalPolynomial(_LINEAR, linear, _UNCHANGED))
+
+    _polynomial: RationalPolynomial = field(init=False, repr=False)
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        value, d_xy, d_linear = self._polynomial.derivatives(xy)
+        g, sin, cos = self.values[4:7], np.sin(self.values[7]), np.cos(self.values[7])
+        by_sin, by_cos = d_linear[:, :, 4:7], d_linear[:, :, 7:10]
+        by_theta = by_sin @ (g * cos) - by_cos @ (g * sin)
+        columns = [d_linear[:, :, :4], by_sin * sin + by_cos * cos, by_theta[:, :, None], d_linear[:, :, 10:]]
+        return Derivatives(value, d_xy, np.concatenate(columns, axis=2))
+
+    def one_to_one(self, xy: ArrayLike) -> Mask:
+        """See :meth:`PlaneMapping.one_to_one`."""
+        return self._polynomial.one_to_one(xy)
+
+    def _value(self, xy: Array) -> Array:
+        return self._polynomial._value(xy)
+
+    def _slope(self, xy: Array) -> tuple[Array, Array]:
+        return self._polynomial._slope(xy)

@@ -1,0 +1,220 @@
+"""What a sensor makes of the light that falls on it: noise, saturation, grey steps, jitter of its rows.
+
+The noise model is that of the photon transfer curve (Janesick, Photon Transfer; EMVA Standard 1288): the
+variance of a grey value is its light over the gain in electrons per grey value, plus the noise of reading,
+plus 1/12 for the rounding to whole grey values. Signal-to-noise ratios follow the convention of peak signal,
+SNR = 20·log10(255/σ) dB.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..data import Array
+from ..errors import UsageError
+
+__all__ = ["Sensor", "illumination", "jpeg", "sigma_of_snr", "snr_db"]
+
+
+def snr_db(sigma: float, full_scale: float = 255.0) -> float:
+    """Signal-to-noise ratio in dB of a noise of standard deviation `sigma` grey values: 20·log10(255/σ)."""
+    return float(20 * np.log10(full_scale / sigma))
+
+
+def sigma_of_snr(snr: float, full_scale: float = 255.0) -> float:
+    """Standard deviation in grey values of a signal-to-noise ratio in dB; see :func:`snr_db`."""
+    return float(full_scale / 10 ** (snr / 20))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """An area sensor and its electronics.
+
+    Parameters
+    ----------
+    width, height : int
+        Number of columns and rows.
+    bits : int
+        Depth of the grey values, 1 to 16; it saturates at 2^bits − 1.
+    gain : float
+        Electrons per grey value.
+    read_noise : float
+        Standard deviation of the noise of reading, in grey values.
+    shot_noise : bool
+        Whether the light arrives as a Poisson process of electrons.
+    offset : float
+        Grey value without light.
+    row_jitter_px : float
+        Standard deviation of the shift of a row along x, in pixels (a frame grabber's line synchronisation).
+    quantise : bool
+        Whether grey values are rounded to integers; otherwise they are floats, but saturate all the same.
+
+    Raises
+    ------
+    UsageError
+        When a value is impossible.
+    """
+
+    width: int
+    height: int
+    bits: int = 8
+    gain: float = 40.0
+    read_noise: float = 0.0
+    shot_noise: bool = True
+    offset: float = 0.0
+    row_jitter_px: float = 0.0
+    quantise: bool = True
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 2 or not 1 <= self.bits <= 16:
+            raise UsageError(f"has {self.width}×{self.height} pixels of {self.bits} bits", where="sensor")
+        for name in ("read_noise", "offset", "row_jitter_px"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"is {getattr(self, name)}, not at least zero", where=f"{name} of a sensor")
+        if not self.gain > 0:
+            raise UsageError(f"is {self.gain}, not positive", where="gain of a sensor")
+
+    @property
+    def full_scale(self) -> float:
+        """Grey value at which the sensor saturates."""
+        return float(2**self.bits - 1)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the exposed pixels."""
+        if not self.quantise:
+            return np.dtype(np.float64)
+        return np.dtype(np.uint8 if self.bits <= 8 else np.uint16)
+
+    def expose(self, irradiance: ArrayLike, rng: np.random.Generator) -> NDArray[Any]:
+        """Take an image.
+
+        Parameters
+        ----------
+        irradiance : array_like (height, width)
+            Light on each pixel, in grey values.
+        rng : Generator
+            Source of the noise: same state, same image.
+
+        Returns
+        -------
+        ndarray (height, width)
+            Grey values of :attr:`dtype`.
+
+        Raises
+        ------
+        UsageError
+            When the image has another size than the sensor, or light is negative or not finite.
+        """
+        light = self._light(irradiance)
+        grey: Array = rng.poisson(light * self.gain) / self.gain if self.shot_noise else light.copy()
+        grey += self.offset
+        if self.read_noise > 0:
+            grey += rng.normal(0.0, self.read_noise, grey.shape)
+        if self.quantise:
+            np.rint(grey, out=grey)
+        return np.clip(grey, 0.0, self.full_scale, out=grey).astype(self.dtype)
+
+    def variance(self, irradiance: ArrayLike) -> Array:
+        """Variance of the grey values of each pixel, (height, width), in squared grey values.
+
+        It does not cover clipping at black and at saturation, and takes the rounding error as independent of
+        the light, which needs a noise of about half a grey value.
+        """
+        light = self._light(irradiance)
+        shot = light / self.gain if self.shot_noise else np.zeros_like(light)
+        variance: Array = shot + self.read_noise**2 + (1 / 12 if self.quantise else 0.0)
+        return variance
+
+    def row_shifts(self, rng: np.random.Generator) -> Array:
+        """Shifts of the rows along x in pixels, (height,), for the formation of the image to be exposed."""
+        return rng.normal(0.0, self.row_jitter_px, self.height)
+
+    def _light(self, irradiance: ArrayLike) -> Array:
+        light = np.asarray(irradiance, dtype=np.float64)
+        if light.shape != (self.height, self.width):
+            raise UsageError(
+                f"has the shape {light.shape}, not ({self.height}, {self.width})",
+                where="irradiance of a sensor",
+            )
+        # Formed images are exact to rounding error only; more than that below zero is a mistake.
+        if not (light.min() >= -1e-6 * self.full_scale and light.max() < np.inf):
+            raise UsageError("is negative or not finite somewhere", where="irradiance of a sensor")
+        return np.maximum(light, 0.0)
+
+
+def jpeg(pixels: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """What is left of an image after compression by JPEG.
+
+    Parameters
+    ----------
+    pixels : ndarray (height, width)
+        Grey values of 8 bits.
+    quality : int
+        1 to 100.
+
+    Raises
+    ------
+    UsageError
+        When the image is not grey of 8 bits, or there is no such quality.
+    """
+    if pixels.dtype != np.uint8 or pixels.ndim != 2 or not 1 <= quality <= 100:
+        raise UsageError(
+            f"cannot be compressed: {pixels.dtype} of shape {pixels.shape} at quality {quality}",
+            where="image",
+            do="JPEG takes grey values of 8 bits and a quality of 1 to 100",
+        )
+    _, stream = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = cv2.imdecode(stream, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(decoded, dtype=np.uint8)
+
+
+def illumination(
+    width: int,
+    height: int,
+    *,
+    gradient: tuple[float, float] = (0.0, 0.0),
+    curvature: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    corner_angle: float = 0.0,
+) -> Array:
+    """Uneven light over an image, 1 at its centre.
+
+    The field (1 + gx·x + gy·y + qxx·x² + qxy·xy + qyy·y²)·cos⁴α, with x and y from the centre of the image in
+    units of half its larger side; cos⁴α is the natural fall-off of light (Kraus, Photogrammetry).
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image in pixels.
+    gradient : (float, float)
+        gx and gy.
+    curvature : (float, float, float)
+        qxx, qxy and qyy.
+    corner_angle : float
+        Angle α between the axis and the ray to the corner of the image, radians; tan α grows with the radius.
+
+    Returns
+    -------
+    ndarray (height, width)
+        Factors to multiply the irradiance with.
+
+    Raises
+    ------
+    UsageError
+        When there is a place without light.
+    """
+    half = np.array([(width - 1) / 2, (height - 1) / 2])
+    x = (np.arange(width) - half[0])[None, :] / half.max()
+    y = (np.arange(height) - half[1])[:, None] / half.max()
+    qxx, qxy, qyy = curvature
+    field = 1 + gradient[0] * x + gradient[1] * y + qxx * x**2 + qxy * x * y + qyy * y**2
+    tangent_squared = np.tan(corner_angle) ** 2 * (x**2 + y**2) * (half.max() ** 2 / (half @ half))
+    light: Array = field / (1 + tangent_squared) ** 2
+    if not light.min() > 0:
+        raise UsageError("leaves a part of the image without light", where="illumination")
+    return light
