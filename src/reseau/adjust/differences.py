@@ -1,0 +1,91 @@
+"""Derivatives by differences, and whether a Jacobian agrees with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from reseau.data import Array, Mask
+
+__all__ = ["JacobianCheck", "compare_jacobians", "differences"]
+
+# Truncation (h⁴) balances rounding (ε/h) at ε^(1/5) where x is the only scale; less is safer where it is not.
+_STEP = float(np.finfo(np.float64).eps) ** 0.25
+
+
+def differences(function: Callable[[Array], Array], x: Array, columns: Mask | None = None) -> Array:
+    """Jacobian by central differences of fourth order (Abramowitz & Stegun 1964, sect. 25.3).
+
+    Parameters
+    ----------
+    function : callable
+        Of x (u,), gives an ndarray of any shape.
+    x : ndarray (u,)
+        Where.
+    columns : ndarray of bool (u,), optional
+        Which derivatives; the others are left zero.
+
+    Returns
+    -------
+    ndarray (..., u)
+        Derivatives, of the shape of the function's value + (u,).
+    """
+    here = np.asarray(function(x), dtype=np.float64)
+    jacobian = np.zeros((*here.shape, len(x)))
+    for j in np.flatnonzero(np.ones(len(x), bool) if columns is None else columns):
+        h = _STEP * abs(x[j]) if x[j] != 0 else _step_from_zero(function, x, int(j), here)
+        value = []
+        for multiple in (-2.0, -1.0, 1.0, 2.0):
+            moved = x.copy()
+            moved[j] = x[j] + multiple * h
+            value.append((np.asarray(function(moved), dtype=np.float64), moved[j] - x[j]))
+        (f_2, _), (f_1, d_1), (f1, d1), (f2, _) = value
+        jacobian[..., j] = (8.0 * (f1 - f_1) - (f2 - f_2)) / (6.0 * (d1 - d_1))
+    return jacobian
+
+
+def _step_from_zero(function: Callable[[Array], Array], x: Array, j: int, here: Array) -> float:
+    """A step for a value of zero, which tells no size: one that changes the function by little."""
+    h: float = _STEP
+    size = float(np.abs(here).max(initial=0.0))
+    moved = x.copy()
+    for _ in range(30):
+        moved[j] = h
+        change = float(np.abs(np.asarray(function(moved), dtype=np.float64) - here).max(initial=0.0))
+        if change <= 10 * _STEP * size or size == 0:
+            break
+        h /= 10.0
+    return h
+
+
+@dataclass(frozen=True)
+class JacobianCheck:
+    """How far an analytic Jacobian is from differences.
+
+    Parameters
+    ----------
+    error : float
+        Greatest difference in any column, relative to the greatest value of the column.
+    worst : str
+        Parameter of the column where it occurs.
+    row : int
+        Observation or condition where it occurs.
+    """
+
+    error: float
+    worst: str
+    row: int
+
+    def agrees(self, tolerance: float = 1e-6) -> bool:
+        """Whether the derivatives agree to this relative error."""
+        return self.error <= tolerance
+
+
+def compare_jacobians(analytic: Array, numeric: Array, names: tuple[str, ...]) -> JacobianCheck:
+    """Compare two Jacobians (n, u) column by column, each relative to its greatest entry."""
+    size = np.maximum(np.abs(analytic), np.abs(numeric)).max(axis=0)
+    error = np.abs(analytic - numeric) / np.where(size > 0, size, 1.0)
+    row, column = np.unravel_index(int(np.argmax(error)), error.shape)
+    return JacobianCheck(float(error[row, column]), names[int(column)], int(row))

@@ -1,0 +1,361 @@
+"""The least-squares engine: Levenberg–Marquardt and Gauss–Newton over either kind of problem.
+
+What decides is the *relative offset* (Bates & Watts 1981): the length of the residual vector in the space of
+the parameters over its length outside, each per degree of freedom; that is the correction still to come in
+units of the standard deviations. Near the minimum the sum of squares no longer tells two points apart in
+double precision while the offset still does, so that there the offset judges the steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from reseau.data import Array
+from reseau.errors import UsageError
+
+from .checks import check_jacobian
+from .linear import Linearised, constraint_matrix, linearise
+from .models import Model, State, model_of
+from .problem import Problem
+from .result import Adjustment, Failure, NullVector, Solution
+
+__all__ = ["Options", "adjust"]
+
+_EPS = float(np.finfo(np.float64).eps)
+_MEMORY, _SHRINK, _LEAST_DAMPING, _MOST_DAMPING = 0.7, 1.0 / 3.0, 1e-18, 1e18
+_LEAST_LENGTH = 2.0**-20
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to adjust.
+
+    Parameters
+    ----------
+    method : {"levenberg-marquardt", "gauss-newton"}
+        Gauss–Newton halves a step until the sum of squares decreases.
+    max_iterations : int
+        Corrections tried at most.
+    tolerance : float
+        Relative offset at which the iteration has converged: what is left to correct, in standard deviations
+        a posteriori.
+    damping : float
+        Initial damping of Levenberg–Marquardt, relative to the scaled columns of length one.
+    curvature : float
+        Levenberg–Marquardt refuses a step v whose geodesic acceleration a has 2|a|/|v| above this, in scaled
+        parameters.
+    rank_tolerance : float, optional
+        Singular values of the scaled design below this part of the largest count as zero. By default 1e-13
+        with analytic derivatives and 1e-9 with differences.
+    scale : {"a-posteriori", "a-priori"}
+        Whether :attr:`Adjustment.covariance` and :attr:`Adjustment.sigma` are multiplied by the estimated
+        variance factor, or take the covariance of the observations at its word. Without redundancy it is
+        always a priori.
+    check_jacobian : float, optional
+        Compare analytic derivatives with differences at the approximate values, and raise `UsageError` when
+        they differ by more than this, relative to the greatest of each column.
+    """
+
+    method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
+    max_iterations: int = 1000
+    tolerance: float = 1e-10
+    damping: float = 1e-4
+    curvature: float = 0.75
+    rank_tolerance: float | None = None
+    scale: Literal["a-posteriori", "a-priori"] = "a-posteriori"
+    check_jacobian: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in ("levenberg-marquardt", "gauss-newton"):
+            raise UsageError(f"is no method: {self.method!r}", where="Options.method")
+        if self.scale not in ("a-posteriori", "a-priori"):
+            raise UsageError(f"is no scale: {self.scale!r}", where="Options.scale")
+        if self.max_iterations < 0 or not self.tolerance > 0 or not self.damping > 0:
+            raise UsageError("max_iterations, tolerance and damping must be positive", where="Options")
+
+
+def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Failure:
+    """Adjust a problem by least squares.
+
+    Parameters
+    ----------
+    problem : GaussMarkov or GaussHelmert
+        What is to be adjusted.
+    options : Options, optional
+        How.
+
+    Returns
+    -------
+    Adjustment or Failure
+        A failure is falsy and carries its reason; `.required()` of either returns the adjustment or raises.
+
+    Raises
+    ------
+    UsageError
+        When parts of the problem do not fit together.
+
+    Notes
+    -----
+    Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
+    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05, eq. 2.4; convergence after Bates & Watts (1981),
+    *Technometrics* 23, 179–183.
+    """
+    run = _Run(problem, options or Options())
+    if run.options.check_jacobian is not None:
+        _check(run.model, run.options.check_jacobian)
+    return run.adjust()
+
+
+class _Run:
+    """One adjustment on its way."""
+
+    def __init__(self, problem: Problem, options: Options) -> None:
+        self.problem, self.options = problem, options
+        parameters = problem.parameters
+        self.model = model_of(problem)
+        self.free = np.flatnonzero(parameters.mask)
+        self.constraints = constraint_matrix(
+            problem.constraints, parameters.names, parameters.values, parameters.mask
+        )
+        analytic = getattr(problem, "jacobian", None) or getattr(problem, "jacobians", None)
+        self.rank_tolerance = options.rank_tolerance or (1e-13 if analytic else 1e-9)
+        datum = set(problem.datum)
+        self.datum = np.array([name in datum for name in parameters.free], dtype=bool)
+        self.marquardt = options.method == "levenberg-marquardt"
+        self.damping, self.growth, self.length = options.damping if self.marquardt else 0.0, 2.0, 1.0
+        self.lengths = np.zeros(len(self.free))
+        self.costs: list[float] = []
+        self.iterations = 0
+
+    def adjust(self) -> Adjustment | Failure:
+        model, x = self.model, self.model.start
+        x = self._moved(x, self.constraints.onto(x[self.free].astype(np.float64)))
+        self.begin = x[self.free].astype(np.float64)
+        state = model.evaluate(x)
+        if not state.usable:
+            return self._failure("the problem has no finite residuals at the approximate values", state)
+        self.floor = model.floor
+        self.costs.append(state.cost)
+        linear = self._linearise(state)
+        while not isinstance(linear, Failure):
+            if self._offset(linear, state) <= self.options.tolerance or state.cost <= self._rounding(
+                state, linear
+            ):
+                return self._arrived(state, linear)
+            following = self._advance(state, linear)
+            if isinstance(following, Failure):
+                return following
+            if following is None:
+                return self._arrived(state, linear)
+            state, linear = following
+        return linear
+
+    def _advance(
+        self, state: State, linear: Linearised
+    ) -> tuple[State, Linearised | Failure] | Failure | None:
+        """The next better point; None when rounding leaves none, which is the minimum."""
+        if linear.reducible <= 1e-9 * state.cost + self.floor:
+            closer = self._closer(state, linear)
+            if closer is not None or self._offset(linear, state) < 1e-6:
+                return closer
+        self.length = 1.0
+        while self.iterations < self.options.max_iterations:
+            trial = self._trial(state, linear, self.damping, self.length, self.marquardt)
+            promised = linear.predicted(self.damping) if self.marquardt else self.length * linear.reducible
+            gain = (state.cost - trial.cost) / promised if trial.usable and promised > 0 else -1.0
+            if gain > 1e-4:
+                self._relax(gain)
+                self.costs.append(trial.cost)
+                return trial, self._linearise(trial)
+            if not self._restrain():
+                if self._offset(linear, state) < 1e-4 or state.cost <= 1e6 * self._rounding(state, linear):
+                    return None
+                return self._failure("no step decreases the sum of squares, nor is it at a minimum", state)
+        return self._failure(f"has not converged in {self.iterations} iterations", state)
+
+    def _trial(
+        self, state: State, linear: Linearised, damping: float, length: float, bend: bool = False
+    ) -> State:
+        self.iterations += 1
+        step = length * self._datum_step(state, linear, damping)
+        if bend:
+            bent = self._bend(state, linear, damping, step)
+            if bent is None:
+                return State(state.x, state.residuals, state.whitened, np.inf)
+            step = step + bent
+        return self.model.evaluate(self._moved(state.x, step), state)
+
+    def _bend(self, state: State, linear: Linearised, damping: float, step: Array) -> Array | None:
+        """Geodesic acceleration: half the second-order correction; None where a step is too curved to trust.
+
+        A step whose second-order part is not small against it leaves the region in which the model is known
+        at all, and often for a plateau where a parameter has lost its influence (Transtrum & Sethna 2012).
+        """
+        h = 0.1
+        ahead = self.model.evaluate(self._moved(state.x, h * step), state)
+        if not ahead.usable:
+            return None
+        second = 2.0 / h * ((ahead.whitened - state.whitened) / h - linear.design @ step)
+        bent = linear.answer(second, damping)
+        size, bend = np.linalg.norm(step / linear.scale), np.linalg.norm(bent / linear.scale)
+        if 2.0 * bend > self.options.curvature * size:
+            return None
+        return 0.5 * bent
+
+    def _closer(self, state: State, linear: Linearised) -> tuple[State, Linearised] | None:
+        """Where the sum of squares is flat to rounding: the full step, if the offset says it is nearer."""
+        trial = self._trial(state, linear, 0.0, 1.0)
+        if not trial.usable or trial.cost > state.cost * (1.0 + 1e-8) + self.floor:
+            return None
+        following = self._linearise(trial)
+        if isinstance(following, Failure) or following.reducible >= 0.81 * linear.reducible:
+            return None
+        self.costs.append(trial.cost)
+        return trial, following
+
+    def _rounding(self, state: State, linear: Linearised) -> float:
+        """What rounding of the observations and of the function's terms leaves of an exact fit, squared."""
+        terms = np.abs(linear.design) @ np.abs(state.x[self.free].astype(np.float64))
+        return self.floor + _EPS**2 * float(terms @ terms)
+
+    def _relax(self, gain: float) -> None:
+        shrink = max(_SHRINK, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        self.damping = max(self.damping * shrink, _LEAST_DAMPING) if self.damping else 0.0
+        self.growth = 2.0
+
+    def _restrain(self) -> bool:
+        """Shorten the next step; False when it can hardly be shorter."""
+        if self.marquardt:
+            self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
+            self.growth *= 2.0
+            return self.damping < _MOST_DAMPING
+        self.length *= 0.5
+        return self.length > _LEAST_LENGTH
+
+    def _linearise(self, state: State) -> Linearised | Failure:
+        design = self.model.design(state)[:, self.free]
+        if not np.isfinite(design).all():
+            column = int(np.flatnonzero(~np.isfinite(design).all(axis=0))[0])
+            name = self.problem.parameters.free[column]
+            return self._failure(f"the derivatives with respect to {name} are not finite", state)
+        # After Moré (1978): a column that was long a short while ago is still scaled as such, so that a
+        # parameter about to lose its influence does not run away. The memory fades, or narrow valleys would
+        # take for ever.
+        self.lengths = np.maximum(_MEMORY * self.lengths, np.sqrt((design**2).sum(axis=0)))
+        return linearise(design, state.whitened, self.constraints, self.rank_tolerance, self.lengths)
+
+    def _moved(self, x: Array, step: Array) -> Array:
+        full = np.zeros(len(x))
+        full[self.free] = step
+        return x + self.model.carry(full)
+
+    def _offset(self, linear: Linearised, state: State) -> float:
+        """Relative offset of Bates & Watts (1981), eq. 3."""
+        redundancy = len(linear.design) - linear.rank
+        if linear.rank == 0:
+            return 0.0
+        inside = np.sqrt(linear.reducible / linear.rank)
+        if redundancy <= 0 or linear.outside == 0.0:
+            return float(inside) if inside**2 > self.floor else 0.0
+        return float(inside / (linear.outside / np.sqrt(redundancy)))
+
+    def _datum_step(self, state: State, linear: Linearised, damping: float) -> Array:
+        step = linear.step(damping)
+        if not self.datum.any() or linear.rank == len(linear.singular):
+            return step
+        # Inner constraints: Gᵀ (x − x_begin) = 0 over the chosen parameters (Förstner & Wrobel 2016, sect.
+        # 4.5).
+        past = np.where(self.datum, state.x[self.free].astype(np.float64) - self.begin + step, 0.0)
+        g = linear.null
+        inner = g[self.datum].T @ g[self.datum]
+        return step - g @ (np.linalg.pinv(inner) @ (g.T @ past)) / (1.0 + damping)
+
+    def _arrived(self, state: State, linear: Linearised) -> Adjustment | Failure:
+        factor, defect = linear.factor, linear.null.shape[1]
+        if defect:
+            vectors = self._null_vectors(linear)
+            listed = "; ".join(" with ".join(vector) for vector in vectors)
+            if not self.datum.any():
+                reason = f"rank defect {defect}: the observations do not determine {listed}"
+                return self._failure(reason, state, vectors)
+            g = linear.null
+            inner = g[self.datum].T @ g[self.datum]
+            size = np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
+            if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < 1e-10:
+                reason = f"rank defect {defect}: the chosen datum does not determine {listed}"
+                return self._failure(reason, state, vectors)
+            weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
+            factor = factor - g @ (weight @ factor)
+        return self._adjustment(state, linear, factor, defect)
+
+    def _adjustment(self, state: State, linear: Linearised, factor: Array, defect: int) -> Adjustment:
+        parameters = self.problem.parameters
+        cofactor = np.zeros((len(parameters), len(parameters)))
+        cofactor[np.ix_(self.free, self.free)] = factor @ factor.T
+        redundancy = len(linear.design) - self.model.left_out - linear.rank
+        shape = self.problem.observations.shape
+        solution = Solution(
+            design=linear.design,
+            whitened=state.whitened,
+            factor=factor,
+            influence=tuple(self.model.influence(state)),
+            cofactors=tuple(self.model.cofactors()),
+        )
+        return Adjustment(
+            problem=self.problem,
+            names=parameters.names,
+            exact_values=state.x,
+            cofactor=cofactor,
+            sigma0=float(np.sqrt(state.cost / redundancy)) if redundancy > 0 else float("nan"),
+            redundancy=redundancy,
+            cost=state.cost,
+            residuals=state.residuals.reshape(shape),
+            scale=self.options.scale if redundancy > 0 else "a-priori",
+            iterations=self.iterations,
+            costs=tuple(self.costs),
+            datum_defect=defect,
+            options=self.options,
+            solution=solution,
+        )
+
+    def _null_vectors(self, linear: Linearised) -> tuple[NullVector, ...]:
+        """A basis of the null space with as many zeros as may be: reduced by pivots, in scaled parameters."""
+        vectors = linear.scaled_null.copy()
+        count = vectors.shape[1]
+        for column in range(count):
+            rest = vectors[:, column:]
+            row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
+            vectors[:, [column, column + pick]] = vectors[:, [column + pick, column]]
+            vectors[:, column] /= vectors[row, column]
+            others = np.arange(count) != column
+            vectors[:, others] -= np.outer(vectors[:, column], vectors[row, others])
+        free = self.problem.parameters.free
+        length = np.sqrt((linear.design**2).sum(axis=0))
+        scale = 1.0 / np.where(length > 0, length, 1.0)
+        named = []
+        for vector in vectors.T:
+            involved = np.flatnonzero(np.abs(vector) > 1e-6 * np.abs(vector).max())
+            named.append({free[i]: float(vector[i] * scale[i]) for i in involved})
+        return tuple(named)
+
+    def _failure(self, reason: str, state: State, null_space: tuple[NullVector, ...] = ()) -> Failure:
+        values = state.x.astype(np.float64)
+        return Failure(
+            reason=reason,
+            values=dict(zip(self.problem.parameters.names, values.tolist(), strict=True)),
+            iterations=self.iterations,
+            costs=tuple(self.costs),
+            null_space=null_space,
+        )
+
+
+def _check(model: Model, tolerance: float) -> None:
+    found = check_jacobian(model.problem)
+    if not found.agrees(tolerance):
+        raise UsageError(
+            f"differs from differences by {found.error:.2g} of its column, at row {found.row}",
+            where=f"derivative with respect to {found.worst}",
+        )

@@ -1,0 +1,391 @@
+"""A problem made ready for the iterations: whitened residuals and design at any values of the parameters.
+
+Both kinds of problem come to the same: least squares of a whitened vector r(x). In the Gauss–Markov model
+r = W (f(x) − l). In the Gauss–Helmert model the residuals v of given x are found first, as those of least
+vᵀPv that keep the conditions; then r = L⁻¹(g − B v) with L Lᵀ = B Q Bᵀ (Mikhail 1976, ch. 7; Förstner &
+Wrobel 2016, sect. 4.8), so that rᵀr = vᵀPv, and L⁻¹A is its derivative to first order. Observed parameters
+are further rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from reseau.data import Array
+from reseau.errors import UsageError
+
+from .differences import differences
+from .problem import GaussHelmert, GaussMarkov, Problem, Values
+from .stochastic import Blocks, Weighting, blocks_of
+
+__all__ = ["Model", "State", "model_of"]
+
+_EPS = float(np.finfo(np.float64).eps)
+_INNER = 30
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A problem evaluated at one set of parameters.
+
+    Parameters
+    ----------
+    x : ndarray (u,)
+        Parameters, in the arithmetic of the observations.
+    residuals : ndarray (n,)
+        v = adjusted − observed.
+    whitened : ndarray (N,)
+        r of observations or conditions, then of observed parameters.
+    cost : float
+        rᵀr; infinite where the problem cannot be evaluated.
+    root : Blocks or None
+        L⁻¹ of the conditions (Gauss–Helmert).
+    derivatives : ndarray or None
+        B of the conditions (b, c, k).
+    """
+
+    x: Values
+    residuals: Array
+    whitened: Array
+    cost: float
+    root: Blocks | None = None
+    derivatives: Array | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the function had finite values."""
+        return bool(np.isfinite(self.cost))
+
+
+class Model:
+    """What both kinds share: arithmetic of the parameters, and the rows of the observed ones."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.names = problem.parameters.names
+        self.mask = problem.parameters.mask
+        observed = problem.observations
+        self.factors = None if problem.weights is None else problem.weights.ravel()
+        kind = type(observed.flat[0]) if observed.dtype == object and observed.size else None
+        self._kind: Callable[[float], Any] | None = kind
+        self._dtype = observed.dtype
+        self.prior = None
+        if problem.parameters.prior is not None:
+            prior = problem.parameters.prior.select(problem.parameters.free)
+            if prior.names:
+                self.prior = prior
+                self.prior_at = np.array([self.names.index(name) for name in prior.names], dtype=np.intp)
+                blocks = blocks_of(prior.covariance, prior.values.shape, "prior")
+                self.prior_weighting = Weighting(blocks, where="prior")
+
+    def carry(self, values: Array) -> Values:
+        """Values in the arithmetic of the observations."""
+        if self._kind is not None:
+            return np.array([self._kind(float(value)) for value in values], dtype=object)
+        return values.astype(self._dtype)
+
+    @property
+    def start(self) -> Values:
+        """Approximate values of the parameters."""
+        return self.carry(self.problem.parameters.values)
+
+    def evaluate(self, x: Values, near: State | None = None) -> State:
+        """Residuals at x; `near` is a state not far away."""
+        # What overflows at a bold step is refused by its cost; it need not warn as well.
+        try:
+            with np.errstate(all="ignore"):
+                state = self._evaluate(x, near)
+        except ArithmeticError:
+            state = None
+        if state is None or not np.isfinite(state.whitened).all():
+            n = self.problem.size
+            return State(x, np.full(n, np.nan), np.zeros(0), np.inf)
+        return state
+
+    def design(self, state: State) -> Array:
+        """Whitened design matrix (N, u) of all parameters at a state that is usable; fixed ones are zero."""
+        with np.errstate(all="ignore"):
+            rows = self._design(state)
+        if self.prior is not None:
+            extra = np.zeros((len(self.prior.names), len(self.names)))
+            extra[np.arange(len(extra)), self.prior_at] = 1.0
+            rows = np.vstack([rows, self.prior_weighting.whiten(extra)])
+        rows[:, ~self.mask] = 0.0
+        return rows
+
+    def influence(self, state: State) -> list[Blocks]:
+        """T with P v = T r and P A = T r' in each observation, then in each observed parameter."""
+        blocks = self._influence(state)
+        if self.prior is not None:
+            rows, columns = self.problem.size, len(state.whitened) - len(self.prior.names)
+            for root in self.prior_weighting.roots:
+                turned = np.swapaxes(root.matrices, 1, 2)
+                blocks.append(Blocks(rows + root.row, columns + root.row, turned))
+        return blocks
+
+    def cofactors(self) -> list[Blocks]:
+        """Covariances that belong to the blocks of :meth:`influence`."""
+        blocks = list(self.weighting.cofactors)
+        if self.prior is not None:
+            n = self.problem.size
+            blocks += [Blocks(n + q.row, n + q.row, q.matrices) for q in self.prior_weighting.cofactors]
+        return blocks
+
+    @property
+    def floor(self) -> float:
+        """A sum of squares that is no more than the rounding of the observations."""
+        if self._kind is not None:
+            return 0.0
+        eps = float(np.finfo(self._dtype).eps)
+        observed = np.abs(self.problem.observations.astype(np.float64).ravel())
+        noise = self.weighting.whiten(eps * observed)
+        return float(noise @ noise)
+
+    def _with_prior(self, x: Values, whitened: Array) -> Array:
+        if self.prior is None:
+            return whitened
+        misfit = x[self.prior_at].astype(np.float64) - self.prior.values
+        return np.concatenate([whitened, self.prior_weighting.whiten(misfit)])
+
+    weighting: Weighting
+
+    @property
+    def left_out(self) -> int:
+        """Observations or conditions that do not count."""
+        raise NotImplementedError
+
+    def _evaluate(self, x: Values, near: State | None) -> State | None:
+        raise NotImplementedError
+
+    def _design(self, state: State) -> Array:
+        raise NotImplementedError
+
+    def _influence(self, state: State) -> list[Blocks]:
+        raise NotImplementedError
+
+
+class _Markov(Model):
+    """l + v = f(x)."""
+
+    def __init__(self, problem: GaussMarkov) -> None:
+        super().__init__(problem)
+        self.markov = problem
+        self.weighting = Weighting(blocks_of(problem.covariance, problem.observations.shape), self.factors)
+
+    @property
+    def left_out(self) -> int:
+        return 0 if self.factors is None else int((self.factors == 0).sum())
+
+    def _compute(self, x: Values) -> Values:
+        computed = np.asarray(self.markov.function(x))
+        if computed.size != self.problem.size:
+            raise UsageError(
+                f"gave {computed.shape} for observations {self.problem.observations.shape}", where="function"
+            )
+        return computed.reshape(-1)
+
+    def _evaluate(self, x: Values, near: State | None) -> State | None:
+        residuals = (self._compute(x) - self.problem.observations.reshape(-1)).astype(np.float64)
+        # What is left out may be anything, but must not reach the others as 0 · NaN.
+        counted = residuals if self.factors is None else np.where(self.factors == 0, 0.0, residuals)
+        whitened = self._with_prior(x, self.weighting.whiten(counted))
+        return State(x, residuals, whitened, float(whitened @ whitened))
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivatives (n, u) of the function."""
+        n, u = self.problem.size, len(self.names)
+        if self.markov.jacobian is None:
+            return self.numeric(x)
+        given = np.asarray(self.markov.jacobian(x), dtype=np.float64)
+        if given.shape not in ((*self.problem.observations.shape, u), (n, u)):
+            raise UsageError(f"gave {given.shape}, not {(n, u)}", where="jacobian")
+        return given.reshape(n, u)
+
+    def numeric(self, x: Array) -> Array:
+        """The same by differences."""
+        return differences(lambda y: self._compute(self.carry(y)).astype(np.float64), x, self.mask)
+
+    def _design(self, state: State) -> Array:
+        jacobian = self.jacobian(state.x.astype(np.float64))
+        if self.factors is not None:
+            jacobian = np.where((self.factors == 0)[:, None], 0.0, jacobian)
+        return self.weighting.whiten(jacobian)
+
+    def _influence(self, state: State) -> list[Blocks]:
+        return [root.transposed for root in self.weighting.roots]
+
+
+class _Helmert(Model):
+    """g(l + v, x) = 0, in b groups of c conditions and k observations; a single group where they mix."""
+
+    def __init__(self, problem: GaussHelmert) -> None:
+        super().__init__(problem)
+        self.helmert = problem
+        shape = problem.observations.shape
+        blocks = blocks_of(problem.covariance, shape)
+        self.grouped = len(shape) == 2
+        groups, k = shape if self.grouped else (1, problem.size)
+        if self.grouped and not _fits(blocks, k):
+            groups, k = 1, problem.size
+        self.groups, self.k = groups, k
+        self.weighting = Weighting([_regrouped(blocks, groups, k)], self._whole_groups(problem))
+        self.covariances = self.weighting.cofactors[0].matrices
+
+    def _whole_groups(self, problem: GaussHelmert) -> Array | None:
+        if self.factors is None:
+            return None
+        factors = self.factors.reshape(self.groups, self.k)
+        out = (factors == 0).any(axis=1)
+        if out.any() and self.groups == 1:
+            raise UsageError(
+                "cannot leave out an observation of conditions that share all of them", where="weights"
+            )
+        self.outside = out
+        self.factors = np.where(out[:, None], 0.0, factors).ravel()
+        return self.factors
+
+    @property
+    def left_out(self) -> int:
+        return 0 if self.factors is None else int(self.outside.sum()) * self._conditions_each
+
+    def _conditions(self, observed: Array, x: Array) -> Array:
+        g = np.asarray(
+            self.helmert.conditions(observed.reshape(self.problem.observations.shape), x), dtype=float
+        )
+        if self.grouped and g.ndim and g.shape[0] == len(self.problem.observations):
+            self._conditions_each = g.size // self.groups
+        elif self.grouped or g.ndim != 1:
+            raise UsageError(f"gave {g.shape} of {self.problem.observations.shape}", where="conditions")
+        else:
+            self._conditions_each = g.size
+        return g.reshape(self.groups, self._conditions_each)
+
+    def derivatives(self, observed: Array, x: Array) -> tuple[Array, Array]:
+        """A (b, c, u) and B (b, c, k)."""
+        if self.helmert.jacobians is None:
+            return self.numeric(observed, x)
+        shape, u = self.problem.observations.shape, len(self.names)
+        a, b = self.helmert.jacobians(observed.reshape(shape), x)
+        a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+        rows = self.groups * self._conditions_each
+        if (self.grouped and b.shape != (shape[0], rows // shape[0], shape[1])) or a.size != rows * u:
+            raise UsageError(f"gave A {a.shape} and B {b.shape}", where="jacobians")
+        return a.reshape(self.groups, -1, u), self._in_groups(b)
+
+    def _in_groups(self, b: Array) -> Array:
+        if self.grouped and self.groups == 1:
+            b = scipy.linalg.block_diag(*b)
+        return b.reshape(self.groups, self._conditions_each, self.k)
+
+    def numeric(self, observed: Array, x: Array) -> tuple[Array, Array]:
+        """The same by differences; those of one column of all marks at once."""
+        a = differences(lambda y: self._conditions(observed, y), x, self.mask)
+        if not self.grouped:
+            b = differences(lambda y: self._conditions(y, x).ravel(), observed)
+            return a, b[None]
+        marks, k = self.problem.observations.shape
+        l0 = observed.reshape(marks, k)
+        step = np.maximum(np.abs(l0).max(axis=0), 1.0)
+
+        def moved(t: Array) -> Array:
+            return self._conditions((l0 + (t - 1.0) * step).ravel(), x).reshape(marks, -1)
+
+        b = differences(moved, np.ones(k)) / step
+        return a, self._in_groups(b)
+
+    def _evaluate(self, x: Values, near: State | None) -> State | None:
+        l0, at = self.problem.observations.ravel(), x.astype(np.float64)
+        v = np.zeros_like(l0) if near is None or not near.usable else near.residuals
+        tiny = self.floor
+        for _ in range(_INNER):
+            g = self._conditions(l0 + v, at)
+            _, b = self.derivatives(l0 + v, at)
+            w = g - (b @ v.reshape(self.groups, self.k, 1))[..., 0]
+            state = self._solve(x, w, b)
+            if state is None:
+                return None
+            change = self.weighting.whiten(state.residuals - v)
+            v = state.residuals
+            if change @ change <= 1e-24 * state.cost + 10 * tiny:
+                return state
+        return None
+
+    def _solve(self, x: Values, w: Array, b: Array) -> State | None:
+        """The residuals of least squares that keep the linearised conditions w + B v = 0 at x."""
+        bq = b @ self._safe_covariances
+        m = bq @ np.swapaxes(b, 1, 2)
+        if not np.isfinite(m).all():
+            return None
+        try:
+            lower = np.linalg.cholesky(m)
+        except np.linalg.LinAlgError:
+            return None
+        if self.groups == 1:
+            inverse = scipy.linalg.solve_triangular(lower[0], np.eye(len(lower[0])), lower=True)[None]
+        else:
+            inverse = np.linalg.inv(lower)
+        r = inverse @ w[..., None]
+        v = -np.swapaxes(bq, 1, 2) @ (np.swapaxes(inverse, 1, 2) @ r)
+        if self.factors is not None:
+            inverse = np.where(self.outside[:, None, None], 0.0, inverse)
+            r = np.where(self.outside[:, None, None], 0.0, r)
+        whitened = self._with_prior(x, r.ravel())
+        return State(x, v.ravel(), whitened, float(whitened @ whitened), Blocks(0, 0, inverse), b)
+
+    @property
+    def _safe_covariances(self) -> Array:
+        """Covariances where marks left out keep theirs, so that their residuals are still found."""
+        if self.factors is None or not self.outside.any():
+            return self.covariances
+        whole = self.helmert.covariance
+        given = _regrouped(blocks_of(whole, self.problem.observations.shape), self.groups, self.k)
+        return np.where(self.outside[:, None, None], given, self.covariances)
+
+    def _design(self, state: State) -> Array:
+        assert state.root is not None
+        observed = self.problem.observations.ravel() + state.residuals
+        a, _ = self.derivatives(observed, state.x.astype(np.float64))
+        return state.root.times(a.reshape(-1, len(self.names)))
+
+    def _influence(self, state: State) -> list[Blocks]:
+        assert state.root is not None
+        assert state.derivatives is not None
+        return [Blocks(0, 0, -np.swapaxes(state.root.matrices @ state.derivatives, 1, 2))]
+
+
+def _fits(blocks: list[Array], k: int) -> bool:
+    """Whether no block reaches from one mark into another."""
+    return all(part.shape[1] == 1 or (part.shape[1] == k) for part in blocks) and all(
+        part.shape[0] * part.shape[1] % k == 0 for part in blocks
+    )
+
+
+def _regrouped(blocks: list[Array], groups: int, k: int) -> Array:
+    """The covariance as blocks (groups, k, k)."""
+    if groups == 1:
+        return np.asarray(scipy.linalg.block_diag(*[matrix for part in blocks for matrix in part]))[None]
+    index = np.arange(k)
+    out = []
+    for part in blocks:
+        if part.shape[1] == k:
+            out.append(part)
+            continue
+        wide = np.zeros((len(part) // k, k, k))
+        wide[:, index, index] = part.reshape(-1, k)
+        out.append(wide)
+    return np.concatenate(out)
+
+
+def model_of(problem: Problem) -> Model:
+    """The problem made ready."""
+    return _Markov(problem) if isinstance(problem, GaussMarkov) else _Helmert(problem)
+
+
+def with_weights(problem: Problem, weights: Array) -> Problem:
+    """The problem with factors on its weights, given flat."""
+    return replace(problem, weights=weights.reshape(problem.observations.shape))

@@ -1,0 +1,179 @@
+"""The unknowns of an adjustment: named, fixed or free, observed beforehand or not, bound by conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reseau.data import Array, Mask
+from reseau.errors import UsageError
+
+__all__ = ["Constraint", "Parameters", "Prior"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Observed parameters: values from elsewhere with their covariance.
+
+    Parameters
+    ----------
+    names : sequence of str (p,)
+        Which parameters.
+    values : array_like (p,)
+        What was observed of them.
+    covariance : array_like (p,) or (p, p)
+        Standard deviations or a full covariance matrix, in the units of the parameters.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+    def __init__(self, names: Iterable[str], values: ArrayLike, covariance: ArrayLike) -> None:
+        object.__setattr__(self, "names", tuple(names))
+        object.__setattr__(self, "values", np.asarray(values, dtype=np.float64))
+        object.__setattr__(self, "covariance", np.asarray(covariance, dtype=np.float64))
+        p = len(self.names)
+        if self.values.shape != (p,) or self.covariance.shape not in ((p,), (p, p)):
+            raise UsageError(
+                f"{p} names, values {self.values.shape} and covariance {self.covariance.shape}", where="Prior"
+            )
+        if len(set(self.names)) != p:
+            raise UsageError("names a parameter twice", where="Prior")
+
+    def select(self, keep: Iterable[str]) -> Prior:
+        """What is known of some of the parameters: the marginal of the covariance."""
+        kept = set(keep)
+        rows = np.array([i for i, name in enumerate(self.names) if name in kept], dtype=np.intp)
+        diagonal = self.covariance.ndim == 1
+        covariance = self.covariance[rows] if diagonal else self.covariance[np.ix_(rows, rows)]
+        return Prior([self.names[i] for i in rows], self.values[rows], covariance)
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A linear condition between parameters: Σ coefficient · parameter = value.
+
+    Parameters
+    ----------
+    coefficients : mapping of str to float
+        By the names of the parameters.
+    value : float
+        The right-hand side.
+    """
+
+    coefficients: Mapping[str, float]
+    value: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Named parameters with their approximate values.
+
+    Parameters
+    ----------
+    names : sequence of str (u,)
+        Unique names.
+    values : array_like (u,)
+        Approximate values where free, true values where fixed.
+    free : sequence of str, optional
+        Names of those to be estimated; all by default.
+    prior_sigma : mapping of str to float, optional
+        Standard deviations of those whose `values` are observations as well.
+    prior : Prior, optional
+        Observed parameters whose observed value is not the approximate one, or which are correlated.
+
+    Raises
+    ------
+    UsageError
+        For names that stand twice or are unknown, and values that are not finite.
+
+    Examples
+    --------
+    >>> p = Parameters(["a", "b", "c"], [1.0, 2.0, 3.0]).fix("b")
+    >>> p.free
+    ('a', 'c')
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    free: tuple[str, ...]
+    prior: Prior | None
+
+    def __init__(
+        self,
+        names: Iterable[str],
+        values: ArrayLike,
+        free: Iterable[str] | None = None,
+        prior_sigma: Mapping[str, float] | None = None,
+        prior: Prior | None = None,
+    ) -> None:
+        object.__setattr__(self, "names", tuple(names))
+        object.__setattr__(self, "values", np.array(values, dtype=np.float64))
+        if self.values.shape != (len(self.names),) or not np.isfinite(self.values).all():
+            raise UsageError(
+                f"{len(self.names)} names need as many finite values, not {self.values.shape}",
+                where="Parameters",
+            )
+        if len(set(self.names)) != len(self.names):
+            twice = next(name for i, name in enumerate(self.names) if name in self.names[:i])
+            raise UsageError("stands twice among the parameters", where=twice)
+        wanted = set(self.names) if free is None else set(self._known(free))
+        object.__setattr__(self, "free", tuple(name for name in self.names if name in wanted))
+        if prior_sigma:
+            if prior is not None:
+                raise UsageError("give either prior_sigma or prior", where="Parameters")
+            at = [self.index(name) for name in self._known(prior_sigma)]
+            prior = Prior(prior_sigma, self.values[at], list(prior_sigma.values()))
+        if prior is not None:
+            self._known(prior.names)
+        object.__setattr__(self, "prior", prior)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[self.index(name)])
+
+    @property
+    def mask(self) -> Mask:
+        """True for the free ones, (u,)."""
+        free = set(self.free)
+        return np.array([name in free for name in self.names], dtype=bool)
+
+    def index(self, name: str) -> int:
+        """Where a parameter stands.
+
+        Raises
+        ------
+        UsageError
+            When there is none of this name.
+        """
+        self._known([name])
+        return self.names.index(name)
+
+    def fix(self, *names: str, at: float | None = None) -> Parameters:
+        """The same with these held fixed, at their present values or at the one given."""
+        gone = set(self._known(names))
+        values = self.values.copy()
+        if at is not None:
+            values[[self.index(name) for name in names]] = at
+        return Parameters(self.names, values, [n for n in self.free if n not in gone], prior=self.prior)
+
+    def release(self, *names: str) -> Parameters:
+        """The same with these free."""
+        return Parameters(self.names, self.values, (*self.free, *self._known(names)), prior=self.prior)
+
+    def with_values(self, values: ArrayLike) -> Parameters:
+        """The same with other (approximate) values, (u,); what was observed of them stays."""
+        return Parameters(self.names, values, self.free, prior=self.prior)
+
+    def _known(self, names: Iterable[str]) -> list[str]:
+        listed = list(names)
+        unknown = [str(name) for name in listed if name not in self.names]
+        if unknown:
+            raise UsageError("is not among the parameters", where=", ".join(unknown[:5]))
+        return listed

@@ -1,0 +1,173 @@
+"""Reliability: how well observations control each other (Baarda 1968), for any covariance and either model.
+
+With P v = T r and D = I − A Q Aᵀ in the whitened space, all follows from the blocks of T D Tᵀ = P Qᵥᵥ P:
+redundancy numbers are the diagonal of Q P Qᵥᵥ P … = (Qᵥᵥ P), and for an error in observation i alone (the
+conventional alternative hypothesis) the test value is w = (P v)ᵢ / √(P Qᵥᵥ P)ᵢᵢ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+import scipy.special
+
+from reseau.data import Array
+from reseau.errors import UsageError
+
+from .stochastic import Blocks
+
+__all__ = ["ExternalReliability", "Solution", "Standardised", "critical_tau", "critical_w", "noncentrality"]
+
+# A redundancy number below this is rounding: nothing controls the observation.
+_UNCONTROLLED = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Standardised:
+    """Redundancy numbers and test values in columns over observations and observed parameters (N,).
+
+    Parameters
+    ----------
+    redundancy_numbers : ndarray (N,)
+        Diagonal of Qᵥᵥ P.
+    w : ndarray (N,)
+        Test values for a variance factor of one; NaN where nothing controls the observation.
+    unit_error : ndarray (N,)
+        Error whose test value is one in the mean, 1/√(P Qᵥᵥ P)ᵢᵢ; infinite where nothing controls it.
+    """
+
+    redundancy_numbers: Array
+    w: Array
+    unit_error: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalReliability:
+    """Effects of undetected errors on the parameters.
+
+    Parameters
+    ----------
+    names : tuple of str (u,)
+        Parameters.
+    effects : ndarray (..., u)
+        Change of each parameter, for a minimal detectable error in each observation; of the observations'
+        shape. Infinite or NaN where nothing controls the observation.
+    lengths : ndarray (...)
+        Length of the change in the metric of the parameters, √(∇xᵀ Q⁻¹ ∇x) (Baarda's λ̄, its root): no
+        function of the parameters changes by more than this many of its standard deviations.
+    """
+
+    names: tuple[str, ...]
+    effects: Array
+    lengths: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The whitened linear problem at the estimates.
+
+    Parameters
+    ----------
+    design : ndarray (N', f)
+        Whitened design of the free parameters.
+    whitened : ndarray (N',)
+        Whitened residuals.
+    factor : ndarray (f, rank)
+        F with the cofactor matrix of the parameters F Fᵀ.
+    influence : tuple of Blocks
+        T with P v = T r.
+    cofactors : tuple of Blocks
+        Covariances of the observations and observed parameters.
+    """
+
+    design: Array
+    whitened: Array
+    factor: Array
+    influence: tuple[Blocks, ...]
+    cofactors: tuple[Blocks, ...]
+
+    def standardise(self) -> Standardised:
+        """Redundancy numbers and test values."""
+        through = self.design @ self.factor
+        numbers, tests, errors = [], [], []
+        for turn, cofactor in zip(self.influence, self.cofactors, strict=True):
+            t = turn.matrices
+            b, k, _ = t.shape
+            a = turn.times(through).reshape(b, k, -1)
+            own = t @ np.swapaxes(t, 1, 2)
+            controlled = own - a @ np.swapaxes(a, 1, 2)
+            number = np.einsum("bij,bji->bi", cofactor.matrices, controlled).ravel()
+            diagonal = np.diagonal(controlled, axis1=1, axis2=2).ravel()
+            before = np.diagonal(own, axis1=1, axis2=2).ravel()
+            known = diagonal > _UNCONTROLLED * before
+            size = np.sqrt(np.where(known, diagonal, 1.0))
+            numbers.append(np.clip(number, 0.0, None) if k == 1 else number)
+            tests.append(np.where(known, turn.times(self.whitened) / size, np.nan))
+            errors.append(np.where(known, 1.0 / size, np.inf))
+        return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
+
+    def effects(self, standardised: Standardised, delta: float) -> tuple[Array, Array]:
+        """Changes (N, f) of the parameters, and their lengths, for errors of delta times the unit error."""
+        through = self.design @ self.factor
+        turned = np.concatenate([turn.times(through) for turn in self.influence])
+        size = (delta * standardised.unit_error)[:, None]
+        with np.errstate(invalid="ignore"):
+            moved = turned * size
+            lengths: Array = np.sqrt((moved**2).sum(axis=1))
+            return moved @ self.factor.T, lengths
+
+
+def noncentrality(alpha: float, power: float) -> float:
+    """Baarda's δ₀: mean of a normal test value found by a two-sided test of level alpha with this power.
+
+    Examples
+    --------
+    >>> round(noncentrality(0.001, 0.8), 3)
+    4.132
+    """
+    critical = critical_w(alpha)
+    if not alpha < power < 1:
+        raise UsageError(f"{power} must be between alpha and 1", where="power")
+
+    def missing(delta: float) -> float:
+        found = scipy.special.ndtr(delta - critical) + scipy.special.ndtr(-delta - critical)
+        return float(found - power)
+
+    highest = critical + float(scipy.special.ndtri(power)) + 1.0
+    return float(scipy.optimize.brentq(missing, 0.0, max(highest, 1.0), xtol=1e-12))
+
+
+def critical_w(alpha: float) -> float:
+    """Critical value of Baarda's w, two-sided.
+
+    Examples
+    --------
+    >>> round(critical_w(0.001), 2)
+    3.29
+    """
+    if not 0 < alpha < 1:
+        raise UsageError(f"{alpha} must be between 0 and 1", where="alpha")
+    return float(-scipy.special.ndtri(alpha / 2.0))
+
+
+def critical_tau(alpha: float, redundancy: int) -> float:
+    """Critical value of Pope's τ, two-sided (Pope 1976, eq. 26): of t with redundancy − 1 degrees of freedom.
+
+    Raises
+    ------
+    UsageError
+        For a redundancy below 2, which leaves τ = ±1.
+
+    Examples
+    --------
+    >>> round(critical_tau(0.05, 10), 2)
+    1.9
+    """
+    if not 0 < alpha < 1:
+        raise UsageError(f"{alpha} must be between 0 and 1", where="alpha")
+    if redundancy < 2:
+        raise UsageError(f"τ has no distribution at a redundancy of {redundancy}", where="critical_tau")
+    t = float(scipy.special.stdtrit(redundancy - 1, 1.0 - alpha / 2.0))
+    return float(t * np.sqrt(redundancy / (redundancy - 1 + t**2)))

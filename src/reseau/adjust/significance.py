@@ -1,0 +1,184 @@
+"""Tests of an adjustment: its variance factor, its coefficients, and one model within another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.special
+
+from reseau.errors import UsageError
+
+if TYPE_CHECKING:
+    from .result import Adjustment
+
+__all__ = ["CoefficientTest", "GlobalTest", "NestedTest", "coefficient_test", "compare", "global_test"]
+
+
+@dataclass(frozen=True)
+class GlobalTest:
+    """Test of the variance factor against one.
+
+    Parameters
+    ----------
+    statistic : float
+        vᵀPv.
+    redundancy : int
+        Degrees of freedom.
+    lower, upper : float
+        Bounds the statistic keeps with probability 1 − alpha.
+    p : float
+        Two-sided probability of a statistic as extreme.
+    passed : bool
+        Whether the bounds are kept.
+    """
+
+    statistic: float
+    redundancy: int
+    lower: float
+    upper: float
+    p: float
+    passed: bool
+
+
+@dataclass(frozen=True)
+class CoefficientTest:
+    """Test of one parameter against a value.
+
+    Parameters
+    ----------
+    name : str
+        Parameter.
+    distribution : {"t", "chi2", "F"}
+        Of the statistic.
+    statistic, critical : float
+        Value of the test (its magnitude for t), and the value it exceeds with probability alpha.
+    p : float
+        Probability of exceeding the statistic when the parameter has the value.
+    significant : bool
+        Whether the parameter differs from the value.
+    """
+
+    name: str
+    distribution: str
+    statistic: float
+    critical: float
+    p: float
+    significant: bool
+
+
+@dataclass(frozen=True)
+class NestedTest:
+    """Test of a model within a wider one.
+
+    Parameters
+    ----------
+    distribution : {"F", "chi2"}
+        F when the variance factor is estimated, χ² when the sigmas are taken at their word.
+    statistic, critical : float
+        Value of the test, and the value it exceeds with probability alpha.
+    degrees : (int, int)
+        Restrictions, and the redundancy of the wider model.
+    p : float
+        Probability of exceeding the statistic when the restrictions hold.
+    significant : bool
+        Whether the wider model is needed.
+    """
+
+    distribution: str
+    statistic: float
+    critical: float
+    degrees: tuple[int, int]
+    p: float
+    significant: bool
+
+
+def _level(alpha: float) -> None:
+    if not 0 < alpha < 1:
+        raise UsageError(f"{alpha} must be between 0 and 1", where="alpha")
+
+
+def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
+    """Two-sided χ² test of a weighted sum of squares (Koch 1999, sect. 4.2.4).
+
+    Raises
+    ------
+    UsageError
+        Without redundancy, or for an alpha outside (0, 1).
+    """
+    _level(alpha)
+    if redundancy < 1:
+        raise UsageError("there is nothing to test without redundancy", where="global_test")
+    lower = float(scipy.special.chdtri(redundancy, 1.0 - alpha / 2.0))
+    upper = float(scipy.special.chdtri(redundancy, alpha / 2.0))
+    tail = float(scipy.special.chdtrc(redundancy, cost))
+    return GlobalTest(cost, redundancy, lower, upper, 2.0 * min(tail, 1.0 - tail), lower <= cost <= upper)
+
+
+def coefficient_test(fit: Adjustment, name: str, value: float, alpha: float) -> CoefficientTest:
+    """Test of one parameter, by t (a posteriori) or χ² (a priori) (Koch 1999, sect. 4.3).
+
+    Raises
+    ------
+    UsageError
+        When the parameter was fixed or is unknown.
+    """
+    _level(alpha)
+    at = fit.index(name)
+    if name not in fit.free or not fit.cofactor[at, at] > 0:
+        raise UsageError("was not estimated", where=name)
+    ratio = (float(fit.values[at]) - value) / float(np.sqrt(fit.cofactor[at, at]))
+    if fit.scale == "a-priori":
+        statistic, critical = ratio**2, float(scipy.special.chdtri(1, alpha))
+        p = float(scipy.special.chdtrc(1, statistic))
+        return CoefficientTest(name, "chi2", statistic, critical, p, statistic > critical)
+    statistic = abs(ratio) / fit.sigma0 if fit.sigma0 > 0 else (np.inf if ratio else 0.0)
+    critical = float(scipy.special.stdtrit(fit.redundancy, 1.0 - alpha / 2.0))
+    p = float(2.0 * scipy.special.stdtr(fit.redundancy, -statistic))
+    return CoefficientTest(name, "t", statistic, critical, p, bool(statistic > critical))
+
+
+def compare(nested: Adjustment, full: Adjustment, alpha: float = 0.05) -> NestedTest:
+    """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
+
+    Parameters
+    ----------
+    nested, full : Adjustment
+        Of the same observations with the same covariance, `nested` a special case of `full`.
+    alpha : float
+        Level.
+
+    Returns
+    -------
+    NestedTest
+        F test of the increase of vᵀPv; χ² test when `full` was adjusted with ``scale="a-priori"``.
+
+    Raises
+    ------
+    UsageError
+        When the redundancies or the numbers of observations show that they are not nested.
+
+    Notes
+    -----
+    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, eq. 4.145; for non-linear
+    models the likelihood ratio in the same form.
+    """
+    _level(alpha)
+    restrictions = nested.redundancy - full.redundancy
+    if restrictions < 1 or nested.problem.size != full.problem.size:
+        raise UsageError(
+            f"redundancies {nested.redundancy} and {full.redundancy} are not of a model within another",
+            where="compare",
+        )
+    increase = max(nested.cost - full.cost, 0.0)
+    degrees = (restrictions, full.redundancy)
+    if full.scale == "a-priori":
+        critical = float(scipy.special.chdtri(restrictions, alpha))
+        p = float(scipy.special.chdtrc(restrictions, increase))
+        return NestedTest("chi2", increase, critical, degrees, p, increase > critical)
+    variance = full.cost / full.redundancy
+    statistic = increase / restrictions / variance if variance > 0 else (np.inf if increase else 0.0)
+    critical = float(scipy.special.fdtri(*degrees, 1.0 - alpha))
+    p = float(scipy.special.fdtrc(*degrees, statistic))
+    return NestedTest("F", statistic, critical, degrees, p, bool(statistic > critical))

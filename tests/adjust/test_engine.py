@@ -1,0 +1,488 @@
+"""The engine: estimates, covariances, constraints, priors, datum, failures, of both kinds of problem."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reseau.adjust import (
+    Constraint,
+    Failure,
+    GaussHelmert,
+    GaussMarkov,
+    Options,
+    Parameters,
+    Prior,
+    adjust,
+    check_jacobian,
+)
+from reseau.errors import EstimationError, UsageError
+
+T = np.linspace(0.0, 4.0, 30)
+TRUE = np.array([2.0, 0.8, 0.5])
+
+
+def decay(x):
+    return x[0] * np.exp(-x[1] * T) + x[2]
+
+
+def decay_jacobian(x):
+    e = np.exp(-x[1] * T)
+    return np.stack([e, -x[0] * T * e, np.ones_like(T)], axis=1)
+
+
+def noisy(sigma=0.01, seed=3):
+    return decay(TRUE) + np.random.default_rng(seed).normal(0, sigma, len(T))
+
+
+def decay_problem(y=None, covariance=0.01, **more):
+    parameters = more.pop("parameters", Parameters("abc", [1.0, 1.0, 0.0]))
+    more.setdefault("jacobian", decay_jacobian)
+    return GaussMarkov(decay, noisy() if y is None else y, covariance, parameters, **more)
+
+
+def spd(rng, n):
+    a = rng.normal(size=(n, n + 3))
+    return a @ a.T / n * 1e-4
+
+
+METHODS = ["levenberg-marquardt", "gauss-newton"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_observations_give_the_true_parameters(method):
+    fit = adjust(decay_problem(decay(TRUE)), Options(method=method)).required()
+    np.testing.assert_allclose(fit.values, TRUE, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("jacobian", [decay_jacobian, None])
+def test_linear_theory_holds_at_the_minimum(method, jacobian):
+    """v ⟂ columns, Q = (AᵀPA)⁻¹, sigma0² = vᵀPv / r with a full covariance."""
+    covariance = spd(np.random.default_rng(1), len(T))
+    fit = adjust(decay_problem(covariance=covariance, jacobian=jacobian), Options(method=method)).required()
+    a, p = decay_jacobian(fit.values), np.linalg.inv(covariance)
+    normal = a.T @ p @ a
+    gradient = a.T @ p @ fit.residuals
+    # The correction still to come, in standard deviations.
+    assert np.sqrt(gradient @ np.linalg.solve(normal, gradient)) < 1e-7
+    np.testing.assert_allclose(fit.cofactor, np.linalg.inv(normal), rtol=1e-6)
+    assert fit.redundancy == len(T) - 3
+    assert fit.sigma0**2 == pytest.approx(fit.residuals @ p @ fit.residuals / fit.redundancy, rel=1e-9)
+    np.testing.assert_allclose(fit.adjusted, decay(fit.values), atol=1e-13)
+
+
+def test_sigmas_a_full_matrix_blocks_and_lists_of_them_mean_the_same():
+    sigma = np.linspace(0.01, 0.03, len(T))
+    given = [
+        sigma,
+        np.diag(sigma**2),
+        np.stack([np.diag(pair**2) for pair in sigma.reshape(-1, 2)]),
+        [sigma[:10], np.diag(sigma[10:] ** 2)],
+    ]
+    fits = [adjust(decay_problem(covariance=c)).required() for c in given]
+    for fit in fits[1:]:
+        np.testing.assert_allclose(fit.values, fits[0].values, atol=1e-10)
+        np.testing.assert_allclose(fit.covariance, fits[0].covariance, rtol=1e-8)
+        np.testing.assert_allclose(fit.w, fits[0].w, atol=1e-6)
+        np.testing.assert_allclose(fit.redundancy_numbers, fits[0].redundancy_numbers, atol=1e-9)
+
+
+def test_correlated_blocks_are_the_full_matrix_they_stand_for():
+    rng = np.random.default_rng(5)
+    blocks = np.stack([spd(rng, 3) for _ in range(10)])
+    full = np.zeros((30, 30))
+    for i, block in enumerate(blocks):
+        full[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
+    a = adjust(decay_problem(covariance=blocks)).required()
+    b = adjust(decay_problem(covariance=full)).required()
+    np.testing.assert_allclose(a.values, b.values, atol=1e-10)
+    np.testing.assert_allclose(a.w, b.w, atol=1e-6)
+    np.testing.assert_allclose(a.minimal_detectable_errors(), b.minimal_detectable_errors(), rtol=1e-7)
+
+
+@given(st.sets(st.sampled_from("abc"), min_size=1))
+@settings(max_examples=8, deadline=None)
+def test_fixed_parameters_stay_and_the_free_ones_are_those_of_the_smaller_problem(free):
+    start = Parameters("abc", TRUE, free=free)
+    fit = adjust(decay_problem(parameters=start)).required()
+    fixed = [name for name in "abc" if name not in free]
+    for name in fixed:
+        assert fit[name] == start[name]
+        assert fit.sigma_of(name) == 0.0
+    assert fit.redundancy == len(T) - len(free)
+    a = decay_jacobian(fit.values)[:, start.mask] / 0.01
+    np.testing.assert_allclose(
+        fit.covariance_of(*sorted(free), scaled=False), np.linalg.inv(a.T @ a), rtol=1e-7
+    )
+
+
+def test_an_unknown_name_is_an_error():
+    with pytest.raises(UsageError, match="d: is not among the parameters"):
+        Parameters("abc", [0, 0, 0], free=["d"])
+    with pytest.raises(UsageError, match="d"):
+        decay_problem(constraints=[Constraint({"d": 1.0})])
+
+
+def test_constraints_hold_exactly_and_add_redundancy():
+    constraint = Constraint({"a": 1.0, "c": -3.0}, 0.5)
+    fit = adjust(decay_problem(constraints=[constraint])).required()
+    assert fit["a"] - 3 * fit["c"] == pytest.approx(0.5, abs=1e-12)
+    assert fit.redundancy == len(T) - 3 + 1
+
+    # The same by substitution a = 0.5 + 3 c.
+    substituted = GaussMarkov(
+        lambda x: decay(np.array([0.5 + 3 * x[1], x[0], x[1]])), noisy(), 0.01, Parameters("bc", [1.0, 0.0])
+    )
+    other = adjust(substituted).required()
+    assert fit["b"] == pytest.approx(other["b"], abs=1e-9)
+    assert fit.sigma_of("b") == pytest.approx(other.sigma_of("b"), rel=1e-6)
+    variance = np.array([1.0, -3.0]) @ fit.covariance_of("a", "c") @ [1.0, -3.0]
+    assert abs(variance) < 1e-12 * fit.sigma_of("a") ** 2 * 1e3
+
+
+def test_dependent_constraints_count_once_and_contradictions_are_errors():
+    twice = [Constraint({"a": 1.0, "c": -1.0}, 1.5), Constraint({"a": -2.0, "c": 2.0}, -3.0)]
+    assert adjust(decay_problem(constraints=twice)).required().redundancy == len(T) - 2
+    wrong = [twice[0], Constraint({"a": 1.0, "c": -1.0}, 1.0)]
+    with pytest.raises(UsageError, match="contradict"):
+        adjust(decay_problem(constraints=wrong))
+
+
+def test_a_prior_is_an_observation_of_the_parameter():
+    prior = Prior(["c", "a"], [0.6, 1.9], np.array([[0.02**2, 1e-4], [1e-4, 0.03**2]]))
+    fit = adjust(decay_problem(parameters=Parameters("abc", [1, 1, 0], prior=prior))).required()
+    whole = np.zeros((32, 32))
+    whole[:30, :30], whole[30:, 30:] = np.eye(30) * 1e-4, prior.covariance
+    extended = GaussMarkov(
+        lambda x: np.concatenate([decay(x), x[[2, 0]]]),
+        np.concatenate([noisy(), prior.values]),
+        whole,
+        Parameters("abc", [1.0, 1.0, 0.0]),
+    )
+    other = adjust(extended).required()
+    np.testing.assert_allclose(fit.values, other.values, atol=1e-9)
+    np.testing.assert_allclose(fit.cofactor, other.cofactor, rtol=1e-5)
+    assert fit.redundancy == other.redundancy
+    np.testing.assert_allclose(fit.prior_w, other.w[30:], atol=1e-5)
+    np.testing.assert_allclose(fit.prior_redundancy_numbers, other.redundancy_numbers[30:], atol=1e-7)
+    numbers = fit.redundancy_numbers.sum() + fit.prior_redundancy_numbers.sum()
+    assert numbers == pytest.approx(fit.redundancy, abs=1e-8)
+
+
+def test_the_prior_of_a_fixed_parameter_does_not_count():
+    free = Parameters("abc", TRUE, free="ab")
+    with_prior = Parameters("abc", TRUE, free="ab", prior_sigma={"c": 0.1})
+    a, b = (adjust(decay_problem(parameters=p)).required() for p in (free, with_prior))
+    assert a.redundancy == b.redundancy
+    assert a.cost == b.cost
+
+
+def test_an_observation_of_weight_zero_is_as_good_as_absent():
+    keep = np.ones(len(T), dtype=bool)
+    keep[[4, 5, 20]] = False
+    covariance = spd(np.random.default_rng(8), len(T))
+    y = noisy()
+    spoilt = np.where(keep, y, 1e6)
+    fit = adjust(decay_problem(spoilt, covariance, weights=keep.astype(float))).required()
+    shorter = GaussMarkov(
+        lambda x: decay(x)[keep], y[keep], covariance[np.ix_(keep, keep)], Parameters("abc", [1.0, 1.0, 0.0])
+    )
+    other = adjust(shorter).required()
+    np.testing.assert_allclose(fit.values, other.values, atol=1e-9)
+    np.testing.assert_allclose(fit.cofactor, other.cofactor, rtol=1e-5)
+    assert fit.redundancy == other.redundancy
+    np.testing.assert_allclose(fit.w[keep], other.w, atol=1e-5)
+    assert np.isnan(fit.w[~keep]).all()
+    np.testing.assert_array_equal(fit.rejected, ~keep)
+
+
+def test_badly_scaled_parameters_are_no_rank_defect():
+    unit = np.array([1e12, 1.0, 1e-12])
+    scaled = GaussMarkov(
+        lambda x: decay(x * unit), noisy(), 0.01, Parameters("abc", np.array([1.0, 1.0, 0.1]) / unit)
+    )
+    fit, plain = adjust(scaled).required(), adjust(decay_problem()).required()
+    np.testing.assert_allclose(fit.values * unit, plain.values, atol=1e-8)
+    np.testing.assert_allclose(fit.sigma * unit, plain.sigma, rtol=1e-5)
+
+
+def test_a_rank_defect_names_the_parameters_of_its_null_space():
+    def function(x):
+        return decay(np.array([x[0] + 2 * x[3], x[1], x[2]]))
+
+    names = ["a", "b", "c", "shift", "idle"]
+    failed = adjust(GaussMarkov(function, noisy(), 0.01, Parameters(names, [1.0, 1.0, 0.0, 0.5, 7.0])))
+    assert not failed
+    assert isinstance(failed, Failure)
+    assert "rank defect 2" in failed.reason
+    found = {frozenset(vector) for vector in failed.null_space}
+    assert found == {frozenset({"a", "shift"}), frozenset({"idle"})}
+    pair = next(vector for vector in failed.null_space if "a" in vector)
+    assert pair["a"] / pair["shift"] == pytest.approx(-2.0, abs=1e-6)
+    with pytest.raises(EstimationError, match="shift"):
+        failed.required()
+
+
+def test_a_function_that_is_not_finite_at_the_start_is_a_failure_with_the_reason():
+    failed = adjust(GaussMarkov(lambda x: np.log(x[0]) * T, noisy(), 0.01, Parameters("a", [-1.0])))
+    assert not failed
+    assert "approximate values" in failed.reason
+
+
+def test_too_few_iterations_are_a_failure_not_an_estimate():
+    failed = adjust(decay_problem(), Options(max_iterations=1))
+    assert not failed
+    assert "1 iterations" in failed.reason
+    assert len(failed.costs) >= 1
+
+
+def test_a_problem_without_redundancy_has_a_covariance_a_priori_only():
+    fit = adjust(GaussMarkov(lambda x: x * 2.0, [2.0, 6.0], 0.1, Parameters("ab", [0.0, 0.0]))).required()
+    np.testing.assert_allclose(fit.values, [1.0, 3.0], atol=1e-12)
+    assert fit.redundancy == 0
+    assert np.isnan(fit.sigma0)
+    assert fit.scale == "a-priori"
+    np.testing.assert_allclose(fit.sigma, 0.05, atol=1e-12)
+    with pytest.raises(UsageError):
+        fit.covariance_of(scaled=True)
+
+
+def test_a_wrong_derivative_is_found_and_named():
+    def wrong(x):
+        jacobian = decay_jacobian(x)
+        jacobian[7, 1] *= 1.01
+        return jacobian
+
+    assert check_jacobian(decay_problem()).agrees()
+    check = check_jacobian(decay_problem(jacobian=wrong))
+    assert (check.worst, check.row) == ("b", 7)
+    with pytest.raises(UsageError, match="respect to b"):
+        adjust(decay_problem(jacobian=wrong), Options(check_jacobian=1e-6))
+
+
+def test_scale_chooses_between_the_variance_factors():
+    y = decay(TRUE) + np.random.default_rng(3).normal(0, 0.05, len(T))
+    posterior = adjust(decay_problem(y)).required()
+    prior = adjust(decay_problem(y), Options(scale="a-priori")).required()
+    np.testing.assert_allclose(posterior.sigma, prior.sigma * posterior.sigma0, rtol=1e-12)
+    np.testing.assert_array_equal(prior.covariance, prior.cofactor)
+
+
+# --- a levelling net without a datum: heights known but for a constant
+
+PAIRS = list(itertools.combinations(range(4), 2))
+HEIGHTS = np.array([10.0, 12.0, 9.0, 15.0])
+START = HEIGHTS + np.array([0.1, -0.2, 0.3, 0.2])
+ERRORS = np.array([0.01, -0.02, 0.01, 0.0, 0.02, -0.01])
+LEVELLED = np.array([HEIGHTS[j] - HEIGHTS[i] for i, j in PAIRS]) + ERRORS
+
+
+def net(datum=(), start=START):
+    names = ["H1", "H2", "H3", "H4"]
+    return GaussMarkov(
+        lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
+        LEVELLED,
+        0.01,
+        Parameters(names, start),
+        datum=datum,
+    )
+
+
+def test_inner_constraints_give_the_corrections_and_the_covariance_of_least_norm():
+    fit = adjust(net(["H1", "H2", "H3", "H4"])).required()
+    assert fit.datum_defect == 1
+    assert fit.redundancy == len(PAIRS) - 3
+    assert (fit.values - START).sum() == pytest.approx(0.0, abs=1e-12)
+    a = np.zeros((len(PAIRS), 4))
+    for row, (i, j) in enumerate(PAIRS):
+        a[row, i], a[row, j] = -1.0, 1.0
+    np.testing.assert_allclose(fit.cofactor, np.linalg.pinv(a.T @ a / 0.01**2), atol=1e-14)
+
+
+def test_a_datum_over_some_parameters_moves_only_along_the_null_space():
+    some, every = (adjust(net(d)).required() for d in (["H1", "H2"], ["H1", "H2", "H3", "H4"]))
+    shift = some.values - every.values
+    np.testing.assert_allclose(shift, shift[0], atol=1e-12)
+    np.testing.assert_allclose(some.residuals, every.residuals, atol=1e-12)
+    assert (some.values - START)[:2].sum() == pytest.approx(0.0, abs=1e-12)
+    assert np.trace(some.cofactor[:2, :2]) < np.trace(every.cofactor[:2, :2])
+    assert np.trace(some.cofactor) > np.trace(every.cofactor)
+
+
+def test_a_net_without_datum_names_all_heights():
+    failed = adjust(net())
+    assert not failed
+    assert set(failed.null_space[0]) == {"H1", "H2", "H3", "H4"}
+
+
+def test_a_datum_that_cannot_help_is_a_failure():
+    names = ["H1", "H2", "H3", "H4", "free"]
+    problem = GaussMarkov(
+        lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
+        LEVELLED,
+        0.01,
+        Parameters(names, [*HEIGHTS, 0.0]),
+        datum=["H1"],
+    )
+    failed = adjust(problem)
+    assert not failed
+    assert "free" in failed.reason
+
+
+def test_a_free_plane_net_of_distances_keeps_its_nonlinear_datum():
+    """Distances leave two shifts and a rotation; inner constraints hold over the whole correction."""
+    rng = np.random.default_rng(2)
+    xy = np.array([[0.0, 0.0], [100.0, 5.0], [90.0, 80.0], [10.0, 110.0], [50.0, 40.0]])
+    pairs = np.array(list(itertools.combinations(range(5), 2)))
+
+    def distances(x):
+        p = np.asarray(x).reshape(5, 2)
+        return np.hypot(*(p[pairs[:, 0]] - p[pairs[:, 1]]).T)
+
+    def slopes(x):
+        p, out = np.asarray(x).reshape(5, 2), np.zeros((len(pairs), 5, 2))
+        unit = p[pairs[:, 0]] - p[pairs[:, 1]]
+        unit /= np.hypot(*unit.T)[:, None]
+        out[np.arange(len(pairs)), pairs[:, 0]], out[np.arange(len(pairs)), pairs[:, 1]] = unit, -unit
+        return out.reshape(len(pairs), 10)
+
+    names = [f"{axis}{i}" for i in range(5) for axis in "xy"]
+    start = (xy + rng.normal(0, 2.0, xy.shape)).ravel()
+    observed = distances(xy.ravel()) + rng.normal(0, 0.01, len(pairs))
+    problem = GaussMarkov(distances, observed, 0.01, Parameters(names, start), slopes, datum=names)
+    fit = adjust(problem).required()
+    assert fit.datum_defect == 3
+    assert fit.redundancy == len(pairs) - 7
+    p, correction = fit.values.reshape(5, 2), (fit.values - start).reshape(5, 2)
+    rotation = (p[:, 0] * correction[:, 1] - p[:, 1] * correction[:, 0]).sum()
+    assert np.abs(correction.sum(axis=0)).max() < 1e-9
+    # Over Σ(x² + y²) = 4e4 mm² this is a rotation of 1e-9.
+    assert abs(rotation) < 4e-5
+
+
+# --- Gauss–Helmert
+
+
+def line_conditions(xy, x):
+    """Points on y = a + b x, both coordinates observed: (m, 1) conditions."""
+    return (x[0] + x[1] * xy[:, 0] - xy[:, 1])[:, None]
+
+
+def line_jacobians(xy, x):
+    m = len(xy)
+    a = np.stack([np.ones(m), xy[:, 0]], axis=1)[:, None, :]
+    b = np.broadcast_to(np.array([[x[1], -1.0]]), (m, 1, 2))
+    return a, b
+
+
+def line_points(m=40, seed=0, sigma=(0.05, 0.02)):
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 10, m)
+    return np.column_stack([t, 1.0 + 0.5 * t]) + rng.normal(size=(m, 2)) * sigma
+
+
+@pytest.mark.parametrize("jacobians", [line_jacobians, None])
+def test_a_line_through_points_of_two_errors_is_the_one_of_total_least_squares(jacobians):
+    points = line_points(sigma=(0.05, 0.05))
+    problem = GaussHelmert(line_conditions, points, 0.05, Parameters("ab", [0.0, 0.0]), jacobians)
+    fit = adjust(problem).required()
+    centred = points - points.mean(axis=0)
+    direction = np.linalg.svd(centred)[2][0]
+    slope = direction[1] / direction[0]
+    assert fit["b"] == pytest.approx(slope, abs=1e-9)
+    assert fit["a"] == pytest.approx(points[:, 1].mean() - slope * points[:, 0].mean(), abs=1e-8)
+    smallest = np.linalg.svd(centred, compute_uv=False)[1]
+    assert fit.cost == pytest.approx((smallest / 0.05) ** 2, rel=1e-9)
+    assert np.abs(line_conditions(fit.adjusted, fit.values)).max() < 1e-10
+    assert fit.redundancy == len(points) - 2
+
+
+def test_conditions_in_blocks_and_in_one_are_the_same():
+    points = line_points(m=12)
+    rng = np.random.default_rng(4)
+    blocks = np.stack([spd(rng, 2) * 10 for _ in points])
+    marks = adjust(
+        GaussHelmert(line_conditions, points, blocks, Parameters("ab", [0.0, 0.0]), line_jacobians)
+    ).required()
+    whole = np.zeros((24, 24))
+    for i, block in enumerate(blocks):
+        whole[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+    flat = adjust(
+        GaussHelmert(
+            lambda flat, x: line_conditions(flat.reshape(-1, 2), x)[:, 0],
+            points.ravel(),
+            whole,
+            Parameters("ab", [0.0, 0.0]),
+        )
+    ).required()
+    full = adjust(
+        GaussHelmert(line_conditions, points, whole, Parameters("ab", [0.0, 0.0]), line_jacobians)
+    ).required()
+    for other in (flat, full):
+        np.testing.assert_allclose(marks.values, other.values, atol=1e-8)
+        np.testing.assert_allclose(marks.cofactor, other.cofactor, rtol=1e-5)
+        np.testing.assert_allclose(marks.w.ravel(), other.w.ravel(), atol=1e-4)
+        np.testing.assert_allclose(
+            marks.redundancy_numbers.ravel(), other.redundancy_numbers.ravel(), atol=1e-6
+        )
+
+
+def test_gauss_helmert_is_gauss_markov_when_the_conditions_are_observation_equations():
+    y = noisy()
+    helmert = GaussHelmert(
+        lambda obs, x: decay(x)[:, None] - obs, y[:, None], 0.01, Parameters("abc", [1.0, 1.0, 0.0])
+    )
+    a, b = adjust(helmert).required(), adjust(decay_problem(y)).required()
+    np.testing.assert_allclose(a.values, b.values, atol=1e-9)
+    np.testing.assert_allclose(a.residuals.ravel(), b.residuals, atol=1e-9)
+    np.testing.assert_allclose(a.w.ravel(), b.w, atol=1e-5)
+    np.testing.assert_allclose(a.redundancy_numbers.ravel(), b.redundancy_numbers, atol=1e-7)
+    np.testing.assert_allclose(
+        a.external_reliability().effects.reshape(len(T), 3), b.external_reliability().effects, atol=1e-6
+    )
+
+
+def test_gauss_helmert_redundancy_numbers_sum_to_the_redundancy():
+    fit = adjust(
+        GaussHelmert(
+            line_conditions, line_points(), [0.05, 0.02] * np.ones((40, 2)), Parameters("ab", [0, 0])
+        )
+    ).required()
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-7)
+
+
+def test_a_mark_of_weight_zero_is_left_out_whole():
+    points = line_points()
+    spoilt = points.copy()
+    spoilt[7] += 5.0
+    weights = np.ones((40, 2))
+    weights[7, 0] = 0.0
+    sigma = np.array([0.05, 0.02]) * np.ones((40, 2))
+    fit = adjust(
+        GaussHelmert(
+            line_conditions, spoilt, sigma, Parameters("ab", [0, 0]), line_jacobians, weights=weights
+        )
+    ).required()
+    rest = np.delete(points, 7, axis=0)
+    other = adjust(
+        GaussHelmert(line_conditions, rest, sigma[1:], Parameters("ab", [0, 0]), line_jacobians)
+    ).required()
+    np.testing.assert_allclose(fit.values, other.values, atol=1e-9)
+    np.testing.assert_allclose(fit.cofactor, other.cofactor, rtol=1e-6)
+    assert fit.redundancy == other.redundancy
+
+
+def test_wrong_derivatives_by_the_observations_are_found():
+    def wrong(xy, x):
+        a, b = line_jacobians(xy, x)
+        return a, b * [1.1, 1.0]
+
+    good = GaussHelmert(line_conditions, line_points(), 0.05, Parameters("ab", [0.3, 0.4]), line_jacobians)
+    assert check_jacobian(good).agrees()
+    bad = GaussHelmert(line_conditions, line_points(), 0.05, Parameters("ab", [0.3, 0.4]), wrong)
+    assert check_jacobian(bad).worst == "observation 0"
