@@ -289,6 +289,31 @@ def test_polynomial_comes_back_from_its_dictionary(name: str) -> None:
     assert not bare.values.any()
 
 
+@EVERY
+@settings(max_examples=6, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_derivatives_and_inverse_hold_for_other_values_too(case: Case, seed: int) -> None:
+    """Parameters changed so that each moves the image by up to 2 % of its size."""
+    rng, points = np.random.default_rng(seed), case.points(25)
+    u = len(case.mapping.names)
+    change = rng.uniform(-1, 1, u) * 2000 * steps(case, points)
+    other = case._replace(mapping=case.mapping.with_values(case.mapping.values + change))
+    points = points[other.mapping.one_to_one(points)]
+    direction = rng.uniform(-1, 1, u) * steps(case, case.points(25))
+    ahead, behind = (
+        other.mapping.with_values(other.mapping.values + s * direction)(points) for s in (0.5, -0.5)
+    )
+    found = other.mapping.derivatives(points)
+    sure = np.isfinite(ahead + behind).all(axis=1)
+    np.testing.assert_allclose(
+        (found.d_parameters @ direction)[sure], (ahead - behind)[sure], rtol=0, atol=1e-9 * size(case, points)
+    )
+    # The condition of the inverse is that of the derivatives: near a fold it magnifies the rounding error.
+    well = np.linalg.cond(found.d_xy) < 1e3
+    back = other.mapping.inverse(found.value[well])
+    assert np.abs(back - points[well]).max(initial=0) < 1e-9 * max(1.0, case.extent)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.floats(-1, 1), min_size=13, max_size=13),

@@ -207,6 +207,16 @@ def test_rotation_vector_matrix_and_angles_are_one_rotation(r: tuple[float, floa
     np.testing.assert_allclose(angles_to_matrix(*matrix_to_angles(matrix)), matrix, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 1.0, 3.0, np.pi - 1e-9, np.pi])
+def test_rotation_vector_is_found_for_every_angle(angle: float) -> None:
+    axes = np.random.default_rng(6).normal(size=(300, 3))
+    axes = np.concatenate([axes, np.eye(3), -np.eye(3)])
+    vectors = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    found = matrix_to_vector(rotation_matrix(vectors))
+    opposite = (angle == np.pi) & ((found * vectors).sum(1) < 0)  # at π both signs are right
+    np.testing.assert_allclose(np.where(opposite[:, None], -found, found), vectors, rtol=1e-9, atol=2e-15)
+
+
 def test_angles_zero_are_a_vertical_photograph() -> None:
     pose = Pose.from_angles(0.0, 0.0, 0.0, [0.0, 0.0, 1000.0])
     # A point east is right in the image, a point north up (y down: negative), the ground in front.

@@ -11,7 +11,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ..data import Array
 from ..errors import UsageError
@@ -109,8 +108,37 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     orthogonal = np.abs(flat @ flat.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) < 1e-6
     if not orthogonal or (np.linalg.det(flat) < 0).any():
         raise UsageError("is not orthogonal with determinant +1", where="rotation matrix")
-    vectors: Array = Rotation.from_matrix(flat).as_rotvec().reshape(matrices.shape[:-1])
+    quaternion = _quaternions(flat)
+    w, v = quaternion[:, :1], quaternion[:, 1:]
+    sine = np.linalg.norm(v, axis=1, keepdims=True)
+    # θ/sin(θ/2), which is 2 at θ = 0; arctan2 keeps it exact up to π.
+    factor = np.where(sine > 1e-9, 2 * np.arctan2(sine, w) / np.where(sine > 0, sine, 1.0), 2.0)
+    vectors: Array = (factor * v).reshape(matrices.shape[:-1])
     return vectors
+
+
+def _quaternions(matrix: Array) -> Array:
+    """Unit quaternions (n, 4), scalar first and not negative, of rotation matrices (n, 3, 3).
+
+    All four columns of the outer product q·qᵀ follow from the matrix; the one with the largest diagonal is
+    free of cancellation (Shepperd 1978, Quaternion from rotation matrix, J. Guidance and Control 1).
+    """
+    m = matrix.transpose(1, 2, 0)
+    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    diagonal = 1 + signs @ np.stack([m[0, 0], m[1, 1], m[2, 2]])
+    columns = np.array(
+        [
+            [diagonal[0], x, y, z],
+            [x, diagonal[1], xy, xz],
+            [y, xy, diagonal[2], yz],
+            [z, xz, yz, diagonal[3]],
+        ]
+    )
+    q: Array = columns[diagonal.argmax(axis=0), :, np.arange(len(matrix))]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(q[:, :1] < 0, -q, q)
 
 
 def angles_to_matrix(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Array:
