@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping as Named
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -69,6 +69,24 @@ class _Tables(NamedTuple):
     powers: tuple[tuple[int, int], ...]
     fixed: Array
     by_parameter: Array
+
+
+@lru_cache(maxsize=64)
+def _read(rows: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]) -> _Tables:
+    """Read the terms of the fixed part and of each parameter; once per model, not per iteration."""
+    read: list[tuple[int, int, dict[tuple[int, int], float]]] = []
+    for k, (name, sums) in enumerate(rows):
+        for part, text in sums:
+            if part not in PARTS:
+                raise FormatError(f"is none of {', '.join(PARTS)}", where=f"part {part!r} of {name!r}")
+            read.append((k, PARTS.index(part), monomials(text)))
+    powers = tuple(sorted({power for *_, sum_ in read for power in sum_}))
+    table = np.zeros((len(rows), len(PARTS), len(powers)))
+    for k, row, sum_ in read:
+        for power, coefficient in sum_.items():
+            table[k, row, powers.index(power)] += coefficient
+    table.flags.writeable = False
+    return _Tables(powers, table[0], table[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +143,7 @@ class RationalPolynomial(PlaneMapping):
     @cached_property
     def _tables(self) -> _Tables:
         rows = [("", self.fixed), *self.terms.items()]
-        read: list[tuple[int, int, dict[tuple[int, int], float]]] = []
-        for k, (name, sums) in enumerate(rows):
-            for part, text in sums.items():
-                if part not in PARTS:
-                    raise FormatError(f"is none of {', '.join(PARTS)}", where=f"part {part!r} of {name!r}")
-                read.append((k, PARTS.index(part), monomials(text)))
-        powers = tuple(sorted({power for *_, sum_ in read for power in sum_}))
-        table = np.zeros((len(rows), len(PARTS), len(powers)))
-        for k, row, sum_ in read:
-            for power, coefficient in sum_.items():
-                table[k, row, powers.index(power)] += coefficient
-        return _Tables(powers, table[0], table[1:])
+        return _read(tuple((name, tuple(sums.items())) for name, sums in rows))
 
     @cached_property
     def _coefficients(self) -> Array:
