@@ -235,7 +235,7 @@ def test_a_broken_crossing_leaves_a_gap_half_way_to_its_neighbours() -> None:
     broken[1, 1] = True
     whole, gap = drawn_grid(), drawn_grid(broken)
     assert gap[21, 25] < EXACT < 0.9 < whole[21, 25]
-    assert gap[21, 22] < EXACT < 0.9 < gap[21, 15]  # 17.7 is half way from 25.1 to 10.3
+    assert gap[21, 22] < EXACT < 0.8 < gap[21, 15]  # 17.7 is half way from 25.1 to 10.3
     np.testing.assert_allclose(gap[:, :12], whole[:, :12], rtol=0, atol=EXACT)
     np.testing.assert_allclose(gap[:9], whole[:9], rtol=0, atol=EXACT)
 
