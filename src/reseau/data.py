@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import ImageError, UsageError
 
-__all__ = ["Array", "Frame", "ImagePoints", "Mask"]
+__all__ = ["Array", "Frame", "ImagePoints", "Mask", "Rows"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

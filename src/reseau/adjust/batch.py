@@ -370,13 +370,13 @@ class _Work:
         scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
         return normal * scale[:, :, None] * scale[:, None, :], scale
 
-    def _step(self, rows: Rows) -> tuple[Array, Array]:
+    def _step(self, rows: Rows, damping: Array | None = None) -> tuple[Array, Array]:
         """Damped correction (m, u) and the decrease of the sum of squares it predicts (m,)."""
         scaled, scale = self._scaled(rows)
         right = self.gradient[rows] * scale
         index = np.arange(scaled.shape[1])
         damped = scaled.copy()
-        damped[:, index, index] += self.damping[rows, None]
+        damped[:, index, index] += (self.damping[rows] if damping is None else damping)[:, None]
         step = np.linalg.solve(damped, right[:, :, None])[:, :, 0]
         curvature = np.einsum("mi,mij,mj->m", step, scaled, step)
         predicted = 2.0 * (step * right).sum(axis=1) - curvature
@@ -384,14 +384,22 @@ class _Work:
 
     def _small(self, rows: Rows, step: Array, predicted: Array) -> Mask:
         """Which corrections are negligible, and not merely damped to look so."""
-        free = self.damping[rows] <= max(self.options.damping, 1e-2)
-        if self.tolerance is not None:
-            small = (np.abs(step) <= self.tolerance).all(axis=1)
-        else:
-            variance = self.cost[rows] / np.maximum(self.redundancy[rows], 1)
-            small = predicted <= 1e-8 * variance
+        small = self._negligible(rows, step, predicted)
+        # Near the minimum rounding may refuse one step after another until the damping holds all of them
+        # back: what the step would be without it decides.
+        held = np.flatnonzero(small & (self.damping[rows] > max(self.options.damping, 1e-2)))
+        if len(held):
+            free, gain = self._step(rows[held], np.full(len(held), _LEAST_DAMPING))
+            small[held] = self._negligible(rows[held], free, gain)
         rounding: Mask = predicted <= 10 * _EPS * self.cost[rows] + self.floor[rows]
-        return (small & free) | rounding
+        return small | rounding
+
+    def _negligible(self, rows: Rows, step: Array, predicted: Array) -> Mask:
+        if self.tolerance is not None:
+            small: Mask = (np.abs(step) <= self.tolerance).all(axis=1)
+            return small
+        variance = self.cost[rows] / np.maximum(self.redundancy[rows], 1)
+        return np.asarray(predicted <= 1e-8 * variance)
 
     def _leave(self, rows: Rows, reason: BatchReason) -> None:
         self.active[rows] = False

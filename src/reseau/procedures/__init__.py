@@ -1,0 +1,1 @@
+"""One module per published procedure: its steps in its order, nothing else."""

@@ -1,0 +1,416 @@
+"""The matcher: patches of a frame adjusted to the formed image of what they should show.
+
+For each mark, position, width of the point-spread function, contrast, the background as a plane, and where
+wanted the form, are estimated together, all marks of a frame in one batch of least-squares problems
+(:func:`reseau.adjust.adjust_batch`). What is matched differs only in the outline that is formed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjust import BatchAdjustment, BatchOptions, adjust_batch
+from ..data import Array, Mask, Rows
+from ..optics.formation import Outline, PixelResponse, coverage_derivatives
+
+__all__ = ["SIZE", "MatchOptions", "Matches", "match"]
+
+X, Y, WIDTH, CONTRAST, LEVEL, SLOPE_X, SLOPE_Y, FORM = range(8)
+
+_STEP_PX = 1e-4
+"""Corrections of a position that end the iterations; far below any noise."""
+
+_FORM_ERROR = 0.2
+"""Share of its amplitude by which a mark may differ from the formed one and still be that mark."""
+
+_SHARPEST = 0.5
+"""Share of the expected width below which a point-spread function cannot be told from none."""
+
+SIZE = np.eye(2)[None]
+"""The form's one parameter for a mark of unknown size: the local frame grows by its share."""
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How patches are matched.
+
+    Parameters
+    ----------
+    half_px : int
+        Half side of the square window around a mark.
+    psf_px : float
+        Expected width (one sigma) of the point-spread function.
+    psf_log_sigma : float
+        How far that may be wrong, as the standard deviation of its logarithm.
+    contrast : float, optional
+        Expected contrast; by default half the light of a dark mark, the brightest pixel of a bright one.
+    contrast_sigma : float
+        Standard deviation of that; infinite where nothing is known.
+    response : PixelResponse
+        The pixel.
+    polarity : {"dark", "bright"}
+        A dark mark takes a share of the light that falls on it, so that its own image follows the background;
+        a bright one adds light to it.
+    rejection : float
+        Pixels whose residual exceeds this many robust standard deviations of their patch are left out:
+        bit errors, dust, a scene.
+    row_jitter_px : float
+        Standard deviation of the shift of single rows along x. It enters the stochastic model as what it is,
+        an error common to a row and proportional to the image's slope.
+    start_px : float
+        How far the approximate positions may be off.
+    """
+
+    half_px: int = 6
+    psf_px: float = 0.8
+    psf_log_sigma: float = 0.5
+    contrast: float | None = None
+    contrast_sigma: float = np.inf
+    response: PixelResponse = field(default_factory=PixelResponse)
+    polarity: Literal["dark", "bright"] = "dark"
+    rejection: float = 4.5
+    row_jitter_px: float = 0.0
+    start_px: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What came out, in columns over the k marks.
+
+    Parameters
+    ----------
+    xy : ndarray (k, 2)
+        Positions in pixels.
+    cov : ndarray (k, 2, 2)
+        Their covariances, from the residuals of each patch.
+    psf_px : ndarray (k,)
+        Widths of the point-spread function.
+    contrast : ndarray (k,)
+        Share of the light that a dark mark takes; grey values that a bright one adds.
+    t : ndarray (k,)
+        Contrast over its standard deviation, width and form given.
+    form : ndarray (k, m)
+        Parameters of the form.
+    noise : ndarray (k,)
+        Standard deviation of the residuals, grey values.
+    correlation : ndarray (k,)
+        Correlation of the patch with the formed image, the plane of the background taken off both.
+    seen : ndarray (k,)
+        Share of the mark that lies on valid pixels.
+    rejected : ndarray (k,)
+        Share of the mark that lies on pixels left out as blunders.
+    converged : ndarray of bool (k,)
+        Whether the adjustment did.
+    residuals : ndarray (k, rows, columns)
+        Adjusted minus observed, NaN where left out.
+    """
+
+    xy: Array
+    cov: Array
+    psf_px: Array
+    contrast: Array
+    t: Array
+    form: Array
+    noise: Array
+    correlation: Array
+    seen: Array
+    rejected: Array
+    converged: Mask
+    residuals: Array
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, keep: Mask) -> Matches:
+        """The matches of a mask (k,)."""
+        return Matches(**{column.name: getattr(self, column.name)[keep] for column in fields(self)})
+
+    def replaced(self, rows: Rows, others: Matches) -> Matches:
+        """These matches with `rows` taken from others, made in the same window or a narrower one."""
+        columns = {}
+        margin = (self.residuals.shape[1] - others.residuals.shape[1]) // 2
+        for column in fields(self):
+            mine, theirs = getattr(self, column.name).copy(), getattr(others, column.name)
+            if column.name == "residuals":
+                around = ((0, 0), (margin, margin), (margin, margin))
+                theirs = np.pad(theirs, around, constant_values=np.nan)
+            mine[rows] = theirs
+            columns[column.name] = mine
+        return Matches(**columns)
+
+
+def match(
+    pixels: NDArray[Any],
+    valid: Mask,
+    outline: Outline,
+    xy: Array,
+    options: MatchOptions,
+    *,
+    noise: float,
+    form: Array | None = None,
+    form_sigma: Array | None = None,
+) -> Matches:
+    """Match every patch with the formed image of its mark.
+
+    Parameters
+    ----------
+    pixels : ndarray (h, w)
+        Grey values.
+    valid : ndarray (h, w) of bool
+        Pixels that may be used.
+    outline : Outline
+        Outlines (k, j, 2) in pixels around the point that is to be measured.
+    xy : ndarray (k, 2)
+        Approximate positions, good to about the radius of the mark.
+    options : MatchOptions
+        How.
+    noise : float
+        Approximate standard deviation of the grey values; it weighs the priors only.
+    form : ndarray (m, 2, 2), optional
+        Generators of the form: the outline is multiplied by 1 + Σ p_i F_i.
+    form_sigma : ndarray (m,), optional
+        Prior standard deviations of the p around 0.
+
+    Returns
+    -------
+    Matches
+        Of all k; those that failed have `converged` False or a small `t`.
+    """
+    patch = _Patches(pixels, valid, outline, xy, options, form)
+    free = np.full(FORM + patch.forms, np.inf)
+    free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
+    free[CONTRAST] = options.contrast_sigma
+    if form_sigma is not None:
+        free[FORM:] = form_sigma
+    start = patch.start(noise)
+    weights = patch.weights / noise**2
+    # Only the position must be sharp; the others are symmetric about it and do not pull at it.
+    tolerance = np.full(start.shape[1], 0.01)
+    tolerance[[X, Y]] = _STEP_PX
+    tolerance[[LEVEL, SLOPE_X, SLOPE_Y]] = 0.05 * noise
+    if options.polarity == "bright":
+        tolerance[CONTRAST] = 0.05 * noise
+
+    def adjust(start_at: Array) -> BatchAdjustment:
+        return adjust_batch(
+            patch.form_image,
+            start_at,
+            patch.grey,
+            weights=weights,
+            prior=(start, free),
+            options=BatchOptions(tolerance=tolerance, max_iterations=30),
+        )
+
+    found = adjust(start)
+    # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
+    for _ in range(2):
+        limit = options.rejection * _robust_sigma(found, weights) + patch.tolerated(found.estimates)
+        kept = patch.weights * (np.abs(found.residuals) < limit)
+        if (kept == (weights > 0)).all():
+            break
+        weights = kept / noise**2
+        found = adjust(found.estimates)
+    if options.row_jitter_px > 0:
+        patch.whiten(found, options.row_jitter_px)
+        found = adjust(found.estimates)
+    return patch.matches(found, weights > 0)
+
+
+def _robust_sigma(found: BatchAdjustment, weights: Array) -> Array:
+    """1.4826 × the median of the absolute residuals in use, (k, 1)."""
+    size = np.where(weights > 0, np.abs(found.residuals), np.nan)
+    size[~(weights > 0).any(axis=1), 0] = 0.0
+    sigma: Array = 1.4826 * np.nanmedian(size, axis=1, keepdims=True)
+    # An image of few grey steps may have half its residuals at nought.
+    return np.maximum(sigma, 0.5 * np.nan_to_num(found.sigma0[:, None]))
+
+
+class _Patches:
+    """Windows of a frame, and the image formed in them."""
+
+    def __init__(
+        self,
+        pixels: NDArray[Any],
+        valid: Mask,
+        outline: Outline,
+        xy: Array,
+        options: MatchOptions,
+        form: Array | None,
+    ) -> None:
+        self.outline, self.xy, self.options = outline, xy, options
+        self.generators = np.zeros((0, 2, 2)) if form is None else form
+        self.forms = len(self.generators)
+        self.offset = np.arange(-options.half_px, options.half_px + 1)
+        self.centre = np.rint(xy).astype(np.intp)
+        columns, rows = self.centre[:, :1] + self.offset, self.centre[:, 1:] + self.offset
+        self.columns, self.rows = columns.astype(float), rows.astype(float)
+        h, w = pixels.shape
+        c, r = np.clip(columns, 0, w - 1)[:, None, :], np.clip(rows, 0, h - 1)[:, :, None]
+        inside = ((rows >= 0) & (rows < h))[:, :, None] & ((columns >= 0) & (columns < w))[:, None, :]
+        k = len(xy)
+        self.shape = (k, len(self.offset), len(self.offset))
+        self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
+        self.weights = (inside & valid[r, c]).reshape(k, -1).astype(np.float64)
+        self.whitener: tuple[Array, Array] | None = None
+
+    def start(self, noise: float) -> Array:
+        """Approximate values, and the pixels of the background that belong to something else left out.
+
+        The background is a plane fitted robustly to what lies around the mark, by weights after Tukey that
+        are tightened from step to step.
+        """
+        x = np.zeros((len(self.xy), FORM + self.forms))
+        x[:, WIDTH] = np.log(np.hypot(self.options.psf_px, 0.7 * self.options.start_px))
+        share, _ = self._coverage(x, np.arange(len(x)))
+        x[:, WIDTH] = np.log(self.options.psf_px)
+        around = self.weights * (share.reshape(len(x), -1) < 0.02)
+        u, v = np.meshgrid(self.offset, self.offset)
+        design = np.stack([np.ones(u.size), u.ravel(), v.ravel()], axis=1)
+        grey = np.where(around > 0, self.grey, np.nan)
+        grey[~(around > 0).any(axis=1), 0] = 0.0
+        plane = np.zeros((len(x), 3))
+        plane[:, 0] = np.nanmedian(grey, axis=1)
+        far = np.zeros_like(around)
+        for factor in (6.0, 5.0, 4.0, 4.0, 4.0):
+            v_ = np.where(around > 0, self.grey - plane @ design.T, np.nan)
+            v_[~(around > 0).any(axis=1), 0] = 0.0
+            scale = np.maximum(1.4826 * np.nanmedian(np.abs(v_), axis=1, keepdims=True), noise)
+            far = np.abs(np.nan_to_num(v_)) / (factor * scale)
+            w = around * np.clip(1 - far**2, 0, None) ** 2
+            normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(3)
+            plane = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * plane)[..., None])[..., 0]
+        self.weights = np.where(far > 1.5, 0.0, self.weights)
+        x[:, [LEVEL, SLOPE_X, SLOPE_Y]] = plane
+        if self.options.contrast is not None:
+            x[:, CONTRAST] = self.options.contrast
+        elif self.options.polarity == "dark":
+            x[:, CONTRAST] = 0.5
+        else:
+            top = np.where(self.weights > 0, self.grey - plane @ design.T, 0.0)
+            x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
+        return x
+
+    def width(self, x: Array) -> Array:
+        """Width of the point-spread function (k,): its logarithm is estimated, above a least one."""
+        width: Array = np.hypot(_SHARPEST * self.options.psf_px, np.exp(x[:, WIDTH]))
+        return width
+
+    def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
+        """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
+        share, d_share = self._coverage(x, at)
+        u, v = self.offset[None, None, :], self.offset[None, :, None]
+        level, contrast = x[:, LEVEL, None, None], x[:, CONTRAST, None, None]
+        plane = level + x[:, SLOPE_X, None, None] * u + x[:, SLOPE_Y, None, None] * v
+        if self.options.polarity == "dark":
+            rest = 1 - contrast * share
+            grey, by_share, by_contrast = plane * rest, -plane * contrast, -plane * share
+        else:
+            rest = np.ones_like(share)
+            grey, by_share, by_contrast = plane + contrast * share, contrast, share
+        jacobian = np.empty((*share.shape, x.shape[1]))
+        shape_columns = [X, Y, WIDTH, *range(FORM, x.shape[1])]
+        jacobian[..., shape_columns] = np.moveaxis(by_share[:, None] * d_share, 1, -1)
+        jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / self.width(x))[:, None, None]
+        jacobian[..., CONTRAST] = by_contrast
+        jacobian[..., LEVEL], jacobian[..., SLOPE_X], jacobian[..., SLOPE_Y] = rest, rest * u, rest * v
+        grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
+        if self.whitener is not None:
+            grey, jacobian = self._whitened(grey, jacobian, at)
+        return grey, jacobian
+
+    def _coverage(self, x: Array, at: Rows) -> tuple[Array, Array]:
+        nodes, steps, motions = self.outline.xy[at], self.outline.dxy[at], None
+        if self.forms:
+            grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, FORM:], self.generators)
+            motions = np.einsum("pij,knj->kpni", self.generators, nodes)
+            nodes, steps = nodes @ np.swapaxes(grown, 1, 2), steps @ np.swapaxes(grown, 1, 2)
+        position = self.xy[at] + x[:, :2]
+        return coverage_derivatives(
+            Outline(nodes + position[:, None, :], steps),
+            self.columns[at],
+            self.rows[at],
+            self.width(x),
+            self.options.response,
+            motions,
+        )
+
+    def tolerated(self, x: Array) -> Array:
+        """Residuals (k, n) that are laid to the model of the mark, not to blunders.
+
+        No mark is quite the square or the disk that it should be, and no point-spread function a Gaussian; in
+        a strong mark that shows before the noise does.
+        """
+        share, _ = self._coverage(x, np.arange(len(x)))
+        amplitude = np.abs(x[:, CONTRAST])
+        if self.options.polarity == "dark":
+            amplitude = amplitude * np.abs(x[:, LEVEL])
+        tolerated: Array = _FORM_ERROR * amplitude[:, None] * (share.reshape(len(x), -1) > 0.02)
+        return tolerated
+
+    def whiten(self, found: BatchAdjustment, jitter: float) -> None:
+        """Take an error of each row, jitter × slope along x, into the stochastic model.
+
+        The covariance of a row is σ²(I + q² g gᵀ) with the slope g of the formed image and q = jitter/σ. Its
+        inverse square root I − g gᵀ(1 − (1 + q² gᵀg)^(−1/2))/gᵀg makes the residuals of a row independent.
+        """
+        _, jacobian = self.form_image(found.estimates, np.arange(len(self.xy)))
+        slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
+        length2 = (slope**2).sum(axis=2, keepdims=True)
+        q2 = (jitter / np.maximum(found.sigma0, 1e-12))[:, None, None] ** 2
+        factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
+        self.whitener = (slope, factor)
+
+    def _whitened(self, grey: Array, jacobian: Array, at: Rows) -> tuple[Array, Array]:
+        assert self.whitener is not None
+        slope, factor = self.whitener[0][at], self.whitener[1][at]
+        m, rows, columns = slope.shape
+        v = (grey - self.grey[at]).reshape(m, rows, columns)
+        v = v - slope * factor * (slope * v).sum(axis=2, keepdims=True)
+        j = jacobian.reshape(m, rows, columns, -1)
+        along = np.einsum("mrc,mrcu->mru", slope * factor, j)
+        j = j - slope[..., None] * along[:, :, None, :]
+        return self.grey[at] + v.reshape(m, -1), j.reshape(m, rows * columns, -1)
+
+    def matches(self, found: BatchAdjustment, used: Mask) -> Matches:
+        """Columns of results from the adjusted batch."""
+        x, k = found.estimates, len(self.xy)
+        share, _ = self._coverage(x, np.arange(k))
+        flat = share.reshape(k, -1)
+        sight = np.maximum(flat.sum(axis=1), 1e-12)
+        plane = (
+            x[:, LEVEL, None, None]
+            + x[:, SLOPE_X, None, None] * self.offset[None, None, :]
+            + x[:, SLOPE_Y, None, None] * self.offset[None, :, None]
+        ).reshape(k, -1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cov = found.covariance
+            expected = -plane * flat if self.options.polarity == "dark" else flat
+            correlation = _correlation(self.grey - plane, expected, used)
+            t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - FORM, 1) / (1 - correlation**2))
+        return Matches(
+            xy=self.xy + x[:, :2],
+            cov=cov[:, :2, :2],
+            psf_px=self.width(x),
+            contrast=x[:, CONTRAST],
+            t=np.nan_to_num(t),
+            form=x[:, FORM:],
+            noise=found.sigma0,
+            correlation=np.nan_to_num(correlation),
+            seen=(flat * self.weights).sum(axis=1) / sight,
+            rejected=(flat * (self.weights - used)).sum(axis=1) / sight,
+            converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
+            residuals=np.where(used, found.residuals, np.nan).reshape(self.shape),
+        )
+
+
+def _correlation(a: Array, b: Array, used: Mask) -> Array:
+    """Correlation of the rows of two arrays over the entries in use, (k,)."""
+    n = used.sum(axis=1, keepdims=True)
+    a = np.where(used, a - np.where(used, a, 0).sum(axis=1, keepdims=True) / n, 0)
+    b = np.where(used, b - np.where(used, b, 0).sum(axis=1, keepdims=True) / n, 0)
+    r: Array = (a * b).sum(axis=1) / np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    return r
