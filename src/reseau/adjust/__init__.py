@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from .batch import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from .checks import check_jacobian
+from .components import VarianceComponents, variance_components
+from .consensus import Consensus, ConsensusModel, ransac
 from .differences import JacobianCheck
+from .elimination import Elimination, EliminationStep, eliminate
 from .engine import Options, adjust
 from .parameters import Constraint, Parameters, Prior
 from .problem import GaussHelmert, GaussMarkov, Problem
+from .rejection import Rejection, SnoopingStep, data_snooping, reject_outliers
 from .reliability import ExternalReliability, critical_tau, critical_w, noncentrality
 from .result import Adjustment, Failure
+from .robust import Robust, robust, weight_function
 from .significance import CoefficientTest, GlobalTest, NestedTest, compare
 
 __all__ = [
@@ -18,7 +23,11 @@ __all__ = [
     "BatchOptions",
     "BatchReason",
     "CoefficientTest",
+    "Consensus",
+    "ConsensusModel",
     "Constraint",
+    "Elimination",
+    "EliminationStep",
     "ExternalReliability",
     "Failure",
     "GaussHelmert",
@@ -30,11 +39,22 @@ __all__ = [
     "Parameters",
     "Prior",
     "Problem",
+    "Rejection",
+    "Robust",
+    "SnoopingStep",
+    "VarianceComponents",
     "adjust",
     "adjust_batch",
     "check_jacobian",
     "compare",
     "critical_tau",
     "critical_w",
+    "data_snooping",
+    "eliminate",
     "noncentrality",
+    "ransac",
+    "reject_outliers",
+    "robust",
+    "variance_components",
+    "weight_function",
 ]

@@ -108,6 +108,10 @@ class Solution:
             errors.append(np.where(known, 1.0 / size, np.inf))
         return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
 
+    def weighted_residuals(self) -> Array:
+        """P v of the observations and observed parameters (N,)."""
+        return np.concatenate([turn.times(self.whitened) for turn in self.influence])
+
     def effects(self, standardised: Standardised, delta: float) -> tuple[Array, Array]:
         """Changes (N, f) of the parameters, and their lengths, for errors of delta times the unit error."""
         through = self.design @ self.factor

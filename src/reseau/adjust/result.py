@@ -240,6 +240,12 @@ class Adjustment:
         return self.standardised.redundancy_numbers[self.problem.size :]
 
     @property
+    def weighted_squares(self) -> Array:
+        """Each observation's part vᵢ (P v)ᵢ of vᵀPv; zero where it was left out."""
+        weighted = self._of_observations(self.solution.weighted_residuals())
+        return np.where(self.rejected, 0.0, self.residuals * weighted)
+
+    @property
     def w(self) -> Array:
         """Baarda's test value of each observation, N(0, 1) when the covariance is true."""
         return self._of_observations(self.standardised.w)

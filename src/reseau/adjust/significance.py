@@ -116,7 +116,9 @@ def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
     return GlobalTest(cost, redundancy, lower, upper, 2.0 * min(tail, 1.0 - tail), lower <= cost <= upper)
 
 
-def coefficient_test(fit: Adjustment, name: str, value: float, alpha: float) -> CoefficientTest:
+def coefficient_test(
+    fit: Adjustment, name: str, value: float, alpha: float, scale: str | None = None
+) -> CoefficientTest:
     """Test of one parameter, by t (a posteriori) or χ² (a priori) (Koch 1999, sect. 4.3).
 
     Raises
@@ -129,7 +131,7 @@ def coefficient_test(fit: Adjustment, name: str, value: float, alpha: float) -> 
     if name not in fit.free or not fit.cofactor[at, at] > 0:
         raise UsageError("was not estimated", where=name)
     ratio = (float(fit.values[at]) - value) / float(np.sqrt(fit.cofactor[at, at]))
-    if fit.scale == "a-priori":
+    if (scale or fit.scale) == "a-priori":
         statistic, critical = ratio**2, float(scipy.special.chdtri(1, alpha))
         p = float(scipy.special.chdtrc(1, statistic))
         return CoefficientTest(name, "chi2", statistic, critical, p, statistic > critical)
@@ -139,7 +141,9 @@ def coefficient_test(fit: Adjustment, name: str, value: float, alpha: float) -> 
     return CoefficientTest(name, "t", statistic, critical, p, bool(statistic > critical))
 
 
-def compare(nested: Adjustment, full: Adjustment, alpha: float = 0.05) -> NestedTest:
+def compare(
+    nested: Adjustment, full: Adjustment, alpha: float = 0.05, scale: str | None = None
+) -> NestedTest:
     """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
 
     Parameters
@@ -148,11 +152,13 @@ def compare(nested: Adjustment, full: Adjustment, alpha: float = 0.05) -> Nested
         Of the same observations with the same covariance, `nested` a special case of `full`.
     alpha : float
         Level.
+    scale : {"a-posteriori", "a-priori"}, optional
+        F or χ²; that of `full` by default.
 
     Returns
     -------
     NestedTest
-        F test of the increase of vᵀPv; χ² test when `full` was adjusted with ``scale="a-priori"``.
+        F test of the increase of vᵀPv, or χ² test when the sigmas are taken at their word.
 
     Raises
     ------
@@ -161,7 +167,7 @@ def compare(nested: Adjustment, full: Adjustment, alpha: float = 0.05) -> Nested
 
     Notes
     -----
-    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, eq. 4.145; for non-linear
+    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, sect. 4.2; for non-linear
     models the likelihood ratio in the same form.
     """
     _level(alpha)
@@ -173,7 +179,7 @@ def compare(nested: Adjustment, full: Adjustment, alpha: float = 0.05) -> Nested
         )
     increase = max(nested.cost - full.cost, 0.0)
     degrees = (restrictions, full.redundancy)
-    if full.scale == "a-priori":
+    if (scale or full.scale) == "a-priori":
         critical = float(scipy.special.chdtri(restrictions, alpha))
         p = float(scipy.special.chdtrc(restrictions, increase))
         return NestedTest("chi2", increase, critical, degrees, p, increase > critical)

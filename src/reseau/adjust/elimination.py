@@ -1,0 +1,167 @@
+"""Backward elimination: drop the parameters the observations do not ask for, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from reseau.errors import UsageError
+
+from .engine import Options, adjust
+from .problem import Problem
+from .result import Adjustment, Failure
+from .significance import CoefficientTest, coefficient_test, compare
+
+__all__ = ["Elimination", "EliminationStep", "eliminate"]
+
+Criterion = Literal["t", "chi2", "F"]
+
+
+@dataclass(frozen=True)
+class EliminationStep:
+    """One parameter dropped.
+
+    Parameters
+    ----------
+    test : CoefficientTest
+        Of the parameter that was dropped: its name, the value of its test, the critical value and p.
+    parameters : int
+        Free parameters before.
+    sigma0_before, sigma0_after : float
+        Standard deviation of unit weight with it and without.
+    """
+
+    test: CoefficientTest
+    parameters: int
+    sigma0_before: float
+    sigma0_after: float
+
+    @property
+    def name(self) -> str:
+        """The parameter that was dropped."""
+        return self.test.name
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """What was dropped and what remained; truthy.
+
+    Parameters
+    ----------
+    steps : tuple of EliminationStep
+        In the order of dropping.
+    kept : tuple of CoefficientTest
+        Tests of the candidates that remain: all significant.
+    full : Adjustment
+        With all parameters.
+    adjustment : Adjustment
+        With those that remain; the dropped ones are fixed.
+    criterion : str
+        Test that decided.
+    alpha : float
+        Its level.
+    """
+
+    steps: tuple[EliminationStep, ...]
+    kept: tuple[CoefficientTest, ...]
+    full: Adjustment
+    adjustment: Adjustment
+    criterion: str
+    alpha: float
+
+    def __bool__(self) -> bool:
+        return True
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """Names of the dropped parameters, in their order."""
+        return tuple(step.name for step in self.steps)
+
+    def required(self) -> Elimination:
+        """The elimination itself; see :meth:`Failure.required`."""
+        return self
+
+
+def eliminate(
+    problem: Problem,
+    alpha: float = 0.05,
+    criterion: Criterion = "t",
+    keep: Iterable[str] = (),
+    value: float = 0.0,
+    options: Options | None = None,
+) -> Elimination | Failure:
+    """Drop the least significant parameter, adjust again, and so on until all that remain are significant.
+
+    Parameters
+    ----------
+    problem : GaussMarkov or GaussHelmert
+        With all parameters.
+    alpha : float
+        Level of each test. A parameter stays when it is significant at this level.
+    criterion : {"t", "chi2", "F"}
+        Student's t with the estimated variance factor; χ² with the sigmas taken at their word; or the F test
+        of the model without the parameter against that with it, both adjusted, for non-linear models.
+    keep : iterable of str
+        Parameters not to be dropped.
+    value : float
+        What a parameter is fixed at when it is dropped.
+    options : Options, optional
+        How to adjust.
+
+    Returns
+    -------
+    Elimination or Failure
+        The record and the last adjustment; a failure when one of the adjustments fails.
+
+    Raises
+    ------
+    UsageError
+        For an unknown criterion or name, and for t and F without redundancy.
+    """
+    if criterion not in ("t", "chi2", "F"):
+        raise UsageError(f"is no criterion: {criterion!r}", where="eliminate")
+    kept = set(keep)
+    for name in kept:
+        problem.parameters.index(name)
+    fit = full = adjust(problem, options)
+    if not isinstance(full, Adjustment):
+        return full
+    if criterion != "chi2" and full.redundancy < 1:
+        raise UsageError("has no redundancy to test with", where="eliminate", do="use criterion='chi2'")
+    steps: list[EliminationStep] = []
+    while isinstance(fit, Adjustment):
+        tests = []
+        for name in fit.free:
+            if name not in kept:
+                test = _test(fit, name, value, alpha, criterion)
+                if isinstance(test, Failure):
+                    return test
+                tests.append(test)
+        weakest = min(tests, key=lambda test: (-test.p, test.statistic), default=None)
+        if weakest is None or weakest.significant:
+            return Elimination(tuple(steps), tuple(tests), full, fit, criterion, alpha)
+        before = fit
+        fit = _without(before, weakest.name, value)
+        if isinstance(fit, Adjustment):
+            steps.append(EliminationStep(weakest, len(before.free), before.sigma0, fit.sigma0))
+    return fit
+
+
+def _without(fit: Adjustment, name: str, value: float) -> Adjustment | Failure:
+    """The adjustment with one parameter fixed, begun at the estimates with it."""
+    start = fit.problem.parameters if fit.problem.datum else fit.parameters
+    return adjust(fit.problem.with_parameters(start.fix(name, at=value)), fit.options)
+
+
+def _test(
+    fit: Adjustment, name: str, value: float, alpha: float, criterion: Criterion
+) -> CoefficientTest | Failure:
+    if criterion != "F":
+        scale: Literal["a-priori", "a-posteriori"] = "a-priori" if criterion == "chi2" else "a-posteriori"
+        return coefficient_test(fit, name, value, alpha, scale=scale)
+    without = _without(fit, name, value)
+    if isinstance(without, Failure):
+        return without
+    nested = compare(without, fit, alpha, scale="a-posteriori")
+    return CoefficientTest(name, "F", nested.statistic, nested.critical, nested.p, nested.significant)
