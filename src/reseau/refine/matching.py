@@ -187,7 +187,6 @@ def match(
     if form_sigma is not None:
         free[FORM:] = form_sigma
     start = patch.start(noise)
-    weights = patch.weights / noise**2
     # Only the position must be sharp; the others are symmetric about it and do not pull at it.
     tolerance = np.full(start.shape[1], 0.01)
     tolerance[[X, Y]] = _STEP_PX
@@ -200,33 +199,44 @@ def match(
             patch.form_image,
             start_at,
             patch.grey,
-            weights=weights,
+            weights=used / scale**2,
             prior=(start, free),
             options=BatchOptions(tolerance=tolerance, max_iterations=30),
         )
 
+    used, scale = patch.weights, np.full((len(xy), 1), noise)
     found = adjust(start)
-    # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
     for _ in range(2):
-        limit = options.rejection * _robust_sigma(found, weights) + patch.tolerated(found.estimates)
+        # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
+        sigma = _robust_sigma(found.residuals, used)
+        limit = options.rejection * np.maximum(sigma, noise) + patch.tolerated(found.estimates)
         kept = patch.weights * (np.abs(found.residuals) < limit)
-        if (kept == (weights > 0)).all():
+        # What the model leaves of a scene counts as noise, or the prior knowledge would weigh nothing there.
+        rougher = np.maximum(noise, _rms(found.residuals, kept, start.shape[1]))
+        if (kept == used).all() and (rougher < 1.2 * scale).all():
             break
-        weights = kept / noise**2
+        used, scale = kept, rougher
         found = adjust(found.estimates)
     if options.row_jitter_px > 0:
-        patch.whiten(found, options.row_jitter_px)
+        patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
         found = adjust(found.estimates)
-    return patch.matches(found, weights > 0)
+    return patch.matches(found, used > 0, scale[:, 0])
 
 
-def _robust_sigma(found: BatchAdjustment, weights: Array) -> Array:
-    """1.4826 × the median of the absolute residuals in use, (k, 1)."""
-    size = np.where(weights > 0, np.abs(found.residuals), np.nan)
-    size[~(weights > 0).any(axis=1), 0] = 0.0
+def _robust_sigma(residuals: Array, used: Array) -> Array:
+    """1.4826 × the median of the absolute residuals in use, (k, 1); not below half their rms."""
+    size = np.where(used > 0, np.abs(residuals), np.nan)
+    size[~(used > 0).any(axis=1), 0] = 0.0
     sigma: Array = 1.4826 * np.nanmedian(size, axis=1, keepdims=True)
     # An image of few grey steps may have half its residuals at nought.
-    return np.maximum(sigma, 0.5 * np.nan_to_num(found.sigma0[:, None]))
+    return np.maximum(sigma, 0.5 * _rms(residuals, used, 0))
+
+
+def _rms(residuals: Array, used: Array, parameters: int) -> Array:
+    """Root mean square of the residuals in use, (k, 1)."""
+    squares = np.where(used > 0, np.nan_to_num(residuals) ** 2, 0.0).sum(axis=1, keepdims=True)
+    rms: Array = np.sqrt(squares / np.maximum((used > 0).sum(axis=1, keepdims=True) - parameters, 1))
+    return rms
 
 
 class _Patches:
@@ -351,16 +361,16 @@ class _Patches:
         tolerated: Array = _FORM_ERROR * amplitude[:, None] * (share.reshape(len(x), -1) > 0.02)
         return tolerated
 
-    def whiten(self, found: BatchAdjustment, jitter: float) -> None:
+    def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
         """Take an error of each row, jitter × slope along x, into the stochastic model.
 
         The covariance of a row is σ²(I + q² g gᵀ) with the slope g of the formed image and q = jitter/σ. Its
         inverse square root I − g gᵀ(1 − (1 + q² gᵀg)^(−1/2))/gᵀg makes the residuals of a row independent.
         """
-        _, jacobian = self.form_image(found.estimates, np.arange(len(self.xy)))
+        _, jacobian = self.form_image(x, np.arange(len(self.xy)))
         slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
         length2 = (slope**2).sum(axis=2, keepdims=True)
-        q2 = (jitter / np.maximum(found.sigma0, 1e-12))[:, None, None] ** 2
+        q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2
         factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
         self.whitener = (slope, factor)
 
@@ -375,7 +385,7 @@ class _Patches:
         j = j - slope[..., None] * along[:, :, None, :]
         return self.grey[at] + v.reshape(m, -1), j.reshape(m, rows * columns, -1)
 
-    def matches(self, found: BatchAdjustment, used: Mask) -> Matches:
+    def matches(self, found: BatchAdjustment, used: Mask, scale: Array) -> Matches:
         """Columns of results from the adjusted batch."""
         x, k = found.estimates, len(self.xy)
         share, _ = self._coverage(x, np.arange(k))
@@ -398,7 +408,7 @@ class _Patches:
             contrast=x[:, CONTRAST],
             t=np.nan_to_num(t),
             form=x[:, FORM:],
-            noise=found.sigma0,
+            noise=found.sigma0 * scale,
             correlation=np.nan_to_num(correlation),
             seen=(flat * self.weights).sum(axis=1) / sight,
             rejected=(flat * (self.weights - used)).sum(axis=1) / sight,

@@ -29,8 +29,12 @@ _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
 """Sizes of a mark in the image that are tried where nothing tells it."""
 _UNMODELLED_PX = 0.07
 """What positions scatter beyond their own sigmas in real frames; balances the weights of a field's points."""
+_BLURRED = 1.7
+"""Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
+_BENT = 1.25
+"""Factor on the permitted deviation from the neighbours for marks whose own image is beyond doubt."""
 _LIKE_OTHERS = 4.0
-"""Spreads by which width and contrast of a mark may differ from those of the others."""
+"""Spreads by which the contrast of a mark may differ from that of the others."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +60,8 @@ class ReseauOptions:
     most_sigma_px : float
         Largest standard deviation of a coordinate that still counts as measured.
     neighbour_px : float
-        Largest deviation from what the neighbours predict. A mark whose image is beyond doubt may deviate by
-        half as much again: beside a bright disc a scanned image is bent locally by that much.
+        Largest deviation, per axis, from what the neighbours predict. A mark whose own image is beyond doubt
+        may deviate by a quarter more: beside a bright disc a scanned image is bent locally by that much.
     """
 
     nominal: bool = True
@@ -66,7 +70,7 @@ class ReseauOptions:
     mark_px: float | None = None
     psf_px: float = 0.6
     row_jitter_px: float = 0.0
-    least_t: float = 4.0
+    least_t: float = 3.5
     most_sigma_px: float = 0.5
     neighbour_px: float = 1.0
 
@@ -440,8 +444,8 @@ class _Measurement:
         """What speaks against a mark in its own image, the gravest first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
-        # Sharper than the others a mark may be, where the image is bright; blurred it is something else.
-        width = np.log(found.psf_px / self.psf_px) / max(self.psf_spread, 0.2)
+        strong = found.converged & (found.t > 8)
+        ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.psf_px
         contrast_sigma = found.contrast / np.maximum(np.abs(found.t), 1e-9)
         expected = 0.0 if self.contrast is None else self.contrast
         unlike = np.abs(found.contrast - expected) > _LIKE_OTHERS * np.hypot(
@@ -452,9 +456,9 @@ class _Measurement:
             (found.seen < 0.1, "on lost lines or beyond the edge of the frame"),
             (~found.converged, "the match does not converge"),
             (~(found.t >= o.least_t), "no mark stands out from its surroundings"),
-            (width > _LIKE_OTHERS, "blurred unlike the other marks"),
+            (found.psf_px > _BLURRED * ordinary, "blurred unlike the other marks"),
             (unlike, "of another contrast than the other marks"),
-            (found.correlation < 0.5, "the image is not that of a mark"),
+            (strong & (found.correlation < 0.5), "the image is not that of a mark"),
             (found.rejected > 0.4, "disturbed by bit errors or the scene"),
             (moved, "no mark where its neighbours have it"),
             (~(sigma <= o.most_sigma_px), "too uncertain"),
@@ -464,8 +468,8 @@ class _Measurement:
         """Reject, the worst first, what lies where its neighbours do not have it; fit the field anew."""
         deviation = np.full(xy.shape, np.nan)
         doubtless = np.zeros(len(xy), dtype=bool)
-        doubtless[at] = (found.t > 15) & (found.correlation > 0.8) & (found.seen > 0.9)
-        limit = self.options.neighbour_px * np.where(doubtless, 1.5, 1.0)
+        doubtless[at] = (found.t > 15) & (found.seen > 0.9)
+        limit = self.options.neighbour_px * np.where(doubtless, _BENT, 1.0)
         while (good := np.flatnonzero(why == "")).size >= 10:
             self.field = SmoothField.fit(
                 self.source[good], xy[good], sigma=self._relative(cov[good]), trials=0
