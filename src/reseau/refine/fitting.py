@@ -1,0 +1,107 @@
+"""Fit a mapping of `optics` to measured points: plane transformations, polynomials, models of displays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..adjust import Adjustment, Elimination, Failure, GaussHelmert, Options, Parameters, adjust, eliminate
+from ..data import Array, ImagePoints
+from ..errors import UsageError
+from ..optics import PlaneMapping
+
+__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping"]
+
+
+def mapping_problem(
+    model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
+) -> GaussHelmert:
+    """Write down the conditions model(point) = target for points that carry the errors.
+
+    Parameters
+    ----------
+    model : PlaneMapping
+        Model with approximate values.
+    points : ImagePoints
+        Measured points (n) with covariances: the observations.
+    target : array_like (n, 2)
+        What they are to be mapped to.
+    target_sigma : array_like, optional
+        Standard deviation of the target's coordinates, a number or (n, 2). It is carried to the points
+        through the model's derivatives at the approximate values.
+
+    Raises
+    ------
+    UsageError
+        When target and points differ in number.
+    """
+    goal = np.asarray(target, dtype=np.float64)
+    if goal.shape != (len(points), 2):
+        raise UsageError(f"{len(points)} points with targets of shape {goal.shape}")
+    covariance = points.cov
+    spread = np.broadcast_to(np.asarray(target_sigma, dtype=np.float64), goal.shape)
+    if spread.any():
+        back = np.linalg.inv(model.derivatives(points.xy).d_xy)
+        covariance = covariance + np.einsum("nij,nj,nkj->nik", back, spread**2, back)
+
+    def conditions(xy: Array, values: Array) -> Array:
+        return model.with_values(values)(xy) - goal
+
+    def jacobians(xy: Array, values: Array) -> tuple[Array, Array]:
+        found = model.with_values(values).derivatives(xy)
+        return found.d_parameters, found.d_xy
+
+    parameters = Parameters(model.names, model.values)
+    return GaussHelmert(conditions, points.xy, covariance, parameters, jacobians)
+
+
+def fit_mapping(
+    model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
+) -> Adjustment | Failure:
+    """Adjust all parameters of a model; see `mapping_problem`."""
+    if shortage := _shortage(model, points):
+        return shortage
+    return adjust(mapping_problem(model, points, target, target_sigma))
+
+
+def reduce_mapping(
+    model: PlaneMapping,
+    points: ImagePoints,
+    target: ArrayLike,
+    target_sigma: ArrayLike = 0.0,
+    *,
+    alpha: float = 0.05,
+    criterion: Literal["t", "chi2", "F"] = "chi2",
+    keep: Iterable[str] = (),
+    options: Options | None = None,
+) -> Elimination | Failure:
+    """Adjust a model and drop its insignificant parameters one by one; see `mapping_problem`.
+
+    Parameters
+    ----------
+    alpha : float
+        Level of the tests.
+    criterion : {"t", "chi2", "F"}
+        The test; χ² takes the points' covariances at their word.
+    keep : iterable of str
+        Parameters that are not dropped.
+    options : Options, optional
+        How to adjust.
+    """
+    if shortage := _shortage(model, points):
+        return shortage
+    problem = mapping_problem(model, points, target, target_sigma)
+    return eliminate(problem, alpha, criterion, keep, options=options)
+
+
+def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
+    """A failure where there are fewer coordinates than parameters."""
+    if 2 * len(points) < len(model.names):
+        return Failure(
+            f"{len(points)} points give {2 * len(points)} coordinates, "
+            f"fewer than the {len(model.names)} parameters of the model"
+        )
+    return None
