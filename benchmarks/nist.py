@@ -53,9 +53,7 @@ def main() -> int:
     if not nist.names():
         print(f"no NIST StRD files in {nist.data_directory()}")
         return 1
-    print(
-        f"{'problem':<9} {'start':>5}  {'arithmetic':<10} {'parameters':>10} {'sigmas':>7} {'iterations':>10}       ms"
-    )
+    print("problem   start  arithmetic parameters  sigmas iterations       ms")
     double, best = [], []
     for name in nist.names():
         problem = nist.load(name)

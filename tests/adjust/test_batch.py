@@ -167,3 +167,14 @@ def test_a_problem_out_of_iterations_says_so():
 def test_misuse_is_an_error(start, observed, weights, prior):
     with pytest.raises(UsageError):
         adjust_batch(decay, start, observed, weights=weights, prior=prior)
+
+
+def test_derivatives_of_the_wrong_sign_diverge_and_are_not_taken_for_convergence():
+    true, y = simulated(k=2)
+
+    def wrong(x, rows):
+        values, jacobian = decay(x, rows)
+        return values, np.where((rows == 0)[:, None, None], -jacobian, jacobian)
+
+    fit = adjust_batch(wrong, true + 0.2, y, options=BatchOptions(max_iterations=200, tolerance=1e-9))
+    assert fit.reasons.tolist() == [BatchReason.DIVERGED, BatchReason.CONVERGED]

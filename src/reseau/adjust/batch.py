@@ -391,13 +391,11 @@ class _Work:
         if len(held):
             free, gain = self._step(rows[held], np.full(len(held), _LEAST_DAMPING))
             small[held] = self._negligible(rows[held], free, gain)
-        rounding: Mask = predicted <= 10 * _EPS * self.cost[rows] + self.floor[rows]
-        return small | rounding
+        return np.asarray(small | (predicted <= 10 * _EPS * self.cost[rows] + self.floor[rows]))
 
     def _negligible(self, rows: Rows, step: Array, predicted: Array) -> Mask:
         if self.tolerance is not None:
-            small: Mask = (np.abs(step) <= self.tolerance).all(axis=1)
-            return small
+            return np.asarray((np.abs(step) <= self.tolerance).all(axis=1))
         variance = self.cost[rows] / np.maximum(self.redundancy[rows], 1)
         return np.asarray(predicted <= 1e-8 * variance)
 

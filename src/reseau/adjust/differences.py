@@ -32,9 +32,14 @@ def differences(function: Callable[[Array], Array], x: Array, columns: Mask | No
     ndarray (..., u)
         Derivatives, of the shape of the function's value + (u,).
     """
+    with np.errstate(all="ignore"):
+        return _differences(function, x, np.ones(len(x), bool) if columns is None else columns)
+
+
+def _differences(function: Callable[[Array], Array], x: Array, columns: Mask) -> Array:
     here = np.asarray(function(x), dtype=np.float64)
     jacobian = np.zeros((*here.shape, len(x)))
-    for j in np.flatnonzero(np.ones(len(x), bool) if columns is None else columns):
+    for j in np.flatnonzero(columns):
         h = _STEP * abs(x[j]) if x[j] != 0 else _step_from_zero(function, x, int(j), here)
         value = []
         for multiple in (-2.0, -1.0, 1.0, 2.0):
@@ -47,16 +52,36 @@ def differences(function: Callable[[Array], Array], x: Array, columns: Mask | No
 
 
 def _step_from_zero(function: Callable[[Array], Array], x: Array, j: int, here: Array) -> float:
-    """A step for a value of zero, which tells no size: one that changes the function by little."""
-    h: float = _STEP
-    size = float(np.abs(here).max(initial=0.0))
-    moved = x.copy()
-    for _ in range(30):
+    """A step for a value of zero, which tells no size: one within which the function is nearly straight."""
+
+    def slope(h: float) -> Array:
+        moved = x.copy()
         moved[j] = h
-        change = float(np.abs(np.asarray(function(moved), dtype=np.float64) - here).max(initial=0.0))
-        if change <= 10 * _STEP * size or size == 0:
+        return (np.asarray(function(moved), dtype=np.float64) - here) / h
+
+    noise = 10 * float(np.finfo(np.float64).eps) * float(np.abs(here).max(initial=0.0))
+
+    def straight(narrow: Array, wide: Array, h: float) -> bool:
+        # Not a number is not straight either.
+        bent = float(np.abs(wide - narrow).max(initial=0.0))
+        return bent <= 1e-3 * float(np.abs(narrow).max(initial=0.0)) + noise / h
+
+    h: float = _STEP
+    narrow, wide = slope(h / 10.0), slope(h)
+    for _ in range(30):
+        if straight(narrow, wide, h / 10.0):
             break
-        h /= 10.0
+        h, wide = h / 10.0, narrow
+        narrow = slope(h / 10.0)
+    # And wide enough for the change to stand out of the rounding of the function.
+    for _ in range(30):
+        size = float(np.abs(wide).max(initial=0.0))
+        if size == 0 or noise / h <= 1e-10 * size:
+            break
+        wider = slope(10.0 * h)
+        if not straight(wide, wider, h):
+            break
+        h, wide = 10.0 * h, wider
     return h
 
 

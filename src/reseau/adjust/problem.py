@@ -44,7 +44,8 @@ class _Common:
             weights = np.asarray(self.weights, dtype=np.float64)
             if weights.shape != self.observations.shape or not (weights >= 0).all():
                 raise UsageError(f"must be {self.observations.shape} and not negative", where="weights")
-            object.__setattr__(self, "weights", weights)
+            # Denormal factors would overflow in the covariance; they say zero.
+            object.__setattr__(self, "weights", np.where(weights < 1e-200, 0.0, weights))
         blocks_of(self.covariance, self.observations.shape)
 
     @property

@@ -92,9 +92,9 @@ def weight_function(name: WeightName, tuning: float | None = None) -> Callable[[
         return within**2
 
     def danish(t: Array) -> Array:
-        # Beyond 26 k the exponential is zero in double precision.
-        excess = np.clip(np.abs(t) / k, 1.0, 27.0) ** 2 - 1.0
-        return np.exp(-excess)
+        # Beyond 6 k the weight of 6e-16 is no weight.
+        size = np.abs(t) / k
+        return np.where(size < 6.0, np.exp(1.0 - np.clip(size, 1.0, 6.0) ** 2), 0.0)
 
     return {"huber": huber, "tukey": tukey, "danish": danish}[name]
 

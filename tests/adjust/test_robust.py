@@ -1,0 +1,264 @@
+"""Blunders: rejection, snooping, robust weights, consensus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from reseau.adjust import (
+    BatchOptions,
+    GaussHelmert,
+    GaussMarkov,
+    Parameters,
+    adjust,
+    adjust_batch,
+    data_snooping,
+    ransac,
+    reject_outliers,
+    robust,
+    weight_function,
+)
+from reseau.errors import UsageError
+
+T = np.linspace(0.0, 10.0, 50)
+A = np.stack([np.ones_like(T), T], axis=1)
+
+
+def line(y, sigma=0.1, **more):
+    return GaussMarkov(lambda x: A @ x, y, sigma, Parameters("ab", [0.0, 0.0]), lambda x: A, **more)
+
+
+def clean(seed=0):
+    return 2.0 + 0.3 * T + np.random.default_rng(seed).normal(0, 0.1, len(T))
+
+
+def spoilt(seed=0, rows=(3, 20, 44), size=3.0):
+    y = clean(seed)
+    y[list(rows)] += size
+    return y
+
+
+def marks(seed=0, rows=()):
+    rng = np.random.default_rng(seed)
+    xy = np.column_stack([T, 2.0 + 0.3 * T]) + rng.normal(0, 0.1, (50, 2))
+    for row in rows:
+        xy[row, 1] += 3.0
+
+    def conditions(p, x):
+        return (x[0] + x[1] * p[:, 0] - p[:, 1])[:, None]
+
+    return GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 0.0]))
+
+
+def test_snooping_finds_the_blunders_and_nothing_else():
+    found = data_snooping(line(spoilt()), alpha=0.0001).required()
+    assert np.flatnonzero(found.rejected).tolist() == [3, 20, 44]
+    without = np.ones(50)
+    without[[3, 20, 44]] = 0
+    direct = adjust(line(spoilt(), weights=without)).required()
+    np.testing.assert_allclose(found.adjustment.values, direct.values, atol=1e-10)
+    assert [step.restored for step in found.steps] == [False] * 3
+    assert all(step.statistic > step.critical for step in found.steps)
+
+
+def test_snooping_by_tau_needs_no_true_sigmas():
+    found = data_snooping(line(spoilt(), sigma=None), alpha=0.001, test="tau").required()
+    assert np.flatnonzero(found.rejected).tolist() == [3, 20, 44]
+
+
+def test_snooping_leaves_good_observations_alone_at_its_level():
+    """Over n observations some are rejected with probability ≈ 1 − (1 − α)ⁿ."""
+    alpha, trials = 0.001, 200
+    some = sum(
+        bool(data_snooping(line(clean(seed)), alpha).required().rejected.any()) for seed in range(trials)
+    )
+    expected = trials * (1 - (1 - alpha) ** len(T))
+    assert abs(some - expected) < 4 * np.sqrt(expected)
+
+
+def test_snooping_takes_back_what_worse_blunders_had_made_look_bad():
+    """Two blunders on the same lever hide each other, and good observations look worst at first."""
+    x = np.append(np.arange(0.0, 5.5, 0.5), [12.0, 12.5])
+    design = np.stack([np.ones_like(x), x], axis=1)
+    restored = 0
+    for seed in range(100):
+        y = np.random.default_rng(seed).normal(0, 0.1, len(x))
+        y[-2:] += 1.5
+        problem = GaussMarkov(lambda p: design @ p, y, 0.1, Parameters("ab", [0.0, 0.0]), lambda p: design)
+        found = data_snooping(problem, alpha=0.01, max_fraction=0.6)
+        back = [step for step in found.steps if step.restored] if found else []
+        for step in back:
+            assert step.statistic <= step.critical
+            assert step.index in [other.index for other in found.steps if not other.restored]
+        restored += bool(back)
+    assert restored > 2
+
+
+def test_too_many_blunders_are_a_failure_that_suspects_the_model():
+    y = 2.0 + 0.3 * T + np.sin(T) * 3
+    for found in (data_snooping(line(y)), reject_outliers(line(y), k=1.0, max_fraction=0.1)):
+        assert not found
+        assert "model" in found.reason
+
+
+def test_rejection_at_three_sigma_settles_on_the_good_observations():
+    found = reject_outliers(line(spoilt(size=2.0)), k=3.0).required()
+    assert np.flatnonzero(found.rejected).tolist() == [3, 20, 44]
+    sigma0 = found.adjustment.sigma0
+    assert (np.abs(found.adjustment.residuals[~found.rejected]) <= 3 * sigma0 * 0.1).all()
+    assert (np.abs(found.adjustment.residuals[found.rejected]) > 3 * sigma0 * 0.1).all()
+
+
+def test_what_is_left_out_from_the_start_stays_out_and_is_not_counted_as_rejected():
+    weights = np.ones(50)
+    weights[7] = 0.0
+    y = spoilt()
+    y[7] = 1e9
+    for found in (
+        data_snooping(line(y, weights=weights), 0.0001),
+        reject_outliers(line(y, weights=weights), 3.5),
+    ):
+        assert np.flatnonzero(found.required().rejected).tolist() == [3, 20, 44]
+        assert found.adjustment.rejected[7]
+
+
+def test_of_marks_the_whole_mark_goes():
+    for found in (data_snooping(marks(rows=[5, 30]), 0.0001), reject_outliers(marks(rows=[5, 30]), k=4.5)):
+        rejected = found.required().rejected
+        assert np.flatnonzero(rejected[:, 0]).tolist() == [5, 30]
+        np.testing.assert_array_equal(rejected[:, 0], rejected[:, 1])
+
+
+@pytest.mark.parametrize("name", ["huber", "tukey", "danish"])
+@pytest.mark.parametrize("scale", ["mad", "a-priori"])
+def test_robust_weights_withstand_blunders(name, scale):
+    found = robust(line(spoilt(size=20.0)), name, scale=scale).required()
+    good = adjust(line(clean())).required()
+    plain = adjust(line(spoilt(size=20.0))).required()
+    error = np.abs(found.adjustment.values - good.values) / np.sqrt(np.diag(good.cofactor))
+    worse = np.abs(plain.values - good.values) / np.sqrt(np.diag(good.cofactor))
+    assert error.max() < 1.0
+    assert worse.max() > 10.0
+    assert found.factors[[3, 20, 44]].max() < 0.1
+    if scale == "mad":
+        assert found.scale == pytest.approx(1.0, abs=0.35)
+
+
+def test_huber_estimates_solve_hubers_equation():
+    """Σ ψ(v/σs) a = 0 with ψ bounded at 1.345."""
+    found = robust(line(spoilt()), "huber", tolerance=1e-10).required()
+    v = found.adjustment.residuals / 0.1 / found.scale
+    psi = np.clip(v, -1.345, 1.345)
+    assert np.abs(A.T @ psi).max() < 1e-5 * np.abs(A).sum()
+
+
+def test_robust_marks_share_one_factor():
+    found = robust(marks(rows=[5, 30]), "tukey").required()
+    np.testing.assert_array_equal(found.factors[:, 0], found.factors[:, 1])
+    assert (found.factors[[5, 30]] == 0).all()
+    assert found.scale == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize("name", ["huber", "tukey", "danish"])
+def test_weight_functions_are_one_at_zero_even_and_falling(name):
+    function = weight_function(name)
+    t = np.linspace(0, 60, 601)
+    w = function(t)
+    assert w[0] == 1.0
+    assert (np.diff(w) <= 0).all()
+    assert (w >= 0).all()
+    assert w[-1] < 0.05
+    np.testing.assert_array_equal(function(-t), w)
+
+
+def test_weight_functions_serve_the_batch():
+    y = spoilt(size=20.0)[None]
+
+    def function(x, rows):
+        return x @ A.T, np.broadcast_to(A, (len(rows), 50, 2))
+
+    options = BatchOptions(reweight=weight_function("huber"), max_iterations=100, tolerance=1e-9)
+    batch = adjust_batch(function, np.zeros((1, 2)), y, weights=np.full((1, 50), 100.0), options=options)
+    single = robust(line(y[0]), "huber", tolerance=1e-9).required()
+    np.testing.assert_allclose(batch.estimates[0], single.adjustment.values, atol=1e-6)
+
+
+def test_misuse_is_an_error():
+    for call in (
+        lambda: weight_function("cauchy"),
+        lambda: weight_function("huber", -1.0),
+        lambda: robust(line(clean()), scale="mean"),
+        lambda: data_snooping(line(clean()), test="t"),
+        lambda: reject_outliers(line(clean()), k=-1),
+        lambda: ransac(Line, T, 0, 1.0, np.random.default_rng(0)),
+        lambda: ransac(Line, (T, T[1:]), 2, 1.0, np.random.default_rng(0)),
+    ):
+        with pytest.raises(UsageError):
+            call()
+
+
+@dataclass(frozen=True)
+class Line:
+    """A model as scikit-image has them."""
+
+    a: float
+    b: float
+
+    @classmethod
+    def from_estimate(cls, x, y):
+        if np.ptp(x) == 0:
+            return None
+        design = np.stack([np.ones_like(x), x], axis=1)
+        a, b = np.linalg.lstsq(design, y, rcond=None)[0]
+        return cls(float(a), float(b))
+
+    def residuals(self, x, y):
+        return np.abs(self.a + self.b * x - y)
+
+
+def scattered(seed=0, outliers=25):
+    rng = np.random.default_rng(seed)
+    y = clean(seed)
+    rows = rng.choice(50, outliers, replace=False)
+    y[rows] = rng.uniform(-20, 20, outliers)
+    return y, np.isin(np.arange(50), rows)
+
+
+def test_consensus_is_found_among_half_of_outliers():
+    y, bad = scattered()
+    found = ransac(Line, (T, y), 2, 0.4, np.random.default_rng(1)).required()
+    assert not (found.inliers & bad & (np.abs(y - 2 - 0.3 * T) > 0.6)).any()
+    assert (found.inliers | bad).mean() > 0.95
+    direct = Line.from_estimate(T[found.inliers], y[found.inliers])
+    assert found.model == direct
+    assert found.model.b == pytest.approx(0.3, abs=0.03)
+
+
+def test_consensus_is_reproducible_and_stops_early_without_outliers():
+    y, _ = scattered()
+    one, two = (ransac(Line, (T, y), 2, 0.4, np.random.default_rng(3)).required() for _ in range(2))
+    assert one.model == two.model
+    assert one.trials == two.trials
+    assert ransac(Line, (T, clean()), 2, 1.0, np.random.default_rng(0)).required().trials < 10
+
+
+def test_consensus_succeeds_at_its_confidence():
+    failures = 0
+    for seed in range(200):
+        y, _ = scattered(seed)
+        found = ransac(Line, (T, y), 2, 0.4, np.random.default_rng(seed), confidence=0.99)
+        failures += not found or abs(found.model.b - 0.3) > 0.05
+    assert failures <= 8  # 2 expected of 200
+
+
+def test_no_consensus_is_a_failure_with_the_reason():
+    same = np.zeros(50)
+    found = ransac(Line, (same, clean()), 2, 0.1, np.random.default_rng(0), max_trials=20)
+    assert not found
+    assert "none of 20 samples" in found.reason
+    rng = np.random.default_rng(0)
+    found = ransac(Line, (T, rng.uniform(0, 1e6, 50)), 2, 1e-3, rng, max_trials=20)
+    assert not found
+    assert "only 2 of 50" in found.reason
