@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from reseau.data import Array, Mask
 from reseau.errors import UsageError
 
+from .threads import one_thread
+
 __all__ = ["BatchAdjustment", "BatchOptions", "BatchReason", "adjust_batch"]
 
 Rows = NDArray[np.intp]
@@ -178,11 +180,12 @@ def adjust_batch(
     array([2, 1])
     """
     work = _Work(function, initial, observations, weights, prior, options or BatchOptions())
-    work.start()
-    for _ in range(work.options.max_iterations):
-        if not work.iterate():
-            break
-    return work.finish()
+    with one_thread():
+        work.start()
+        for _ in range(work.options.max_iterations):
+            if not work.iterate():
+                break
+        return work.finish()
 
 
 class _Work:

@@ -21,6 +21,7 @@ from .linear import Linearised, constraint_matrix, linearise
 from .models import Model, State, model_of
 from .problem import Problem
 from .result import Adjustment, Failure, NullVector, Solution
+from .threads import one_thread
 
 __all__ = ["Options", "adjust"]
 
@@ -103,10 +104,11 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Fai
     ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05, eq. 2.4; convergence after Bates & Watts (1981),
     *Technometrics* 23, 179–183.
     """
-    run = _Run(problem, options or Options())
-    if run.options.check_jacobian is not None:
-        _check(run.model, run.options.check_jacobian)
-    return run.adjust()
+    with one_thread():
+        run = _Run(problem, options or Options())
+        if run.options.check_jacobian is not None:
+            _check(run.model, run.options.check_jacobian)
+        return run.adjust()
 
 
 class _Run:
@@ -141,7 +143,7 @@ class _Run:
         self.costs.append(state.cost)
         linear = self._linearise(state)
         while not isinstance(linear, Failure):
-            if self._offset(linear, state) <= self.options.tolerance or state.cost <= self._rounding(
+            if self._offset(linear, state) <= self.options.tolerance or state.cost <= 100.0 * self._rounding(
                 state, linear
             ):
                 return self._arrived(state, linear)
@@ -163,7 +165,8 @@ class _Run:
                 return closer
         self.length = 1.0
         while self.iterations < self.options.max_iterations:
-            trial = self._trial(state, linear, self.damping, self.length, self.marquardt)
+            bend = self.marquardt and self.model.constant_weights
+            trial = self._trial(state, linear, self.damping, self.length, bend)
             promised = linear.predicted(self.damping) if self.marquardt else self.length * linear.reducible
             gain = (state.cost - trial.cost) / promised if trial.usable and promised > 0 else -1.0
             if gain > 1e-4:

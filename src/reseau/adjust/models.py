@@ -153,6 +153,8 @@ class Model:
         return np.concatenate([whitened, self.prior_weighting.whiten(misfit)])
 
     weighting: Weighting
+    # Whether whitening is the same at all parameters, so that second differences of r are those of the function.
+    constant_weights: bool
 
     @property
     def left_out(self) -> int:
@@ -171,6 +173,8 @@ class Model:
 
 class _Markov(Model):
     """l + v = f(x)."""
+
+    constant_weights = True
 
     def __init__(self, problem: GaussMarkov) -> None:
         super().__init__(problem)
@@ -222,6 +226,8 @@ class _Markov(Model):
 
 class _Helmert(Model):
     """g(l + v, x) = 0, in b groups of c conditions and k observations; a single group where they mix."""
+
+    constant_weights = False
 
     def __init__(self, problem: GaussHelmert) -> None:
         super().__init__(problem)

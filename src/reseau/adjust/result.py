@@ -19,6 +19,7 @@ from .significance import CoefficientTest, GlobalTest, coefficient_test, global_
 
 if TYPE_CHECKING:
     from .engine import Options
+from .threads import one_thread
 
 __all__ = ["Adjustment", "Failure", "NullVector", "Solution"]
 
@@ -223,7 +224,8 @@ class Adjustment:
     @cached_property
     def standardised(self) -> Standardised:
         """Redundancy numbers and test values of observations and then of observed parameters, flat."""
-        return self.solution.standardise()
+        with one_thread():
+            return self.solution.standardise()
 
     def _of_observations(self, flat: Array) -> Array:
         shape = self.problem.observations.shape
@@ -291,7 +293,8 @@ class Adjustment:
         ExternalReliability
             Effects by observation.
         """
-        effects, lengths = self.solution.effects(self.standardised, noncentrality(alpha, power))
+        with one_thread():
+            effects, lengths = self.solution.effects(self.standardised, noncentrality(alpha, power))
         full = np.zeros((len(effects), len(self.names)))
         full[:, self.problem.parameters.mask] = effects
         return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))

@@ -196,15 +196,19 @@ class PixelResponse:
 
     fill: float = 1.0
 
-    def orders(self, t: Array, sigma: Array | float, highest: int, *, integral: bool = True) -> list[Array]:
-        """Integral, value and derivatives of the response at offsets `t` (px).
+    def orders(
+        self, pixels: Array, points: Array, sigma: Array | float, highest: int, *, integral: bool = True
+    ) -> list[Array]:
+        """Integral, value and derivatives of the response of pixels to light at points.
 
         Parameters
         ----------
-        t : ndarray
-            Pixel minus point.
+        pixels : ndarray (..., c)
+            Pixel coordinates along the axis.
+        points : ndarray (..., j)
+            Coordinates of the points along the axis.
         sigma : ndarray or float
-            Width of the Gaussian in pixels, broadcasting with `t`.
+            Width of the Gaussian in pixels, broadcasting with (..., j, c).
         highest : int
             Highest derivative wanted.
         integral : bool
@@ -212,26 +216,35 @@ class PixelResponse:
 
         Returns
         -------
-        list of ndarray
+        list of ndarray (..., j, c)
             :math:`H, h, h', …` up to the derivative `highest`; the first is left out when not wanted.
         """
         half = max(self.fill, 1e-6) / 2
-        ends = []
-        for edge in (t + half, t - half):
-            z = edge / sigma
-            found = [ndtr(z)]
-            if integral or highest:
-                bell = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
-            if integral:
-                found.insert(0, edge * found[0] + sigma * bell)
-            # Derivatives of a Gaussian: Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
-            before: Array | float = 0.0
-            hermite: Array | float = 1.0
-            for k in range(highest):
-                found.append(hermite * bell / (-sigma) ** k / sigma)
-                before, hermite = hermite, z * hermite - k * before
-            ends.append(found)
+        if self.fill == 1.0 and (np.diff(pixels) == 1.0).all():
+            # Neighbours that leave no gap share an edge: half the work.
+            edges = np.concatenate([pixels[..., :1] - half, pixels + half], axis=-1)
+            found = _steps(edges[..., None, :] - points[..., None], sigma, highest, integral)
+            return [np.diff(order, axis=-1) for order in found]
+        offset = pixels[..., None, :] - points[..., None]
+        ends = [_steps(offset + edge, sigma, highest, integral) for edge in (half, -half)]
         return [(right - left) / (2 * half) for right, left in zip(*ends, strict=True)]
+
+
+def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
+    """The blurred step's integral, the step and its derivatives at offsets `t`."""
+    z = t / sigma
+    found: list[Array] = [ndtr(z)]
+    if integral or highest:
+        bell = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    if integral:
+        found.insert(0, t * found[0] + sigma * bell)
+    # Derivatives of a Gaussian: Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
+    before: Array | float = 0.0
+    hermite: Array | float = 1.0
+    for k in range(highest):
+        found.append(hermite * bell / (-sigma) ** k / sigma)
+        before, hermite = hermite, z * hermite - k * before
+    return found
 
 
 def coverage(
@@ -257,8 +270,8 @@ def coverage(
     ndarray (..., r, c)
     """
     width = np.asarray(sigma, dtype=np.float64)[..., None, None]
-    h_x = response.orders(columns[..., None, :] - outline.xy[..., :, :1], width, 0)[0]
-    h_y = response.orders(rows[..., None, :] - outline.xy[..., :, 1:], width, 0, integral=False)[0]
+    h_x = response.orders(columns, outline.xy[..., 0], width, 0)[0]
+    h_y = response.orders(rows, outline.xy[..., 1], width, 0, integral=False)[0]
     share: Array = np.swapaxes(h_y * -outline.dxy[..., :, 1:], -1, -2) @ h_x
     return share
 
@@ -287,8 +300,8 @@ def coverage_derivatives(
         With respect to a shift along x, a shift along y, `sigma`, and the further parameters.
     """
     width = np.asarray(sigma, dtype=np.float64)[..., None, None]
-    big_x, h_x, d_x = response.orders(columns[..., None, :] - outline.xy[..., :, :1], width, 1)
-    h_y, d_y = response.orders(rows[..., None, :] - outline.xy[..., :, 1:], width, 1, integral=False)
+    big_x, h_x, d_x = response.orders(columns, outline.xy[..., 0], width, 1)
+    h_y, d_y = response.orders(rows, outline.xy[..., 1], width, 1, integral=False)
     dx, dy = outline.dxy[..., :, :1], outline.dxy[..., :, 1:]
     t_y, td_y = np.swapaxes(h_y, -1, -2), np.swapaxes(d_y, -1, -2)
     flat_x, flat_y = np.swapaxes(dx, -1, -2), np.swapaxes(dy, -1, -2)
@@ -363,8 +376,8 @@ def _shifted_coverage(
     if shifts is None:
         return coverage(outline, columns.astype(float), rows.astype(float), sigma, response)
     highest = 4
-    along = response.orders(columns[..., None, :] - outline.xy[..., :, :1], sigma, highest - 1)
-    h_y = response.orders(rows[..., None, :] - outline.xy[..., :, 1:], sigma, 0, integral=False)[0]
+    along = response.orders(columns, outline.xy[..., 0], sigma, highest - 1)
+    h_y = response.orders(rows, outline.xy[..., 1], sigma, 0, integral=False)[0]
     weighted = np.swapaxes(h_y * -outline.dxy[..., :, 1:], -1, -2)
     share, factor = np.zeros((*rows.shape, columns.shape[-1])), np.ones_like(shifts)
     for order, h_x in enumerate(along):

@@ -81,6 +81,7 @@ class SmoothField:
         sigma: Array | None = None,
         degree: int | None = None,
         local: bool = True,
+        length: float | None = None,
         trials: int = 0,
         seed: int = 0,
     ) -> SmoothField:
@@ -96,6 +97,8 @@ class SmoothField:
             Degree of the trend; by default as high as the number of points bears.
         local : bool
             Whether a signal may be added to the trend.
+        length : float, optional
+            Correlation length, where it is known; else the likeliest is taken.
         trials : int
             Number of simulated fields of white noise for the test of the signal's need; 0: no test.
         seed : int
@@ -111,18 +114,18 @@ class SmoothField:
         design, extent = _design(source, source, degree)
         if len(source) < design.shape[1] + 2:
             raise UsageError(f"{len(source)} points do not bear a trend of degree {degree}")
+        if not local:
+            return _polynomial(source, target, degree, design, relative)
         q, _ = np.linalg.qr(design / relative[:, None], mode="complete")
         free = q[:, design.shape[1] :]
         white = free.T @ (target / relative[:, None])
         distance = cdist(source, source)
-        ratios, lengths = (_RATIOS, _LENGTHS) if local else (_RATIOS[:1], _LENGTHS[-1:])
-        spectra = [
-            _spectrum(free, _correlation(distance / (extent * length)), relative, local) for length in lengths
-        ]
+        ratios, lengths = _RATIOS, _LENGTHS if length is None else np.array([length / extent])
+        spectra = [_spectrum(free, _correlation(distance / (extent * scale)), relative) for scale in lengths]
         gains = np.array([_gains(spectrum, vectors.T @ white, ratios) for spectrum, vectors in spectra])
         best = int(gains.max(axis=1).sum(axis=1).argmax())
         at = gains[best].argmax(axis=0)
-        need = _need(spectra, ratios, gains, trials, seed) if local and trials else np.full(2, np.nan)
+        need = _need(spectra, ratios, gains, trials, seed) if trials else np.full(2, np.nan)
         ratio = ratios[at]
         spectrum, vectors = spectra[best]
         solutions, noise = [], np.empty(2)
@@ -150,8 +153,10 @@ class SmoothField:
 
     def __call__(self, xy: Array) -> Array:
         """Values of the field at points (n, 2)."""
-        kernel = _correlation(cdist(xy, self.source) / self.length)
         design, _ = _design(self.source, xy, self.degree)
+        if not self.ratio.any():
+            return design @ np.stack([trend for _, _, trend in self._solutions], axis=1)
+        kernel = _correlation(cdist(xy, self.source) / self.length)
         parts = [
             design @ trend + ratio * (kernel @ (weights / self._relative))
             for ratio, (weights, _, trend) in zip(self.ratio, self._solutions, strict=True)
@@ -186,6 +191,20 @@ class SmoothField:
         return weights / diagonal * scale, self.noise / np.sqrt(diagonal) * scale
 
 
+def _polynomial(source: Array, target: Array, degree: int, design: Array, relative: Array) -> SmoothField:
+    """The trend alone, by least squares."""
+    q, r = np.linalg.qr(design / relative[:, None])
+    white = target / relative[:, None]
+    fitted = q.T @ white
+    rest = white - q @ fitted
+    noise = np.sqrt((rest**2).sum(axis=0) / (len(source) - design.shape[1]))
+    trend = np.linalg.solve(r, fitted)
+    free = 1 - (q**2).sum(axis=1)
+    solutions = tuple((rest[:, axis], free, trend[:, axis]) for axis in range(2))
+    none = np.zeros(2)
+    return SmoothField(source, target, degree, np.inf, none, noise, np.full(2, np.nan), relative, solutions)
+
+
 def _extent(source: Array) -> tuple[Array, float]:
     low, high = source.min(axis=0), source.max(axis=0)
     return (low + high) / 2, float(max((high - low).max() / 2, 1e-12))
@@ -206,10 +225,8 @@ def _correlation(z: Array) -> Array:
     return value
 
 
-def _spectrum(free: Array, correlation: Array, relative: Array, local: bool) -> tuple[Array, Array]:
+def _spectrum(free: Array, correlation: Array, relative: Array) -> tuple[Array, Array]:
     """Eigenvalues and vectors of the signal's covariance in the space that the trend leaves free."""
-    if not local:
-        return np.zeros(free.shape[1]), np.eye(free.shape[1])
     values, vectors = eigh(free.T @ (correlation / np.outer(relative, relative)) @ free, check_finite=False)
     return np.maximum(values, 0), vectors
 

@@ -201,7 +201,7 @@ def match(
             patch.grey,
             weights=used / scale**2,
             prior=(start, free),
-            options=BatchOptions(tolerance=tolerance, max_iterations=30),
+            options=BatchOptions(tolerance=tolerance, max_iterations=20),
         )
 
     used, scale = patch.weights, np.full((len(xy), 1), noise)

@@ -29,6 +29,8 @@ _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
 """Sizes of a mark in the image that are tried where nothing tells it."""
 _UNMODELLED_PX = 0.07
 """What positions scatter beyond their own sigmas in real frames; balances the weights of a field's points."""
+_LEARN_FROM = 50
+"""So many of the strongest marks tell what a mark of this frame looks like."""
 _BLURRED = 1.7
 """Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
 _BENT = 1.25
@@ -316,22 +318,15 @@ class _Measurement:
         """Match, learn, match again, judge."""
         placed = self.search.assignment
         has = placed.candidate >= 0
-        start = np.where(has[:, None], placed.at, self.predicted)
-        at = first_at = np.flatnonzero(self._near_frame(start))
-        first = self._match(at, start[at], self._first_options(), 0.3 if self.free_size else 0.1)
-        sure = self._sure(first) & has[at]
-        self._learn(first, sure)
-        if sure.sum() >= 10:
-            self.field = SmoothField.fit(
-                self.source[at[sure]], first.xy[sure], sigma=self._relative(first.cov[sure])
-            )
-            self.predicted = self.field(self.source)
+        # The strongest tell what a mark looks like here, and where exactly to look for the others.
+        strongest = np.flatnonzero(has)[np.argsort(placed.candidate[has], kind="stable")[:_LEARN_FROM]]
+        first = self._match(
+            strongest, placed.at[strongest], self._first_options(), 0.3 if self.free_size else 0.1
+        )
+        self._learn(first)
         at = np.flatnonzero(self._near_frame(self.predicted))
-        known = np.full((len(self.source), 2), np.nan)
-        known[first_at] = first.xy
-        close = np.hypot(*(known - self.predicted).T) < 1.0
-        start = np.where(close[:, None], known, self.predicted)
-        found = self._best_window(at, start[at])
+        found = self._best_window(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
+        self._refit(at, found)
         judged = self._judged(at, found)
         # Where a mark was missed, its neighbours now say better where to look.
         again = np.flatnonzero(judged.why[at] != "")
@@ -383,13 +378,18 @@ class _Measurement:
             form_sigma=np.array([size_sigma]),
         )
 
-    def _sure(self, first: Matches) -> Mask:
-        """Marks beyond doubt: to learn from."""
-        sure: Mask = first.converged & (first.t > 8) & (first.seen > 0.9) & (first.rejected < 0.2)
-        return sure
+    def _refit(self, at: Rows, found: Matches) -> None:
+        """The field through the marks beyond doubt; that of the candidates was coarse."""
+        near = np.abs(found.xy - self.predicted[at]).max(axis=1) < max(3.0, self.extent_px)
+        sure = _sure(found) & near
+        if sure.sum() >= 10:
+            relative = self._relative(found.cov[sure])
+            self.field = SmoothField.fit(self.source[at[sure]], found.xy[sure], sigma=relative)
+            self.predicted = self.field(self.source)
 
-    def _learn(self, first: Matches, sure: Mask) -> None:
+    def _learn(self, first: Matches) -> None:
         """What the marks of this frame look like: width, contrast, size."""
+        sure = _sure(first)
         if sure.sum() < 5:
             self.psf_px, self.psf_spread = self.options.psf_px, 0.3
             self.contrast, self.contrast_spread, self.size_spread = None, np.inf, 0.1
@@ -471,9 +471,10 @@ class _Measurement:
         doubtless[at] = (found.t > 15) & (found.seen > 0.9)
         limit = self.options.neighbour_px * np.where(doubtless, _BENT, 1.0)
         while (good := np.flatnonzero(why == "")).size >= 10:
-            self.field = SmoothField.fit(
-                self.source[good], xy[good], sigma=self._relative(cov[good]), trials=0
-            )
+            relative = self._relative(cov[good])
+            # The length found first serves all rounds; where there is none yet, the likeliest is taken.
+            length = self.field.length if np.isfinite(self.field.length) else None
+            self.field = SmoothField.fit(self.source[good], xy[good], sigma=relative, length=length)
             deviation[:] = np.nan
             deviation[good], sigma = self.field.leave_one_out()
             # Where the neighbours themselves do not know to a pixel, they cannot object.
@@ -522,6 +523,12 @@ class _Measurement:
             deviation=spread(judged.deviation, search.known),
             field=self.field,
         )
+
+
+def _sure(found: Matches) -> Mask:
+    """Matches beyond doubt."""
+    sure: Mask = found.converged & (found.t > 8) & (found.seen > 0.9) & (found.rejected < 0.2)
+    return sure
 
 
 def _robust(values: Array, least: float) -> tuple[float, float]:
