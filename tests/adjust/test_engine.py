@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -501,3 +502,112 @@ def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
         jacobian=lambda x: (at / unit * np.exp(x[0] / unit * at))[:, None],
     )
     assert check_jacobian(problem).agrees(1e-6)
+
+
+@given(st.integers(1, 5), st.integers(1, 12), st.integers(0, 2**32 - 1), st.sampled_from(METHODS))
+@settings(max_examples=60, deadline=None)
+def test_a_linear_problem_is_solved_as_by_the_pseudoinverse(u, extra, seed, method):
+    rng = np.random.default_rng(seed)
+    design = rng.normal(size=(u + extra, u))
+    covariance = spd(rng, u + extra)
+    y = rng.normal(size=u + extra)
+    names = [f"p{i}" for i in range(u)]
+    problem = GaussMarkov(lambda x: design @ x, y, covariance, Parameters(names, np.zeros(u)))
+    fit = adjust(problem, Options(method=method)).required()
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    direct = np.linalg.lstsq(root @ design, root @ y, rcond=None)[0]
+    # In standard deviations of unit weight.
+    assert np.abs((fit.values - direct) / np.sqrt(np.diag(fit.cofactor))).max() < 1e-6
+    assert fit.redundancy_numbers.sum() == pytest.approx(extra, abs=1e-6)
+    assert np.abs(fit.correlation).max() < 1.0 + 1e-12
+
+
+def test_gauss_newton_shortens_steps_that_overshoot():
+    """atan has its zero at 0; from 2 the full step leads farther and farther away."""
+    problem = GaussMarkov(
+        np.arctan, np.zeros(1), 1.0, Parameters("a", [2.0]), lambda x: np.array([[1.0 / (1.0 + x[0] ** 2)]])
+    )
+    fit = adjust(problem, Options(method="gauss-newton")).required()
+    assert fit["a"] == pytest.approx(0.0, abs=1e-9)
+    assert (np.diff(fit.costs) < 0).all()
+
+
+@pytest.mark.parametrize("number", [np.longdouble, "decimal"])
+def test_wider_observations_give_digits_that_double_precision_has_not(number):
+    """Observations 1 + a t that differ from 1 by a few rounding units of double precision only."""
+    decimals = [Decimal(1) + Decimal(i) * Decimal("1e-17") for i in range(10)]
+    kind = object if number == "decimal" else np.longdouble
+    exact = decimals if number == "decimal" else [np.longdouble(str(d)) for d in decimals]
+    t = np.arange(10.0)
+    design = np.stack([np.ones(10), t], axis=1)
+
+    def function(x):
+        return np.array([x[0] + x[1] * int(i) for i in t], dtype=x.dtype)
+
+    problem = GaussMarkov(
+        function, np.array(exact, dtype=kind), None, Parameters("ab", [0, 0]), lambda x: design
+    )
+    fit = adjust(problem).required()
+    if number == "decimal" or np.finfo(np.longdouble).eps < 1e-18:
+        assert fit["b"] == pytest.approx(1e-17, rel=0.02)
+    assert fit.exact_values.dtype == kind
+
+
+def test_everything_public_is_exported_and_says_what_it_is():
+    import reseau.adjust as adjust_package
+
+    assert sorted(adjust_package.__all__) == adjust_package.__all__
+    for name in adjust_package.__all__:
+        thing = getattr(adjust_package, name)
+        assert name == "Problem" or (thing.__doc__ or "").strip()
+
+
+@pytest.mark.parametrize(
+    ("covariance", "words"),
+    [
+        (np.ones(29), "shape"),
+        (np.zeros(30), "above zero"),
+        (np.full(30, np.nan), "finite"),
+        (-np.eye(30), "positive definite"),
+        (np.triu(np.ones((30, 30))), "symmetric"),
+        (np.ones((10, 2, 2)), "20 observations"),
+        ([np.ones(10), np.eye(10)], "20 observations"),
+        ([[1.0, 2.0], [3.0]], "no array"),
+    ],
+)
+def test_a_covariance_that_does_not_fit_is_an_error(covariance, words):
+    with pytest.raises(UsageError, match=words):
+        adjust(decay_problem(covariance=covariance))
+
+
+@pytest.mark.parametrize(
+    "misuse",
+    [
+        lambda: Options(method="newton"),
+        lambda: Options(scale="both"),
+        lambda: Options(tolerance=0.0),
+        lambda: Parameters("ab", [1.0]),
+        lambda: Parameters("aa", [1.0, 2.0]),
+        lambda: Parameters("ab", [1.0, np.nan]),
+        lambda: Parameters("ab", [1.0, 2.0], prior_sigma={"a": 1.0}, prior=Prior("a", [1.0], [1.0])),
+        lambda: Prior("ab", [1.0], [1.0, 1.0]),
+        lambda: decay_problem(np.full(30, np.nan)),
+        lambda: decay_problem(weights=-np.ones(30)),
+        lambda: adjust(decay_problem(constraints=[Constraint({})])),
+        lambda: adjust(decay_problem(jacobian=lambda x: np.zeros((3, 3)))),
+        lambda: adjust(GaussMarkov(lambda x: x, np.zeros(3), 1.0, Parameters("ab", [0.0, 0.0]))),
+        lambda: GaussHelmert(line_conditions, np.zeros((2, 2, 2)), 1.0, Parameters("ab", [0.0, 0.0])),
+        lambda: adjust(decay_problem()).required()["d"],
+        lambda: adjust(decay_problem(parameters=Parameters("abc", TRUE, "ab"))).required().test_of("c"),
+    ],
+)
+def test_misuse_is_an_error(misuse):
+    with pytest.raises(UsageError):
+        misuse()
+
+
+def test_nothing_to_estimate_is_still_an_adjustment():
+    fit = adjust(decay_problem(parameters=Parameters("abc", TRUE, free=[]))).required()
+    assert fit.redundancy == len(T)
+    np.testing.assert_allclose(fit.values, TRUE)
+    np.testing.assert_allclose(fit.redundancy_numbers, 1.0, atol=1e-12)

@@ -269,10 +269,8 @@ class _Work:
         gain = (self.cost[rows] - cost) / np.maximum(predicted, np.finfo(float).tiny)
         good = (gain > 1e-4) & np.isfinite(jacobian).all(axis=(1, 2))
         taken, refused = rows[good], rows[~good]
-        if good.all():
-            self._accept(taken, trial, residuals, jacobian)
-        else:
-            self._accept(taken, trial[good], residuals[good], jacobian[good])
+        kept = slice(None) if good.all() else good  # no copy where all are taken
+        self._accept(taken, trial[kept], residuals[kept], jacobian[kept])
         shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain[good], 1.0) - 1.0) ** 3)
         self.damping[taken] = np.maximum(self.damping[taken] * shrink, _LEAST_DAMPING)
         self.growth[taken] = 2.0
@@ -297,8 +295,8 @@ class _Work:
         self.reasons[~regular & (self.reasons != BatchReason.NOT_FINITE)] = BatchReason.SINGULAR
         determined = self.redundancy > 0
         sigma0 = np.full(len(self.x), np.nan)
+        determined &= np.isfinite(self.cost)
         sigma0[determined] = np.sqrt(self.cost[determined] / self.redundancy[determined])
-        sigma0[~np.isfinite(sigma0)] = np.nan
         return BatchAdjustment(
             estimates=self.x,
             cofactor=inverse * scale[:, :, None] * scale[:, None, :],
@@ -353,7 +351,6 @@ class _Work:
         self.gradient[rows] = misfit - (weighted @ residuals[:, :, None])[:, :, 0]
 
     def _robust_factors(self, rows: Rows, residuals: Array) -> Array:
-        """The hook's factors, from residuals over a robust scale of each problem."""
         assert self.options.reweight is not None
         missing = self.missing[rows]
         size = np.abs(residuals) * np.sqrt(self.weights[rows])

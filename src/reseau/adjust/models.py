@@ -153,7 +153,7 @@ class Model:
         return np.concatenate([whitened, self.prior_weighting.whiten(misfit)])
 
     weighting: Weighting
-    # Whether whitening is the same at all parameters, so that second differences of r are those of the function.
+    # Whether r is whitened alike at all parameters, so that its second differences are the function's.
     constant_weights: bool
 
     @property

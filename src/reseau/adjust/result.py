@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from reseau.data import Array, Mask
 from reseau.errors import EstimationError, UsageError
 
+from .parameters import Parameters
 from .problem import Problem
 from .reliability import ExternalReliability, Solution, Standardised, noncentrality
 from .significance import CoefficientTest, GlobalTest, coefficient_test, global_test
@@ -155,7 +156,7 @@ class Adjustment:
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
-    def parameters(self) -> Any:
+    def parameters(self) -> Parameters:
         """The problem's parameters at their estimates."""
         return self.problem.parameters.with_values(self.values)
 

@@ -77,7 +77,13 @@ def blocks_of(covariance: Covariance, shape: tuple[int, ...], where: str = "cova
     if isinstance(covariance, list | tuple) and all(isinstance(part, np.ndarray) for part in covariance):
         parts = [_one_kind(np.asarray(part, dtype=np.float64), None, where) for part in covariance]
     else:
-        parts = [_one_kind(np.asarray(covariance, dtype=np.float64), shape, where)]
+        try:
+            whole = np.asarray(covariance, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(
+                "is no array of numbers", where=where, do="give several parts as ndarrays"
+            ) from None
+        parts = [_one_kind(whole, shape, where)]
     size = sum(part.shape[0] * part.shape[1] for part in parts)
     if size != n:
         raise UsageError(f"is for {size} observations, but there are {n}", where=where)
@@ -88,7 +94,10 @@ def _one_kind(given: Array, shape: tuple[int, ...] | None, where: str) -> Array:
     if not np.isfinite(given).all():
         raise UsageError("is not finite", where=where)
     if (shape is not None and (given.ndim == 0 or given.shape == shape)) or given.ndim == 1:
-        sigma = given.ravel() if shape is None else np.broadcast_to(given, shape).ravel()
+        try:
+            sigma = given.ravel() if shape is None else np.broadcast_to(given, shape).ravel()
+        except ValueError:
+            raise UsageError(f"has the shape {given.shape} for observations {shape}", where=where) from None
         if not (sigma > 0).all():
             raise UsageError("sigmas must be above zero", where=where, do="leave observations out by weights")
         return (sigma**2)[:, None, None]
