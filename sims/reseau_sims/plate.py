@@ -1,0 +1,107 @@
+"""A reseau in front of the screen: what its marks do to the light on its way to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from reseau.data import Array, Mask
+from reseau.errors import UsageError
+from reseau.formats import ReseauDesign
+from reseau.optics.formation import Outline, draw, mark_outline
+from reseau.optics.grids import line_grid
+
+from .camera import Camera
+
+__all__ = ["Plate"]
+
+_SPACING_PX = 0.7
+"""Distance of the nodes of an outline in widths of the point-spread function; see `Outline.polygon`."""
+
+
+@dataclass
+class Plate:
+    """The marks of a design, in the plane of the screen.
+
+    Parameters
+    ----------
+    design : ReseauDesign
+        Coordinates in millimetres, y up, in the system of the screen.
+    opacity : float
+        Share of the light behind it that a dark mark takes; a wire reflects a little of the room's.
+    brightness : float
+        Grey values that a bright mark adds.
+    beyond_mm : float
+        How far wires run on beyond the outermost crossings, to their frame.
+    missing : frozenset of str
+        Marks that are broken off.
+    false_marks : ndarray (k, 2)
+        Where dirt looks like a mark (mm).
+    """
+
+    design: ReseauDesign
+    opacity: float = 0.94
+    brightness: float = 90.0
+    beyond_mm: float = 13.0
+    missing: frozenset[str] = frozenset()
+    false_marks: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.design.xy).all():
+            raise UsageError("lacks coordinates of marks", where=f"design {self.design.name}")
+
+    def over(self, light: Array, camera: Camera, row_shifts: Array | None = None) -> Array:
+        """The light (height, width) that reaches the camera past the marks."""
+        share = np.zeros(camera.shape)
+        for outline in self._outlines(_mm_per_px(camera) * _SPACING_PX * camera.psf_px):
+            image = outline.mapped(lambda xy: camera.view.derivatives(xy)[:2]).oriented()
+            share += draw(image, camera.shape, camera.psf_px, camera.response, row_shifts)
+        np.clip(share, 0.0, 1.0, out=share)
+        if self.design.polarity == "bright":
+            return light + self.brightness * share
+        return light * (1 - self.opacity * share)
+
+    def _outlines(self, spacing: float) -> list[Outline]:
+        """All marks in the plane of the design, in batches of like outlines."""
+        mark, ids = self.design.mark, self.design.ids
+        there = np.array([name not in self.missing for name in ids])
+        dirt = [] if not len(self.false_marks) else [_at(self._dirt(spacing), self.false_marks)]
+        if mark.shape == "line-grid":
+            return [*self._wires(there, spacing), *dirt]
+        if mark.size is None:
+            raise UsageError("does not tell the size of its marks", where=f"design {self.design.name}")
+        outline = mark_outline(mark.shape, mark.size, mark.line_width, spacing)
+        return [_at(outline, self.design.xy[there]), *dirt]
+
+    def _wires(self, there: Mask, spacing: float) -> list[Outline]:
+        xy = self.design.xy
+        x, column = np.unique(xy[:, 0], return_inverse=True)
+        y, row = np.unique(xy[:, 1], return_inverse=True)
+        if len(x) * len(y) != len(xy) or self.design.mark.line_width is None:
+            raise UsageError("is no grid of wires", where=f"design {self.design.name}")
+        broken = np.zeros((len(y), len(x)), dtype=bool)
+        broken[row, column] = ~there
+        return list(
+            line_grid(x, y, self.design.mark.line_width, spacing, beyond=self.beyond_mm, broken=broken)
+        )
+
+    def _dirt(self, spacing: float) -> Outline:
+        """What looks like a mark: one of the design, or two crossed splinters of wire."""
+        mark = self.design.mark
+        if mark.shape == "line-grid":
+            width = mark.line_width or 0.0
+            return mark_outline("cross", 8 * width, width, spacing)
+        return mark_outline(mark.shape, mark.size or 0.0, mark.line_width, spacing)
+
+
+def _at(outline: Outline, xy: Array) -> Outline:
+    return outline.affine(np.tile(np.eye(2), (len(xy), 1, 1)), xy)
+
+
+def _mm_per_px(camera: Camera) -> float:
+    """Smallest length in the plane that a pixel sees, at the corners and the centre of the frame."""
+    height, width = camera.shape
+    corners = np.array([(x, y) for x in (0, width / 2, width) for y in (0, height / 2, height)])
+    slope = camera.view.derivatives(camera.view.inverse(corners)).d_xy
+    return float(1 / np.sqrt(np.abs(np.linalg.det(slope))).max())

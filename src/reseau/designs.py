@@ -1,0 +1,101 @@
+"""Regular reseaus: designs made from a few numbers, and the standard one of the oscilloscope procedure."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from .errors import UsageError
+from .formats import DesignPoint, Mark, ReseauDesign
+
+__all__ = ["regular_reseau", "standard_reseau"]
+
+
+def regular_reseau(
+    columns: int,
+    rows: int,
+    pitch: float,
+    mark: Mark,
+    *,
+    name: str = "reseau",
+    polarity: Literal["dark", "bright"] = "dark",
+    origin: str | None = None,
+    axis: str | None = None,
+) -> ReseauDesign:
+    """A grid of marks around the origin of its plane, millimetres, x right, y up.
+
+    Rows are lettered from the top, columns numbered from the left: ``A1`` is the upper left mark.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Number of marks in a row and in a column, at least 2 each.
+    pitch : float
+        Distance of neighbouring marks in millimetres.
+    mark : Mark
+        What a mark looks like.
+    origin, axis : str, optional
+        The marks O and S that define the common system: by default the one in the middle and the last of its
+        row.
+
+    Raises
+    ------
+    UsageError
+        When a number is impossible, marks would touch, or `origin` or `axis` is none of them.
+
+    Examples
+    --------
+    >>> grid = regular_reseau(3, 2, 10.0, Mark(shape="disk", size=1.0))
+    >>> grid.ids
+    ('A1', 'A2', 'A3', 'B1', 'B2', 'B3')
+    >>> grid.origin, grid.axis, grid.points[0].x, grid.points[0].y
+    ('B2', 'B3', -10.0, 5.0)
+    """
+    if min(columns, rows) < 2 or not pitch > 0 or columns * rows > 100_000:
+        raise UsageError(f"cannot have {columns} × {rows} marks at {pitch} mm", where=f"design {name}")
+    extent = (mark.line_width if mark.shape == "line-grid" else mark.size) or 0.0
+    if not 0 < extent < pitch:
+        raise UsageError(f"marks of {extent} mm do not fit a pitch of {pitch} mm", where=f"design {name}")
+    if mark.shape in ("cross", "line-grid") and not mark.line_width:
+        raise UsageError(f"marks of shape {mark.shape!r} need a width of line", where=f"design {name}")
+    points = tuple(
+        DesignPoint(
+            id=f"{_letters(row)}{column + 1}",
+            # Whole micrometres, so that the file says what was meant.
+            x=float(np.round((column - (columns - 1) / 2) * pitch, 6)),
+            y=float(np.round(((rows - 1) / 2 - row) * pitch, 6)),
+        )
+        for row in range(rows)
+        for column in range(columns)
+    )
+    middle = _letters(rows // 2)
+    origin = origin or f"{middle}{columns // 2 + 1}"
+    axis = axis or f"{middle}{columns}"
+    for role, mark_id in (("origin", origin), ("axis", axis)):
+        if all(point.id != mark_id for point in points):
+            raise UsageError(f"names {mark_id!r}, which is none of the marks", where=role)
+    if origin == axis:
+        raise UsageError(f"both are {origin!r}; they must differ", where="origin and axis")
+    return ReseauDesign(
+        name=name, unit="mm", mark=mark, polarity=polarity, origin=origin, axis=axis, points=points
+    )
+
+
+def _letters(row: int) -> str:
+    """A, B, … Z, AA, AB, …"""
+    letters = ""
+    row += 1
+    while row:
+        row, letter = divmod(row - 1, 26)
+        letters = chr(ord("A") + letter) + letters
+    return letters
+
+
+def standard_reseau() -> ReseauDesign:
+    """The reseau of the simulated bench: 15 × 12 wires of 0.3 mm in front of a screen of 150 × 120 mm.
+
+    Thin aluminium wires of the dimensions of the screen, as in the first section of Wishahy's procedure; the
+    paper does not tell their number.
+    """
+    return regular_reseau(15, 12, 10.0, Mark(shape="line-grid", line_width=0.3), name="wires-15x12")
