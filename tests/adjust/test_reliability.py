@@ -157,7 +157,7 @@ def test_blunders_in_conditions_are_found_at_the_power_of_theory():
 
 
 def test_tau_keeps_its_level_when_the_sigmas_are_unknown():
-    alpha, trials = 0.05, 3000
+    alpha, trials = 0.05, 2000
     rng = np.random.default_rng(11)
     critical = critical_tau(alpha, len(T) - 3)
     above = 0
@@ -218,7 +218,7 @@ def test_predicted_sigmas_and_ellipses_cover_at_their_probability():
 
 @pytest.mark.slow
 def test_predicted_sigmas_and_ellipses_cover_at_their_probability_over_many_trials():
-    holds(40000)
+    holds(20000)
 
 
 def test_sigma0_is_one_when_the_sigmas_are_true():
@@ -239,7 +239,7 @@ def test_the_global_test_finds_sigmas_that_are_too_small():
 
 
 def test_t_and_chi2_tests_of_a_coefficient_keep_their_level():
-    trials, alpha = 2000, 0.05
+    trials, alpha = 1000, 0.05
     rng = np.random.default_rng(9)
     t = chi2 = 0
     for _ in range(trials):

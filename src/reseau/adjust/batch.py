@@ -161,7 +161,7 @@ def adjust_batch(
 
     Notes
     -----
-    Damping after Nielsen (1999), *Damping parameter in Marquardt's method*, IMM-REP-1999-05, eq. 2.4; columns
+    Damping after Nielsen (1999), *Damping parameter in Marquardt's method*, IMM-REP-1999-05; columns
     are scaled to normal equations of unit diagonal (Marquardt 1963).
 
     Examples

@@ -16,7 +16,7 @@ _STEP = float(np.finfo(np.float64).eps) ** 0.25
 
 
 def differences(function: Callable[[Array], Array], x: Array, columns: Mask | None = None) -> Array:
-    """Jacobian by central differences of fourth order (Abramowitz & Stegun 1964, sect. 25.3).
+    """Jacobian by central differences of fourth order (Abramowitz & Stegun 1964, ch. 25).
 
     Parameters
     ----------

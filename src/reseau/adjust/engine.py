@@ -101,7 +101,7 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Fai
     Notes
     -----
     Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
-    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05, eq. 2.4; convergence after Bates & Watts (1981),
+    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
     *Technometrics* 23, 179–183.
     """
     with one_thread():
@@ -256,7 +256,7 @@ class _Run:
         return x + self.model.carry(full)
 
     def _offset(self, linear: Linearised, state: State) -> float:
-        """Relative offset of Bates & Watts (1981), eq. 3."""
+        """Relative offset of Bates & Watts (1981)."""
         redundancy = len(linear.design) - linear.rank
         if linear.rank == 0:
             return 0.0

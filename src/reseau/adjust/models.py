@@ -3,7 +3,7 @@
 Both kinds of problem come to the same: least squares of a whitened vector r(x). In the Gauss–Markov model
 r = W (f(x) − l). In the Gauss–Helmert model the residuals v of given x are found first, as those of least
 vᵀPv that keep the conditions; then r = L⁻¹(g − B v) with L Lᵀ = B Q Bᵀ (Mikhail 1976, ch. 7; Förstner &
-Wrobel 2016, sect. 4.8), so that rᵀr = vᵀPv, and L⁻¹A is its derivative to first order. Observed parameters
+Wrobel 2016, ch. 4), so that rᵀr = vᵀPv, and L⁻¹A is its derivative to first order. Observed parameters
 are further rows.
 """
 

@@ -157,7 +157,7 @@ def critical_w(alpha: float) -> float:
 
 
 def critical_tau(alpha: float, redundancy: int) -> float:
-    """Critical value of Pope's τ, two-sided (Pope 1976, eq. 26): of t with redundancy − 1 degrees of freedom.
+    """Critical value of Pope's τ, two-sided (Pope 1976): of t with redundancy − 1 degrees of freedom.
 
     Raises
     ------

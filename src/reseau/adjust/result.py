@@ -264,7 +264,7 @@ class Adjustment:
         return self.w / self.sigma0
 
     def minimal_detectable_errors(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """Errors of single observations that the w-test finds with the given power (Baarda 1968, eq. 5.3).
+        """Errors of single observations that the w-test finds with the given power (Baarda 1968).
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class Adjustment:
         return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))
 
     def global_test(self, alpha: float = 0.05) -> GlobalTest:
-        """Two-sided χ² test of the variance factor against one (Koch 1999, sect. 4.2.4)."""
+        """Two-sided χ² test of the variance factor against one (Koch 1999, ch. 4)."""
         return global_test(self.cost, self.redundancy, alpha)
 
     def test_of(self, name: str, value: float = 0.0, alpha: float = 0.05) -> CoefficientTest:

@@ -100,7 +100,7 @@ def _level(alpha: float) -> None:
 
 
 def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
-    """Two-sided χ² test of a weighted sum of squares (Koch 1999, sect. 4.2.4).
+    """Two-sided χ² test of a weighted sum of squares (Koch 1999, ch. 4).
 
     Raises
     ------
@@ -119,7 +119,7 @@ def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
 def coefficient_test(
     fit: Adjustment, name: str, value: float, alpha: float, scale: str | None = None
 ) -> CoefficientTest:
-    """Test of one parameter, by t (a posteriori) or χ² (a priori) (Koch 1999, sect. 4.3).
+    """Test of one parameter, by t (a posteriori) or χ² (a priori) (Koch 1999, ch. 4).
 
     Raises
     ------
@@ -167,7 +167,7 @@ def compare(
 
     Notes
     -----
-    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, sect. 4.2; for non-linear
+    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, ch. 4; for non-linear
     models the likelihood ratio in the same form.
     """
     _level(alpha)
