@@ -110,14 +110,12 @@ class BatchAdjustment:
     @property
     def covariance(self) -> Array:
         """Covariance of the estimates a posteriori, (k, u, u); NaN without redundancy."""
-        scaled: Array = self.cofactor * (self.sigma0**2)[:, None, None]
-        return scaled
+        return np.asarray(self.cofactor * (self.sigma0**2)[:, None, None])
 
     @property
     def sigma(self) -> Array:
         """Standard deviations of the estimates a posteriori, (k, u)."""
-        sigma: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return sigma
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
 
 def adjust_batch(
@@ -219,7 +217,7 @@ class _Work:
         self._set_prior(prior)
         tolerance = options.tolerance
         self.tolerance = None if tolerance is None else np.broadcast_to(np.asarray(tolerance, float), (u,))
-        # Sums of squares below this are rounding of the observations themselves.
+        # Sums of squares below this are rounding of the observations.
         self.floor = n * _EPS**2 * (w * self.observed**2).sum(axis=1)
         self.normal, self.gradient = np.zeros((k, u, u)), np.zeros((k, u))
         self.cost, self.factors = np.full(k, np.inf), np.ones((k, n))
@@ -283,9 +281,7 @@ class _Work:
         """Cofactors and what else follows from the last normal equations."""
         # Problems still active when the iterations end may have arrived with the last of them.
         rows = np.flatnonzero(self.active)
-        if len(rows):
-            step, predicted = self._step(rows)
-            self._leave(rows[self._small(rows, step, predicted)], BatchReason.CONVERGED)
+        self._leave(rows[self._small(rows, *self._step(rows))], BatchReason.CONVERGED)
         scaled, scale = self._scaled(np.arange(len(self.x)))
         values, vectors = np.linalg.eigh(scaled)
         regular = (values[:, 0] > _SINGULAR) & np.isfinite(self.cost)
@@ -330,7 +326,7 @@ class _Work:
     def _cost(self, residuals: Array, x: Array, rows: Rows) -> Array:
         w = self.weights[rows] * self.factors[rows]
         prior = ((x - self.mean[rows]) ** 2 * self.prior_weight).sum(axis=1)
-        cost: Array = np.einsum("mn,mn,mn->m", residuals, w, residuals) + prior
+        cost = np.einsum("mn,mn,mn->m", residuals, w, residuals) + prior
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def _accept(self, rows: Rows, x: Array, residuals: Array, jacobian: Array) -> None:

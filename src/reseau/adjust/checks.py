@@ -8,7 +8,7 @@ from reseau.data import Array
 from reseau.errors import UsageError
 
 from .differences import JacobianCheck, compare_jacobians
-from .models import _Helmert, _Markov, model_of
+from .models import HelmertModel, MarkovModel, model_of
 from .problem import Problem
 
 __all__ = ["check_jacobian"]
@@ -39,11 +39,11 @@ def check_jacobian(problem: Problem, at: Array | None = None) -> JacobianCheck:
     model = model_of(problem)
     mask = problem.parameters.mask
     names = problem.parameters.free
-    if isinstance(model, _Markov):
+    if isinstance(model, MarkovModel):
         if model.markov.jacobian is None:
             raise UsageError("has no analytic derivatives to check", where="problem")
         return compare_jacobians(model.jacobian(x)[:, mask], model.numeric(x)[:, mask], names)
-    assert isinstance(model, _Helmert)
+    assert isinstance(model, HelmertModel)
     if model.helmert.jacobians is None:
         raise UsageError("has no analytic derivatives to check", where="problem")
     observed = problem.observations.ravel()

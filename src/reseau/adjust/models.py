@@ -10,7 +10,7 @@ are further rows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from .differences import differences
 from .problem import GaussHelmert, GaussMarkov, Problem, Values
 from .stochastic import Blocks, Weighting, blocks_of
 
-__all__ = ["Model", "State", "model_of"]
+__all__ = ["HelmertModel", "MarkovModel", "Model", "State", "model_of"]
 
 _EPS = float(np.finfo(np.float64).eps)
 _INNER = 30
@@ -171,7 +171,7 @@ class Model:
         raise NotImplementedError
 
 
-class _Markov(Model):
+class MarkovModel(Model):
     """l + v = f(x)."""
 
     constant_weights = True
@@ -183,6 +183,7 @@ class _Markov(Model):
 
     @property
     def left_out(self) -> int:
+        """Observations of weight zero."""
         return 0 if self.factors is None else int((self.factors == 0).sum())
 
     def _compute(self, x: Values) -> Values:
@@ -224,7 +225,7 @@ class _Markov(Model):
         return [root.transposed for root in self.weighting.roots]
 
 
-class _Helmert(Model):
+class HelmertModel(Model):
     """g(l + v, x) = 0, in b groups of c conditions and k observations; a single group where they mix."""
 
     constant_weights = False
@@ -257,6 +258,7 @@ class _Helmert(Model):
 
     @property
     def left_out(self) -> int:
+        """Conditions of the marks left out."""
         return 0 if self.factors is None else int(self.outside.sum()) * self._conditions_each
 
     def _conditions(self, observed: Array, x: Array) -> Array:
@@ -389,9 +391,4 @@ def _regrouped(blocks: list[Array], groups: int, k: int) -> Array:
 
 def model_of(problem: Problem) -> Model:
     """The problem made ready."""
-    return _Markov(problem) if isinstance(problem, GaussMarkov) else _Helmert(problem)
-
-
-def with_weights(problem: Problem, weights: Array) -> Problem:
-    """The problem with factors on its weights, given flat."""
-    return replace(problem, weights=weights.reshape(problem.observations.shape))
+    return MarkovModel(problem) if isinstance(problem, GaussMarkov) else HelmertModel(problem)
