@@ -34,8 +34,8 @@ class Screen:
         Grey values that a camera sees of each sample; row 0 at the top. Nothing is lit at first.
     """
 
-    width_mm: float = 162.0
-    height_mm: float = 132.0
+    width_mm: float = 158.0
+    height_mm: float = 122.0
     pitch_mm: float = 0.1
     margin_mm: float = 6.0
     light: NDArray[np.float32] = field(init=False)

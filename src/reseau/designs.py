@@ -93,9 +93,9 @@ def _letters(row: int) -> str:
 
 
 def standard_reseau() -> ReseauDesign:
-    """The reseau of the simulated bench: 15 × 12 wires of 0.3 mm in front of a screen of 150 × 120 mm.
+    """The reseau of the simulated bench: 15 × 11 wires of 0.3 mm in front of a screen of 150 × 120 mm.
 
     Thin aluminium wires of the dimensions of the screen, as in the first section of Wishahy's procedure; the
     paper does not tell their number.
     """
-    return regular_reseau(15, 12, 10.0, Mark(shape="line-grid", line_width=0.3), name="wires-15x12")
+    return regular_reseau(15, 11, 10.0, Mark(shape="line-grid", line_width=0.3), name="wires-15x11")
