@@ -19,7 +19,7 @@ from ..optics.formation import Outline, PixelResponse, coverage_derivatives
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "match"]
 
-X, Y, WIDTH, CONTRAST, LEVEL, SLOPE_X, SLOPE_Y, FORM = range(8)
+X, Y, WIDTH, CONTRAST, LEVEL = range(5)
 
 _STEP_PX = 1e-4
 """Corrections of a position that end the iterations; far below any noise."""
@@ -61,6 +61,8 @@ class MatchOptions:
     row_jitter_px : float
         Standard deviation of the shift of single rows along x. It enters the stochastic model as what it is,
         an error common to a row and proportional to the image's slope.
+    background : int
+        Degree of the polynomial that the background is: 1, or 2 amid a scene.
     start_px : float
         How far the approximate positions may be off.
     """
@@ -74,6 +76,7 @@ class MatchOptions:
     polarity: Literal["dark", "bright"] = "dark"
     rejection: float = 4.5
     row_jitter_px: float = 0.0
+    background: int = 1
     start_px: float = 1.0
 
 
@@ -130,16 +133,11 @@ class Matches:
         return Matches(**{column.name: getattr(self, column.name)[keep] for column in fields(self)})
 
     def replaced(self, rows: Rows, others: Matches) -> Matches:
-        """These matches with `rows` taken from others, made in the same window or a narrower one."""
+        """These matches with `rows` taken from others, made in a window of the same size."""
         columns = {}
-        margin = (self.residuals.shape[1] - others.residuals.shape[1]) // 2
         for column in fields(self):
-            mine, theirs = getattr(self, column.name).copy(), getattr(others, column.name)
-            if column.name == "residuals":
-                around = ((0, 0), (margin, margin), (margin, margin))
-                theirs = np.pad(theirs, around, constant_values=np.nan)
-            mine[rows] = theirs
-            columns[column.name] = mine
+            columns[column.name] = getattr(self, column.name).copy()
+            columns[column.name][rows] = getattr(others, column.name)
         return Matches(**columns)
 
 
@@ -181,16 +179,16 @@ def match(
         Of all k; those that failed have `converged` False or a small `t`.
     """
     patch = _Patches(pixels, valid, outline, xy, options, form)
-    free = np.full(FORM + patch.forms, np.inf)
+    free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
     if form_sigma is not None:
-        free[FORM:] = form_sigma
+        free[patch.form_at :] = form_sigma
     start = patch.start(noise)
     # Only the position must be sharp; the others are symmetric about it and do not pull at it.
     tolerance = np.full(start.shape[1], 0.01)
     tolerance[[X, Y]] = _STEP_PX
-    tolerance[[LEVEL, SLOPE_X, SLOPE_Y]] = 0.05 * noise
+    tolerance[LEVEL : patch.form_at] = 0.05 * noise
     if options.polarity == "bright":
         tolerance[CONTRAST] = 0.05 * noise
 
@@ -255,6 +253,11 @@ class _Patches:
         self.generators = np.zeros((0, 2, 2)) if form is None else form
         self.forms = len(self.generators)
         self.offset = np.arange(-options.half_px, options.half_px + 1)
+        u, v = self.offset[None, :] / options.half_px, self.offset[:, None] / options.half_px
+        powers = [(i, j) for i in range(options.background + 1) for j in range(options.background + 1 - i)]
+        # Monomials (n, b) of the background over the window.
+        self.monomials = np.stack([(u**i * v**j).ravel() for i, j in powers], axis=1)
+        self.form_at = LEVEL + len(powers)
         self.centre = np.rint(xy).astype(np.intp)
         columns, rows = self.centre[:, :1] + self.offset, self.centre[:, 1:] + self.offset
         self.columns, self.rows = columns.astype(float), rows.astype(float)
@@ -270,37 +273,34 @@ class _Patches:
     def start(self, noise: float) -> Array:
         """Approximate values, and the pixels of the background that belong to something else left out.
 
-        The background is a plane fitted robustly to what lies around the mark, by weights after Tukey that
-        are tightened from step to step.
+        The background is fitted robustly to what lies around the mark, by weights after Tukey that are
+        tightened from step to step.
         """
-        x = np.zeros((len(self.xy), FORM + self.forms))
+        x = np.zeros((len(self.xy), self.form_at + self.forms))
         x[:, WIDTH] = np.log(np.hypot(self.options.psf_px, 0.7 * self.options.start_px))
         share, _ = self._coverage(x, np.arange(len(x)))
         x[:, WIDTH] = np.log(self.options.psf_px)
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
-        u, v = np.meshgrid(self.offset, self.offset)
-        design = np.stack([np.ones(u.size), u.ravel(), v.ravel()], axis=1)
-        grey = np.where(around > 0, self.grey, np.nan)
-        grey[~(around > 0).any(axis=1), 0] = 0.0
-        plane = np.zeros((len(x), 3))
-        plane[:, 0] = np.nanmedian(grey, axis=1)
+        around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs a value
+        design = self.monomials
+        fitted = np.zeros((len(x), design.shape[1]))
+        fitted[:, 0] = np.nanmedian(np.where(around > 0, self.grey, np.nan), axis=1)
         far = np.zeros_like(around)
         for factor in (6.0, 5.0, 4.0, 4.0, 4.0):
-            v_ = np.where(around > 0, self.grey - plane @ design.T, np.nan)
-            v_[~(around > 0).any(axis=1), 0] = 0.0
-            scale = np.maximum(1.4826 * np.nanmedian(np.abs(v_), axis=1, keepdims=True), noise)
-            far = np.abs(np.nan_to_num(v_)) / (factor * scale)
+            off = np.where(around > 0, np.abs(self.grey - fitted @ design.T), np.nan)
+            scale = np.maximum(1.4826 * np.nanmedian(off, axis=1, keepdims=True), noise)
+            far = np.nan_to_num(off) / (factor * scale)
             w = around * np.clip(1 - far**2, 0, None) ** 2
-            normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(3)
-            plane = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * plane)[..., None])[..., 0]
+            normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(design.shape[1])
+            fitted = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * fitted)[..., None])[..., 0]
         self.weights = np.where(far > 1.5, 0.0, self.weights)
-        x[:, [LEVEL, SLOPE_X, SLOPE_Y]] = plane
+        x[:, LEVEL : self.form_at] = fitted
         if self.options.contrast is not None:
             x[:, CONTRAST] = self.options.contrast
         elif self.options.polarity == "dark":
             x[:, CONTRAST] = 0.5
         else:
-            top = np.where(self.weights > 0, self.grey - plane @ design.T, 0.0)
+            top = np.where(self.weights > 0, self.grey - fitted @ design.T, 0.0)
             x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
         return x
 
@@ -312,9 +312,7 @@ class _Patches:
     def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
         share, d_share = self._coverage(x, at)
-        u, v = self.offset[None, None, :], self.offset[None, :, None]
-        level, contrast = x[:, LEVEL, None, None], x[:, CONTRAST, None, None]
-        plane = level + x[:, SLOPE_X, None, None] * u + x[:, SLOPE_Y, None, None] * v
+        plane, contrast = self.background(x), x[:, CONTRAST, None, None]
         if self.options.polarity == "dark":
             rest = 1 - contrast * share
             grey, by_share, by_contrast = plane * rest, -plane * contrast, -plane * share
@@ -322,20 +320,25 @@ class _Patches:
             rest = np.ones_like(share)
             grey, by_share, by_contrast = plane + contrast * share, contrast, share
         jacobian = np.empty((*share.shape, x.shape[1]))
-        shape_columns = [X, Y, WIDTH, *range(FORM, x.shape[1])]
+        shape_columns = [X, Y, WIDTH, *range(self.form_at, x.shape[1])]
         jacobian[..., shape_columns] = np.moveaxis(by_share[:, None] * d_share, 1, -1)
         jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / self.width(x))[:, None, None]
         jacobian[..., CONTRAST] = by_contrast
-        jacobian[..., LEVEL], jacobian[..., SLOPE_X], jacobian[..., SLOPE_Y] = rest, rest * u, rest * v
         grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
+        jacobian[..., LEVEL : self.form_at] = rest.reshape(len(x), -1, 1) * self.monomials
         if self.whitener is not None:
             grey, jacobian = self._whitened(grey, jacobian, at)
         return grey, jacobian
 
+    def background(self, x: Array) -> Array:
+        """Grey values of the background in the window, (k, rows, columns)."""
+        grey: Array = (x[:, LEVEL : self.form_at] @ self.monomials.T).reshape(len(x), *self.shape[1:])
+        return grey
+
     def _coverage(self, x: Array, at: Rows) -> tuple[Array, Array]:
         nodes, steps, motions = self.outline.xy[at], self.outline.dxy[at], None
         if self.forms:
-            grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, FORM:], self.generators)
+            grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, self.form_at :], self.generators)
             motions = np.einsum("pij,knj->kpni", self.generators, nodes)
             nodes, steps = nodes @ np.swapaxes(grown, 1, 2), steps @ np.swapaxes(grown, 1, 2)
         position = self.xy[at] + x[:, :2]
@@ -391,23 +394,19 @@ class _Patches:
         share, _ = self._coverage(x, np.arange(k))
         flat = share.reshape(k, -1)
         sight = np.maximum(flat.sum(axis=1), 1e-12)
-        plane = (
-            x[:, LEVEL, None, None]
-            + x[:, SLOPE_X, None, None] * self.offset[None, None, :]
-            + x[:, SLOPE_Y, None, None] * self.offset[None, :, None]
-        ).reshape(k, -1)
+        plane = self.background(x).reshape(k, -1)
         with np.errstate(divide="ignore", invalid="ignore"):
             cov = found.covariance
             expected = -plane * flat if self.options.polarity == "dark" else flat
             correlation = _correlation(self.grey - plane, expected, used)
-            t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - FORM, 1) / (1 - correlation**2))
+            t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - self.form_at, 1) / (1 - correlation**2))
         return Matches(
             xy=self.xy + x[:, :2],
             cov=cov[:, :2, :2],
             psf_px=self.width(x),
             contrast=x[:, CONTRAST],
             t=np.nan_to_num(t),
-            form=x[:, FORM:],
+            form=x[:, self.form_at :],
             noise=found.sigma0 * scale,
             correlation=np.nan_to_num(correlation),
             seen=(flat * self.weights).sum(axis=1) / sight,

@@ -29,6 +29,7 @@ _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
 """Sizes of a mark in the image that are tried where nothing tells it."""
 _UNMODELLED_PX = 0.07
 """What positions scatter beyond their own sigmas in real frames; balances the weights of a field's points."""
+BGH, BGD = 3.0, 2
 _LEARN_FROM = 50
 """So many of the strongest marks tell what a mark of this frame looks like."""
 _BLURRED = 1.7
@@ -325,13 +326,13 @@ class _Measurement:
         )
         self._learn(first)
         at = np.flatnonzero(self._near_frame(self.predicted))
-        found = self._best_window(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
+        found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
         self._refit(at, found)
         judged = self._judged(at, found)
         # Where a mark was missed, its neighbours now say better where to look.
         again = np.flatnonzero(judged.why[at] != "")
         if 0 < len(again) < len(at):
-            found = found.replaced(again, self._best_window(at[again], judged.predicted[at[again]]))
+            found = found.replaced(again, self._match_all(at[again], judged.predicted[at[again]]))
             judged = self._judged(at, found)
         return self._columns(at, found, judged)
 
@@ -343,16 +344,12 @@ class _Measurement:
 
     def _first_options(self) -> MatchOptions:
         return MatchOptions(
-            half_px=self._half(4.0),
+            half_px=int(np.clip(np.ceil(self.extent_px / 2 + 4), 4, 40)),
             psf_px=self.options.psf_px,
             psf_log_sigma=0.5,
             polarity=self.search.design.polarity,
             start_px=2.0,
         )
-
-    def _half(self, margin: float) -> int:
-        """Half side of a window that leaves `margin` pixels around a mark."""
-        return int(np.clip(np.ceil(self.extent_px / 2 + margin), 4, 40))
 
     def _outline(self, at: Rows, psf_px: float) -> Outline:
         """Outlines of the marks `at` in pixels, as the field maps them."""
@@ -402,11 +399,10 @@ class _Measurement:
         self.size *= 1 + growth
         self.extent_px *= 1 + growth
 
-    def _best_window(self, at: Rows, start: Array) -> Matches:
-        """Match in a wide window, and in a narrow one where that is better: amid a scene."""
+    def _match_all(self, at: Rows, start: Array) -> Matches:
+        """Match with what has been learnt; amid a scene with a curved background, where that is better."""
         options = replace(
             self._first_options(),
-            half_px=self._half(4.0),
             psf_px=self.psf_px,
             psf_log_sigma=max(0.25, 1.5 * self.psf_spread),
             contrast=self.contrast,
@@ -414,18 +410,15 @@ class _Measurement:
             row_jitter_px=self.options.row_jitter_px,
             start_px=1.0,
         )
-        wide = self._match(at, start, options, self.size_spread)
-        ordinary = np.median(wide.noise[wide.converged]) if wide.converged.any() else np.inf
-        uneasy = np.flatnonzero(~wide.converged | (wide.noise > 1.5 * ordinary) | (wide.rejected > 0.1))
+        found = self._match(at, start, options, self.size_spread)
+        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
+        uneasy = np.flatnonzero(~found.converged | (found.noise > 1.5 * ordinary) | (found.rejected > 0.1))
         if not len(uneasy):
-            return wide
-        narrow = self._match(
-            at[uneasy], start[uneasy], replace(options, half_px=self._half(2.5)), self.size_spread
-        )
-        better = narrow.converged & (
-            ~wide.converged[uneasy] | (_size(narrow.cov) < 0.8 * _size(wide.cov[uneasy]))
-        )
-        return wide.replaced(uneasy[better], narrow.select(better))
+            return found
+        curved = self._match(at[uneasy], start[uneasy], replace(options, background=2), self.size_spread)
+        better = ~found.converged[uneasy] | (_size(curved.cov) < 0.8 * _size(found.cov[uneasy]))
+        better &= curved.converged
+        return found.replaced(uneasy[better], curved.select(better))
 
     def _judged(self, at: Rows, found: Matches) -> _Verdict:
         n = len(self.source)
