@@ -36,17 +36,25 @@ __all__ = [
     "rectangles",
 ]
 
-_NODES_PER_PANEL = 8
+_MOST_NODES = 20
+"""A longer side is divided."""
 _REACH = 5.5
 """Gaussian widths after which a response counts as nought: 4e-8 of the light."""
 _BATCH = 5e4
 """Numbers that are worked on at a time."""
 
 
+def _side_rule(length: float, spacing: float) -> tuple[Array, Array]:
+    """Nodes and weights on [0, 1] of a Gauss–Legendre rule for a side, of many panels when it is long."""
+    nodes = max(2.0, length / spacing + 2)  # two more make up for a short side's ends
+    panels = int(np.ceil(nodes / _MOST_NODES))
+    t, w = _panel(int(np.ceil(nodes / panels)))
+    return (np.arange(panels)[:, None] + t).ravel() / panels, np.tile(w / panels, panels)
+
+
 @cache
-def _panel() -> tuple[Array, Array]:
-    """Nodes and weights of the Gauss–Legendre rule on [0, 1]."""
-    t, w = np.polynomial.legendre.leggauss(_NODES_PER_PANEL)
+def _panel(nodes: int) -> tuple[Array, Array]:
+    t, w = np.polynomial.legendre.leggauss(nodes)
     return (t + 1) / 2, w / 2
 
 
@@ -78,14 +86,12 @@ class Outline:
             Largest mean distance of two nodes, in the unit of the corners; 0.7 widths of the point-spread
             function make the quadrature exact to 1e-6 of the light.
         """
-        t, w = _panel()
         xy, dxy = [], []
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             side = end - start
-            panels = max(1, int(np.ceil(np.hypot(*side) / (spacing * _NODES_PER_PANEL))))
-            along = (np.arange(panels)[:, None] + t).ravel() / panels
+            along, weight = _side_rule(float(np.hypot(*side)), spacing)
             xy.append(start + along[:, None] * side)
-            dxy.append(np.tile(w / panels, panels)[:, None] * side)
+            dxy.append(weight[:, None] * side)
         return cls(np.concatenate(xy), np.concatenate(dxy))
 
     @classmethod
@@ -138,14 +144,12 @@ def rectangles(edges: Array, spacing: float) -> Outline:
     size = edges[:, 2:] - edges[:, :2]
     # Sides of the unit square with as many panels as the largest rectangle needs.
     unit, turn = Outline(np.empty((0, 2)), np.empty((0, 2))), np.array([[0.0, 1.0], [-1.0, 0.0]])
-    t, w = _panel()
     for side in range(4):
-        panels = max(1, int(np.ceil(size[:, side % 2].max(initial=0.0) / (spacing * _NODES_PER_PANEL))))
-        along = (np.arange(panels)[:, None] + t).ravel() / panels
+        along, weight = _side_rule(float(size[:, side % 2].max(initial=0.0)), spacing)
         # The lower side, turned by a quarter about the centre for each further one.
         quarter = np.linalg.matrix_power(turn, side)
         xy = (np.stack([along, np.zeros_like(along)], axis=-1) - 0.5) @ quarter + 0.5
-        dxy = np.stack([np.tile(w / panels, panels), np.zeros_like(along)], axis=-1) @ quarter
+        dxy = np.stack([weight, np.zeros_like(along)], axis=-1) @ quarter
         unit = Outline(np.concatenate([unit.xy, xy]), np.concatenate([unit.dxy, dxy]))
     return Outline(edges[:, None, :2] + unit.xy * size[:, None], unit.dxy * size[:, None])
 

@@ -7,8 +7,8 @@ wanted the form, are estimated together, all marks of a frame in one batch of le
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from ..data import Array, Mask, Rows
 from ..optics.formation import Outline, PixelResponse, coverage_derivatives
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "match"]
+
+Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
 X, Y, WIDTH, CONTRAST, LEVEL = range(5)
 
@@ -134,11 +136,16 @@ class Matches:
 
     def replaced(self, rows: Rows, others: Matches) -> Matches:
         """These matches with `rows` taken from others, made in a window of the same size."""
-        columns = {}
-        for column in fields(self):
-            columns[column.name] = getattr(self, column.name).copy()
-            columns[column.name][rows] = getattr(others, column.name)
-        return Matches(**columns)
+        return _with_rows(self, rows, others)
+
+
+def _with_rows(whole: Columns, rows: Rows, part: Columns) -> Columns:
+    """A dataclass of columns with some rows taken from another."""
+    columns = {}
+    for column in fields(whole):
+        columns[column.name] = getattr(whole, column.name).copy()
+        columns[column.name][rows] = getattr(part, column.name)
+    return replace(whole, **columns)
 
 
 def match(
@@ -192,18 +199,19 @@ def match(
     if options.polarity == "bright":
         tolerance[CONTRAST] = 0.05 * noise
 
-    def adjust(start_at: Array) -> BatchAdjustment:
+    def adjust(rows: Rows, start_at: Array) -> BatchAdjustment:
         return adjust_batch(
-            patch.form_image,
-            start_at,
-            patch.grey,
-            weights=used / scale**2,
-            prior=(start, free),
-            options=BatchOptions(tolerance=tolerance, max_iterations=20),
+            lambda x, at: patch.form_image(x, rows[at]),
+            start_at[rows],
+            patch.grey[rows],
+            weights=used[rows] / scale[rows] ** 2,
+            prior=(start[rows], free),
+            options=BatchOptions(tolerance=tolerance, max_iterations=40),
         )
 
+    every = np.arange(len(xy))
     used, scale = patch.weights, np.full((len(xy), 1), noise)
-    found = adjust(start)
+    found = adjust(every, start)
     for _ in range(2):
         # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
         sigma = _robust_sigma(found.residuals, used)
@@ -211,13 +219,14 @@ def match(
         kept = patch.weights * (np.abs(found.residuals) < limit)
         # What the model leaves of a scene counts as noise, or the prior knowledge would weigh nothing there.
         rougher = np.maximum(noise, _rms(found.residuals, kept, start.shape[1]))
-        if (kept == used).all() and (rougher < 1.2 * scale).all():
+        changed = np.flatnonzero((kept != used).any(axis=1) | (rougher > 1.2 * scale)[:, 0])
+        if not len(changed):
             break
-        used, scale = kept, rougher
-        found = adjust(found.estimates)
+        used, scale = kept, np.where(np.isin(every, changed)[:, None], rougher, scale)
+        found = _with_rows(found, changed, adjust(changed, found.estimates))
     if options.row_jitter_px > 0:
         patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
-        found = adjust(found.estimates)
+        found = adjust(every, found.estimates)
     return patch.matches(found, used > 0, scale[:, 0])
 
 

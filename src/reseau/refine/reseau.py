@@ -32,7 +32,9 @@ _UNMODELLED_PX = 0.07
 BGH, BGD = 3.0, 2
 _LEARN_FROM = 50
 """So many of the strongest marks tell what a mark of this frame looks like."""
-_BLURRED = 1.7
+_SEEN = 0.1
+"""Share of a mark that must lie on pixels that carry an image."""
+_BLURRED = 1.5
 """Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
 _BENT = 1.25
 """Factor on the permitted deviation from the neighbours for marks whose own image is beyond doubt."""
@@ -330,7 +332,7 @@ class _Measurement:
         self._refit(at, found)
         judged = self._judged(at, found)
         # Where a mark was missed, its neighbours now say better where to look.
-        again = np.flatnonzero(judged.why[at] != "")
+        again = np.flatnonzero((judged.why[at] != "") & (found.seen > _SEEN))
         if 0 < len(again) < len(at):
             found = found.replaced(again, self._match_all(at[again], judged.predicted[at[again]]))
             judged = self._judged(at, found)
@@ -446,7 +448,7 @@ class _Measurement:
         )
         moved = np.hypot(*(found.xy - self.predicted[at]).T) > max(2.5, 0.6 * self.extent_px)
         return [
-            (found.seen < 0.1, "on lost lines or beyond the edge of the frame"),
+            (found.seen <= _SEEN, "on lost lines or beyond the edge of the frame"),
             (~found.converged, "the match does not converge"),
             (~(found.t >= o.least_t), "no mark stands out from its surroundings"),
             (found.psf_px > _BLURRED * ordinary, "blurred unlike the other marks"),
