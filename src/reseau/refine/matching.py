@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..adjust import BatchAdjustment, BatchOptions, adjust_batch
 from ..data import Array, Mask, Rows
-from ..optics.formation import Outline, PixelResponse, coverage_derivatives
+from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "match"]
 
@@ -287,7 +287,7 @@ class _Patches:
         """
         x = np.zeros((len(self.xy), self.form_at + self.forms))
         x[:, WIDTH] = np.log(np.hypot(self.options.psf_px, 0.7 * self.options.start_px))
-        share, _ = self._coverage(x, np.arange(len(x)))
+        share = self._share(x)
         x[:, WIDTH] = np.log(self.options.psf_px)
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs a value
@@ -320,7 +320,7 @@ class _Patches:
 
     def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
-        share, d_share = self._coverage(x, at)
+        share, d_share = self._derivatives(x, at)
         plane, contrast = self.background(x), x[:, CONTRAST, None, None]
         if self.options.polarity == "dark":
             rest = 1 - contrast * share
@@ -344,15 +344,24 @@ class _Patches:
         grey: Array = (x[:, LEVEL : self.form_at] @ self.monomials.T).reshape(len(x), *self.shape[1:])
         return grey
 
-    def _coverage(self, x: Array, at: Rows) -> tuple[Array, Array]:
-        nodes, steps, motions = self.outline.xy[at], self.outline.dxy[at], None
+    def _placed(self, x: Array, at: Rows) -> Outline:
+        """Outlines of the patches `at` where the parameters (m, u) have them."""
+        nodes, steps = self.outline.xy[at], self.outline.dxy[at]
         if self.forms:
             grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, self.form_at :], self.generators)
-            motions = np.einsum("pij,knj->kpni", self.generators, nodes)
             nodes, steps = nodes @ np.swapaxes(grown, 1, 2), steps @ np.swapaxes(grown, 1, 2)
-        position = self.xy[at] + x[:, :2]
+        return Outline(nodes + (self.xy[at] + x[:, :2])[:, None, :], steps)
+
+    def _share(self, x: Array) -> Array:
+        """Share of each pixel that the marks take, all patches, (k, rows, columns)."""
+        outline = self._placed(x, np.arange(len(x)))
+        return coverage(outline, self.columns, self.rows, self.width(x), self.options.response)
+
+    def _derivatives(self, x: Array, at: Rows) -> tuple[Array, Array]:
+        """That share for the patches `at`, and its derivatives by position, width and form."""
+        motions = np.einsum("pij,knj->kpni", self.generators, self.outline.xy[at]) if self.forms else None
         return coverage_derivatives(
-            Outline(nodes + position[:, None, :], steps),
+            self._placed(x, at),
             self.columns[at],
             self.rows[at],
             self.width(x),
@@ -366,7 +375,7 @@ class _Patches:
         No mark is quite the square or the disk that it should be, and no point-spread function a Gaussian; in
         a strong mark that shows before the noise does.
         """
-        share, _ = self._coverage(x, np.arange(len(x)))
+        share = self._share(x)
         amplitude = np.abs(x[:, CONTRAST])
         if self.options.polarity == "dark":
             amplitude = amplitude * np.abs(x[:, LEVEL])
@@ -400,7 +409,7 @@ class _Patches:
     def matches(self, found: BatchAdjustment, used: Mask, scale: Array) -> Matches:
         """Columns of results from the adjusted batch."""
         x, k = found.estimates, len(self.xy)
-        share, _ = self._coverage(x, np.arange(k))
+        share = self._share(x)
         flat = share.reshape(k, -1)
         sight = np.maximum(flat.sum(axis=1), 1e-12)
         plane = self.background(x).reshape(k, -1)

@@ -34,7 +34,7 @@ _LEARN_FROM = 50
 """So many of the strongest marks tell what a mark of this frame looks like."""
 _SEEN = 0.1
 """Share of a mark that must lie on pixels that carry an image."""
-_BLURRED = 1.5
+_BLURRED = 1.55
 """Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
 _BENT = 1.25
 """Factor on the permitted deviation from the neighbours for marks whose own image is beyond doubt."""
