@@ -105,12 +105,13 @@ class Screen:
         Returns
         -------
         ndarray (height, width)
-            Grey values; nothing beyond the raster.
+            Grey values; beyond the raster the tube is as dark as at its edge.
         """
         height, width = shape
         x, y = on_lattice(view.inverse, np.arange(float(width)), np.arange(float(height)))
         rows, columns = self.light.shape
         at = np.stack([(rows - 1) / 2 - y / self.pitch_mm, (columns - 1) / 2 + x / self.pitch_mm])
         # Linear between samples of the size of a pixel: the tube has nothing finer than its spot.
-        light: Array = map_coordinates(self.light, np.nan_to_num(at, nan=-1e9), output=np.float64, order=1)
+        at = np.nan_to_num(at, nan=-1e9)
+        light: Array = map_coordinates(self.light, at, output=np.float64, order=1, mode="nearest")
         return light

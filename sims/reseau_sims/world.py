@@ -123,6 +123,10 @@ class World:
         """The design of the reseau."""
         return self.plate.design
 
+    def view(self) -> PlaneMapping:
+        """From the plane of the reseau (mm) to the image (px), without noise: the truth."""
+        return self.camera.view
+
     def truth(self) -> Truth:
         """Exact positions of all marks of the design, also of those that are missing."""
         design = self.design

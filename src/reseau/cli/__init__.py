@@ -1,0 +1,77 @@
+"""The command line: `reseau --help`.
+
+Modules of commands import what they compute with inside the commands, so that help and mistakes are answered
+at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from .. import __version__
+from ..errors import ReseauError
+from . import apply, demo, design, measure, refine
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="reseau",
+    help="Calibration of measuring cameras and imaging instruments.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(demo.demo)
+app.add_typer(design.app, name="design")
+app.add_typer(measure.app, name="measure")
+app.command()(refine.refine)
+app.command()(apply.apply)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"reseau {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+    ] = False,
+) -> None:
+    """Calibration of measuring cameras and imaging instruments."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 1 failed, 2 wrong use; errors in one line on stderr."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    try:
+        return int(app(arguments, standalone_mode=False) or 0)
+    except ReseauError as error:
+        return _complain(str(error), error.exit_status)
+    except KeyboardInterrupt:
+        return _complain("interrupted", 130)
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Typer's own complaints about arguments know how to say themselves; they have no public class.
+        said: Any = getattr(error, "format_message", None)
+        if said is None:
+            raise
+        return _complain(str(said()) or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
+
+
+def _complain(message: str, status: int) -> int:
+    print(f"reseau: {' '.join(message.split())}", file=sys.stderr)
+    return status

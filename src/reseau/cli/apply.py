@@ -1,0 +1,113 @@
+"""`reseau apply`: correct points, or resample an image, by a stored calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .common import AsJson, Out, is_points, progress, read_measurement, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..data import ImagePoints
+    from ..refine import CameraCorrection
+
+__all__ = ["apply"]
+
+_IMAGES = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
+
+
+def apply(
+    calibration: Annotated[Path, typer.Argument(help="Calibration file.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="IMAGE|POINTS", help="Image, or coordinates (JSON, CSV).")
+    ],
+    out: Out = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Pixels per unit of the corrected image; default: about as before.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Correct points, or resample an image into the corrected system."""
+    from ..calibration import Calibration
+    from ..refine import CameraCorrection
+
+    correction = CameraCorrection.from_calibration(Calibration.read(calibration))
+    if is_points(source):
+        _points(correction, source, out, as_json)
+    else:
+        _image(correction, calibration, source, out, scale, as_json)
+
+
+def _points(correction: CameraCorrection, source: Path, out: Path | None, as_json: bool) -> None:
+    from ..formats import write_whole
+    from ..provenance import canonical_json
+
+    suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
+    points = correction.apply(read_measurement(source).image_points())
+    document = canonical_json(_columns(points, correction.unit))
+    if out is not None:
+        write_whole(out, document if suffix == ".json" else _csv(points))
+    if as_json:
+        say(document)
+    elif out is None:
+        say(_csv(points))
+    else:
+        say(f"{out}: {len(points)} points in {correction.unit}\n")
+
+
+def _columns(points: ImagePoints, unit: str) -> dict[str, Any]:
+    s = points.sigma
+    table = {
+        "id": list(points.names),
+        "x": points.xy[:, 0].tolist(),
+        "y": points.xy[:, 1].tolist(),
+        "sx": s[:, 0].tolist(),
+        "sy": s[:, 1].tolist(),
+        "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
+    }
+    return {"schema": "reseau-points/1", "unit": unit, "system": "common", "points": table}
+
+
+def _csv(points: ImagePoints) -> str:
+    lines = ["id,x,y,sx,sy"]
+    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
+        lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
+    return "\n".join(lines) + "\n"
+
+
+def _image(
+    correction: CameraCorrection,
+    calibration: Path,
+    source: Path,
+    out: Path | None,
+    scale: float | None,
+    as_json: bool,
+) -> None:
+    from ..calibration import Calibration
+    from ..errors import UsageError
+    from ..images import read_frame
+    from ..provenance import Provenance, canonical_json, sha256_of
+    from ..refine.corrected import CorrectedImage, write_corrected
+
+    if scale is not None and not scale > 0:
+        raise UsageError(f"{scale:g} is not positive", where="--scale")
+    out = out or source.with_name(f"{source.stem}-corrected{source.suffix}")
+    suffix_of(writable(out), _IMAGES)
+    frame = read_frame(source)
+    validity = Calibration.read(calibration).validity
+    plan = CorrectedImage.plan(correction, (frame.width, frame.height), validity.get("extent"), scale)
+    with progress(f"resampling {source.name}", plan.bands) as step:
+        write_corrected(out, frame.pixels, plan, step)
+    provenance = Provenance(
+        {source.name: frame.sha256, calibration.name: sha256_of(calibration)}, {"scale": plan.scale}
+    )
+    if as_json:
+        say(canonical_json(plan.to_dict() | {"image": str(out), "provenance": provenance.to_dict()}))
+    else:
+        x, y = plan.origin
+        say(
+            f"{out}: {plan.width} × {plan.height} px, {plan.scale:.6g} px/{correction.unit}, "
+            f"first pixel at ({x:.6g}, {y:.6g}) {correction.unit}\n"
+        )

@@ -1,0 +1,118 @@
+"""What several commands need: files in, results out, progress."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from ..errors import EstimationError, InputError, UsageError
+
+if TYPE_CHECKING:
+    from ..adjust import Failure
+    from ..data import Frame, ImagePoints
+    from ..formats import ReseauMeasurement
+
+T = TypeVar("T")
+
+AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
+Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+
+
+def is_points(path: Path) -> bool:
+    """Whether a file holds image coordinates and not an image, by its name."""
+    return path.suffix.lower() in (".json", ".csv")
+
+
+def read_measurement(path: Path) -> ReseauMeasurement:
+    """Image coordinates from a ``reseau-measurement/1`` file or a CSV ``id,x,y[,sx,sy]``."""
+    from ..formats import ReseauMeasurement
+    from ..provenance import sha256_of
+
+    if path.suffix.lower() == ".csv":
+        return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
+    return ReseauMeasurement.read(path)
+
+
+def read_photo(path: Path) -> Frame | ImagePoints:
+    """An image, or the image coordinates that were measured in one."""
+    from ..images import read_frame
+
+    return read_measurement(path).image_points() if is_points(path) else read_frame(path)
+
+
+def required(found: T | Failure, where: object) -> T:
+    """The estimate; or its failure as an error that names the file it is about.
+
+    Raises
+    ------
+    EstimationError
+        When there is no estimate.
+    """
+    reason = getattr(found, "reason", None)
+    if not found and reason is not None:
+        # A reason may name the frame already; once is enough.
+        name = Path(str(where)).name
+        raise EstimationError(str(reason).removeprefix(f"{name}: "), where=where)
+    return found  # type: ignore[return-value]
+
+
+def writable(path: Path) -> Path:
+    """The path, when a file can be written there; asked before the work begins.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise InputError("has no such folder", where=path, do="create it first")
+    if path.is_dir():
+        raise InputError("is a folder", where=path, do="name a file")
+    return path
+
+
+def suffix_of(path: Path, allowed: tuple[str, ...]) -> str:
+    """The suffix of an output file, one of those allowed.
+
+    Raises
+    ------
+    UsageError
+        When it is none of them.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in allowed:
+        raise UsageError(f"ends in {suffix or 'nothing'!r}", where=path, do=f"use {', '.join(allowed)}")
+    return suffix
+
+
+def say(text: str) -> None:
+    """Write to standard output."""
+    sys.stdout.write(text)
+
+
+@contextmanager
+def progress(title: str, steps: int) -> Iterator[Any]:
+    """Show a bar on standard error where that is a terminal; yields a function to call after each step."""
+    if not sys.stderr.isatty():
+        yield lambda description=None: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}", justify="left"),
+        BarColumn(bar_width=30),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=steps)
+
+        def step(description: str | None = None) -> None:
+            bar.update(task, advance=1, description=description)
+
+        yield step

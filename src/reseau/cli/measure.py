@@ -1,0 +1,71 @@
+"""`reseau measure`: image coordinates of targets in a frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..formats import ReseauMeasurement
+
+__all__ = ["app", "measurement_csv"]
+
+app = typer.Typer(help="Measure image coordinates of a target.", no_args_is_help=True)
+
+
+@app.callback()
+def _targets() -> None:
+    """Measure image coordinates of a target."""
+
+
+@app.command()
+def reseau(
+    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the reseau.")],
+    out: Out = None,
+    mark_px: Annotated[
+        float | None, typer.Option(help="Size of a mark (of a grid: width of its lines) in pixels.")
+    ] = None,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the marks of a reseau."""
+    from ..formats import ReseauDesign, write_whole
+    from ..images import read_frame
+    from ..refine import ReseauOptions, measure_reseau
+
+    suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+    target = ReseauDesign.read(design)
+    rms = None
+    if is_points(image):
+        found = read_measurement(image)
+    else:
+        frame = read_frame(image)
+        options = ReseauOptions(mark_px=mark_px, row_jitter_px=row_jitter)
+        with progress(f"measuring {image.name}", 1):
+            result = required(measure_reseau(frame, target, options), image)
+        found, rms = result.measurement(), result.rms()
+    if out is not None:
+        write_whole(out, measurement_csv(found) if suffix == ".csv" else found.to_json())
+    if as_json:
+        say(found.to_json())
+        return
+    say(f"{image.name}: {found.found} of {found.expected} marks measured\n")
+    if rms is not None:
+        say(f"leave-one-out rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
+    for point in found.points:
+        if not point.ok:
+            say(f"  {point.id}: {point.why}\n")
+
+
+def measurement_csv(found: ReseauMeasurement) -> str:
+    """Marks that were measured as CSV ``id,x,y,sx,sy``."""
+    points = found.image_points()
+    lines = ["id,x,y,sx,sy"]
+    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
+        lines.append(f"{name},{x:.6f},{y:.6f},{sx:.3e},{sy:.3e}")
+    return "\n".join(lines) + "\n"

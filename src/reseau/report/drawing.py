@@ -1,0 +1,246 @@
+"""Designs as drawings to print in true size: SVG and PDF, with crop marks and a bar to check the print by.
+
+Both are written from one list of filled polygons, circles and texts in millimetres.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from ..data import Array
+from ..errors import UsageError
+from ..formats import ReseauDesign
+from .style import drawing as house_style
+
+__all__ = ["design_pdf", "design_svg"]
+
+_MARGIN = 18.0
+"""Paper around the target, mm: crop marks, the bar and the title lie in it."""
+_BAR = 100.0
+_CROP = 5.0
+_GREY = "#555555"
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """A drawing in millimetres, y down, from the upper left corner of the paper.
+
+    Parameters
+    ----------
+    width, height : float
+        Of the paper.
+    target : (float, float, float, float)
+        Left, top, right and lower end of the target.
+    polygons : list of ndarray (k, 2)
+        Filled with the colour of the marks.
+    circles : list of (x, y, radius)
+        Filled likewise.
+    lines : list of (x0, y0, x1, y1)
+        Hairlines outside the target.
+    texts : list of (x, y, anchor, text)
+        Labels, 2.6 mm high.
+    """
+
+    width: float
+    height: float
+    target: tuple[float, float, float, float]
+    polygons: list[Array]
+    circles: list[tuple[float, float, float]]
+    lines: list[tuple[float, float, float, float]]
+    texts: list[tuple[float, float, str, str]]
+
+
+def _sheet(design: ReseauDesign) -> _Sheet:
+    """Lay the design out on paper.
+
+    Raises
+    ------
+    UsageError
+        When coordinates are missing, or the unit is not the millimetre.
+    """
+    xy = design.xy
+    if design.unit != "mm" or not np.isfinite(xy).all():
+        raise UsageError("has no millimetre coordinates for all marks", where=f"design {design.name}")
+    mark = design.mark
+    size = mark.size or mark.line_width or 0.0
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    around = max(size, 0.5 * _gap(xy))
+    width, height = high - low + 2 * (around + _MARGIN)
+    # A narrow target has a sheet that still takes the bar.
+    width = max(width, _BAR + 2 * _MARGIN)
+    left = float((width - (high - low)[0]) / 2 - around)
+    target = (left, _MARGIN, float(width - left), float(_MARGIN + (high - low)[1] + 2 * around))
+    paper = np.stack([xy[:, 0] - low[0] + left + around, high[1] - xy[:, 1] + _MARGIN + around], axis=1)
+    polygons, circles = _marks(design, paper, target)
+    lines = [*_crop_marks(target), *_bar(width, target[3])]
+    name_of = dict(zip(design.ids, paper, strict=True))
+    texts = [
+        (target[0], target[1] - 7.5, "start", f"{design.name}: {len(xy)} marks, {_describe(design)}"),
+        (width / 2, target[3] + 15.2, "middle", "100 mm: measure it before you trust the print"),
+    ]
+    for letter, mark_id in (("O", design.origin), ("S", design.axis)):
+        if mark_id is not None:
+            x, y = name_of[mark_id]
+            offset = 0.5 * size + 1.0
+            texts.append((float(x + offset), float(y - offset), "start", letter))
+    return _Sheet(
+        float(width),
+        float(height + 8),
+        target,
+        polygons,
+        circles,
+        lines,
+        texts,
+    )
+
+
+def _gap(xy: Array) -> float:
+    distance = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    np.fill_diagonal(distance, np.inf)
+    return float(np.median(distance.min(axis=1)))
+
+
+def _describe(design: ReseauDesign) -> str:
+    mark = design.mark
+    parts: list[str] = [mark.shape]
+    if mark.size:
+        parts.append(f"{mark.size:g} mm")
+    if mark.line_width:
+        parts.append(f"lines {mark.line_width:g} mm")
+    return f"{' '.join(parts)}, O = {design.origin or '–'}, S = {design.axis or '–'}"
+
+
+def _marks(
+    design: ReseauDesign, at: Array, target: tuple[float, ...]
+) -> tuple[list[Array], list[tuple[float, float, float]]]:
+    mark = design.mark
+    if mark.shape == "line-grid":
+        w = (mark.line_width or 0.0) / 2
+        upright = [_box(x - w, target[1], x + w, target[3]) for x in np.unique(at[:, 0])]
+        level = [_box(target[0], y - w, target[2], y + w) for y in np.unique(at[:, 1])]
+        return upright + level, []
+    r = (mark.size or 0.0) / 2
+    if mark.shape in ("disk", "rod"):
+        return [], [(float(x), float(y), r) for x, y in at]
+    if mark.shape == "square":
+        return [_box(x - r, y - r, x + r, y + r) for x, y in at], []
+    w = (mark.line_width or 0.0) / 2
+    arm = [
+        (-w, -r),
+        (w, -r),
+        (w, -w),
+        (r, -w),
+        (r, w),
+        (w, w),
+        (w, r),
+        (-w, r),
+        (-w, w),
+        (-r, w),
+        (-r, -w),
+        (-w, -w),
+    ]
+    return [np.array(arm) + point for point in at], []
+
+
+def _box(x0: float, y0: float, x1: float, y1: float) -> Array:
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)
+
+
+def _crop_marks(target: tuple[float, ...]) -> Iterator[tuple[float, float, float, float]]:
+    x0, y0, x1, y1 = map(float, target)
+    for x, out in ((x0, -1), (x1, 1)):
+        for y, down in ((y0, -1), (y1, 1)):
+            yield x + out, y, x + out * (1 + _CROP), y
+            yield x, y + down, x, y + down * (1 + _CROP)
+
+
+def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, float]]:
+    """The scale bar: 100 mm between the middles of its end strokes, with a stroke every 10 mm."""
+    left, y = float(width - _BAR) / 2, float(bottom) + 10.0
+    yield left, y, left + _BAR, y
+    for k in range(11):
+        tall = 1.8 if k % 5 == 0 else 1.0
+        yield left + 10 * k, y - tall, left + 10 * k, y + tall
+
+
+def _colours(design: ReseauDesign) -> tuple[str, str]:
+    """Of the ground and of the marks."""
+    return ("#ffffff", "#000000") if design.polarity == "dark" else ("#000000", "#ffffff")
+
+
+def _number(value: float) -> str:
+    return f"{value:.4f}".rstrip("0").rstrip(".")
+
+
+def design_svg(design: ReseauDesign) -> str:
+    """The target as SVG in true size.
+
+    Raises
+    ------
+    UsageError
+        When the design has no millimetre coordinates for all marks.
+    """
+    sheet = _sheet(design)
+    ground, ink = _colours(design)
+    x0, y0, x1, y1 = sheet.target
+    n = _number
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{n(sheet.width)}mm" height="{n(sheet.height)}mm" '
+        f'viewBox="0 0 {n(sheet.width)} {n(sheet.height)}">',
+        f"<title>{escape(design.name)}</title>",
+        f'<rect width="{n(sheet.width)}" height="{n(sheet.height)}" fill="#ffffff"/>',
+        f'<rect x="{n(x0)}" y="{n(y0)}" width="{n(x1 - x0)}" height="{n(y1 - y0)}" fill="{ground}"/>',
+        f'<g fill="{ink}">',
+    ]
+    for polygon in sheet.polygons:
+        path = "L".join(f"{n(x)} {n(y)}" for x, y in polygon)
+        parts.append(f'<path d="M{path}Z"/>')
+    parts += [f'<circle cx="{n(x)}" cy="{n(y)}" r="{n(r)}"/>' for x, y, r in sheet.circles]
+    parts.append(f'</g><g stroke="{_GREY}" stroke-width="0.1">')
+    parts += [f'<path d="M{n(a)} {n(b)}L{n(c)} {n(d)}"/>' for a, b, c, d in sheet.lines]
+    parts.append(f'</g><g font-family="Helvetica, Arial, sans-serif" font-size="2.6" fill="{_GREY}">')
+    parts += [
+        f'<text x="{n(x)}" y="{n(y)}" text-anchor="{anchor}">{escape(text)}</text>'
+        for x, y, anchor, text in sheet.texts
+    ]
+    return "\n".join(parts) + "</g></svg>\n"
+
+
+def design_pdf(design: ReseauDesign) -> bytes:
+    """The target as a PDF of one page in true size, all of it vectors.
+
+    Raises
+    ------
+    UsageError
+        When the design has no millimetre coordinates for all marks.
+    """
+    from matplotlib.collections import PatchCollection
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Patch, Polygon, Rectangle
+
+    sheet = _sheet(design)
+    ground, ink = _colours(design)
+    x0, y0, x1, y1 = sheet.target
+    with house_style():
+        figure = Figure(figsize=(sheet.width / 25.4, sheet.height / 25.4))
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, sheet.width), ylim=(sheet.height, 0))
+        axes.axis("off")
+        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=ground, ec="none"))
+        patches: list[Patch] = [Polygon(polygon, closed=True) for polygon in sheet.polygons]
+        patches += [Circle((x, y), r) for x, y, r in sheet.circles]
+        axes.add_collection(PatchCollection(patches, facecolor=ink, edgecolor="none", linewidth=0))
+        for a, b, c, d in sheet.lines:
+            axes.plot([a, c], [b, d], color=_GREY, lw=0.1 / 25.4 * 72, solid_capstyle="butt")
+        sides = {"start": "left", "middle": "center"}
+        for x, y, anchor, text in sheet.texts:
+            axes.text(x, y, text, ha=sides[anchor], va="baseline", fontsize=2.6 / 25.4 * 72, color=_GREY)
+        stream = io.BytesIO()
+        figure.savefig(
+            stream, format="pdf", metadata={"CreationDate": None, "Creator": None, "Title": design.name}
+        )
+    return stream.getvalue()

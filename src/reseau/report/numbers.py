@@ -1,0 +1,64 @@
+"""Numbers as tables want them: a true minus, as many decimals as the column, powers of ten raised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["Power", "aligned", "grouped", "power"]
+
+_MINUS = "\u2212"
+
+
+def aligned(values: Iterable[float], decimals: int) -> list[str]:
+    """Numbers of one column, all with the same decimals; a dash where there is none.
+
+    Examples
+    --------
+    >>> aligned([1.234, -0.5, float("nan")], 2)
+    ['1.23', '−0.50', '–']
+    """
+    return [f"{v:.{decimals}f}".replace("-", _MINUS) if np.isfinite(v) else "–" for v in map(float, values)]
+
+
+def grouped(value: float) -> str:
+    """One decimal below a thousand, whole and in groups of three above.
+
+    Examples
+    --------
+    >>> grouped(62.24), grouped(1064179.8) == "1\u202f064\u202f180"
+    ('62.2', True)
+    """
+    return f"{value:.1f}" if value < 1000 else f"{value:,.0f}".replace(",", "\u202f")
+
+
+class Power(NamedTuple):
+    """A value and its standard deviation over a common power of ten."""
+
+    value: str
+    sigma: str
+    exponent: str
+
+
+def power(value: float, sigma: float) -> Power:
+    """A value with as many digits as two of its standard deviation allow.
+
+    Examples
+    --------
+    >>> power(-0.00123456, 0.0000012)
+    Power(value='−1.2346', sigma='0.0012', exponent='−3')
+    >>> power(0.99342, 0.00002)
+    Power(value='0.993420', sigma='0.000020', exponent='')
+    """
+    largest = max(abs(value), sigma)
+    exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
+    # Between a tenth and ten thousand a number reads best as it is.
+    exponent = 0 if -2 <= exponent <= 3 else exponent
+    scaled = sigma / 10.0**exponent
+    decimals = int(np.clip(1 - np.floor(np.log10(scaled)), 0, 9)) if scaled > 0 else 6
+    shown, spread = aligned([value / 10.0**exponent, scaled], decimals)
+    return Power(
+        shown, spread if sigma > 0 else "held", str(exponent).replace("-", _MINUS) if exponent else ""
+    )
