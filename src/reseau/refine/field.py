@@ -60,6 +60,8 @@ class SmoothField:
         Standard deviation of the noise of a point of weight 1, per axis.
     need : ndarray (2,)
         Probability, per axis, that white noise alone would ask as much for a signal; NaN if not tested.
+    sigma : ndarray (n,)
+        Relative standard deviations of the points.
     """
 
     source: Array
@@ -69,7 +71,7 @@ class SmoothField:
     ratio: Array
     noise: Array
     need: Array
-    _relative: Array
+    sigma: Array
     _solutions: tuple[tuple[Array, Array, Array], ...]
 
     @classmethod
@@ -158,7 +160,7 @@ class SmoothField:
             return design @ np.stack([trend for _, _, trend in self._solutions], axis=1)
         kernel = _correlation(cdist(xy, self.source) / self.length)
         parts = [
-            design @ trend + ratio * (kernel @ (weights / self._relative))
+            design @ trend + ratio * (kernel @ (weights / self.sigma))
             for ratio, (weights, _, trend) in zip(self.ratio, self._solutions, strict=True)
         ]
         return np.stack(parts, axis=1)
@@ -185,7 +187,7 @@ class SmoothField:
         With :math:`P` the inverse covariance after elimination of the trend, :math:`(P l)_i / P_{ii}` and
         :math:`P_{ii}^{-1/2}` (Dubrule 1983); nothing is fitted anew.
         """
-        scale = self._relative[:, None]
+        scale = self.sigma[:, None]
         weights = np.stack([solution[0] for solution in self._solutions], axis=1)
         diagonal = np.maximum(np.stack([solution[1] for solution in self._solutions], axis=1), 1e-12)
         return weights / diagonal * scale, self.noise / np.sqrt(diagonal) * scale

@@ -8,6 +8,7 @@ narrows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from .field import SmoothField, trend_degree
 __all__ = ["Assignment", "GridOptions", "assign", "lay_out"]
 
 _NEIGHBOURS = 6
+_PLAIN = 0.8
+"""Score, as a part of the marks, that leaves no doubt where the design lies."""
 
 
 @dataclass(frozen=True)
@@ -220,19 +223,34 @@ def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOpt
     Assignment or None
         The one with the highest score; None when no hypothesis gathers marks.
     """
-    strong = replace(candidates, xy=candidates.xy[: 4 * len(source)], t=candidates.t[: 4 * len(source)])
+    strong = _strongest(candidates, 4 * len(source))
     if len(strong) < 8 or len(source) < 8:
         return None
+    # Along a wire much looks a little like a crossing: where all vote, that may outvote the crossings; where
+    # the strongest alone do, a scene behind the marks may. So the ones first and then the others.
+    electorates = (_strongest(candidates, 3 * len(source) // 2), strong)
     best: Assignment | None = None
     # y up first: where both explain the image alike, the first is kept.
     for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
         plane = source * [1, -1 if mirrored else 1]
-        for similarity in _similarities(plane, strong, options):
-            for start in _shifted(plane, similarity, strong):
+        for voters in electorates:
+            if best is not None and best.score > _PLAIN * len(source):
+                break
+            for start in _starts(plane, voters, options):
                 found = assign(source, start, strong, valid)
                 if found is not None and (best is None or found.score > best.score + 0.75):
                     best = found
     return best
+
+
+def _strongest(candidates: Candidates, count: int) -> Candidates:
+    return replace(candidates, xy=candidates.xy[:count], t=candidates.t[:count])
+
+
+def _starts(plane: Array, voters: Candidates, options: GridOptions) -> Iterator[Array]:
+    """Positions of the marks to begin from, the likeliest first."""
+    for similarity in _similarities(plane, voters, options):
+        yield from _shifted(plane, similarity, voters)
 
 
 def _complex(xy: Array) -> NDArray[np.complex128]:

@@ -1,85 +1,32 @@
 """The matcher: patches of a frame adjusted to the formed image of what they should show.
 
-For each mark, position, width of the point-spread function, contrast, the background as a plane, and where
-wanted the form, are estimated together, all marks of a frame in one batch of least-squares problems
+For each mark, position, width of the point-spread function, contrast, the background, and where wanted the
+form, are estimated together, all marks of a frame in one batch of least-squares problems
 (:func:`reseau.adjust.adjust_batch`). What is matched differs only in the outline that is formed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..adjust import BatchAdjustment, BatchOptions, adjust_batch
 from ..data import Array, Mask, Rows
-from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
+from ..optics.formation import Outline
+from .patches import CONTRAST, LEVEL, WIDTH, MatchOptions, Patches, X, Y
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "match"]
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
-X, Y, WIDTH, CONTRAST, LEVEL = range(5)
-
 _STEP_PX = 1e-4
 """Corrections of a position that end the iterations; far below any noise."""
 
-_FORM_ERROR = 0.2
-"""Share of its amplitude by which a mark may differ from the formed one and still be that mark."""
-
-_SHARPEST = 0.5
-"""Share of the expected width below which a point-spread function cannot be told from none."""
-
 SIZE = np.eye(2)[None]
 """The form's one parameter for a mark of unknown size: the local frame grows by its share."""
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """How patches are matched.
-
-    Parameters
-    ----------
-    half_px : int
-        Half side of the square window around a mark.
-    psf_px : float
-        Expected width (one sigma) of the point-spread function.
-    psf_log_sigma : float
-        How far that may be wrong, as the standard deviation of its logarithm.
-    contrast : float, optional
-        Expected contrast; by default half the light of a dark mark, the brightest pixel of a bright one.
-    contrast_sigma : float
-        Standard deviation of that; infinite where nothing is known.
-    response : PixelResponse
-        The pixel.
-    polarity : {"dark", "bright"}
-        A dark mark takes a share of the light that falls on it, so that its own image follows the background;
-        a bright one adds light to it.
-    rejection : float
-        Pixels whose residual exceeds this many robust standard deviations of their patch are left out:
-        bit errors, dust, a scene.
-    row_jitter_px : float
-        Standard deviation of the shift of single rows along x. It enters the stochastic model as what it is,
-        an error common to a row and proportional to the image's slope.
-    background : int
-        Degree of the polynomial that the background is: 1, or 2 amid a scene.
-    start_px : float
-        How far the approximate positions may be off.
-    """
-
-    half_px: int = 6
-    psf_px: float = 0.8
-    psf_log_sigma: float = 0.5
-    contrast: float | None = None
-    contrast_sigma: float = np.inf
-    response: PixelResponse = field(default_factory=PixelResponse)
-    polarity: Literal["dark", "bright"] = "dark"
-    rejection: float = 4.5
-    row_jitter_px: float = 0.0
-    background: int = 1
-    start_px: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +132,7 @@ def match(
     Matches
         Of all k; those that failed have `converged` False or a small `t`.
     """
-    patch = _Patches(pixels, valid, outline, xy, options, form)
+    patch = Patches(pixels, valid, outline, xy, options, form)
     free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
@@ -227,7 +174,7 @@ def match(
     if options.row_jitter_px > 0:
         patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
         found = adjust(every, found.estimates)
-    return patch.matches(found, used > 0, scale[:, 0])
+    return _columns(patch, found, used > 0, scale[:, 0])
 
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:
@@ -246,192 +193,31 @@ def _rms(residuals: Array, used: Array, parameters: int) -> Array:
     return rms
 
 
-class _Patches:
-    """Windows of a frame, and the image formed in them."""
-
-    def __init__(
-        self,
-        pixels: NDArray[Any],
-        valid: Mask,
-        outline: Outline,
-        xy: Array,
-        options: MatchOptions,
-        form: Array | None,
-    ) -> None:
-        self.outline, self.xy, self.options = outline, xy, options
-        self.generators = np.zeros((0, 2, 2)) if form is None else form
-        self.forms = len(self.generators)
-        self.offset = np.arange(-options.half_px, options.half_px + 1)
-        u, v = self.offset[None, :] / options.half_px, self.offset[:, None] / options.half_px
-        powers = [(i, j) for i in range(options.background + 1) for j in range(options.background + 1 - i)]
-        # Monomials (n, b) of the background over the window.
-        self.monomials = np.stack([(u**i * v**j).ravel() for i, j in powers], axis=1)
-        self.form_at = LEVEL + len(powers)
-        self.centre = np.rint(xy).astype(np.intp)
-        columns, rows = self.centre[:, :1] + self.offset, self.centre[:, 1:] + self.offset
-        self.columns, self.rows = columns.astype(float), rows.astype(float)
-        h, w = pixels.shape
-        c, r = np.clip(columns, 0, w - 1)[:, None, :], np.clip(rows, 0, h - 1)[:, :, None]
-        inside = ((rows >= 0) & (rows < h))[:, :, None] & ((columns >= 0) & (columns < w))[:, None, :]
-        k = len(xy)
-        self.shape = (k, len(self.offset), len(self.offset))
-        self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
-        self.weights = (inside & valid[r, c]).reshape(k, -1).astype(np.float64)
-        self.whitener: tuple[Array, Array] | None = None
-
-    def start(self, noise: float) -> Array:
-        """Approximate values, and the pixels of the background that belong to something else left out.
-
-        The background is fitted robustly to what lies around the mark, by weights after Tukey that are
-        tightened from step to step.
-        """
-        x = np.zeros((len(self.xy), self.form_at + self.forms))
-        x[:, WIDTH] = np.log(np.hypot(self.options.psf_px, 0.7 * self.options.start_px))
-        share = self._share(x)
-        x[:, WIDTH] = np.log(self.options.psf_px)
-        around = self.weights * (share.reshape(len(x), -1) < 0.02)
-        around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs a value
-        design = self.monomials
-        fitted = np.zeros((len(x), design.shape[1]))
-        fitted[:, 0] = np.nanmedian(np.where(around > 0, self.grey, np.nan), axis=1)
-        far = np.zeros_like(around)
-        for factor in (6.0, 5.0, 4.0, 4.0, 4.0):
-            off = np.where(around > 0, np.abs(self.grey - fitted @ design.T), np.nan)
-            scale = np.maximum(1.4826 * np.nanmedian(off, axis=1, keepdims=True), noise)
-            far = np.nan_to_num(off) / (factor * scale)
-            w = around * np.clip(1 - far**2, 0, None) ** 2
-            normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(design.shape[1])
-            fitted = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * fitted)[..., None])[..., 0]
-        self.weights = np.where(far > 1.5, 0.0, self.weights)
-        x[:, LEVEL : self.form_at] = fitted
-        if self.options.contrast is not None:
-            x[:, CONTRAST] = self.options.contrast
-        elif self.options.polarity == "dark":
-            x[:, CONTRAST] = 0.5
-        else:
-            top = np.where(self.weights > 0, self.grey - fitted @ design.T, 0.0)
-            x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
-        return x
-
-    def width(self, x: Array) -> Array:
-        """Width of the point-spread function (k,): its logarithm is estimated, above a least one."""
-        width: Array = np.hypot(_SHARPEST * self.options.psf_px, np.exp(x[:, WIDTH]))
-        return width
-
-    def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
-        """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
-        share, d_share = self._derivatives(x, at)
-        plane, contrast = self.background(x), x[:, CONTRAST, None, None]
-        if self.options.polarity == "dark":
-            rest = 1 - contrast * share
-            grey, by_share, by_contrast = plane * rest, -plane * contrast, -plane * share
-        else:
-            rest = np.ones_like(share)
-            grey, by_share, by_contrast = plane + contrast * share, contrast, share
-        jacobian = np.empty((*share.shape, x.shape[1]))
-        shape_columns = [X, Y, WIDTH, *range(self.form_at, x.shape[1])]
-        jacobian[..., shape_columns] = np.moveaxis(by_share[:, None] * d_share, 1, -1)
-        jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / self.width(x))[:, None, None]
-        jacobian[..., CONTRAST] = by_contrast
-        grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
-        jacobian[..., LEVEL : self.form_at] = rest.reshape(len(x), -1, 1) * self.monomials
-        if self.whitener is not None:
-            grey, jacobian = self._whitened(grey, jacobian, at)
-        return grey, jacobian
-
-    def background(self, x: Array) -> Array:
-        """Grey values of the background in the window, (k, rows, columns)."""
-        grey: Array = (x[:, LEVEL : self.form_at] @ self.monomials.T).reshape(len(x), *self.shape[1:])
-        return grey
-
-    def _placed(self, x: Array, at: Rows) -> Outline:
-        """Outlines of the patches `at` where the parameters (m, u) have them."""
-        nodes, steps = self.outline.xy[at], self.outline.dxy[at]
-        if self.forms:
-            grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, self.form_at :], self.generators)
-            nodes, steps = nodes @ np.swapaxes(grown, 1, 2), steps @ np.swapaxes(grown, 1, 2)
-        return Outline(nodes + (self.xy[at] + x[:, :2])[:, None, :], steps)
-
-    def _share(self, x: Array) -> Array:
-        """Share of each pixel that the marks take, all patches, (k, rows, columns)."""
-        outline = self._placed(x, np.arange(len(x)))
-        return coverage(outline, self.columns, self.rows, self.width(x), self.options.response)
-
-    def _derivatives(self, x: Array, at: Rows) -> tuple[Array, Array]:
-        """That share for the patches `at`, and its derivatives by position, width and form."""
-        motions = np.einsum("pij,knj->kpni", self.generators, self.outline.xy[at]) if self.forms else None
-        return coverage_derivatives(
-            self._placed(x, at),
-            self.columns[at],
-            self.rows[at],
-            self.width(x),
-            self.options.response,
-            motions,
-        )
-
-    def tolerated(self, x: Array) -> Array:
-        """Residuals (k, n) that are laid to the model of the mark, not to blunders.
-
-        No mark is quite the square or the disk that it should be, and no point-spread function a Gaussian; in
-        a strong mark that shows before the noise does.
-        """
-        share = self._share(x)
-        amplitude = np.abs(x[:, CONTRAST])
-        if self.options.polarity == "dark":
-            amplitude = amplitude * np.abs(x[:, LEVEL])
-        tolerated: Array = _FORM_ERROR * amplitude[:, None] * (share.reshape(len(x), -1) > 0.02)
-        return tolerated
-
-    def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
-        """Take an error of each row, jitter × slope along x, into the stochastic model.
-
-        The covariance of a row is σ²(I + q² g gᵀ) with the slope g of the formed image and q = jitter/σ. Its
-        inverse square root I − g gᵀ(1 − (1 + q² gᵀg)^(−1/2))/gᵀg makes the residuals of a row independent.
-        """
-        _, jacobian = self.form_image(x, np.arange(len(self.xy)))
-        slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
-        length2 = (slope**2).sum(axis=2, keepdims=True)
-        q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2
-        factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
-        self.whitener = (slope, factor)
-
-    def _whitened(self, grey: Array, jacobian: Array, at: Rows) -> tuple[Array, Array]:
-        assert self.whitener is not None
-        slope, factor = self.whitener[0][at], self.whitener[1][at]
-        m, rows, columns = slope.shape
-        v = (grey - self.grey[at]).reshape(m, rows, columns)
-        v = v - slope * factor * (slope * v).sum(axis=2, keepdims=True)
-        j = jacobian.reshape(m, rows, columns, -1)
-        along = np.einsum("mrc,mrcu->mru", slope * factor, j)
-        j = j - slope[..., None] * along[:, :, None, :]
-        return self.grey[at] + v.reshape(m, -1), j.reshape(m, rows * columns, -1)
-
-    def matches(self, found: BatchAdjustment, used: Mask, scale: Array) -> Matches:
-        """Columns of results from the adjusted batch."""
-        x, k = found.estimates, len(self.xy)
-        share = self._share(x)
-        flat = share.reshape(k, -1)
-        sight = np.maximum(flat.sum(axis=1), 1e-12)
-        plane = self.background(x).reshape(k, -1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cov = found.covariance
-            expected = -plane * flat if self.options.polarity == "dark" else flat
-            correlation = _correlation(self.grey - plane, expected, used)
-            t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - self.form_at, 1) / (1 - correlation**2))
-        return Matches(
-            xy=self.xy + x[:, :2],
-            cov=cov[:, :2, :2],
-            psf_px=self.width(x),
-            contrast=x[:, CONTRAST],
-            t=np.nan_to_num(t),
-            form=x[:, self.form_at :],
-            noise=found.sigma0 * scale,
-            correlation=np.nan_to_num(correlation),
-            seen=(flat * self.weights).sum(axis=1) / sight,
-            rejected=(flat * (self.weights - used)).sum(axis=1) / sight,
-            converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
-            residuals=np.where(used, found.residuals, np.nan).reshape(self.shape),
-        )
+def _columns(patch: Patches, found: BatchAdjustment, used: Mask, scale: Array) -> Matches:
+    """Columns of results from the adjusted batch."""
+    x, k = found.estimates, len(patch.xy)
+    flat = patch.share(x).reshape(k, -1)
+    sight = np.maximum(flat.sum(axis=1), 1e-12)
+    plane = patch.background(x).reshape(k, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cov = found.covariance
+        expected = -plane * flat if patch.options.polarity == "dark" else flat
+        correlation = _correlation(patch.grey - plane, expected, used)
+        t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - patch.form_at, 1) / (1 - correlation**2))
+    return Matches(
+        xy=patch.xy + x[:, :2],
+        cov=cov[:, :2, :2],
+        psf_px=patch.width(x),
+        contrast=x[:, CONTRAST],
+        t=np.nan_to_num(t),
+        form=x[:, patch.form_at :],
+        noise=found.sigma0 * scale,
+        correlation=np.nan_to_num(correlation),
+        seen=(flat * patch.weights).sum(axis=1) / sight,
+        rejected=(flat * (patch.weights - used)).sum(axis=1) / sight,
+        converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
+        residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
+    )
 
 
 def _correlation(a: Array, b: Array, used: Mask) -> Array:
