@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,6 @@ from .field import SmoothField, trend_degree
 __all__ = ["Assignment", "GridOptions", "assign", "lay_out"]
 
 _NEIGHBOURS = 6
-_PLAIN = 0.8
-"""Score, as a part of the marks, that leaves no doubt where the design lies."""
 
 
 @dataclass(frozen=True)
@@ -233,13 +232,15 @@ def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOpt
     # y up first: where both explain the image alike, the first is kept.
     for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
         plane = source * [1, -1 if mirrored else 1]
-        for voters in electorates:
-            if best is not None and best.score > _PLAIN * len(source):
+        for start in chain.from_iterable(_starts(plane, voters, options) for voters in electorates):
+            found = assign(source, start, strong, valid)
+            if found is None:
+                continue
+            if best is None or found.score > best.score + 0.75:
+                best = found
+            # All marks but one: a regular design laid one pitch off misses more.
+            if found.score >= len(source) - 1:
                 break
-            for start in _starts(plane, voters, options):
-                found = assign(source, start, strong, valid)
-                if found is not None and (best is None or found.score > best.score + 0.75):
-                    best = found
     return best
 
 
