@@ -70,7 +70,7 @@ def regular_reseau(
         for column in range(columns)
     )
     middle = _letters(rows // 2)
-    origin = origin or f"{middle}{columns // 2 + 1}"
+    origin = origin or f"{middle}{(columns + 1) // 2}"
     axis = axis or f"{middle}{columns}"
     for role, mark_id in (("origin", origin), ("axis", axis)):
         if all(point.id != mark_id for point in points):

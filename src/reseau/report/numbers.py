@@ -20,7 +20,9 @@ def aligned(values: Iterable[float], decimals: int) -> list[str]:
     >>> aligned([1.234, -0.5, float("nan")], 2)
     ['1.23', '−0.50', '–']
     """
-    return [f"{v:.{decimals}f}".replace("-", _MINUS) if np.isfinite(v) else "–" for v in map(float, values)]
+    # Rounded first and zero added: no minus before a zero.
+    rounded = [round(float(v), decimals) + 0.0 if np.isfinite(v) else None for v in values]
+    return ["–" if v is None else f"{v:.{decimals}f}".replace("-", _MINUS) for v in rounded]
 
 
 def grouped(value: float) -> str:

@@ -1,0 +1,25 @@
+"""What tests share: the reference data, which is not part of the project."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+_BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Callable[[str], Path]:
+    """A file or folder of the reference data by name; the test is skipped, and says so, without it."""
+    root = Path(os.environ.get("RESEAU_DATA", _BESIDE))
+
+    def find(name: str) -> Path:
+        path = root / name
+        if not path.exists():
+            pytest.skip(f"no reference data {name!r} in {root}; set RESEAU_DATA")
+        return path
+
+    return find

@@ -1,0 +1,67 @@
+"""Drawings of designs: true size, every mark in its place."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from reseau.designs import regular_reseau, standard_reseau
+from reseau.errors import UsageError
+from reseau.formats import Mark
+from reseau.report.drawing import design_pdf, design_svg
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def test_the_paper_and_its_units_are_millimetres() -> None:
+    root = ET.fromstring(design_svg(standard_reseau()))
+    width, height = (float(root.get(side, "").removesuffix("mm")) for side in ("width", "height"))
+    assert root.get("viewBox") == f"0 0 {width:g} {height:g}"
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", design_pdf(standard_reseau()))
+    assert box is not None
+    points = np.array([float(box[1]), float(box[2])])
+    np.testing.assert_allclose(points / 72 * 25.4, [width, height], rtol=0, atol=1e-3)
+
+
+def test_disks_have_the_distances_of_the_design() -> None:
+    design = regular_reseau(6, 5, 12.5, Mark(shape="disk", size=3.0))
+    circles = list(ET.fromstring(design_svg(design)).iter(f"{SVG}circle"))
+    at = np.array([(float(c.get("cx", "")), float(c.get("cy", ""))) for c in circles])
+    assert {c.get("r") for c in circles} == {"1.5"}
+    # y runs down on paper and up in the design.
+    np.testing.assert_allclose((at - at[0]) * [1, -1], design.xy - design.xy[0], rtol=0, atol=2e-4)
+
+
+def test_the_bar_is_a_hundred_millimetres_long() -> None:
+    for design in (standard_reseau(), regular_reseau(2, 2, 10.0, Mark(shape="square", size=2.0))):
+        lines = re.findall(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)"', design_svg(design))
+        lengths = [float(c) - float(a) for a, b, c, d in lines if b == d]
+        assert max(lengths) == pytest.approx(100.0, abs=1e-3)
+
+
+def test_crosses_have_their_arms() -> None:
+    design = regular_reseau(3, 3, 10.0, Mark(shape="cross", size=4.0, line_width=0.5), polarity="bright")
+    svg = design_svg(design)
+    paths = re.findall(r'd="M([^"]+)Z"', svg)
+    assert len(paths) == 9
+    corners = np.array([[float(v) for v in pair.split()] for pair in paths[0].split("L")])
+    assert len(corners) == 12
+    np.testing.assert_allclose(np.ptp(corners, axis=0), 4.0, rtol=0, atol=2e-4)
+    x, y = corners.T
+    area = abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
+    assert area == pytest.approx(2 * 4 * 0.5 - 0.25, abs=2e-3)
+    assert 'fill="#000000"/>' in svg  # the ground of bright marks
+
+
+def test_same_design_same_bytes() -> None:
+    assert design_pdf(standard_reseau()) == design_pdf(standard_reseau())
+    assert design_svg(standard_reseau()) == design_svg(standard_reseau())
+
+
+def test_a_design_without_millimetres_cannot_be_drawn() -> None:
+    inches = standard_reseau().model_copy(update={"unit": "inch"})
+    with pytest.raises(UsageError, match="no millimetre coordinates"):
+        design_svg(inches)

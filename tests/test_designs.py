@@ -1,0 +1,47 @@
+"""Regular reseaus: names, coordinates, and what does not fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.designs import regular_reseau, standard_reseau
+from reseau.errors import UsageError
+from reseau.formats import Mark, ReseauDesign
+
+DISK = Mark(shape="disk", size=2.0)
+
+
+def test_rows_are_lettered_beyond_z() -> None:
+    grid = regular_reseau(2, 29, 5.0, DISK)
+    assert grid.ids[-6:] == ("AA1", "AA2", "AB1", "AB2", "AC1", "AC2")
+    np.testing.assert_allclose(grid.xy.mean(axis=0), 0, rtol=0, atol=1e-12)
+    assert grid.xy[0, 1] == 70.0
+
+
+def test_the_standard_reseau_covers_its_screen_and_is_a_document() -> None:
+    grid = standard_reseau()
+    assert len(grid.points) == 165
+    np.testing.assert_array_equal(np.abs(grid.xy).max(axis=0), [70.0, 50.0])
+    at = dict(zip(grid.ids, grid.xy.tolist(), strict=True))
+    assert (at[grid.origin or ""], at[grid.axis or ""]) == ([0.0, 0.0], [70.0, 0.0])
+    assert ReseauDesign.parse(grid.to_json(), where="standard") == grid
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "pitch", "mark", "options", "complaint"),
+    [
+        (1, 5, 10.0, DISK, {}, "1 × 5 marks"),
+        (5, 5, -1.0, DISK, {}, "5 × 5 marks"),
+        (5, 5, 1.5, DISK, {}, "do not fit a pitch"),
+        (5, 5, 10.0, Mark(shape="disk"), {}, "do not fit"),
+        (5, 5, 10.0, Mark(shape="cross", size=3.0), {}, "width of line"),
+        (5, 5, 10.0, DISK, {"origin": "Z9"}, "origin: names 'Z9'"),
+        (5, 5, 10.0, DISK, {"origin": "A1", "axis": "A1"}, "must differ"),
+    ],
+)
+def test_impossible_reseaus_are_refused(
+    columns: int, rows: int, pitch: float, mark: Mark, options: dict[str, str], complaint: str
+) -> None:
+    with pytest.raises(UsageError, match=complaint):
+        regular_reseau(columns, rows, pitch, mark, **options)  # type: ignore[arg-type]
