@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..adjust import Adjustment, Elimination, Failure
+from ..adjust import Adjustment, Elimination, Failure, Options
 from ..calibration import Calibration, Covariance, Quantity
 from ..data import Array, ImagePoints
-from ..errors import FormatError
+from ..errors import FormatError, UsageError
 from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
@@ -36,9 +36,10 @@ class CameraCorrection:
     model : RationalPolynomial
         Photo-coordinates to coordinates of the reseau, both in the common system, mm.
     cofactor : ndarray (u, u)
-        Covariance matrix of the model's parameters.
+        Covariance matrix of the model's parameters: a priori where χ² tests decided, which take the points'
+        covariances at their word, else a posteriori.
     photo_system : Similarity
-        Pixels into the common system: y up, scaled to the reseau.
+        Pixels into the common system: scaled to the reseau, of the handedness of its design.
     object_system : Similarity
         Coordinates of the design into the common system.
     unit : str
@@ -74,6 +75,7 @@ class CameraCorrection:
         ImagePoints
             In the common system, in the design's unit. The covariances contain the points' own and that of
             the model; for points that the model was fitted to, the two are correlated, which is left out.
+            What the model cannot follow is no part of them: see `CorrectionFit.local` and the global test.
         """
         photo = _mapped(self.photo_system, points)
         value, slope, by_parameter = self.model.derivatives(photo.xy)
@@ -135,11 +137,12 @@ class CameraCorrection:
             model = RationalPolynomial.from_dict(content["mapping"]).with_values(calibration.values())
             systems = [_system_from_dict(content[key]) for key in ("photo_system", "object_system")]
             unit = str(content["unit"])
-        except (KeyError, TypeError, ValueError) as error:
+            row_of = {name: i for i, name in enumerate(calibration.parameters)}
+            order = [row_of[name] for name in model.names]
+        except (KeyError, TypeError, ValueError, UsageError) as error:
             raise FormatError(
                 f"lacks or misstates {error}", where=f"model of calibration {calibration.name}"
             ) from None
-        order = [list(calibration.parameters).index(name) for name in model.names]
         return cls(model, calibration.matrix()[np.ix_(order, order)], systems[0], systems[1], unit)
 
 
@@ -272,6 +275,7 @@ def correct_camera(
         alpha=alpha,
         criterion=criterion,
         keep=[name for name in ("a1", "b2") if name in model.names],
+        options=Options(scale="a-priori" if criterion == "chi2" else "a-posteriori"),
     )
     if isinstance(elimination, Failure):
         return elimination
