@@ -102,7 +102,7 @@ def test_marks_of_every_shape_are_centred_on_their_truth(mark: Mark, polarity: s
         window = change[row - 24 : row + 25, column - 24 : column + 25]
         offset = np.arange(-24.0, 25.0)
         centroid = np.array([(window * offset).sum(), (window * offset[:, None]).sum()]) / window.sum()
-        # The centre of gravity of a bent mark is off its middle: 0.0035 px for a cross of 3 mm, 4/9 of it here.
+        # The centre of gravity of a bent mark is off its middle: 0.0035 px for 3 mm, 4/9 of it here.
         np.testing.assert_allclose(centroid + np.array([column, row]), at, rtol=0, atol=2e-3)
 
 

@@ -1,0 +1,179 @@
+"""Commands: what they write is what was asked for, and it is right."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from reseau.calibration import Calibration
+from reseau.formats import ReseauDesign, ReseauMeasurement
+from reseau.images import read_frame, write_image
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def test_help_names_every_command(reseau: Run) -> None:
+    status, out, err = reseau("--help")
+    assert (status, err) == (0, "")
+    for command in ("demo", "design", "measure", "refine", "apply"):
+        assert command in out
+
+
+def test_help_is_not_kept_waiting_by_heavy_imports() -> None:
+    heavy = ("numpy", "scipy", "cv2", "matplotlib", "pydantic")
+    code = f"import reseau.cli, sys; print([m for m in {heavy} if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
+
+
+def test_help_answers_at_once() -> None:
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        code = "from reseau.cli import main; main(['--help'])"
+        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.6  # 0.17 s on an idle machine; tests share theirs
+
+
+def test_the_version_is_that_of_the_package(reseau: Run) -> None:
+    from reseau import __version__
+
+    assert reseau("--version")[:2] == (0, f"reseau {__version__}\n")
+
+
+def test_measuring_finds_the_marks_where_they_are(reseau: Run, photo: Any, tmp_path: Path) -> None:
+    status, out, _ = reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
+    assert status == 0
+    assert "63 of 63 marks measured" in out
+    points = ReseauMeasurement.read(tmp_path / "m.json").image_points()
+    truth = photo.view(photo.grid.xy)
+    assert np.sqrt(((points.xy - truth) ** 2).mean()) < 0.02
+    assert np.sqrt((((points.xy - truth) / points.sigma) ** 2).mean()) == pytest.approx(1.0, abs=0.25)
+
+
+def test_json_on_standard_output_is_the_document(reseau: Run, photo: Any, tmp_path: Path) -> None:
+    arguments = ("measure", "reseau", photo.image, "-d", photo.design)
+    _, out, err = reseau(*arguments, "--json")
+    assert err == ""
+    document = ReseauMeasurement.parse(out, where="stdout")
+    assert (document.found, document.image) == (63, "photo.png")
+    reseau(*arguments, "-o", tmp_path / "m.csv")
+    again = ReseauMeasurement.read_csv(tmp_path / "m.csv").image_points()
+    np.testing.assert_allclose(again.xy, document.image_points().xy, rtol=0, atol=1e-6)
+
+
+def test_coordinates_are_taken_where_an_image_is(
+    reseau: Run, photo: Any, calibration: Path, tmp_path: Path
+) -> None:
+    reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
+    reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.csv")
+    from_image = Calibration.read(calibration)
+    for name in ("m.json", "m.csv"):
+        status, out, _ = reseau("refine", "--photo-i", tmp_path / name, "--reseau", photo.design, "--json")
+        assert status == 0
+        from_points = Calibration.parse(out, where=name)
+        assert list(from_points.parameters) == list(from_image.parameters)
+        for key, quantity in from_points.parameters.items():
+            other = from_image.parameters[key]
+            assert abs(quantity.value - other.value) < 0.05 * other.sigma
+    status, out, _ = reseau("measure", "reseau", tmp_path / "m.csv", "-d", photo.design)
+    assert (status, out) == (0, "m.csv: 63 of 63 marks measured\n")
+
+
+def test_a_calibration_corrects_its_own_marks(
+    reseau: Run, photo: Any, calibration: Path, tmp_path: Path
+) -> None:
+    reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
+    status, out, _ = reseau("apply", calibration, tmp_path / "m.json", "--json")
+    assert status == 0
+    table = json.loads(out)
+    assert table["unit"] == "mm"
+    xy = np.stack([table["points"]["x"], table["points"]["y"]], axis=1)
+    origin = photo.grid.xy[photo.grid.ids.index(photo.grid.origin)]
+    assert np.abs(xy - (photo.grid.xy - origin)).max() < 0.02  # millimetres; 0.01 px are 0.0025 mm
+    assert reseau("apply", calibration, tmp_path / "m.json", "-o", tmp_path / "p.csv")[0] == 0
+    lines = (tmp_path / "p.csv").read_text().splitlines()
+    assert lines[0] == "id,x,y,sx,sy"
+    assert len(lines) == 64
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("a.png", np.uint8), ("a.tif", np.uint8), ("b.tif", np.uint16), ("b.png", np.uint16)]
+)
+def test_a_corrected_image_has_its_marks_in_place(
+    reseau: Run, photo: Any, calibration: Path, tmp_path: Path, name: str, dtype: type
+) -> None:
+    factor = 1 if dtype is np.uint8 else 200
+    write_image(tmp_path / name, np.rint(np.clip(photo.pixels, 0, 255) * factor).astype(dtype))
+    out = tmp_path / f"out{Path(name).suffix}"
+    status, text, _ = reseau("apply", calibration, tmp_path / name, "-o", out, "--scale", 5, "--json")
+    assert status == 0
+    raster, frame = json.loads(text), read_frame(out)
+    assert frame.pixels.dtype == dtype
+    assert (frame.width, frame.height) == (raster["width"], raster["height"])
+    origin = photo.grid.xy[photo.grid.ids.index(photo.grid.origin)]
+    for mark in (0, 11, 30, 62):
+        x, y = (photo.grid.xy[mark] - origin - raster["first_pixel"]) * [5, -5]
+        column, row = round(x), round(y)
+        window = frame.pixels[row - 8 : row + 9, column - 8 : column + 9].astype(float)
+        dark = np.maximum(150 * factor - window, 0)
+        offset = np.arange(-8.0, 9.0)
+        centroid = np.array([(dark * offset).sum(), (dark * offset[:, None]).sum()]) / dark.sum()
+        # A threshold's centre of gravity amid noise of 1.5 grey values.
+        np.testing.assert_allclose(centroid + np.array([column, row]), [x, y], rtol=0, atol=0.06)
+
+
+def test_a_corrected_tiff_says_its_true_size(
+    reseau: Run, photo: Any, calibration: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "c.tif"
+    assert reseau("apply", calibration, photo.image, "-o", out, "--scale", 5)[0] == 0
+    with tifffile.TiffFile(out) as tiff:
+        tags = tiff.pages.first.tags
+        numerator, denominator = tags["XResolution"].value
+        assert numerator / denominator == pytest.approx(50.0)  # pixels per centimetre
+        assert tags["ResolutionUnit"].value == 3
+    assert cv2.imread(str(out), cv2.IMREAD_UNCHANGED) is not None
+
+
+def test_a_design_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> None:
+    files = {suffix: tmp_path / f"d.{suffix}" for suffix in ("svg", "pdf", "json")}
+    options = ("--columns", 5, "--rows", 4, "--shape", "disk", "--size", 2, "--name", "five")
+    status, out, _ = reseau(
+        "design",
+        "reseau",
+        *options,
+        "--svg",
+        files["svg"],
+        "--pdf",
+        files["pdf"],
+        "-o",
+        files["json"],
+        "--json",
+    )
+    assert status == 0
+    assert ReseauDesign.parse(out, where="stdout") == ReseauDesign.read(files["json"])
+    assert files["svg"].read_text().startswith("<svg")
+    assert files["pdf"].read_bytes().startswith(b"%PDF")
+    design = ReseauDesign.read(files["json"])
+    assert (design.name, len(design.points), design.mark.size) == ("five", 20, 2.0)
+
+
+def test_a_report_can_be_asked_for(reseau: Run, photo: Any, tmp_path: Path) -> None:
+    page = tmp_path / "r.html"
+    arguments = ("refine", "--photo-i", photo.image, "--reseau", photo.design, "--report", page)
+    status, out, _ = reseau(*arguments, "--check", "B2,E7")
+    assert status == 0
+    assert out.startswith("photo.png: 63 marks")
+    assert "2 check marks" in page.read_text()
