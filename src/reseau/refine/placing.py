@@ -100,6 +100,9 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
         strength = float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
         if best is None or strength + found.score > best[0]:
             best = (strength + found.score, Placement(screened, found, mark_px))
+        # Every mark, and as large as the design says: another size would say no better.
+        if size is not None and found.score >= len(source) - 1:
+            break
     marks = 0 if best is None else int((best[1].assignment.candidate >= 0).sum())
     least = max(4, min(10, len(source) // 3))
     if best is None or marks < least or best[1].assignment.score < -0.1 * len(source):
