@@ -20,6 +20,7 @@ FILES = {
     "design.json",
     "comparison.json",
     "photo_i.png",
+    "overview.png",
 }
 Run = Callable[..., tuple[int, str, str]]
 

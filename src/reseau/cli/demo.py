@@ -50,6 +50,7 @@ def demo(
     from ..provenance import canonical_json
     from ..report import photo_i_report
     from ..report.comparison import compare_with_truth, comparison_table
+    from ..report.overview import overview_png
 
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=out, do="name a folder")
@@ -83,6 +84,7 @@ def demo(
             frame,
             {
                 "report.html": page,
+                "overview.png": overview_png(found, frame, bench.design.unit),
                 "calibration.json": calibration.to_json(),
                 "measurement.json": measurement.to_json(),
                 "design.json": bench.design.to_json(),
@@ -126,7 +128,7 @@ def _refined(bench: Bench, frame: Frame, check: tuple[str, ...], seed: int) -> t
     return found, Provenance(inputs, {"seed": seed, "check": list(check), "alpha": 0.05})
 
 
-def _write_folder(out: Path, frame: Frame, documents: dict[str, str]) -> None:
+def _write_folder(out: Path, frame: Frame, documents: dict[str, str | bytes]) -> None:
     """Write all files beside their place first, then move them there: an error leaves what was before.
 
     Raises
@@ -144,8 +146,8 @@ def _write_folder(out: Path, frame: Frame, documents: dict[str, str]) -> None:
         raise InputError(f"cannot be written ({error.strerror})", where=out) from None
     try:
         write_image(draft / "photo_i.png", frame.pixels)
-        for name, text in documents.items():
-            write_whole(draft / name, text)
+        for name, content in documents.items():
+            write_whole(draft / name, content)
         draft.chmod(0o755)
         if not out.exists():
             draft.replace(out)

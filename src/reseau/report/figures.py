@@ -10,7 +10,7 @@ from ..data import Array
 from ..refine import CameraCorrection
 from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 
-__all__ = ["distortion_figure", "nice", "residual_figure"]
+__all__ = ["distortion_figure", "draw_vectors", "nice", "residual_figure"]
 
 _SIZE = (8.6, 3.5)
 
@@ -80,6 +80,26 @@ def _pitch(at: Array) -> float:
     return float(np.median(distance.min(axis=1)))
 
 
+def draw_vectors(axes: Axes, marks: Pair, check: Pair, unit: str, title: str) -> None:
+    """Draw residual vectors at fitted marks and, in red, at check marks, with a scale arrow.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where.
+    marks, check : (ndarray (n, 2), ndarray (n, 2))
+        Positions and vectors.
+    unit : str
+        Of both.
+    title : str
+        Above.
+    """
+    pitch = _pitch(marks[0])
+    _frame_of(axes, np.concatenate([marks[0], check[0]]), pitch)
+    _plane(axes, unit, title)
+    _vectors(axes, marks, check, 0.9 * pitch, unit)
+
+
 def residual_figure(marks: Triple, check: Triple, unit: str) -> str:
     """Vectors that the best similarity leaves, and those that the correction leaves, side by side.
 
@@ -99,13 +119,10 @@ def residual_figure(marks: Triple, check: Triple, unit: str) -> str:
     with drawing():
         figure = Figure(figsize=_SIZE, layout="constrained")
         panels = figure.subplots(1, 2, sharey=True)
-        pitch = _pitch(marks[0])
         for k, (axes, title) in enumerate(
             zip(panels, ("before: best similarity", "after: corrected"), strict=True), start=1
         ):
-            _frame_of(axes, np.concatenate([marks[0], check[0]]), pitch)
-            _plane(axes, unit, title)
-            _vectors(axes, (marks[0], marks[k]), (check[0], check[k]), 0.9 * pitch, unit)
+            draw_vectors(axes, (marks[0], marks[k]), (check[0], check[k]), unit, title)
         panels[0].set_ylabel(f"$\\bar y$ / {unit}")
         return to_svg(figure)
 
