@@ -17,6 +17,7 @@ from .poses import (
     rotation_matrix,
 )
 from .sensor import Sensor, illumination, jpeg, sigma_of_snr, snr_db
+from .strokes import Strokes
 
 __all__ = [
     "Brown",
@@ -35,6 +36,7 @@ __all__ = [
     "RationalPolynomial",
     "Sensor",
     "Similarity",
+    "Strokes",
     "angles_to_matrix",
     "illumination",
     "jpeg",

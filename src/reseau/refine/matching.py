@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ..adjust import BatchAdjustment, BatchOptions, adjust_batch
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline
-from .patches import CONTRAST, LEVEL, WIDTH, MatchOptions, Patches, X, Y
+from .patches import CONTRAST, LEVEL, WIDTH, GrownOutline, MatchOptions, Patches, Shape, X, Y
 
-__all__ = ["SIZE", "MatchOptions", "Matches", "match"]
+__all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "match"]
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
@@ -98,7 +98,7 @@ def _with_rows(whole: Columns, rows: Rows, part: Columns) -> Columns:
 def match(
     pixels: NDArray[Any],
     valid: Mask,
-    outline: Outline,
+    outline: Outline | Shape,
     xy: Array,
     options: MatchOptions,
     *,
@@ -114,8 +114,9 @@ def match(
         Grey values.
     valid : ndarray (h, w) of bool
         Pixels that may be used.
-    outline : Outline
-        Outlines (k, j, 2) in pixels around the point that is to be measured.
+    outline : Outline or Shape
+        Outlines (k, j, 2) in pixels around the point that is to be measured, or a shape of k marks with
+        parameters of its own.
     xy : ndarray (k, 2)
         Approximate positions, good to about the radius of the mark.
     options : MatchOptions
@@ -123,7 +124,7 @@ def match(
     noise : float
         Approximate standard deviation of the grey values; it weighs the priors only.
     form : ndarray (m, 2, 2), optional
-        Generators of the form: the outline is multiplied by 1 + Σ p_i F_i.
+        Generators of the form for an outline: it is multiplied by 1 + Σ p_i F_i.
     form_sigma : ndarray (m,), optional
         Prior standard deviations of the p around 0.
 
@@ -132,7 +133,9 @@ def match(
     Matches
         Of all k; those that failed have `converged` False or a small `t`.
     """
-    patch = Patches(pixels, valid, outline, xy, options, form)
+    if isinstance(outline, Outline):
+        outline = GrownOutline(outline, np.zeros((0, 2, 2)) if form is None else form)
+    patch = Patches(pixels, valid, outline, xy, options)
     free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma

@@ -7,7 +7,7 @@ coefficients of the background, and those of the form, in this order.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["CONTRAST", "LEVEL", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
+__all__ = ["CONTRAST", "LEVEL", "WIDTH", "GrownOutline", "MatchOptions", "Patches", "Shape", "X", "Y"]
 
 X, Y, WIDTH, CONTRAST, LEVEL = range(5)
 
@@ -72,6 +72,53 @@ class MatchOptions:
     start_px: float = 1.0
 
 
+class Shape(Protocol):
+    """What the marks look like: outlines around their points, as functions of parameters of the form."""
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form; all are 0 to begin with."""
+
+    def outline(self, form: Array, at: Rows) -> Outline:
+        """Outlines (m, j, 2) in pixels of the marks `at` with the parameters (m, p)."""
+
+    def motions(self, form: Array, at: Rows) -> Array | None:
+        """Velocities of their nodes for each parameter, (m, p, j, 2); None without parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrownOutline:
+    """Outlines that are multiplied by 1 + Σ p_i F_i.
+
+    Parameters
+    ----------
+    nodes : Outline
+        Outlines (k, j, 2) in pixels.
+    generators : ndarray (p, 2, 2)
+        The F.
+    """
+
+    nodes: Outline
+    generators: Array
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form."""
+        return len(self.generators)
+
+    def outline(self, form: Array, at: Rows) -> Outline:
+        """Outlines with the parameters (m, p)."""
+        xy, dxy = self.nodes.xy[at], self.nodes.dxy[at]
+        if self.parameters:
+            grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
+            xy, dxy = xy @ grown, dxy @ grown
+        return Outline(xy, dxy)
+
+    def motions(self, form: Array, at: Rows) -> Array | None:
+        """Velocities of the nodes."""
+        return np.einsum("pij,knj->kpni", self.generators, self.nodes.xy[at]) if self.parameters else None
+
+
 class Patches:
     """Windows of a frame, and the image formed in them."""
 
@@ -79,14 +126,12 @@ class Patches:
         self,
         pixels: NDArray[Any],
         valid: Mask,
-        outline: Outline,
+        shape: Shape,
         xy: Array,
         options: MatchOptions,
-        form: Array | None,
     ) -> None:
-        self.outline, self.xy, self.options = outline, xy, options
-        self.generators = np.zeros((0, 2, 2)) if form is None else form
-        self.forms = len(self.generators)
+        self.form, self.xy, self.options = shape, xy, options
+        self.forms = shape.parameters
         self.offset = np.arange(-options.half_px, options.half_px + 1)
         u, v = self.offset[None, :] / options.half_px, self.offset[:, None] / options.half_px
         powers = [(i, j) for i in range(options.background + 1) for j in range(options.background + 1 - i)]
@@ -172,11 +217,8 @@ class Patches:
 
     def _placed(self, x: Array, at: Rows) -> Outline:
         """Outlines of the patches `at` where the parameters (m, u) have them."""
-        nodes, steps = self.outline.xy[at], self.outline.dxy[at]
-        if self.forms:
-            grown = np.eye(2) + np.einsum("kp,pij->kij", x[:, self.form_at :], self.generators)
-            nodes, steps = nodes @ np.swapaxes(grown, 1, 2), steps @ np.swapaxes(grown, 1, 2)
-        return Outline(nodes + (self.xy[at] + x[:, :2])[:, None, :], steps)
+        formed = self.form.outline(x[:, self.form_at :], at)
+        return Outline(formed.xy + (self.xy[at] + x[:, :2])[:, None, :], formed.dxy)
 
     def share(self, x: Array) -> Array:
         """Share of each pixel that the marks take, all patches, (k, rows, columns)."""
@@ -185,14 +227,13 @@ class Patches:
 
     def _derivatives(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """That share for the patches `at`, and its derivatives by position, width and form."""
-        motions = np.einsum("pij,knj->kpni", self.generators, self.outline.xy[at]) if self.forms else None
         return coverage_derivatives(
             self._placed(x, at),
             self.columns[at],
             self.rows[at],
             self.width(x),
             self.options.response,
-            motions,
+            self.form.motions(x[:, self.form_at :], at),
         )
 
     def tolerated(self, x: Array) -> Array:
