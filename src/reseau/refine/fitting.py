@@ -62,7 +62,8 @@ def fit_mapping(
     model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
 ) -> Adjustment | Failure:
     """Adjust all parameters of a model; see `mapping_problem`."""
-    if shortage := _shortage(model, points):
+    shortage = _shortage(model, points)
+    if shortage is not None:
         return shortage
     return adjust(mapping_problem(model, points, target, target_sigma))
 
@@ -91,7 +92,8 @@ def reduce_mapping(
     options : Options, optional
         How to adjust.
     """
-    if shortage := _shortage(model, points):
+    shortage = _shortage(model, points)
+    if shortage is not None:
         return shortage
     problem = mapping_problem(model, points, target, target_sigma)
     return eliminate(problem, alpha, criterion, keep, options=options)
