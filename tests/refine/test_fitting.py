@@ -114,10 +114,11 @@ def test_the_sigma_of_the_target_enters():
     one = fit_mapping(model, seen, target, 0.008).required()
     # The model doubles lengths: 0.008 there is 0.004 here.
     both = fit_mapping(model, ImagePoints.with_sigma(NAMES, seen.xy, 0.005), target).required()
-    np.testing.assert_allclose(one.values, both.values, rtol=1e-9)
+    # To the noise of the derivatives the sigma is carried with.
+    np.testing.assert_allclose(one.values, both.values, atol=1e-5)
     size = np.sqrt(np.outer(np.diag(both.cofactor), np.diag(both.cofactor)))
-    np.testing.assert_allclose(one.cofactor / size, both.cofactor / size, atol=1e-9)
-    assert one.cost == pytest.approx(both.cost, rel=1e-9)
+    np.testing.assert_allclose(one.cofactor / size, both.cofactor / size, atol=1e-4)
+    assert one.cost == pytest.approx(both.cost, rel=1e-4)
     neglected = fit_mapping(model, seen, target).required()
     assert neglected.cost > 2 * one.cost
 
@@ -214,3 +215,14 @@ def test_a_fit_is_an_adjustment_with_all_that_belongs_to_it():
     assert isinstance(fit, Adjustment)
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy)
     assert fit.names == RationalPolynomial.camera().names
+
+
+def test_a_projectivity_needs_no_approximate_values():
+    """Pixels, y down, far from the origin: the identity is of no use there."""
+    model = RationalPolynomial.projective().with_values(
+        {"a1": 9.0, "b1": 0.3, "c1": 800.0, "a2": 0.2, "b2": -9.1, "c2": 600.0, "a0": 1e-3, "b0": -7e-4}
+    )
+    fit = fit_mapping(RationalPolynomial.projective(), points(XY), model(XY)).required()
+    np.testing.assert_allclose(fit.values, model.values, rtol=1e-9)
+    near = fit_mapping(model, points(XY), model(XY)).required()
+    np.testing.assert_allclose(near.values, model.values, rtol=1e-9)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..adjust import Adjustment, Elimination, Failure, GaussHelmert, Options, Parameters, adjust, eliminate
 from ..data import Array, ImagePoints
 from ..errors import UsageError
-from ..optics import PlaneMapping
+from ..optics import PlaneMapping, RationalPolynomial
 
 __all__ = ["fit_mapping", "mapping_problem", "reduce_mapping"]
 
@@ -61,11 +61,14 @@ def mapping_problem(
 def fit_mapping(
     model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
 ) -> Adjustment | Failure:
-    """Adjust all parameters of a model; see `mapping_problem`."""
+    """Adjust all parameters of a model; see `mapping_problem`.
+
+    A rational polynomial needs no approximate values: it begins from a linear solution where that is nearer.
+    """
     shortage = _shortage(model, points)
     if shortage is not None:
         return shortage
-    return adjust(mapping_problem(model, points, target, target_sigma))
+    return adjust(mapping_problem(_begun(model, points, target), points, target, target_sigma))
 
 
 def reduce_mapping(
@@ -95,8 +98,43 @@ def reduce_mapping(
     shortage = _shortage(model, points)
     if shortage is not None:
         return shortage
-    problem = mapping_problem(model, points, target, target_sigma)
+    problem = mapping_problem(_begun(model, points, target), points, target, target_sigma)
     return eliminate(problem, alpha, criterion, keep, options=options)
+
+
+def _begun(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:
+    """The model at values that take the points nearer to the target, if a linear solution has such.
+
+    N/(1 + D) + P = T is linear in the parameters of N, D and P when it is multiplied with 1 + D and D·P is
+    left out, the product of two small things.
+    """
+    goal = np.asarray(target, dtype=np.float64)
+    if not isinstance(model, RationalPolynomial) or goal.shape != points.xy.shape:
+        return model
+    if set(model.fixed) - {"X", "Y"} or on_one_line(points.xy):
+        return model
+    at_zero = model.with_values(np.zeros(len(model.names))).derivatives(points.xy)
+    columns = np.array(at_zero.d_parameters)
+    for k, name in enumerate(model.names):
+        text = model.terms[name].get("D")
+        if text is not None:
+            term = {name: {"X": text, "Y": text}}
+            sums = RationalPolynomial(term, np.ones(1), offset=model.offset, scale=model.scale)
+            columns[:, :, k] -= goal * sums(points.xy)
+    matrix = columns.reshape(-1, len(model.names))
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1.0
+    found = np.linalg.lstsq(matrix / size, (goal - at_zero.value).ravel(), rcond=1e-12)[0] / size
+    linear = model.with_values(found)
+    with np.errstate(invalid="ignore"):
+        nearer = np.square(linear(points.xy) - goal).sum() < np.square(model(points.xy) - goal).sum()
+    return linear if nearer else model
+
+
+def on_one_line(xy: Array) -> bool:
+    """Whether points (n, 2) lie on one line, to rounding."""
+    spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+    return len(xy) < 3 or bool(spread[1] <= 1e-9 * spread[0])
 
 
 def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
