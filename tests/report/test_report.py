@@ -16,6 +16,8 @@ from reseau.refine import CameraCorrection
 from reseau.report import photo_i_report
 from reseau.report.comparison import compare_with_truth, comparison_table
 from reseau.report.figures import nice
+from reseau.report.overlay import frame_overlay, preview
+from reseau.report.overview import overview_png
 from reseau_sims import World
 
 NOISE_PX = 0.01
@@ -117,6 +119,28 @@ def test_a_correction_from_a_file_has_nothing_to_show(world: World, found: Photo
     read = CameraCorrection.from_calibration(found.camera.calibration(name="c"))
     with pytest.raises(UsageError, match="was read from a file"):
         photo_i_report(PhotoI(found.points, read, None), world.design)
+
+
+def test_marks_not_found_are_crossed_out_and_those_nobody_expects_are_left_out() -> None:
+    frame = Frame(np.random.default_rng(2).integers(0, 4000, (60, 80)).astype(np.uint16), 65535.0)
+    xy = np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 10.0], [np.nan, np.nan]])
+    ok = np.array([True, False, True, False])
+    drawn = frame_overlay(frame, ("a", "b", "c", "d"), xy, ok, ("c",))
+    assert drawn.count("<circle") == 2
+    assert drawn.count("<path") == 1
+    assert 'cx="10.00" cy="20.00"' in drawn
+    assert len(set(re.findall(r'stroke="(#\w+)"', drawn))) == 3  # fitted, not found, held out
+    grey = preview(frame, 40)
+    assert grey.shape == (30, 40)
+    assert np.ptp(grey) > 100  # stretched
+
+
+def test_the_overview_is_a_small_picture_and_the_same_to_the_byte(world: World, found: PhotoI) -> None:
+    pixels = np.random.default_rng(2).integers(0, 255, (1200, 1600)).astype(np.uint8)
+    first, second = (overview_png(found, Frame(pixels, 255.0), "mm") for _ in range(2))
+    assert first == second
+    assert first.startswith(b"\x89PNG")
+    assert len(first) < 300_000
 
 
 @pytest.mark.parametrize(
