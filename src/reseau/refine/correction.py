@@ -20,7 +20,7 @@ from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
 from .field import SmoothField
-from .fitting import fit_mapping, reduce_mapping
+from .fitting import fit_mapping, on_one_line, reduce_mapping
 
 __all__ = ["CameraCorrection", "correct_camera"]
 
@@ -260,6 +260,8 @@ def correct_camera(
         )
     marks = points.select(known)
     plane = np.array([coordinates[name][:2] for name in known], dtype=np.float64)
+    if on_one_line(plane):
+        return Failure(f"the {len(known)} marks lie on one line and determine nothing across it")
     sigma = np.array([coordinates[name][2] for name in known])
     systems = _common_system(marks, plane, design)
     if isinstance(systems, Failure):
@@ -288,7 +290,8 @@ def correct_camera(
     residuals = (corrected.xy - target)[used]
     local = None
     if used.sum() >= 20:
-        local = SmoothField.fit(target[used], residuals, degree=0, trials=trials)
+        null = _simulated_residuals(reduced, photo.select(used), sigma[used], trials)
+        local = SmoothField.fit(target[used], residuals, degree=0, null=null)
     record = CorrectionFit(
         elimination,
         photo.select(used),
@@ -299,6 +302,18 @@ def correct_camera(
         local,
     )
     return CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit, record)
+
+
+def _simulated_residuals(model: RationalPolynomial, photo: ImagePoints, sigma: Array, trials: int) -> Array:
+    """What an adjustment of this model leaves of the points' errors alone, (trials, n, 2)."""
+    _, slope, by_parameter = model.derivatives(photo.xy)
+    cov = slope @ photo.cov @ np.swapaxes(slope, 1, 2) + sigma[:, None, None] ** 2 * np.eye(2)
+    root = np.linalg.cholesky(cov)
+    taken, _ = np.linalg.qr(np.linalg.solve(root, by_parameter).reshape(2 * len(photo), -1))
+    white = np.random.default_rng(0).standard_normal((trials, 2 * len(photo)))
+    white -= (white @ taken) @ taken.T
+    left: Array = np.einsum("nij,tnj->tni", root, white.reshape(trials, -1, 2))
+    return left
 
 
 def _mapped(system: Similarity, points: ImagePoints) -> ImagePoints:

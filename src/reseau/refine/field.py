@@ -86,6 +86,7 @@ class SmoothField:
         length: float | None = None,
         trials: int = 0,
         seed: int = 0,
+        null: Array | None = None,
     ) -> SmoothField:
         """Fit the field.
 
@@ -105,6 +106,9 @@ class SmoothField:
             Number of simulated fields of white noise for the test of the signal's need; 0: no test.
         seed : int
             Of the simulation.
+        null : ndarray (trials, n, 2), optional
+            Values without a signal to test against instead, where these are not white: the residuals of an
+            adjustment lack what its parameters took.
 
         Raises
         ------
@@ -127,7 +131,11 @@ class SmoothField:
         gains = np.array([_gains(spectrum, vectors.T @ white, ratios) for spectrum, vectors in spectra])
         best = int(gains.max(axis=1).sum(axis=1).argmax())
         at = gains[best].argmax(axis=0)
-        need = _need(spectra, ratios, gains, trials, seed) if trials else np.full(2, np.nan)
+        if null is None:
+            white_noise = np.random.default_rng(seed).standard_normal((1, free.shape[1], trials))
+        else:
+            white_noise = np.einsum("nf,tna->aft", free / relative[:, None], null)
+        need = _need(spectra, ratios, gains, white_noise)
         ratio = ratios[at]
         spectrum, vectors = spectra[best]
         solutions, noise = [], np.empty(2)
@@ -246,14 +254,21 @@ def _gains(spectrum: Array, white: Array, ratios: Array) -> Array:
     return gain - gain[:1]
 
 
-def _need(spectra: list[tuple[Array, Array]], ratios: Array, gains: Array, trials: int, seed: int) -> Array:
-    """Share of simulated fields of white noise whose likelihood gains as much by a signal; exact in level."""
-    count = len(spectra[0][0])
-    white = np.random.default_rng(seed).standard_normal((count, trials))
-    # The vectors of the spectra are those of different bases: the same noise is seen through each.
+def _need(spectra: list[tuple[Array, Array]], ratios: Array, gains: Array, null: Array) -> Array:
+    """Share of simulated fields without a signal whose likelihood gains as much by one; exact in level.
+
+    The simulated fields (1 or 2 axes, free values, trials) are seen through the basis of each spectrum.
+    """
+    trials = null.shape[2]
+    if not trials:
+        return np.full(2, np.nan)
     simulated = np.max(
-        [_gains(values, vectors.T @ white, ratios).max(axis=0) for values, vectors in spectra], axis=0
+        [
+            [_gains(values, vectors.T @ axis, ratios).max(axis=0) for axis in null]
+            for values, vectors in spectra
+        ],
+        axis=0,
     )
     observed = gains.max(axis=(0, 1))
-    need: Array = (1 + (simulated[:, None] >= observed).sum(axis=0)) / (trials + 1)
+    need: Array = (1 + (simulated >= observed[:, None]).sum(axis=1)) / (trials + 1)
     return need
