@@ -312,7 +312,7 @@ def _simulated_residuals(model: RationalPolynomial, photo: ImagePoints, sigma: A
     taken, _ = np.linalg.qr(np.linalg.solve(root, by_parameter).reshape(2 * len(photo), -1))
     white = np.random.default_rng(0).standard_normal((trials, 2 * len(photo)))
     white -= (white @ taken) @ taken.T
-    left: Array = np.einsum("nij,tnj->tni", root, white.reshape(trials, -1, 2))
+    left: Array = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(photo), 2))
     return left
 
 
