@@ -326,6 +326,39 @@ def _common_system(
     marks: ImagePoints, plane: Array, design: ReseauDesign
 ) -> tuple[Similarity, Similarity] | Failure:
     """Pixels and design into the system of O and S, at the scale of the design."""
+    ends = defining_marks(marks, plane, design)
+    if isinstance(ends, Failure):
+        return ends
+    (o, o1), (s, s1) = ends
+    object_system = Similarity.common_system(o1, s1)
+    affine = np.linalg.lstsq(plane - plane.mean(axis=0), marks.xy - marks.xy.mean(axis=0), rcond=None)[0]
+    mirrored = bool(np.linalg.det(affine) < 0)
+    turned = Similarity.common_system(o, s, mirrored=mirrored)
+    scale = np.hypot(*(s1 - o1)) / np.hypot(*(s - o))
+    photo_system = Similarity(turned.values * scale, mirrored=mirrored)
+    return photo_system, object_system
+
+
+def defining_marks(
+    marks: ImagePoints, plane: Array, design: ReseauDesign
+) -> tuple[tuple[Array, Array], tuple[Array, Array]] | Failure:
+    """The two marks that define a system, `origin` and `axis` of the design.
+
+    Parameters
+    ----------
+    marks : ImagePoints
+        Measured marks.
+    plane : ndarray (n, 2)
+        Their designed coordinates.
+    design : ReseauDesign
+        Names the two; without names the mark nearest to the middle and that farthest to its right.
+
+    Returns
+    -------
+    two pairs of ndarray (2,), or Failure
+        For each of the two its place among the marks and its designed coordinates. A mark that was not
+        measured lies where a projectivity through the others has it.
+    """
     row_of = {name: i for i, name in enumerate(marks.names)}
     ends: list[tuple[Array, Array]] = []
     for name in _origin_and_axis(marks, plane, design):
@@ -336,7 +369,6 @@ def _common_system(
         if name in row_of:
             ends.append((marks.xy[row_of[name]], designed))
             continue
-        # O or S was not measured: it lies where a projectivity through the others has it.
         fitted = fit_mapping(
             RationalPolynomial.projective(),
             ImagePoints.with_sigma(marks.names, plane - plane.mean(axis=0), 1.0),
@@ -346,14 +378,7 @@ def _common_system(
             return fitted
         projective = RationalPolynomial.projective().with_values(fitted.values)
         ends.append((projective((designed - plane.mean(axis=0))[None])[0] + marks.xy.mean(axis=0), designed))
-    (o, o1), (s, s1) = ends
-    object_system = Similarity.common_system(o1, s1)
-    affine = np.linalg.lstsq(plane - plane.mean(axis=0), marks.xy - marks.xy.mean(axis=0), rcond=None)[0]
-    mirrored = bool(np.linalg.det(affine) < 0)
-    turned = Similarity.common_system(o, s, mirrored=mirrored)
-    scale = np.hypot(*(s1 - o1)) / np.hypot(*(s - o))
-    photo_system = Similarity(turned.values * scale, mirrored=mirrored)
-    return photo_system, object_system
+    return ends[0], ends[1]
 
 
 def _origin_and_axis(marks: ImagePoints, plane: Array, design: ReseauDesign) -> tuple[str, str]:
