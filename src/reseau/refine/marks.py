@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data import Array, Frame, Mask, Rows
 from ..formats import ReseauDesign
-from ..optics.formation import Outline, mark_outline
+from ..optics.formation import Outline, PixelResponse, mark_outline
 from .field import SmoothField
 from .matching import SIZE, Matches, MatchOptions, match
 from .placing import Placement
@@ -47,6 +47,8 @@ class ReseauOptions:
         First guess of the width (one sigma) of the point-spread function; estimated.
     row_jitter_px : float
         Standard deviation of the shift of single rows, where known.
+    fill : float
+        Light-sensitive part of the pitch of the pixels along either axis, 0 to 1, where known.
     least_t : float
         Least contrast of a mark in units of its standard deviation.
     most_sigma_px : float
@@ -62,6 +64,7 @@ class ReseauOptions:
     mark_px: float | None = None
     psf_px: float = 0.6
     row_jitter_px: float = 0.0
+    fill: float = 1.0
     least_t: float = 3.5
     most_sigma_px: float = 0.5
     neighbour_px: float = 1.0
@@ -128,15 +131,18 @@ class MarkMeasurement:
             psf_px=self.options.psf_px,
             psf_log_sigma=0.5,
             polarity=self.design.polarity,
+            response=PixelResponse(self.options.fill),
             start_px=2.0,
         )
 
-    def _outline(self, at: Rows, psf_px: float) -> Outline:
+    def _outline(self, at: Rows, options: MatchOptions) -> Outline:
         """Outlines of the marks `at` in pixels, as the field maps them."""
+        psf_px = options.psf_px
         jacobian = self.field.jacobian(self.source[at])
         mark = self.design.mark
         width = self.size if mark.shape == "line-grid" else mark.line_width
-        reach = 60.0 / self.px_per_unit
+        # The wires of a crossing end where the window does not see it, turned by whatever angle.
+        reach = (1.5 * options.half_px + 8 * psf_px) / self.px_per_unit
         outline = mark_outline(mark.shape, self.size, width, 0.45 * psf_px / self.px_per_unit, reach).affine(
             jacobian
         )
@@ -147,7 +153,7 @@ class MarkMeasurement:
         return match(
             self.screened.grey,
             self.screened.valid,
-            self._outline(at, options.psf_px),
+            self._outline(at, options),
             start,
             options,
             noise=self.screened.noise,
