@@ -105,6 +105,7 @@ def match(
     noise: float,
     form: Array | None = None,
     form_sigma: Array | None = None,
+    claims: tuple[NDArray[Any], Rows] | None = None,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
 
@@ -127,6 +128,9 @@ def match(
         Generators of the form for an outline: it is multiplied by 1 + Σ p_i F_i.
     form_sigma : ndarray (m,), optional
         Prior standard deviations of the p around 0.
+    claims : tuple, optional
+        Whose each pixel is, (h, w) of int, below 0 for nobody's; and the number (k,) under which each mark
+        claims its own. What belongs to another is not looked at.
 
     Returns
     -------
@@ -135,7 +139,7 @@ def match(
     """
     if isinstance(outline, Outline):
         outline = GrownOutline(outline, np.zeros((0, 2, 2)) if form is None else form)
-    patch = Patches(pixels, valid, outline, xy, options)
+    patch = Patches(pixels, valid, outline, xy, options, claims)
     free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma

@@ -129,6 +129,7 @@ class Patches:
         shape: Shape,
         xy: Array,
         options: MatchOptions,
+        claims: tuple[NDArray[Any], Rows] | None = None,
     ) -> None:
         self.form, self.xy, self.options = shape, xy, options
         self.forms = shape.parameters
@@ -147,7 +148,11 @@ class Patches:
         k = len(xy)
         self.shape = (k, len(self.offset), len(self.offset))
         self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
-        self.weights = (inside & valid[r, c]).reshape(k, -1).astype(np.float64)
+        usable = inside & valid[r, c]
+        if claims is not None:
+            owner, mine = claims
+            usable &= (owner[r, c] < 0) | (owner[r, c] == mine[:, None, None])
+        self.weights = usable.reshape(k, -1).astype(np.float64)
         self.whitener: tuple[Array, Array] | None = None
 
     def start(self, noise: float) -> Array:
