@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -16,7 +17,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from .data import Array, ImagePoints
+from .data import Array, ImagePoints, Mask
 from .errors import FormatError, InputError
 from .provenance import canonical_json
 
@@ -258,6 +259,39 @@ class ReseauMeasurement(Document):
         cov[:, 0, 0], cov[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
         cov[:, 0, 1] = cov[:, 1, 0] = np.array([p.rho or 0.0 for p in ok]) * s[:, 0] * s[:, 1]
         return ImagePoints(tuple(p.id for p in ok), xy, cov)
+
+    @classmethod
+    def from_columns(
+        cls,
+        image: str,
+        sha256: str,
+        ids: Sequence[str],
+        xy: Array,
+        cov: Array,
+        ok: Mask,
+        why: Sequence[str],
+    ) -> Self:
+        """Marks as columns: those that are not `ok` have the reason and no coordinates."""
+        points = []
+        for i, name in enumerate(ids):
+            if not ok[i]:
+                points.append(MeasuredPoint(id=name, ok=False, why=why[i]))
+                continue
+            sx, sy = np.sqrt(np.diagonal(cov[i]))
+            points.append(
+                MeasuredPoint(
+                    id=name,
+                    x=float(xy[i, 0]),
+                    y=float(xy[i, 1]),
+                    sx=float(sx),
+                    sy=float(sy),
+                    rho=float(cov[i, 0, 1] / (sx * sy)),
+                    ok=True,
+                )
+            )
+        return cls(
+            image=image, sha256=sha256, points=tuple(points), found=int(ok.sum()), expected=len(points)
+        )
 
     @classmethod
     def from_image_points(cls, points: ImagePoints, *, image: str, sha256: str) -> Self:

@@ -15,7 +15,7 @@ import numpy as np
 from ..adjust import Failure
 from ..data import Array, Frame, ImagePoints, Mask, Rows
 from ..errors import UsageError
-from ..formats import MeasuredPoint, ReseauDesign, ReseauMeasurement
+from ..formats import ReseauDesign, ReseauMeasurement
 from .field import SmoothField
 from .grid import GridOptions
 from .marks import MarkMeasurement, ReseauOptions, Verdict
@@ -94,29 +94,8 @@ class ReseauResult:
 
     def measurement(self) -> ReseauMeasurement:
         """The result as the document that others read."""
-        points = []
-        for i, name in enumerate(self.ids):
-            if not self.ok[i]:
-                points.append(MeasuredPoint(id=name, ok=False, why=self.why[i]))
-                continue
-            sx, sy = np.sqrt(np.diagonal(self.cov[i]))
-            points.append(
-                MeasuredPoint(
-                    id=name,
-                    x=float(self.xy[i, 0]),
-                    y=float(self.xy[i, 1]),
-                    sx=float(sx),
-                    sy=float(sy),
-                    rho=float(self.cov[i, 0, 1] / (sx * sy)),
-                    ok=True,
-                )
-            )
-        return ReseauMeasurement(
-            image=self.image,
-            sha256=self.sha256,
-            points=tuple(points),
-            found=self.found,
-            expected=len(self.ids),
+        return ReseauMeasurement.from_columns(
+            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
         )
 
 

@@ -42,7 +42,7 @@ class Screened:
     noise: float
 
 
-def screen(frame: Frame, run: int) -> Screened:
+def screen(frame: Frame, run: int | None) -> Screened:
     """Find the pixels that carry an image, level the borders, estimate the noise.
 
     Parameters
@@ -51,7 +51,8 @@ def screen(frame: Frame, run: int) -> Screened:
         The frame.
     run : int
         Length in pixels from which a straight run of the least or greatest grey value counts as lost; several
-        times the size of a mark.
+        times the size of a mark. None where marks shine on a black ground: nothing black is lost there, and
+        no border is uneven.
 
     Raises
     ------
@@ -66,6 +67,9 @@ def screen(frame: Frame, run: int) -> Screened:
     if (share := float(np.mean(pixels >= frame.full_scale))) > 0.9:
         raise ImageError(f"is saturated over {share:.0%} of its area", where=frame.name, do="expose it less")
     grey = pixels.astype(np.float32)
+    if run is None:
+        valid = np.ones(pixels.shape, dtype=bool)
+        return Screened(grey, valid, _noise(pixels, valid))
     valid = ~_lost(pixels, run)
     if (share := float(np.mean(valid & (pixels > low)))) < 0.02:
         raise ImageError(f"is black over {1 - share:.0%} of its area", where=frame.name, do="expose it more")
