@@ -1,0 +1,279 @@
+"""The correction of an ultrasonic instrument by one frame of a test object: group B of Wishahy's procedure.
+
+The rods' images, refined of group A, are held against the rods' coordinates, scaled to the photograph (λ1,
+λ2) and carried into the common system by the rods M and N. What the two differ by is the instrument's doing:
+the beam, the electronics, the display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..adjust import Adjustment, Elimination, Failure, Options
+from ..data import Array, ImagePoints
+from ..formats import ReseauDesign
+from ..optics import RationalPolynomial, Similarity
+from .correction import CameraCorrection, defining_marks
+from .fitting import reduce_mapping
+
+__all__ = ["InstrumentCorrection", "InstrumentFit", "ObjectPlane", "correct_instrument"]
+
+_DATUM = ("A0", "A1", "A2", "B0", "B1", "B2")
+"""Coefficients that take up the errors of M, N and the scales by which the systems are joined: they stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPlane:
+    """Coordinates of the test object and the common system.
+
+    Parameters
+    ----------
+    axes : Similarity
+        Object coordinates into the system of the rods M (origin) and N (on the axis), unscaled.
+    scale : ndarray (2,)
+        λ1 and λ2: of the photograph along that axis and across it.
+    system : Similarity
+        The scaled system into the common one: M onto its image M', N onto N'.
+    """
+
+    axes: Similarity
+    scale: Array
+    system: Similarity
+
+    def to_common(self, xy: Array) -> Array:
+        """Object coordinates (n, 2) in the common system."""
+        return self.system(self.axes(xy) * self.scale)
+
+    def from_common(self, xy: Array) -> Array:
+        """Coordinates of the common system (n, 2) as object coordinates."""
+        return self.axes.inverse(self.system.inverse(xy) / self.scale)
+
+    @property
+    def slope(self) -> Array:
+        """Derivatives of `from_common`, (2, 2); the same everywhere."""
+        ends = self.from_common(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        return np.stack([ends[1] - ends[0], ends[2] - ends[0]], axis=1)
+
+    @property
+    def rotation(self) -> float:
+        """Angle (rad) from the x-axis of the common system to that of the object."""
+        along = self.to_common(np.array([[0.0, 0.0], [1.0, 0.0]]))
+        return float(np.arctan2(*(along[1] - along[0])[::-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentFit:
+    """How the correction of an instrument came about.
+
+    Parameters
+    ----------
+    elimination : Elimination
+        The record of the tests of all coefficients.
+    points : ImagePoints
+        Photo-coordinates of the rods in the common system, refined of group A; covariances of the measurement
+        alone.
+    target : ndarray (n, 2)
+        The rods' coordinates there.
+    check : ImagePoints
+        Rods held out, in object coordinates.
+    check_target : ndarray (c, 2)
+        Their designed object coordinates.
+    """
+
+    elimination: Elimination
+    points: ImagePoints
+    target: Array
+    check: ImagePoints
+    check_target: Array
+
+    @property
+    def adjustment(self) -> Adjustment:
+        """With the coefficients that remained."""
+        return self.elimination.adjustment
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentCorrection:
+    """From pixels to the object's plane, refined of group A and group B.
+
+    Parameters
+    ----------
+    camera : CameraCorrection
+        Group A.
+    model : RationalPolynomial
+        Group B: refined photo-coordinates to coordinates of the object, both in the common system.
+    plane : ObjectPlane
+        Between the common system and object coordinates.
+    covariance : ndarray (a + b, a + b)
+        Of the coefficients of both groups, those of the camera first. Group B was fitted behind group A: what
+        is wrong in the one is in part taken up by the other, and their covariance says how much.
+    unit : str
+        Of object coordinates.
+    fit : InstrumentFit, optional
+        How the model came about; None for one read from a calibration.
+    """
+
+    camera: CameraCorrection
+    model: RationalPolynomial
+    plane: ObjectPlane
+    covariance: Array
+    unit: str
+    fit: InstrumentFit | None = None
+
+    def __bool__(self) -> bool:
+        return True
+
+    def required(self) -> InstrumentCorrection:
+        """The correction itself; see :meth:`reseau.adjust.Failure.required`."""
+        return self
+
+    def in_common_system(self, points: ImagePoints) -> ImagePoints:
+        """True coordinates of points in pixels, in the common system, with propagated covariances."""
+        system, camera = self.camera.photo_system, self.camera.model
+        photo, by_pixel, _ = system.derivatives(points.xy)
+        refined, by_photo, by_a = camera.derivatives(photo)
+        value, by_refined, by_b = self.model.derivatives(refined)
+        slope = by_refined @ by_photo @ by_pixel
+        by_both = np.concatenate([by_refined @ by_a, by_b], axis=2)
+        cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
+        cov = cov + by_both @ self.covariance @ np.swapaxes(by_both, 1, 2)
+        return ImagePoints(points.names, value, cov)
+
+    def apply(self, points: ImagePoints) -> ImagePoints:
+        """True object coordinates of points in pixels (Wishahy, step viii), with propagated covariances."""
+        common, slope = self.in_common_system(points), self.plane.slope
+        return ImagePoints(points.names, self.plane.from_common(common.xy), slope @ common.cov @ slope.T)
+
+
+def correct_instrument(
+    points: ImagePoints,
+    design: ReseauDesign,
+    camera: CameraCorrection,
+    *,
+    model: RationalPolynomial | None = None,
+    alpha: float = 0.05,
+    criterion: Literal["t", "chi2", "F"] = "F",
+    check: Iterable[str] = (),
+) -> InstrumentCorrection | Failure:
+    """Correct an instrument by the rods of a test object (Wishahy, steps iv–vii).
+
+    Parameters
+    ----------
+    points : ImagePoints
+        Images of the rods in pixels, referred to PHOTO I.
+    design : ReseauDesign
+        The rods; `origin` and `axis` name M and N. The sigmas of its points are the rods' tolerance.
+    camera : CameraCorrection
+        Group A.
+    model : RationalPolynomial, optional
+        By default equations (7a, b).
+    alpha : float
+        Level of the tests of the coefficients; those not significant are dropped one by one.
+    criterion : {"t", "chi2", "F"}
+        The test.
+    check : iterable of str
+        Rods held out, for an independent check.
+
+    Returns
+    -------
+    InstrumentCorrection or Failure
+        A failure when there are too few rods, or the adjustment fails.
+    """
+    model = RationalPolynomial.ultrasonic() if model is None else model
+    coordinates = {p.id: (p.x, p.y, p.sigma or 0.0) for p in design.points if p.x is not None}
+    known = [name for name in points.names if name in coordinates]
+    if len(known) < 4:
+        return Failure(
+            f"{len(known)} of {len(points)} points are rods with coordinates in design {design.name!r}; "
+            "four are needed at least"
+        )
+    rods = points.select(known)
+    table = np.array([coordinates[name] for name in known], dtype=np.float64)
+    # (vi) refined of group A; (iv, v) object coordinates scaled, and into the common system
+    refined = _refined(camera, rods)
+    plane = _object_plane(refined, table[:, :2], design)
+    if isinstance(plane, Failure):
+        return plane
+    target = plane.to_common(table[:, :2])
+    used = ~np.isin(known, list(check))
+    # (vii) equations (7a, b)
+    elimination = reduce_mapping(
+        model,
+        refined.select(used),
+        target[used],
+        table[used, 2:] * plane.scale,
+        alpha=alpha,
+        criterion=criterion,
+        keep=[name for name in _DATUM if name in model.names],
+        options=Options(scale="a-priori"),
+    )
+    if isinstance(elimination, Failure):
+        return elimination
+    fit = elimination.adjustment
+    full = model.with_values(fit.values)
+    rows = [full.names.index(name) for name in full.names if name not in elimination.dropped]
+    covariance = _joint_covariance(camera, rods.select(used), full, fit, rows)
+    reduced = full.without(*elimination.dropped)
+    correction = InstrumentCorrection(camera, reduced, plane, covariance, design.unit)
+    record = InstrumentFit(
+        elimination,
+        refined.select(used),
+        target[used],
+        correction.apply(rods.select(~used)),
+        table[~used, :2],
+    )
+    return InstrumentCorrection(camera, reduced, plane, covariance, design.unit, record)
+
+
+def _refined(camera: CameraCorrection, points: ImagePoints) -> ImagePoints:
+    """Points refined of group A, with the covariances of their measurement alone."""
+    photo, by_pixel, _ = camera.photo_system.derivatives(points.xy)
+    value, by_photo, _ = camera.model.derivatives(photo)
+    slope = by_photo @ by_pixel
+    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
+
+
+def _object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> ObjectPlane | Failure:
+    """Scales λ1, λ2 and the system that M and N define."""
+    ends = defining_marks(refined, plane, design)
+    if isinstance(ends, Failure):
+        return ends
+    (m_image, m), (n_image, n) = ends
+    affine = np.linalg.lstsq(plane - plane.mean(axis=0), refined.xy - refined.xy.mean(axis=0), rcond=None)[0]
+    mirrored = bool(np.linalg.det(affine) < 0)
+    axes = Similarity.common_system(m, n, mirrored=mirrored)
+    inverse = Similarity.common_system(m_image, n_image)
+    local, seen = axes(plane), inverse(refined.xy)
+    across = float(local[:, 1] @ local[:, 1])
+    if not across > 0:
+        return Failure(f"the rods of design {design.name!r} lie on one line with M and N; λ2 is undetermined")
+    scale = np.array([np.hypot(*(n_image - m_image)) / np.hypot(*(n - m)), local[:, 1] @ seen[:, 1] / across])
+    a, b = inverse.values[2:]
+    system = Similarity(np.array([*m_image, a, -b]))
+    return ObjectPlane(axes, scale, system)
+
+
+def _joint_covariance(
+    camera: CameraCorrection, rods: ImagePoints, model: RationalPolynomial, fit: Adjustment, rows: list[int]
+) -> Array:
+    """Covariance of the coefficients of both groups.
+
+    Group B's estimates follow an error δ of group A's by −Q Aᵀ W G δ, with A and W the design and the weights
+    of its adjustment, Q its cofactor matrix and G the derivatives of its conditions by group A's
+    coefficients.
+    """
+    photo = camera.photo_system(rods.xy)
+    refined, _, by_a = camera.model.derivatives(photo)
+    _, by_refined, by_b = model.derivatives(refined)
+    conditions = by_refined @ by_a
+    cofactors = by_refined @ np.asarray(fit.problem.covariance) @ np.swapaxes(by_refined, 1, 2)
+    weights = np.linalg.inv(cofactors)
+    q_b = fit.cofactor[np.ix_(rows, rows)]
+    moved = -q_b @ np.einsum("nib,nij,nja->ba", by_b[:, :, rows], weights, conditions)
+    q_a = camera.cofactor
+    cross = moved @ q_a
+    return np.block([[q_a, cross.T], [cross, q_b + cross @ moved.T]])

@@ -1,0 +1,103 @@
+"""Group B: an instrument is corrected by the rods of a test object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.adjust import Failure
+from reseau.data import ImagePoints
+from reseau.refine import correct_camera
+from reseau.refine.instrument import correct_instrument
+
+from .oscilloscope import INSTRUMENT, RESEAU, RODS, SCALE, displayed, measured, pixels, reseau_marks
+
+_BODY = np.array([[30.0, 30.0], [60.0, 50.0], [80.0, 70.0], [20.0, 65.0]])
+_ALL = 1 - 1e-9
+"""A level at which every coefficient is significant: nothing is dropped."""
+
+
+def _noise_free():
+    marks = ImagePoints.with_sigma(RESEAU.ids, pixels(RESEAU.xy), 0.01)
+    camera = correct_camera(marks, RESEAU, trials=0, alpha=_ALL).required()
+    rods = ImagePoints.with_sigma(RODS.ids, displayed(RODS.xy), 0.01)
+    return camera, rods
+
+
+def test_without_noise_object_coordinates_come_out_as_they_are():
+    camera, rods = _noise_free()
+    found = correct_instrument(rods, RODS, camera, alpha=_ALL).required()
+    body = ImagePoints.with_sigma("abcd", displayed(_BODY), 0.01)
+    # The camera's model and the instrument's, each through the other's inverse: to a micrometre.
+    np.testing.assert_allclose(found.apply(body).xy, _BODY, atol=1e-3)
+
+
+def test_scales_and_rotation_are_those_of_the_display():
+    camera, rods = _noise_free()
+    plane = correct_instrument(rods, RODS, camera).required().plane
+    # λ contains the display's own scale, 1/A1 and 1/B1.
+    np.testing.assert_allclose(plane.scale, SCALE / [1.01, 0.99], rtol=0.01)
+    assert abs(plane.rotation) < 0.02
+    np.testing.assert_allclose(plane.from_common(plane.to_common(_BODY)), _BODY, atol=1e-10)
+
+
+def test_m_and_n_define_the_system():
+    camera, rods = _noise_free()
+    found = correct_instrument(rods, RODS, camera).required()
+    m, n = (RODS.ids.index(name) for name in (RODS.origin, RODS.axis))
+    refined = camera.model(camera.photo_system(rods.xy))
+    ends = found.plane.to_common(RODS.xy[[m, n]])
+    np.testing.assert_allclose(ends, refined[[m, n]], atol=1e-9)
+
+
+def test_predicted_covariances_of_true_coordinates_cover():
+    rng, trials = np.random.default_rng(1), 80
+    squares = []
+    for _ in range(trials):
+        camera = correct_camera(reseau_marks(rng), RESEAU, trials=0, alpha=_ALL).required()
+        real = RODS.xy + rng.normal(0, 0.05, RODS.xy.shape)
+        rods = measured(RODS.ids, displayed(real), rng)
+        found = correct_instrument(rods, RODS, camera, alpha=_ALL).required()
+        true = found.apply(measured(tuple("abcd"), displayed(_BODY), rng))
+        error = np.linalg.solve(np.linalg.cholesky(true.cov), (true.xy - _BODY)[..., None])[..., 0]
+        squares.append(error**2)
+    rms = np.sqrt(np.mean(squares))
+    # The four points share a fit, so that a trial counts for little more than two numbers.
+    assert abs(rms - 1) < 4 / np.sqrt(4 * trials)
+
+
+def test_coefficients_that_are_not_there_are_dropped_and_the_datum_is_kept():
+    rng = np.random.default_rng(2)
+    camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
+    found = correct_instrument(measured(RODS.ids, displayed(RODS.xy), rng), RODS, camera).required()
+    kept = set(found.model.names)
+    assert {"A0", "A1", "A2", "B0", "B1", "B2"} <= kept
+    assert len(kept) < len(INSTRUMENT.names)
+    assert found.covariance.shape == (len(camera.model.names) + len(kept),) * 2
+
+
+def test_rods_held_out_are_predicted():
+    rng = np.random.default_rng(3)
+    camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
+    held = ("r7", "r12", "r17")
+    found = correct_instrument(
+        measured(RODS.ids, displayed(RODS.xy), rng), RODS, camera, alpha=_ALL, check=held
+    ).required()
+    assert found.fit.check.names == held
+    normalised = (found.fit.check.xy - found.fit.check_target) / found.fit.check.sigma
+    assert np.abs(normalised).max() < 4
+
+
+@pytest.mark.parametrize(("count", "said"), [(3, "four are needed"), (6, "fewer than the 16 parameters")])
+def test_too_few_rods_are_said(count, said):
+    camera, rods = _noise_free()
+    found = correct_instrument(rods.select(rods.names[:count]), RODS, camera)
+    assert isinstance(found, Failure)
+    assert said in found.reason
+
+
+def test_rods_on_one_line_leave_the_second_scale_undetermined():
+    camera, rods = _noise_free()
+    found = correct_instrument(rods.select(["r0", "r1", "r2", "r3", "r4"]), RODS, camera)
+    assert isinstance(found, Failure)
+    assert "λ2" in found.reason or "fewer" in found.reason

@@ -1,0 +1,50 @@
+"""A photograph is referred to PHOTO I, and a camera that moved is noticed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reseau.adjust import Failure
+from reseau.optics import Similarity
+from reseau.refine import correct_camera
+from reseau.refine.registration import register
+
+from .oscilloscope import RESEAU, SIGMA_PX, measured, pixels, reseau_marks
+
+
+def _camera(seed: int = 0):
+    return correct_camera(reseau_marks(np.random.default_rng(seed)), RESEAU, trials=0).required()
+
+
+def test_a_camera_that_stood_still_is_not_said_to_have_moved():
+    # PHOTO I anew for each: its own errors are part of the test's level.
+    found = [register(reseau_marks(np.random.default_rng(100 + s)), RESEAU, _camera(s)) for s in range(40)]
+    assert not any(r.moved for r in found)
+    assert max(r.displacement_px for r in found) < 0.02
+    # At level 0.05 more than 8 of 40 have a probability of 1e-4.
+    assert sum(r.p < 0.05 for r in found) <= 8
+
+
+def test_a_moved_camera_is_noticed_and_its_photograph_carried_back():
+    moved = Similarity(np.array([0.5, -0.3, 1.0002, 0.0003]))
+    marks = measured(RESEAU.ids, moved(pixels(RESEAU.xy)), np.random.default_rng(1))
+    found = register(marks, RESEAU, _camera())
+    assert found.moved
+    back = found.apply(marks).xy - pixels(RESEAU.xy)
+    # 165 marks carry the photograph back to a tenth of what one of them scatters.
+    assert np.abs(back.mean(axis=0)).max() < 0.3 * SIGMA_PX
+    assert np.abs(back).max() < 5 * SIGMA_PX
+
+
+def test_a_tilted_photograph_shows_in_the_standard_deviation_of_unit_weight():
+    xy = pixels(RESEAU.xy)
+    tilted = xy * (1 + 2e-6 * (xy[:, :1] - 800))
+    found = register(measured(RESEAU.ids, tilted, np.random.default_rng(2)), RESEAU, _camera())
+    assert found.sigma0 > 5
+
+
+def test_three_marks_do_not_refer_a_photograph():
+    marks = reseau_marks(np.random.default_rng(3))
+    found = register(marks.select(marks.names[:3]), RESEAU, _camera())
+    assert isinstance(found, Failure)
+    assert "3 marks" in found.reason
