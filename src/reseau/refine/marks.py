@@ -11,6 +11,7 @@ from ..formats import ReseauDesign
 from ..optics.formation import Outline, PixelResponse, mark_outline
 from .field import SmoothField
 from .matching import SIZE, Matches, MatchOptions, match
+from .noise import grey_variance
 from .placing import Placement
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
@@ -107,7 +108,7 @@ class MarkMeasurement:
         first = self._match(
             strongest, placed.at[strongest], self._first_options(), 0.3 if self.free_size else 0.1
         )
-        self._learn(first)
+        self._learn(first, placed.at[strongest])
         at = np.flatnonzero(self._near_frame(self.predicted))
         found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
         self._refit(at, found)
@@ -170,9 +171,10 @@ class MarkMeasurement:
             self.field = SmoothField.fit(self.source[at[sure]], found.xy[sure], sigma=relative)
             self.predicted = self.field(self.source)
 
-    def _learn(self, first: Matches) -> None:
-        """What the marks of this frame look like: width, contrast, size."""
+    def _learn(self, first: Matches, start: Array) -> None:
+        """What the marks of this frame look like: width, contrast, size; and its noise."""
         sure = _sure(first)
+        self.variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
         if sure.sum() < 5:
             self.psf_px, self.psf_spread = self.options.psf_px, 0.3
             self.contrast, self.contrast_spread, self.size_spread = None, np.inf, 0.1
@@ -195,6 +197,7 @@ class MarkMeasurement:
             contrast_sigma=self.contrast_spread,
             row_jitter_px=self.options.row_jitter_px,
             start_px=1.0,
+            variance=self.variance,
         )
         found = self._match(at, start, options, self.size_spread)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf

@@ -158,7 +158,7 @@ def match(
             lambda x, at: patch.form_image(x, rows[at]),
             start_at[rows],
             patch.grey[rows],
-            weights=used[rows] / scale[rows] ** 2,
+            weights=used[rows] * patch.course[rows] / scale[rows] ** 2,
             prior=(start[rows], free),
             options=BatchOptions(tolerance=tolerance, max_iterations=40),
         )
@@ -178,7 +178,8 @@ def match(
             break
         used, scale = kept, np.where(np.isin(every, changed)[:, None], rougher, scale)
         found = _with_rows(found, changed, adjust(changed, found.estimates))
-    if options.row_jitter_px > 0:
+    for _ in range(2 if options.row_jitter_px > 0 else 0):
+        # The residuals hold the jitter the first time; then they are whitened, and tell the noise alone.
         patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
         found = adjust(every, found.estimates)
     return _columns(patch, found, used > 0, scale[:, 0])

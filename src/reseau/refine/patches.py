@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
+from .noise import course
 
 __all__ = ["CONTRAST", "LEVEL", "WIDTH", "GrownOutline", "MatchOptions", "Patches", "Shape", "X", "Y"]
 
@@ -57,6 +58,9 @@ class MatchOptions:
         Degree of the polynomial that the background is: 1, or 2 amid a scene.
     start_px : float
         How far the approximate positions may be off.
+    variance : (float, float), optional
+        Variance of a grey value g as a + b·g, of which only the course counts; see
+        :func:`reseau.refine.noise.grey_variance`. By default all are alike.
     """
 
     half_px: int = 6
@@ -70,6 +74,7 @@ class MatchOptions:
     row_jitter_px: float = 0.0
     background: int = 1
     start_px: float = 1.0
+    variance: tuple[float, float] | None = None
 
 
 class Shape(Protocol):
@@ -153,6 +158,7 @@ class Patches:
             owner, mine = claims
             usable &= (owner[r, c] < 0) | (owner[r, c] == mine[:, None, None])
         self.weights = usable.reshape(k, -1).astype(np.float64)
+        self.course = np.ones(self.grey.shape)
         self.whitener: tuple[Array, Array] | None = None
 
     def start(self, noise: float) -> Array:
@@ -187,6 +193,9 @@ class Patches:
         else:
             top = np.where(self.weights > 0, self.grey - fitted @ design.T, 0.0)
             x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
+        if self.options.variance is not None:
+            grey, _ = self.form_image(x, np.arange(len(x)))
+            self.course = course(grey, self.options.variance)
         return x
 
     def width(self, x: Array) -> Array:
@@ -257,12 +266,14 @@ class Patches:
     def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
         """Take an error of each row, jitter × slope along x, into the stochastic model.
 
-        The covariance of a row is σ²(I + q² g gᵀ) with the slope g of the formed image and q = jitter/σ. Its
-        inverse square root I − g gᵀ(1 − (1 + q² gᵀg)^(−1/2))/gᵀg makes the residuals of a row independent.
+        The covariance of a row is σ²(W⁻¹ + q² g gᵀ) with the slope g of the formed image, q = jitter/σ, and
+        the weights W of the pixels. I − g gᵀW (1 − (1 + q² gᵀWg)^(−1/2))/gᵀWg makes the residuals of a row
+        independent, of the weights W.
         """
+        self.whitener = None
         _, jacobian = self.form_image(x, np.arange(len(self.xy)))
         slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
-        length2 = (slope**2).sum(axis=2, keepdims=True)
+        length2 = (self.course.reshape(self.shape) * slope**2).sum(axis=2, keepdims=True)
         q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2
         factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
         self.whitener = (slope, factor)
@@ -272,8 +283,9 @@ class Patches:
         slope, factor = self.whitener[0][at], self.whitener[1][at]
         m, rows, columns = slope.shape
         v = (grey - self.grey[at]).reshape(m, rows, columns)
-        v = v - slope * factor * (slope * v).sum(axis=2, keepdims=True)
+        weighted = slope * factor * self.course[at].reshape(slope.shape)
+        v = v - slope * (weighted * v).sum(axis=2, keepdims=True)
         j = jacobian.reshape(m, rows, columns, -1)
-        along = np.einsum("mrc,mrcu->mru", slope * factor, j)
+        along = np.einsum("mrc,mrcu->mru", weighted, j)
         j = j - slope[..., None] * along[:, :, None, :]
         return self.grey[at] + v.reshape(m, -1), j.reshape(m, rows * columns, -1)
