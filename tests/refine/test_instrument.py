@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Failure
+from reseau.calibration import Calibration
 from reseau.data import ImagePoints
+from reseau.errors import FormatError
 from reseau.refine import correct_camera
-from reseau.refine.instrument import correct_instrument
+from reseau.refine.instrument import InstrumentCorrection, correct_instrument
 
 from .oscilloscope import INSTRUMENT, RESEAU, RODS, SCALE, displayed, measured, pixels, reseau_marks
 
@@ -101,3 +103,23 @@ def test_rods_on_one_line_leave_the_second_scale_undetermined():
     found = correct_instrument(rods.select(["r0", "r1", "r2", "r3", "r4"]), RODS, camera)
     assert isinstance(found, Failure)
     assert "λ2" in found.reason or "fewer" in found.reason
+
+
+def test_a_calibration_of_both_groups_is_read_back_as_it_was_written():
+    rng = np.random.default_rng(4)
+    camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
+    found = correct_instrument(measured(RODS.ids, displayed(RODS.xy), rng), RODS, camera).required()
+    written = found.calibration(RESEAU, RODS, name="bench")
+    text = written.to_json()
+    back, reseau, rods = InstrumentCorrection.from_calibration(Calibration.parse(text, where="file"))
+    assert (reseau, rods) == (RESEAU, RODS)
+    assert back.calibration(reseau, rods, name="bench").covariance == written.covariance
+    body = measured(tuple("abcd"), displayed(_BODY), rng)
+    np.testing.assert_array_equal(back.apply(body).xy, found.apply(body).xy)
+    np.testing.assert_allclose(back.apply(body).cov, found.apply(body).cov, rtol=1e-12)
+
+
+def test_a_calibration_of_the_camera_alone_is_refused_with_what_to_do():
+    camera = correct_camera(reseau_marks(np.random.default_rng(5)), RESEAU, trials=0).required()
+    with pytest.raises(FormatError, match="camera alone; make it with a PHOTO II"):
+        InstrumentCorrection.from_calibration(camera.calibration(name="bench"))

@@ -20,11 +20,12 @@ from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
 from .field import SmoothField
-from .fitting import fit_mapping, on_one_line, reduce_mapping
+from .fitting import fit_mapping, on_one_line, reduce_mapping, tests_of
 
 __all__ = ["CameraCorrection", "correct_camera"]
 
 _MODEL = "oscilloscope group A"
+_MODELS = (_MODEL, f"{_MODEL} and group B")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class CameraCorrection:
         free = [i for i, s in enumerate(sigma) if s > 0]
         names = self.model.names
         parameters = {
-            key: Quantity(value=float(value), sigma=float(s), unit=_unit_of(self.model, key, self.unit))
+            key: Quantity(value=float(value), sigma=float(s), unit=unit_of(self.model, key, self.unit))
             for key, value, s in zip(names, self.model.values, sigma, strict=True)
         }
         matrix = self.cofactor[np.ix_(free, free)]
@@ -106,8 +107,8 @@ class CameraCorrection:
                 "name": _MODEL,
                 "unit": self.unit,
                 "mapping": self.model.to_dict(values=False),
-                "photo_system": _system_to_dict(self.photo_system),
-                "object_system": _system_to_dict(self.object_system),
+                "photo_system": system_to_dict(self.photo_system),
+                "object_system": system_to_dict(self.object_system),
             },
             parameters=parameters,
             covariance=Covariance(
@@ -131,11 +132,11 @@ class CameraCorrection:
             When the calibration is of another kind.
         """
         content = calibration.model
-        if not isinstance(content, dict) or content.get("name") != _MODEL:
+        if not isinstance(content, dict) or content.get("name") not in _MODELS:
             raise FormatError(f"is no calibration of {_MODEL}", where=f"calibration {calibration.name}")
         try:
-            model = RationalPolynomial.from_dict(content["mapping"]).with_values(calibration.values())
-            systems = [_system_from_dict(content[key]) for key in ("photo_system", "object_system")]
+            model = with_stored_values(RationalPolynomial.from_dict(content["mapping"]), calibration)
+            systems = [system_from_dict(content[key]) for key in ("photo_system", "object_system")]
             unit = str(content["unit"])
             row_of = {name: i for i, name in enumerate(calibration.parameters)}
             order = [row_of[name] for name in model.names]
@@ -189,19 +190,7 @@ class CorrectionFit:
 
     def tests(self) -> tuple[dict[str, Any], ...]:
         """Of every coefficient, dropped ones first and in their order, as in the calibration file."""
-        dropped = [(step.test, "dropped") for step in self.elimination.steps]
-        kept = [(test, "kept") for test in self.elimination.kept]
-        return tuple(
-            {
-                "parameter": test.name,
-                "distribution": test.distribution,
-                "statistic": float(test.statistic),
-                "critical": float(test.critical),
-                "p": float(test.p),
-                "verdict": verdict,
-            }
-            for test, verdict in dropped + kept
-        )
+        return tests_of(self.elimination)
 
     def validity(self) -> dict[str, Any]:
         """Where the correction holds: the extent of its marks in the common system."""
@@ -395,18 +384,24 @@ def _origin_and_axis(marks: ImagePoints, plane: Array, design: ReseauDesign) -> 
     return origin, axis
 
 
-def _unit_of(model: RationalPolynomial, name: str, unit: str) -> str:
+def with_stored_values(model: RationalPolynomial, calibration: Calibration) -> RationalPolynomial:
+    """The model with its parameters' values of a calibration file, which may hold those of others too."""
+    values = calibration.values()
+    return model.with_values(np.array([values[name] for name in model.names]))
+
+
+def unit_of(model: RationalPolynomial, name: str, unit: str) -> str:
     """Unit of a coefficient: that of X over the power of its monomials."""
     part, text = next(iter(model.terms[name].items()))
     exponent = (0 if part == "D" else 1) - max(i + j for i, j in monomials(text))
     return "1" if exponent == 0 else unit if exponent == 1 else f"{unit}^{exponent}"
 
 
-def _system_to_dict(system: Similarity) -> dict[str, Any]:
+def system_to_dict(system: Similarity) -> dict[str, Any]:
     values = dict(zip(system.names, map(float, system.values), strict=True))
     return values | {"mirrored": system.mirrored}
 
 
-def _system_from_dict(content: dict[str, Any]) -> Similarity:
+def system_from_dict(content: dict[str, Any]) -> Similarity:
     values = np.array([float(content[name]) for name in Similarity.names])
     return Similarity(values, bool(content["mirrored"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from ..data import Array, ImagePoints
 from ..errors import UsageError
 from ..optics import PlaneMapping, RationalPolynomial
 
-__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping"]
+__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping", "tests_of"]
 
 
 def mapping_problem(
@@ -145,3 +145,20 @@ def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
             f"fewer than the {len(model.names)} parameters of the model"
         )
     return None
+
+
+def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
+    """Tests of every coefficient, dropped ones first in their order, as in a calibration file."""
+    dropped = [(step.test, "dropped") for step in elimination.steps]
+    kept = [(test, "kept") for test in elimination.kept]
+    return tuple(
+        {
+            "parameter": test.name,
+            "distribution": test.distribution,
+            "statistic": float(test.statistic),
+            "critical": float(test.critical),
+            "p": float(test.p),
+            "verdict": verdict,
+        }
+        for test, verdict in dropped + kept
+    )

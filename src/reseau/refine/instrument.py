@@ -9,16 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..adjust import Adjustment, Elimination, Failure, Options
+from ..calibration import Calibration, Covariance, Quantity
 from ..data import Array, ImagePoints
+from ..errors import FormatError, UsageError
 from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
-from .correction import CameraCorrection, defining_marks
-from .fitting import reduce_mapping
+from ..provenance import canonical_json
+from .correction import (
+    CameraCorrection,
+    defining_marks,
+    system_from_dict,
+    system_to_dict,
+    unit_of,
+    with_stored_values,
+)
+from .fitting import reduce_mapping, tests_of
 
 __all__ = ["InstrumentCorrection", "InstrumentFit", "ObjectPlane", "correct_instrument"]
 
@@ -95,6 +105,10 @@ class InstrumentFit:
         """With the coefficients that remained."""
         return self.elimination.adjustment
 
+    def tests(self) -> tuple[dict[str, Any], ...]:
+        """Tests of all coefficients as in the calibration file."""
+        return tests_of(self.elimination)
+
 
 @dataclass(frozen=True, eq=False)
 class InstrumentCorrection:
@@ -147,6 +161,88 @@ class InstrumentCorrection:
         """True object coordinates of points in pixels (Wishahy, step viii), with propagated covariances."""
         common, slope = self.in_common_system(points), self.plane.slope
         return ImagePoints(points.names, self.plane.from_common(common.xy), slope @ common.cov @ slope.T)
+
+    def calibration(
+        self,
+        reseau: ReseauDesign,
+        rods: ReseauDesign,
+        *,
+        name: str,
+        provenance: dict[str, Any] | None = None,
+        times: dict[str, str] | None = None,
+    ) -> Calibration:
+        """The calibration file of both groups, with the designs that refer further photographs to it."""
+        camera = self.camera.calibration(name=name, provenance=provenance, times=times)
+        names = self.camera.model.names + self.model.names
+        values = np.concatenate([self.camera.model.values, self.model.values])
+        sigma = np.sqrt(np.diagonal(self.covariance))
+        free = [i for i, s in enumerate(sigma) if s > 0]
+        units = [camera.parameters[key].unit for key in self.camera.model.names]
+        units += [unit_of(self.model, key, self.unit) for key in self.model.names]
+        parameters = {
+            key: Quantity(value=float(value), sigma=float(s), unit=unit)
+            for key, value, s, unit in zip(names, values, sigma, units, strict=True)
+        }
+        matrix = tuple(tuple(map(float, row)) for row in self.covariance[np.ix_(free, free)])
+        assert isinstance(camera.model, dict)
+        instrument = {
+            "mapping": self.model.to_dict(values=False),
+            "unit": self.unit,
+            "axes": system_to_dict(self.plane.axes),
+            "scale": [float(s) for s in self.plane.scale],
+            "system": system_to_dict(self.plane.system),
+            "rods": rods.to_dict(),
+        }
+        both = camera.model | {
+            "name": f"{camera.model['name']} and group B",
+            "reseau": reseau.to_dict(),
+            "instrument": instrument,
+        }
+        fit = self.fit
+        return camera.model_copy(
+            update={
+                "model": both,
+                "parameters": parameters,
+                "covariance": Covariance(names=tuple(names[i] for i in free), matrix=matrix),
+                "sigma0": camera.sigma0 if fit is None else float(fit.adjustment.sigma0),
+                "redundancy": camera.redundancy if fit is None else fit.adjustment.redundancy,
+                "tests": camera.tests + (() if fit is None else fit.tests()),
+            }
+        )
+
+    @classmethod
+    def from_calibration(
+        cls, calibration: Calibration
+    ) -> tuple[InstrumentCorrection, ReseauDesign, ReseauDesign]:
+        """Read both groups back, with the designs of the reseau and of the rods.
+
+        Raises
+        ------
+        FormatError
+            When the calibration is not one of both groups.
+        """
+        camera, where = CameraCorrection.from_calibration(calibration), f"calibration {calibration.name}"
+        content = calibration.model
+        if not isinstance(content, dict) or "instrument" not in content:
+            raise FormatError(
+                "holds the camera alone", where=where, do="make it with a PHOTO II and its test object"
+            )
+        try:
+            part = content["instrument"]
+            model = with_stored_values(RationalPolynomial.from_dict(part["mapping"]), calibration)
+            axes, system = (system_from_dict(part[key]) for key in ("axes", "system"))
+            plane = ObjectPlane(axes, np.array([float(s) for s in part["scale"]]), system)
+            row_of = {key: i for i, key in enumerate(calibration.parameters)}
+            order = [row_of[key] for key in camera.model.names + model.names]
+            unit = str(part["unit"])
+            designs = [
+                ReseauDesign.parse(canonical_json(holder[key]), where=where)
+                for holder, key in ((content, "reseau"), (part, "rods"))
+            ]
+        except (KeyError, TypeError, ValueError, UsageError) as error:
+            raise FormatError(f"lacks or misstates {error}", where=f"model of {where}") from None
+        covariance = calibration.matrix()[np.ix_(order, order)]
+        return cls(camera, model, plane, covariance, unit), designs[0], designs[1]
 
 
 def correct_instrument(
