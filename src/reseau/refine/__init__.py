@@ -4,20 +4,32 @@ from .correction import CameraCorrection, CorrectionFit, correct_camera
 from .field import SmoothField
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
+from .pins import PinDetections, PinOptions, find_pins
 from .reseau import ReseauOptions, ReseauResult, measure_reseau
+from .rods import PinResult, measure_pins
+from .wires import Layout, LayoutOptions, Wires, lay_wires
 
 __all__ = [
     "CameraCorrection",
     "CorrectionFit",
+    "Layout",
+    "LayoutOptions",
     "MatchOptions",
     "Matches",
+    "PinDetections",
+    "PinOptions",
+    "PinResult",
     "ReseauOptions",
     "ReseauResult",
     "SmoothField",
+    "Wires",
     "correct_camera",
+    "find_pins",
     "fit_mapping",
+    "lay_wires",
     "mapping_problem",
     "match",
+    "measure_pins",
     "measure_reseau",
     "reduce_mapping",
 ]

@@ -1,0 +1,266 @@
+"""The rods of a design, measured in one frame: the echoes found, told apart by the pattern, judged by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..adjust import Failure
+from ..data import Array, Frame, ImagePoints, Mask, Rows
+from ..errors import UsageError
+from ..formats import ReseauDesign, ReseauMeasurement
+from .field import SmoothField, trend_degree
+from .pins import PinDetections, PinOptions, find_pins
+from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
+
+__all__ = ["PinResult", "measure_pins"]
+
+_ROUNDS = 3
+"""Times that the field is fitted and the pattern laid again by it; the second settles it as a rule."""
+_COLUMNS = (
+    "psf_px",
+    "contrast",
+    "t",
+    "noise",
+    "correlation",
+    "strength",
+    "length",
+    "thickness",
+    "curvature",
+    "tilt",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PinResult:
+    """The rods of a design in one frame, in columns over the n rods.
+
+    Parameters
+    ----------
+    image, sha256 : str
+        The frame.
+    ids : tuple of str (n,)
+        The rods.
+    xy : ndarray (n, 2)
+        Image coordinates in pixels, y on the line, x in its middle; NaN where not measured.
+    cov : ndarray (n, 2, 2)
+        Covariances in px², NaN where not measured.
+    ok : ndarray of bool (n,)
+        Which were measured.
+    why : tuple of str (n,)
+        Why not, empty where measured.
+    predicted : ndarray (n, 2)
+        Where the other rods have each.
+    deviation : ndarray (n, 2)
+        Measured minus predicted from all *other* rods (leave-one-out); NaN where not measured, and where
+        fewer than five are.
+    psf_px, contrast, t, noise, correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
+        As in :class:`reseau.refine.PinDetections`; NaN where not measured.
+    detections : PinDetections
+        All spots of the frame.
+    """
+
+    image: str
+    sha256: str
+    ids: tuple[str, ...]
+    xy: Array
+    cov: Array
+    ok: Mask
+    why: tuple[str, ...]
+    predicted: Array
+    deviation: Array
+    psf_px: Array
+    contrast: Array
+    t: Array
+    noise: Array
+    correlation: Array
+    strength: Array
+    length: Array
+    thickness: Array
+    curvature: Array
+    tilt: Array
+    detections: PinDetections
+
+    @property
+    def found(self) -> int:
+        """Number of rods measured."""
+        return int(self.ok.sum())
+
+    @property
+    def points(self) -> ImagePoints:
+        """The rods that were measured."""
+        names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
+        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
+
+    def rms(self) -> Array:
+        """Leave-one-out deviation, root mean square per axis (2,); NaN where there is none."""
+        known = np.isfinite(self.deviation).all(axis=1)
+        if not known.any():
+            return np.full(2, np.nan)
+        rms: Array = np.sqrt((self.deviation[known] ** 2).mean(axis=0))
+        return rms
+
+    def measurement(self) -> ReseauMeasurement:
+        """The result as the document that others read."""
+        return ReseauMeasurement.from_columns(
+            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
+        )
+
+
+def measure_pins(
+    frame: Frame,
+    design: ReseauDesign,
+    options: PinOptions | None = None,
+    others: Sequence[Frame] = (),
+) -> PinResult | Failure:
+    """Measure every rod of a test object that can be measured.
+
+    Parameters
+    ----------
+    frame : Frame
+        A frame that shows the echoes of the rods, bright on a dark ground.
+    design : ReseauDesign
+        The rods, with or without nominal positions in the image.
+    options : PinOptions, optional
+        How.
+    others : sequence of Frame
+        Further frames of the sequence, see :func:`reseau.refine.find_pins`.
+
+    Returns
+    -------
+    PinResult or Failure
+        A failure (falsy) when the rods' pattern is not to be found among the echoes.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+    UsageError
+        When the design is not one of rods, or tells the places of fewer than four.
+    """
+    o = options or PinOptions()
+    if design.mark.shape != "rod":
+        raise UsageError(
+            f"has marks of the shape {design.mark.shape!r}",
+            where=f"design {design.name}",
+            do="give one of rods",
+        )
+    source = design.xy
+    known = np.flatnonzero(np.isfinite(source).all(axis=1))
+    if len(known) < 4:
+        raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
+    seen = find_pins(frame, o, tuple(others))
+    echoes = np.flatnonzero(seen.ok)
+    layout = _laid(design, known, seen.xy[echoes], o)
+    if isinstance(layout, Failure):
+        return Failure(
+            f"{frame.name}: the rods of design {design.name!r} are not to be found: {layout.reason}"
+        )
+    work = _Rods(frame, source[known], seen, echoes, layout, o)
+    return work.result(design.ids, known)
+
+
+def _laid(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
+    """The pattern over the echoes, by nominal positions where the design has them."""
+    ids = tuple(design.ids[i] for i in known)
+    wires = Wires.of_points(ids, design.xy[known])
+    nominal = design.nominal_px[known]
+    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), o.mirrored)
+    start = nominal if np.isfinite(nominal).all() else None
+    return lay_wires(wires, seen, options, start)
+
+
+class _Rods:
+    """Rods and echoes of one frame, and the field between them."""
+
+    def __init__(
+        self, frame: Frame, source: Array, seen: PinDetections, echoes: Rows, layout: Layout, o: PinOptions
+    ) -> None:
+        self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
+        self.row, self.gate_px = layout.row, layout.gate_px
+        self.predicted = layout(source)
+        self.why = np.full(len(source), "", dtype=object)
+        self.deviation = np.full(source.shape, np.nan)
+        self._settle()
+
+    def _settle(self) -> None:
+        """Fit a field through rods and echoes, assign by it, take out what the others do not bear out."""
+        for _ in range(_ROUNDS):
+            field = self._field()
+            if field is None:
+                break
+            self.predicted = field(self.source)
+            mine, theirs = nearest_pairs(self.predicted, self.seen.xy[self.echoes], self.gate_px)
+            row = np.full(len(self.source), -1)
+            row[mine] = theirs
+            if (row == self.row).all():
+                break
+            self.row = row
+        while (field := self._field()) is not None:
+            has = np.flatnonzero(self.row >= 0)
+            self.predicted = field(self.source)
+            self.deviation[:] = np.nan
+            self.deviation[has], _ = field.leave_one_out()
+            off = np.hypot(*self.deviation[has].T)
+            worst = int(off.argmax())
+            if off[worst] <= self.gate_px:
+                break
+            self.why[has[worst]] = f"{off[worst]:.1f} px off the prediction of its neighbours"
+            self.row[has[worst]] = -1
+        self.deviation[self.row < 0] = np.nan
+
+    def _field(self) -> SmoothField | None:
+        """From the design to the image; None where too few rods were found to test one."""
+        has = np.flatnonzero(self.row >= 0)
+        if len(has) < 5:
+            return None
+        degree = max(1, min(3, trend_degree(len(has))))
+        return SmoothField.fit(
+            self.source[has], self.seen.xy[self.echoes[self.row[has]]], degree=degree, local=len(has) >= 20
+        )
+
+    def result(self, ids: tuple[str, ...], known: Rows) -> PinResult:
+        """Spread over all rods of the design, those without coordinates among them."""
+        n, found = len(ids), self.row >= 0
+        at = self.echoes[self.row[found]]
+        why = np.full(n, "the design does not say where", dtype=object)
+        why[known] = [self._reason(i) for i in range(len(known))]
+
+        def spread(values: Array) -> Array:
+            full = np.full((n, *values.shape[1:]), np.nan)
+            full[known[found]] = values
+            return full
+
+        ok = np.zeros(n, dtype=bool)
+        ok[known] = found
+        predicted = np.full((n, 2), np.nan)
+        predicted[known] = self.predicted
+        return PinResult(
+            image=self.frame.name,
+            sha256=self.frame.sha256,
+            ids=ids,
+            xy=spread(self.seen.xy[at]),
+            cov=spread(self.seen.cov[at]),
+            ok=ok,
+            why=tuple(why),
+            predicted=predicted,
+            deviation=spread(self.deviation[found]),
+            **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
+            detections=self.seen,
+        )
+
+    def _reason(self, rod: int) -> str:
+        """Why a rod was not measured; empty where it was."""
+        if self.row[rod] >= 0 or self.why[rod]:
+            return str(self.why[rod])
+        x, y = self.predicted[rod]
+        if not (0 <= x <= self.frame.width - 1 and 0 <= y <= self.frame.height - 1):
+            return "outside the frame"
+        distance = np.hypot(*(self.seen.xy - self.predicted[rod]).T)
+        distance[self.seen.ok] = np.inf
+        nearest = int(distance.argmin()) if len(distance) else -1
+        if nearest >= 0 and distance[nearest] < self.gate_px:
+            return self.seen.why[nearest]
+        return "no echo where the others have it"
