@@ -16,6 +16,8 @@ error; it stands apart, and no sigma covers it.
 from __future__ import annotations
 
 import argparse
+import io
+import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -227,6 +229,8 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=2000, help="corrections from points, and tests of level")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)
     begun = time.perf_counter()
     worlds = max(1, min(200, given.draws // 10))
     with ProcessPoolExecutor(given.jobs) as pool:
