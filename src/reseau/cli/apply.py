@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, Out, is_points, progress, read_measurement, say, suffix_of, writable
+from .common import (
+    AsJson,
+    Out,
+    is_points,
+    points_csv,
+    points_document,
+    progress,
+    read_measurement,
+    say,
+    suffix_of,
+    writable,
+)
 
 if TYPE_CHECKING:
-    from ..data import ImagePoints
     from ..refine import CameraCorrection
 
 __all__ = ["apply"]
@@ -46,35 +56,15 @@ def _points(correction: CameraCorrection, source: Path, out: Path | None, as_jso
 
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
     points = correction.apply(read_measurement(source).image_points())
-    document = canonical_json(_columns(points, correction.unit))
+    document = canonical_json(points_document(points, correction.unit, "common"))
     if out is not None:
-        write_whole(out, document if suffix == ".json" else _csv(points))
+        write_whole(out, document if suffix == ".json" else points_csv(points))
     if as_json:
         say(document)
     elif out is None:
-        say(_csv(points))
+        say(points_csv(points))
     else:
         say(f"{out}: {len(points)} points in {correction.unit}\n")
-
-
-def _columns(points: ImagePoints, unit: str) -> dict[str, Any]:
-    s = points.sigma
-    table = {
-        "id": list(points.names),
-        "x": points.xy[:, 0].tolist(),
-        "y": points.xy[:, 1].tolist(),
-        "sx": s[:, 0].tolist(),
-        "sy": s[:, 1].tolist(),
-        "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
-    }
-    return {"schema": "reseau-points/1", "unit": unit, "system": "common", "points": table}
-
-
-def _csv(points: ImagePoints) -> str:
-    lines = ["id,x,y,sx,sy"]
-    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
-        lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
-    return "\n".join(lines) + "\n"
 
 
 def _image(

@@ -90,6 +90,28 @@ def suffix_of(path: Path, allowed: tuple[str, ...]) -> str:
     return suffix
 
 
+def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, Any]:
+    """Points in columns, as `--json` gives them."""
+    s = points.sigma
+    table = {
+        "id": list(points.names),
+        "x": points.xy[:, 0].tolist(),
+        "y": points.xy[:, 1].tolist(),
+        "sx": s[:, 0].tolist(),
+        "sy": s[:, 1].tolist(),
+        "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
+    }
+    return {"schema": "reseau-points/1", "unit": unit, "system": system, "points": table}
+
+
+def points_csv(points: ImagePoints) -> str:
+    """Points as ``id,x,y,sx,sy``."""
+    lines = ["id,x,y,sx,sy"]
+    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
+        lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
+    return "\n".join(lines) + "\n"
+
+
 def say(text: str) -> None:
     """Write to standard output."""
     sys.stdout.write(text)

@@ -2,69 +2,285 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import AsJson, Out, progress, read_photo, required, say, suffix_of, writable
+from .common import (
+    AsJson,
+    Out,
+    points_csv,
+    points_document,
+    progress,
+    read_measurement,
+    read_photo,
+    required,
+    say,
+    suffix_of,
+    writable,
+)
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration
+    from ..data import ImagePoints
+    from ..formats import ReseauDesign
+    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+    from ..provenance import Provenance
+    from ..refine.instrument import InstrumentCorrection
 
 __all__ = ["refine"]
 
 
+@dataclass(frozen=True)
+class _Files:
+    """The files of a run, and its options."""
+
+    photo_i: Path | None
+    photo_ii: Path | None
+    photo_iii: tuple[Path, ...]
+    reseau: Path | None
+    test_object: Path | None
+    calibration: Path | None
+    points: Path | None
+    check: tuple[str, ...]
+    alpha: float
+
+    def provenance(self) -> Provenance:
+        """Inputs by hash, and the options."""
+        from ..provenance import Provenance, sha256_of
+
+        named = (self.photo_i, self.photo_ii, self.reseau, self.test_object, self.calibration, self.points)
+        paths = [path for path in named if path is not None] + list(self.photo_iii)
+        inputs = {path.name: sha256_of(path) for path in paths}
+        return Provenance(inputs, {"alpha": self.alpha, "check": list(self.check)})
+
+
 def refine(
-    photo_i: Annotated[Path, typer.Option(help="PHOTO I: the reseau alone; an image or coordinates.")],
-    reseau: Annotated[Path, typer.Option(help="Design of the reseau.")],
+    photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
+    photo_ii: Annotated[
+        Path | None, typer.Option(help="PHOTO II: the test object behind the reseau.")
+    ] = None,
+    photo_iii: Annotated[list[Path] | None, typer.Option(help="PHOTO III: the body to be measured.")] = None,
+    reseau: Annotated[Path | None, typer.Option(help="Design of the reseau.")] = None,
+    test_object: Annotated[
+        Path | None, typer.Option("--object", help="Design of the test object: its rods.")
+    ] = None,
+    calibration: Annotated[Path | None, typer.Option(help="A stored calibration, for PHOTO III.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
     out: Out = None,
-    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    true: Annotated[Path | None, typer.Option(help="True coordinates to write (CSV, JSON).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Report on PHOTO I to write, HTML.")] = None,
     alpha: Annotated[float, typer.Option(help="Level of the tests of the coefficients.")] = 0.05,
-    check: Annotated[str, typer.Option(help="Marks held out as check marks: A1,B2,…")] = "",
+    check: Annotated[str, typer.Option(help="Marks and rods held out for a check: A1,B2,…")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Correct a camera by PHOTO I of a reseau: distortions of lens and film."""
+    """Refine oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
+
+    Every photograph is an image, or a file of the coordinates of its marks, rods and points, told apart by
+    their names.
+    """
+    held = tuple(name for name in check.split(",") if name)
+    files = _Files(
+        photo_i, photo_ii, tuple(photo_iii or ()), reseau, test_object, calibration, points, held, alpha
+    )
+    _checked(files)
+    for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
+        if path is not None:
+            suffix_of(writable(path), suffixes)
+    if calibration is not None:
+        _by_calibration(files, calibration, true, as_json)
+    else:
+        _by_photographs(files, out, true, report, as_json)
+
+
+def _checked(files: _Files) -> None:
+    """Refuse what cannot be meant together.
+
+    Raises
+    ------
+    UsageError
+        With what is missing or too much.
+    """
+    from ..errors import UsageError
+
+    if not 0 < files.alpha < 1:
+        raise UsageError(f"{files.alpha:g} is not between 0 and 1", where="--alpha")
+    if files.calibration is not None:
+        if files.photo_i or files.photo_ii:
+            raise UsageError("is already made of PHOTO I and II", where="--calibration", do="give PHOTO III")
+        if not files.photo_iii:
+            raise UsageError("corrects a photograph", where="--calibration", do="give it as --photo-iii")
+        return
+    if files.photo_i is None or files.reseau is None:
+        raise UsageError("needs --photo-i and --reseau, or --calibration", where="refine")
+    if (files.photo_ii is None) != (files.test_object is None):
+        raise UsageError("--photo-ii and --object go together", where="refine")
+    if files.photo_iii and files.photo_ii is None:
+        raise UsageError("needs PHOTO II before it", where="--photo-iii", do="give --photo-ii and --object")
+
+
+def _by_photographs(
+    files: _Files, out: Path | None, true: Path | None, report: Path | None, as_json: bool
+) -> None:
+    """PHOTO I, and PHOTO II and III where they are given."""
     from ..data import Frame
     from ..errors import UsageError
     from ..formats import ReseauDesign, write_whole
-    from ..procedures.oscilloscope import photo_i as procedure
-    from ..provenance import Provenance, sha256_of
+    from ..procedures.oscilloscope import photo_i
 
-    if not 0 < alpha < 1:
-        raise UsageError(f"{alpha:g} is not between 0 and 1", where="--alpha")
-    for path, suffix in ((out, ".json"), (report, ".html")):
-        if path is not None:
-            suffix_of(writable(path), (suffix,))
-    design = ReseauDesign.read(reseau)
-    held = tuple(name for name in check.split(",") if name)
-    unknown = [name for name in held if name not in design.ids]
+    assert files.photo_i is not None
+    assert files.reseau is not None
+    design = ReseauDesign.read(files.reseau)
+    rods = None if files.test_object is None else ReseauDesign.read(files.test_object)
+    known = set(design.ids) | set(() if rods is None else rods.ids)
+    unknown = [name for name in files.check if name not in known]
     if unknown:
         raise UsageError(f"names {unknown[0]!r}, which is none of the marks", where="--check")
-    photo = read_photo(photo_i)
-    with progress(f"refining {photo_i.name}", 1):
-        found = required(procedure(photo, design, alpha=alpha, check=held), photo_i)
-    provenance = Provenance(
-        {photo_i.name: sha256_of(photo_i), reseau.name: sha256_of(reseau)},
-        {"alpha": alpha, "check": list(held)},
-    )
-    calibration = found.camera.calibration(
-        name=f"{design.name} {photo_i.stem}",
-        provenance=provenance.to_dict(),
-        times={"computed": datetime.now(UTC).isoformat(timespec="seconds")},
-    )
+    steps = 1 + (files.photo_ii is not None) + len(files.photo_iii)
+    photo = read_photo(files.photo_i)
+    with progress("refining", steps) as step:
+        first = required(photo_i(photo, design, alpha=files.alpha, check=files.check), files.photo_i)
+        step("PHOTO I")
+        second = None if rods is None else _second(files, design, rods, first)
+        step("PHOTO II")
+        third = [] if second is None else _third(files, second.instrument, design, step)
+    provenance, times = files.provenance(), {"computed": datetime.now(UTC).isoformat(timespec="seconds")}
+    name = f"{design.name} {files.photo_i.stem}"
+    if second is None or rods is None:
+        result = first.camera.calibration(name=name, provenance=provenance.to_dict(), times=times)
+    else:
+        result = second.instrument.calibration(
+            design, rods, name=name, provenance=provenance.to_dict(), times=times
+        )
     page = None
     if report is not None:
         from ..report import photo_i_report
 
         frame = photo if isinstance(photo, Frame) else None
-        page = photo_i_report(found, design, frame=frame, title=photo_i.name, provenance=provenance)
+        page = photo_i_report(first, design, frame=frame, title=files.photo_i.name, provenance=provenance)
     if out is not None:
-        write_whole(out, calibration.to_json())
+        write_whole(out, result.to_json())
     if page is not None and report is not None:
         write_whole(report, page)
+    _write_true(third, true, None if second is None else second.instrument.unit)
     if as_json:
-        say(calibration.to_json())
+        say(result.to_json())
+    else:
+        _say_first(files.photo_i, first, design)
+        if second is not None and files.photo_ii is not None:
+            _say_second(files.photo_ii, second)
+        _say_third(files, third, None if second is None else second.instrument.unit, true)
+
+
+def _split(points: ImagePoints, design: ReseauDesign) -> tuple[ImagePoints | None, ImagePoints]:
+    """Points that are marks of the reseau, and the others."""
+    import numpy as np
+
+    marks = np.isin(points.names, design.ids)
+    return (points.select(marks) if marks.any() else None), points.select(~marks)
+
+
+def _second(files: _Files, design: ReseauDesign, rods: ReseauDesign, first: PhotoI) -> PhotoII:
+    from ..data import ImagePoints
+    from ..procedures.oscilloscope import photo_ii
+
+    assert files.photo_ii is not None
+    photo, marks = read_photo(files.photo_ii), None
+    if isinstance(photo, ImagePoints):
+        marks, photo = _split(photo, design)
+    found = photo_ii(photo, design, rods, first.camera, marks=marks, alpha=files.alpha, check=files.check)
+    return required(found, files.photo_ii)
+
+
+def _third(
+    files: _Files, instrument: InstrumentCorrection, design: ReseauDesign, step: Any
+) -> list[tuple[Path, PhotoIII]]:
+    from ..data import ImagePoints
+    from ..procedures.oscilloscope import photo_iii
+
+    body = None if files.points is None else read_measurement(files.points).image_points()
+    results = []
+    for path in files.photo_iii:
+        photo, marks = read_photo(path), None
+        if isinstance(photo, ImagePoints):
+            marks, photo = _split(photo, design)
+        found = photo_iii(photo, instrument, design, points=body, marks=marks)
+        results.append((path, required(found, path)))
+        step(path.name)
+    return results
+
+
+def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json: bool) -> None:
+    """True coordinates by a stored calibration."""
+    from ..calibration import Calibration
+    from ..provenance import canonical_json
+    from ..refine.instrument import InstrumentCorrection
+
+    stored: Calibration = Calibration.read(calibration)
+    instrument, design, _ = InstrumentCorrection.from_calibration(stored)
+    with progress("refining", len(files.photo_iii)) as step:
+        third = _third(files, instrument, design, step)
+    _write_true(third, true, instrument.unit)
+    if as_json:
+        documents = [
+            points_document(found.true, instrument.unit, "object")
+            | {"image": path.name, "notes": list(found.notes)}
+            for path, found in third
+        ]
+        say(canonical_json(documents[0] if len(documents) == 1 else documents))
+    else:
+        _say_third(files, third, instrument.unit, true)
+
+
+def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str | None) -> None:
+    """Write true coordinates; of several photographs the names get that of their photograph before them."""
+    from ..data import ImagePoints
+    from ..formats import write_whole
+    from ..provenance import canonical_json
+
+    if true is None or not third or unit is None:
         return
-    fit = found.camera.fit
+    import numpy as np
+
+    several = len(third) > 1
+    names = [f"{path.stem}:{n}" if several else n for path, found in third for n in found.true.names]
+    points = ImagePoints(
+        tuple(names),
+        np.concatenate([found.true.xy for _, found in third]),
+        np.concatenate([found.true.cov for _, found in third]),
+    )
+    document = canonical_json(points_document(points, unit, "object"))
+    write_whole(true, document if true.suffix.lower() == ".json" else points_csv(points))
+
+
+def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
+    fit = first.camera.fit
     rms = (fit.residuals**2).mean(axis=0) ** 0.5 if fit else (0.0, 0.0)
-    say(f"{photo_i.name}: {len(found.points)} marks, {len(found.camera.model.names)} coefficients kept\n")
+    say(f"{path.name}: {len(first.points)} marks, {len(first.camera.model.names)} coefficients kept\n")
     say(f"residuals {rms[0]:.4f} {design.unit} in x, {rms[1]:.4f} {design.unit} in y (rms)\n")
+
+
+def _say_second(path: Path, second: PhotoII) -> None:
+    instrument = second.instrument
+    kept, (along, across) = len(instrument.model.names), instrument.plane.scale
+    say(f"{path.name}: {len(second.pins)} rods, {kept} coefficients kept, λ = {along:.5f}, {across:.5f}\n")
+    if second.causes is not None:
+        for test in second.causes.conditions:
+            verdict = "holds" if test.holds else "does not hold"
+            say(f"  {test.condition} {verdict} (χ² = {test.statistic:.2f}, p = {test.p:.3f})\n")
+    for note in second.notes:
+        say(f"  note: {note}\n")
+
+
+def _say_third(
+    files: _Files, third: list[tuple[Path, PhotoIII]], unit: str | None, true: Path | None
+) -> None:
+    for path, found in third:
+        say(f"{path.name}: {len(found.true)} points in {unit}\n")
+        for note in found.notes:
+            say(f"  note: {note}\n")
+        if true is None:
+            say(points_csv(found.true))

@@ -1,7 +1,9 @@
 """The oscilloscope procedure (Wishahy): images refined by successive elimination of each factor.
 
-Two groups of factors are told apart by two photographs: PHOTO I shows the reseau alone, so that all its
-distortion is that of the camera and the film (group A). The steps carry the paper's numbers.
+Three photographs tell the factors apart. PHOTO I shows the reseau alone: its distortion is that of the camera
+and the film (group A). PHOTO II shows a test object behind the reseau: what is left of it once it is refined
+of group A is the ultrasonic instrument's doing (group B). In PHOTO III both are known, and an object without
+any control point gets its true coordinates. The steps carry the paper's numbers and symbols.
 """
 
 from __future__ import annotations
@@ -10,13 +12,31 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from ..adjust import Failure
 from ..data import Frame, ImagePoints
 from ..formats import ReseauDesign
 from ..optics import RationalPolynomial
-from ..refine import CameraCorrection, ReseauOptions, ReseauResult, correct_camera, measure_reseau
+from ..refine import (
+    CameraCorrection,
+    PinOptions,
+    PinResult,
+    ReseauOptions,
+    ReseauResult,
+    correct_camera,
+    find_pins,
+    measure_pins,
+    measure_reseau,
+)
+from ..refine.causes import COEFFICIENTS, Causes, physical_causes
+from ..refine.instrument import InstrumentCorrection, correct_instrument
+from ..refine.registration import Registration, register
 
-__all__ = ["PhotoI", "photo_i"]
+__all__ = ["PhotoI", "PhotoII", "PhotoIII", "photo_i", "photo_ii", "photo_iii"]
+
+_UPRIGHT = np.deg2rad(20.0)
+"""Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,3 +100,230 @@ def photo_i(
     if isinstance(camera, Failure):
         return camera
     return PhotoI(points, camera, measured)
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoII:
+    """PHOTO II refined.
+
+    Parameters
+    ----------
+    pins : ImagePoints
+        Images of the rods, in pixels of PHOTO I.
+    instrument : InstrumentCorrection
+        Groups A and B.
+    registration : Registration or None
+        How the photograph was referred to PHOTO I; None where its reseau was not given.
+    causes : Causes or None
+        The physical causes of group B's coefficients, and the conditions they impose; None for another model
+        than equations (7a, b).
+    notes : tuple of str
+        What the user should look into.
+    measured : PinResult, optional
+        How the pins were measured; None where they came from elsewhere.
+    """
+
+    pins: ImagePoints
+    instrument: InstrumentCorrection
+    registration: Registration | None
+    causes: Causes | None
+    notes: tuple[str, ...]
+    measured: PinResult | None
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoIII:
+    """PHOTO III refined.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        The body's points in pixels of PHOTO I.
+    true : ImagePoints
+        Their true coordinates in the object's plane, with covariances.
+    registration : Registration or None
+        How the photograph was referred to PHOTO I.
+    notes : tuple of str
+        What the user should look into.
+    """
+
+    points: ImagePoints
+    true: ImagePoints
+    registration: Registration | None
+    notes: tuple[str, ...]
+
+
+def photo_ii(
+    photo: Frame | ImagePoints,
+    reseau: ReseauDesign,
+    test_object: ReseauDesign,
+    camera: CameraCorrection,
+    *,
+    marks: ImagePoints | None = None,
+    options: ReseauOptions | None = None,
+    pins: PinOptions | None = None,
+    model: RationalPolynomial | None = None,
+    alpha: float = 0.05,
+    criterion: Literal["t", "chi2", "F"] = "F",
+    check: Iterable[str] = (),
+) -> PhotoII | Failure:
+    """Correct the ultrasonic instrument by PHOTO II, steps (iv) to (vii).
+
+    Parameters
+    ----------
+    photo : Frame or ImagePoints
+        The photograph of the test object behind the reseau, or its pins measured elsewhere, in pixels.
+    reseau, test_object : ReseauDesign
+        The reseau; the rods, with M and N as `origin` and `axis` and their tolerance as sigmas.
+    camera : CameraCorrection
+        Group A, from PHOTO I.
+    marks : ImagePoints, optional
+        The reseau's marks in this photograph, where the pins came from elsewhere.
+    options, pins
+        How reseau and pins are measured.
+    model, alpha, criterion, check
+        As in :func:`reseau.refine.instrument.correct_instrument`; by default equations (7a, b) with F-tests
+        at 0.05.
+
+    Returns
+    -------
+    PhotoII or Failure
+        A failure when reseau or test object are not found, or too few of their points.
+    """
+    # (iv) photo-coordinates of the test object
+    measured = None
+    if isinstance(photo, Frame):
+        seen = measure_reseau(photo, reseau, options)
+        if isinstance(seen, Failure):
+            return seen
+        found = measure_pins(photo, test_object, pins)
+        if isinstance(found, Failure):
+            return found
+        marks, measured, images = seen.points, found, found.points
+    else:
+        images = photo
+    # (v) into the common system, by way of PHOTO I
+    registration = None
+    if marks is not None:
+        registered = register(marks, reseau, camera)
+        if isinstance(registered, Failure):
+            return registered
+        registration, images = registered, registered.apply(images)
+    # (iv) to (vii)
+    instrument = correct_instrument(
+        images, test_object, camera, model=model, alpha=alpha, criterion=criterion, check=check
+    )
+    if isinstance(instrument, Failure):
+        return instrument
+    notes = _of_the_camera(camera, registration) + _of_the_object(instrument, images, test_object)
+    return PhotoII(images, instrument, registration, _causes(instrument), notes, measured)
+
+
+def photo_iii(
+    photo: Frame | ImagePoints,
+    instrument: InstrumentCorrection,
+    reseau: ReseauDesign,
+    *,
+    points: ImagePoints | None = None,
+    marks: ImagePoints | None = None,
+    options: ReseauOptions | None = None,
+    pins: PinOptions | None = None,
+) -> PhotoIII | Failure:
+    """True coordinates of a body without control points in PHOTO III, step (viii).
+
+    Parameters
+    ----------
+    photo : Frame or ImagePoints
+        The photograph, or points of the body measured elsewhere, in pixels.
+    instrument : InstrumentCorrection
+        Groups A and B.
+    reseau : ReseauDesign
+        The reseau.
+    points : ImagePoints, optional
+        Points of the body in a frame; by default all echoes that are found in it.
+    marks : ImagePoints, optional
+        The reseau's marks, where they were measured elsewhere; without any the camera is taken to have stood
+        still.
+    options, pins
+        How reseau and echoes are measured.
+
+    Returns
+    -------
+    PhotoIII or Failure
+        A failure when the reseau is not found, or the photograph shows nothing.
+    """
+    if isinstance(photo, Frame):
+        seen = measure_reseau(photo, reseau, options)
+        if isinstance(seen, Failure):
+            return seen
+        marks = seen.points
+        body = find_pins(photo, pins).points if points is None else points
+    else:
+        body = photo
+    if not len(body):
+        return Failure("the photograph shows no echo of a body")
+    registration = None
+    if marks is not None:
+        registered = register(marks, reseau, instrument.camera)
+        if isinstance(registered, Failure):
+            return registered
+        registration, body = registered, registered.apply(body)
+    notes = _of_the_camera(instrument.camera, registration)
+    return PhotoIII(body, instrument.apply(body), registration, notes)
+
+
+def _causes(instrument: InstrumentCorrection) -> Causes | None:
+    """The causes, from the adjustment with all coefficients: one dropped would be held at nought."""
+    if instrument.fit is None:
+        return None
+    full = instrument.fit.elimination.full
+    if any(name not in full.names for name in COEFFICIENTS):
+        return None
+    causes = physical_causes(full.names, full.values, full.cofactor)
+    return None if isinstance(causes, Failure) else causes
+
+
+def _of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[str, ...]:
+    """What is odd about the camera's side."""
+    notes = []
+    angle = camera.photo_system.angle
+    if abs(angle) > np.pi - _UPRIGHT:
+        notes.append("the x-axis of the common system runs to the left in the image: are O and S swapped?")
+    elif abs(angle) > _UPRIGHT:
+        notes.append(
+            f"the common system is turned by {np.rad2deg(angle):.0f}° in the image: are O and S right?"
+        )
+    if registration is not None and registration.moved:
+        notes.append(
+            f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
+            "the photograph was carried back"
+        )
+    if registration is not None and registration.sigma0 > 3:
+        notes.append(
+            "the reseau has another shape than in PHOTO I "
+            f"({registration.sigma0:.1f} times its standard deviations): take PHOTO I anew"
+        )
+    return tuple(notes)
+
+
+def _of_the_object(
+    instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
+) -> tuple[str, ...]:
+    """What is odd about the test object's side."""
+    notes, plane = [], instrument.plane
+    if abs(plane.rotation) > np.pi - _UPRIGHT:
+        notes.append("the test object stands on its head or M and N are swapped")
+    elif abs(plane.rotation) > np.deg2rad(2.0):
+        notes.append(f"the test object is turned by {np.rad2deg(plane.rotation):.1f}° against the reseau")
+    missing = [i for i, name in enumerate(design.ids) if name not in pins.names]
+    for axis, word in ((1, "row"), (0, "column")):
+        for value in np.unique(np.round(design.xy[:, axis], 6)):
+            line = np.flatnonzero(np.abs(design.xy[:, axis] - value) < 1e-6)
+            if len(line) >= 3 and set(line) <= set(missing):
+                notes.append(f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing")
+    ratio = plane.scale[0] / plane.scale[1]
+    if abs(ratio - 1) > 0.1:
+        notes.append(
+            f"the scales along and across differ by {abs(ratio - 1):.0%}: check the display's aspect"
+        )
+    return tuple(notes)
