@@ -61,15 +61,20 @@ class Assignment:
         Row of the candidate of each mark, -1 where there is none.
     at : ndarray (n, 2)
         Position of that candidate, NaN where there is none.
-    score : float
-        Marks found, less half of those that should be in sight and have no candidate.
+    missed : int
+        Marks that should be in sight and have no candidate.
     """
 
     field: SmoothField
     predicted: Array
     candidate: Rows
     at: Array
-    score: float
+    missed: int
+
+    @property
+    def score(self) -> float:
+        """Marks found, less half of those missed."""
+        return int((self.candidate >= 0).sum()) - 0.5 * self.missed
 
 
 def spacing(xy: Array) -> float:
@@ -77,7 +82,9 @@ def spacing(xy: Array) -> float:
     return float(np.median(KDTree(xy).query(xy, k=2)[0][:, 1]))
 
 
-def assign(source: Array, start: Array, candidates: Candidates, valid: Mask) -> Assignment | None:
+def assign(
+    source: Array, start: Array, candidates: Candidates, valid: Mask, shifts: int = 4
+) -> Assignment | None:
     """Give marks their candidates, beginning from approximate positions.
 
     Parameters
@@ -90,6 +97,9 @@ def assign(source: Array, start: Array, candidates: Candidates, valid: Mask) -> 
         What looks like a mark.
     valid : ndarray (h, w) of bool
         Pixels that carry an image; a mark is missed only there.
+    shifts : int
+        At most so many common shifts are tried: a grid that lies half a pitch away or more agrees almost as
+        well with one of its neighbours in the place of each mark, but misses those at its border.
 
     Returns
     -------
@@ -98,8 +108,20 @@ def assign(source: Array, start: Array, candidates: Candidates, valid: Mask) -> 
     """
     if len(candidates) < 4:
         return None
-    pitch = spacing(start)
-    start = start + _common_shift(start, candidates, pitch)
+    pitch, best = spacing(start), None
+    for shift in _common_shifts(start, candidates, pitch, shifts):
+        found = _assigned(source, start + shift, candidates, valid, pitch)
+        if found is not None and (best is None or found.score > best.score + 0.75):
+            best = found
+        if best is not None and best.missed <= 0.02 * len(source):
+            break
+    return best
+
+
+def _assigned(
+    source: Array, start: Array, candidates: Candidates, valid: Mask, pitch: float
+) -> Assignment | None:
+    """Give marks their candidates, beginning from positions that a smooth distortion alone makes wrong."""
     centre = _densest(start, candidates, pitch)
     far = np.hypot(*(start - centre).T)
     tree, predicted, gate = KDTree(candidates.xy), start, 0.2 * pitch
@@ -119,7 +141,7 @@ def assign(source: Array, start: Array, candidates: Candidates, valid: Mask) -> 
     rows = _nearest(tree, candidates, predicted, gate, np.ones(len(start), dtype=bool))
     missed = (rows < 0) & _in_sight(predicted, valid)
     at = np.where(rows[:, None] >= 0, candidates.xy[rows], np.nan)
-    return Assignment(field, predicted, rows, at, int((rows >= 0).sum()) - 0.5 * int(missed.sum()))
+    return Assignment(field, predicted, rows, at, int(missed.sum()))
 
 
 def _in_sight(xy: Array, valid: Mask) -> Mask:
@@ -131,16 +153,21 @@ def _in_sight(xy: Array, valid: Mask) -> Mask:
     return seen
 
 
-def _common_shift(start: Array, candidates: Candidates, pitch: float) -> Array:
-    """The shift, of at most a pitch, on which most pairs of start and candidate agree."""
+def _common_shifts(start: Array, candidates: Candidates, pitch: float, count: int) -> Iterator[Array]:
+    """Shifts, of at most a pitch, on which most pairs of start and candidate agree, the likeliest first."""
     offset = (candidates.xy[None] - start[:, None]).reshape(-1, 2)
     weight = np.broadcast_to(np.minimum(candidates.t, 15.0), (len(start), len(candidates))).ravel()
     near = (np.abs(offset) < pitch).all(axis=1)
     votes, (x, y) = _vote(offset[near], weight[near], [(-pitch, pitch)] * 2, max(1.0, pitch / 40), 2.0)
     # Of two shifts with like support the smaller is meant: a grid agrees with itself at every pitch.
     votes *= 1 - 0.3 * np.hypot(x[:, None], y[None]) / (1.5 * pitch)
-    i, j = np.unravel_index(votes.argmax(), votes.shape)
-    return np.array([x[i], y[j]])
+    most = votes.max()
+    for _ in range(count):
+        i, j = np.unravel_index(votes.argmax(), votes.shape)
+        if not votes[i, j] > 0.5 * most:
+            return
+        yield np.array([x[i], y[j]])
+        votes[np.hypot(x[:, None] - x[i], y[None] - y[j]) < 0.3 * pitch] = 0
 
 
 def _vote(
@@ -233,7 +260,7 @@ def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOpt
     for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
         plane = source * [1, -1 if mirrored else 1]
         for start in chain.from_iterable(_starts(plane, voters, options) for voters in electorates):
-            found = assign(source, start, strong, valid)
+            found = assign(source, start, strong, valid, shifts=1)
             if found is None:
                 continue
             if best is None or found.score > best.score + 0.75:
