@@ -107,19 +107,18 @@ def ground_of(grey: Grey, reach: int) -> Grey:
     return grown
 
 
-def find_echoes(grey: Grey, ground: Grey, psf_px: float, least: float) -> Echoes:
+def find_echoes(light: Grey, psf_px: float, least: float) -> Echoes:
     """Find all spots and measure them coarsely.
 
     Parameters
     ----------
-    grey, ground : ndarray (h, w)
-        Frame and its ground.
+    light : ndarray (h, w)
+        Brightness over the ground; what hides an echo has been bridged.
     psf_px : float
         Width of the Gaussian that smooths.
     least : float
         Least height over the ground.
     """
-    light = grey - ground
     smooth: Grey = cv2.GaussianBlur(light, (0, 0), psf_px, borderType=cv2.BORDER_REFLECT)  # type: ignore[assignment]
     row, column = _maxima(smooth, least)
     height = smooth[row, column].astype(np.float64)
@@ -197,7 +196,7 @@ def _measured(
     weight = np.maximum(smooth[row, column] - 0.9 * (level * height)[spot], 0).astype(np.float64)
     middle, along, across, bend, tilt = _bent(spot, column, row, weight, count)
     claimed = _claimed(owner)
-    near_row, near_column = np.nonzero((claimed >= 0) & (smooth > 0.2 * height[np.maximum(claimed, 0)]))
+    near_row, near_column = np.nonzero((claimed >= 0) & (smooth > 0.2 * np.append(height, 0.0)[claimed]))
     near = claimed[near_row, near_column]
     pixels = np.maximum(np.bincount(near, minlength=count), 1)
     mean = [np.bincount(near, values, minlength=count) / pixels for values in (near_column, near_row)]

@@ -7,14 +7,16 @@ images appear as horizontal curved lines"). A spot that is declined is reported 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from ..data import Array, Frame, ImagePoints, Mask, Rows
 from .arcs import ArcMatches, match_arcs
 from .echoes import Echoes, find_echoes, ground_of
-from .graphics import is_sharp, same_in_all, series
+from .graphics import is_sharp, looks_sharp, same_in_all, series
+from .hidden import bridged, find_cuts
 from .matching import MatchOptions
 from .screening import Screened, screen
 
@@ -24,6 +26,8 @@ _UPRIGHT_FROM = 1.8
 """Length over thickness from which the direction of an arc can be told."""
 _GROUND_LENGTHS = 1.0
 """Side of the running median that is the ground, in the greatest lengths of an arc."""
+_LONG_PX = 40.0
+"""Length up to which an arc is a pin's in a frame of any size."""
 _STATIC = 0.7
 """Share of a spot that must be the same in all frames to be no part of the image."""
 
@@ -37,8 +41,8 @@ class PinOptions:
     psf_px : float
         First guess of the width (one sigma) of the point-spread function; estimated.
     most_length_px : float, optional
-        Greatest length of a pin's arc; by default 6 % of the frame's diagonal. What is longer is an edge of
-        the sector, the face of the transducer or an interface.
+        Greatest length of a pin's arc; by default 6 % of the frame's diagonal, not below 40 px. What is
+        longer is an edge of the sector, the face of the transducer or an interface.
     most_tilt_deg : float
         Greatest tilt of an arc against the rows of the frame.
     least_strength : float
@@ -51,6 +55,8 @@ class PinOptions:
         Width of the point-spread function below which a spot is drawn and no echo.
     least_seen, most_rejected : float
         Share of an arc that must lie in the frame, that may be left out as disturbed.
+    most_wire_px : int
+        Greatest width of the dark cut of a wire across an echo, blur included; 0: there are no wires.
     most_sigma_px : float
         Largest standard deviation of a coordinate that still counts as measured.
     gate : float
@@ -65,11 +71,12 @@ class PinOptions:
     most_length_px: float | None = None
     most_tilt_deg: float = 60.0
     least_strength: float = 0.2
-    least_correlation: float = 0.9
+    least_correlation: float = 0.92
     most_touching: float = 0.6
     sharpest_px: float = 0.66
     least_seen: float = 0.6
     most_rejected: float = 0.35
+    most_wire_px: int = 5
     most_sigma_px: float = 0.5
     gate: float = 0.15
     max_rotation_deg: float = 12.0
@@ -132,7 +139,10 @@ class PinDetections:
 
 
 def find_pins(
-    frame: Frame, options: PinOptions | None = None, others: tuple[Frame, ...] = ()
+    frame: Frame,
+    options: PinOptions | None = None,
+    others: Sequence[Frame] = (),
+    hidden: Mask | None = None,
 ) -> PinDetections:
     """Find every arc-like point reflector of a frame.
 
@@ -142,8 +152,10 @@ def find_pins(
         A frame with bright echoes on a dark ground.
     options : PinOptions, optional
         How.
-    others : tuple of Frame
+    others : sequence of Frame
         Further frames of the sequence, in which the object has moved: what is the same in all is no echo.
+    hidden : ndarray (h, w) of bool, optional
+        Pixels that wires of a reseau cover, where they are known; upright cuts through echoes are found.
 
     Returns
     -------
@@ -157,13 +169,16 @@ def find_pins(
     """
     o = options or PinOptions()
     screened = screen(frame, run=None)
-    longest = o.most_length_px or 0.06 * float(np.hypot(*frame.pixels.shape))
+    longest = o.most_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
     light = screened.grey - ground
     least = max(5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
-    echoes = find_echoes(screened.grey, ground, o.psf_px, least)
-    judge = _Judge(frame, screened, echoes, longest, o, others)
-    return judge.verdict()
+    covered = find_cuts(light, screened.noise, o.most_wire_px)
+    if hidden is not None:
+        covered |= hidden
+    echoes = find_echoes(bridged(light, covered), o.psf_px, least)
+    open_ = replace(screened, valid=screened.valid & ~covered)
+    return _Judge(frame, open_, echoes, longest, o, tuple(others)).verdict()
 
 
 class _Judge:
@@ -207,7 +222,7 @@ class _Judge:
         found = self._match(at)
         for mask, reason in self._objections(at, found):
             self._object(at, mask, reason)
-        characters, scale = series(e, sharp | self._looks_drawn(at, found))
+        characters, scale = series(e, sharp | looks_sharp(e) | self._looks_drawn(at, found))
         every = np.arange(len(e))
         self._object(every, characters, "a character in a row of characters", also_sharp=sharp)
         self._object(every, scale, "one of a scale's equally spaced marks", also_sharp=sharp)
@@ -244,8 +259,11 @@ class _Judge:
         moved = np.hypot(*(found.xy - e.xy[at]).T) > np.maximum(3.0, 0.5 * e.length[at])
         border = np.array([self.frame.width, self.frame.height]) - 1
         outside = ((found.xy < 0) | (found.xy > border)).any(axis=1)
+        near = (np.minimum(found.xy, border - found.xy) < found.form.length[:, None] / 2 + 2).any(axis=1)
+        unseen = found.seen < o.least_seen
         return [
-            (outside | (found.seen < o.least_seen), "cut off by the edge of the frame"),
+            (outside | (unseen & near), "cut off by the edge of the frame"),
+            (unseen, "hidden in good part by a wire or a neighbour"),
             (e.joined[at] > o.most_touching, "touches another spot"),
             (~found.converged, "the match does not converge"),
             (found.psf_px < o.sharpest_px, "sharper than an echo: drawn by the instrument"),

@@ -17,6 +17,8 @@ from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
 __all__ = ["PinResult", "measure_pins"]
 
+_BESIDE_PX = 3.0
+"""How far from the middle line of an echo, at least, another rod's place counts as covered by it."""
 _ROUNDS = 3
 """Times that the field is fitted and the pattern laid again by it; the second settles it as a rule."""
 _COLUMNS = (
@@ -114,6 +116,7 @@ def measure_pins(
     design: ReseauDesign,
     options: PinOptions | None = None,
     others: Sequence[Frame] = (),
+    hidden: Mask | None = None,
 ) -> PinResult | Failure:
     """Measure every rod of a test object that can be measured.
 
@@ -127,6 +130,8 @@ def measure_pins(
         How.
     others : sequence of Frame
         Further frames of the sequence, see :func:`reseau.refine.find_pins`.
+    hidden : ndarray (h, w) of bool, optional
+        Pixels that wires of a reseau cover, where they are known.
 
     Returns
     -------
@@ -151,14 +156,15 @@ def measure_pins(
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
     if len(known) < 4:
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
-    seen = find_pins(frame, o, tuple(others))
+    seen = find_pins(frame, o, others, hidden)
     echoes = np.flatnonzero(seen.ok)
     layout = _laid(design, known, seen.xy[echoes], o)
     if isinstance(layout, Failure):
         return Failure(
             f"{frame.name}: the rods of design {design.name!r} are not to be found: {layout.reason}"
         )
-    work = _Rods(frame, source[known], seen, echoes, layout, o)
+    names = tuple(design.ids[i] for i in known)
+    work = _Rods(frame, source[known], names, seen, echoes, layout)
     return work.result(design.ids, known)
 
 
@@ -176,14 +182,22 @@ class _Rods:
     """Rods and echoes of one frame, and the field between them."""
 
     def __init__(
-        self, frame: Frame, source: Array, seen: PinDetections, echoes: Rows, layout: Layout, o: PinOptions
+        self,
+        frame: Frame,
+        source: Array,
+        ids: tuple[str, ...],
+        seen: PinDetections,
+        echoes: Rows,
+        layout: Layout,
     ) -> None:
         self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
         self.row, self.gate_px = layout.row, layout.gate_px
         self.predicted = layout(source)
         self.why = np.full(len(source), "", dtype=object)
         self.deviation = np.full(source.shape, np.nan)
+        self.ids = ids
         self._settle()
+        self._separate()
 
     def _settle(self) -> None:
         """Fit a field through rods and echoes, assign by it, take out what the others do not bear out."""
@@ -210,6 +224,24 @@ class _Rods:
             self.why[has[worst]] = f"{off[worst]:.1f} px off the prediction of its neighbours"
             self.row[has[worst]] = -1
         self.deviation[self.row < 0] = np.nan
+
+    def _separate(self) -> None:
+        """Decline an echo that another rod, which has none, should have a share in."""
+        has, without = np.flatnonzero(self.row >= 0), np.flatnonzero(self.row < 0)
+        if not len(has) or not len(without):
+            return
+        seen, at = self.seen, self.echoes[self.row[has]]
+        offset = self.predicted[without][:, None] - seen.xy[at]
+        c, s = np.cos(seen.tilt[at]), np.sin(seen.tilt[at])
+        along = np.abs(c * offset[..., 0] + s * offset[..., 1])
+        across = np.abs(c * offset[..., 1] - s * offset[..., 0])
+        shared = (along < 0.5 * seen.length[at]) & (across < np.maximum(seen.thickness[at], _BESIDE_PX))
+        for i, k in zip(*np.nonzero(shared), strict=True):
+            one, other = has[k], without[i]
+            self.why[one] = f"its echo touches that of {self.ids[other]}"
+            self.why[other] = f"its echo touches that of {self.ids[one]}"
+            self.row[one] = -1
+            self.deviation[one] = np.nan
 
     def _field(self) -> SmoothField | None:
         """From the design to the image; None where too few rods were found to test one."""
