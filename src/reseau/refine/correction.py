@@ -20,7 +20,7 @@ from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
 from .field import SmoothField
-from .fitting import fit_mapping, on_one_line, reduce_mapping, tests_of
+from .fitting import fit_mapping, on_one_line, reduce_mapping, residual_field, tests_of
 
 __all__ = ["CameraCorrection", "correct_camera"]
 
@@ -277,10 +277,7 @@ def correct_camera(
     correction = CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit)
     corrected = correction.apply(marks)
     residuals = (corrected.xy - target)[used]
-    local = None
-    if used.sum() >= 20:
-        null = _simulated_residuals(reduced, photo.select(used), sigma[used], trials)
-        local = SmoothField.fit(target[used], residuals, degree=0, null=null)
+    local = residual_field(reduced, photo.select(used), target[used], residuals, sigma[used, None], trials)
     record = CorrectionFit(
         elimination,
         photo.select(used),
@@ -291,18 +288,6 @@ def correct_camera(
         local,
     )
     return CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit, record)
-
-
-def _simulated_residuals(model: RationalPolynomial, photo: ImagePoints, sigma: Array, trials: int) -> Array:
-    """What an adjustment of this model leaves of the points' errors alone, (trials, n, 2)."""
-    _, slope, by_parameter = model.derivatives(photo.xy)
-    cov = slope @ photo.cov @ np.swapaxes(slope, 1, 2) + sigma[:, None, None] ** 2 * np.eye(2)
-    root = np.linalg.cholesky(cov)
-    taken, _ = np.linalg.qr(np.linalg.solve(root, by_parameter).reshape(2 * len(photo), -1))
-    white = np.random.default_rng(0).standard_normal((trials, 2 * len(photo)))
-    white -= (white @ taken) @ taken.T
-    left: Array = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(photo), 2))
-    return left
 
 
 def _mapped(system: Similarity, points: ImagePoints) -> ImagePoints:

@@ -12,8 +12,9 @@ from ..adjust import Adjustment, Elimination, Failure, GaussHelmert, Options, Pa
 from ..data import Array, ImagePoints
 from ..errors import UsageError
 from ..optics import PlaneMapping, RationalPolynomial
+from .field import SmoothField
 
-__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping", "tests_of"]
+__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping", "residual_field", "tests_of"]
 
 
 def mapping_problem(
@@ -162,3 +163,43 @@ def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
         }
         for test, verdict in dropped + kept
     )
+
+
+def residual_field(
+    model: PlaneMapping,
+    points: ImagePoints,
+    target: Array,
+    residuals: Array,
+    target_sigma: ArrayLike = 0.0,
+    trials: int = 499,
+) -> SmoothField | None:
+    """What a fitted model leaves, as a smooth field on top of it, and the test whether it is needed.
+
+    Parameters
+    ----------
+    model : PlaneMapping
+        The model at its estimates.
+    points, target, target_sigma
+        What it was fitted to.
+    residuals : ndarray (n, 2)
+        Mapped minus target.
+    trials : int
+        Simulated sets of residuals: what the adjustment leaves of the points' errors alone.
+
+    Returns
+    -------
+    SmoothField or None
+        Over the targets; its `need` is the probability, per axis, that errors alone would ask as much for a
+        field. None with fewer than 20 points.
+    """
+    if len(points) < 20:
+        return None
+    _, slope, by_parameter = model.derivatives(points.xy)
+    spread = np.broadcast_to(np.asarray(target_sigma, dtype=np.float64), target.shape)
+    cov = slope @ points.cov @ np.swapaxes(slope, 1, 2) + spread[:, :, None] ** 2 * np.eye(2)
+    root = np.linalg.cholesky(cov)
+    taken, _ = np.linalg.qr(np.linalg.solve(root, by_parameter).reshape(2 * len(points), -1))
+    white = np.random.default_rng(0).standard_normal((trials, 2 * len(points)))
+    white -= (white @ taken) @ taken.T
+    null = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(points), 2))
+    return SmoothField.fit(target, residuals, degree=0, null=null)

@@ -18,7 +18,7 @@ from ..calibration import Calibration, Covariance, Quantity
 from ..data import Array, ImagePoints
 from ..errors import FormatError, UsageError
 from ..formats import ReseauDesign
-from ..optics import RationalPolynomial, Similarity
+from ..optics import RationalPolynomial, Similarity, wong_display
 from ..provenance import canonical_json
 from .correction import (
     CameraCorrection,
@@ -28,7 +28,9 @@ from .correction import (
     unit_of,
     with_stored_values,
 )
-from .fitting import reduce_mapping, tests_of
+from .field import SmoothField
+from .fitting import reduce_mapping, residual_field, tests_of
+from .rivals import Rivalry, rivals
 
 __all__ = ["InstrumentCorrection", "InstrumentFit", "ObjectPlane", "correct_instrument"]
 
@@ -92,6 +94,11 @@ class InstrumentFit:
         Rods held out, in object coordinates.
     check_target : ndarray (c, 2)
         Their designed object coordinates.
+    local : SmoothField or None
+        What the model leaves; see :func:`reseau.refine.fitting.residual_field`.
+    displays : Rivalry or None
+        The polynomials (first) beside Wong's display model (second), both with all their coefficients; None
+        where there are too few rods for them.
     """
 
     elimination: Elimination
@@ -99,6 +106,8 @@ class InstrumentFit:
     target: Array
     check: ImagePoints
     check_target: Array
+    local: SmoothField | None
+    displays: Rivalry | None
 
     @property
     def adjustment(self) -> Adjustment:
@@ -254,6 +263,7 @@ def correct_instrument(
     alpha: float = 0.05,
     criterion: Literal["t", "chi2", "F"] = "F",
     check: Iterable[str] = (),
+    trials: int = 499,
 ) -> InstrumentCorrection | Failure:
     """Correct an instrument by the rods of a test object (Wishahy, steps iv–vii).
 
@@ -273,6 +283,8 @@ def correct_instrument(
         The test.
     check : iterable of str
         Rods held out, for an independent check.
+    trials : int
+        Simulated sets of residuals for the test whether a local model is needed on top.
 
     Returns
     -------
@@ -315,12 +327,16 @@ def correct_instrument(
     covariance = _joint_covariance(camera, rods.select(used), full, fit, rows)
     reduced = full.without(*elimination.dropped)
     correction = InstrumentCorrection(camera, reduced, plane, covariance, design.unit)
+    fitted, sigma = refined.select(used), table[used, 2:] * plane.scale
+    displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
     record = InstrumentFit(
         elimination,
-        refined.select(used),
+        fitted,
         target[used],
         correction.apply(rods.select(~used)),
         table[~used, :2],
+        residual_field(reduced, fitted, target[used], reduced(fitted.xy) - target[used], sigma, trials),
+        None if isinstance(displays, Failure) else displays,
     )
     return InstrumentCorrection(camera, reduced, plane, covariance, design.unit, record)
 
