@@ -1,12 +1,31 @@
 """Instruments that behave like hardware, all in one shared world; in process for now."""
 
 from .camera import Camera, film
-from .faults import Faults
+from .display import Bending, Display, Instrument
+from .faults import Faults, swapped
 from .plate import Plate
+from .reflectors import Reflectors
+from .scanner import Scanner, Video
 from .screen import Screen
 from .world import Truth, World
 
-__all__ = ["Camera", "Faults", "Plate", "Screen", "Truth", "World", "film", "simulated_bench"]
+__all__ = [
+    "Bending",
+    "Camera",
+    "Display",
+    "Faults",
+    "Instrument",
+    "Plate",
+    "Reflectors",
+    "Scanner",
+    "Screen",
+    "Truth",
+    "Video",
+    "World",
+    "film",
+    "simulated_bench",
+    "swapped",
+]
 
 
 def simulated_bench(seed: int = 0) -> World:

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Faults"]
+from reseau.errors import UsageError
+from reseau.formats import ReseauDesign
+
+__all__ = ["Faults", "swapped"]
+
+
+def swapped(design: ReseauDesign) -> ReseauDesign:
+    """The design as one gets it who confuses O with S, or M with N."""
+    return design.model_copy(update={"origin": design.axis, "axis": design.origin})
 
 
 @dataclass(frozen=True)
@@ -27,6 +35,15 @@ class Faults:
         Pixels of which one bit arrives wrong.
     lost_rows : int
         Rows that do not arrive: they are black.
+    parallax_mm : float
+        Gap between the reseau and the phosphor behind it.
+    camera_moved_mm : float
+        How far someone pushed the camera after PHOTO I, in a direction of the seed; it turned with it, by a
+        degree for 20 mm.
+    object_turned_deg : float
+        How far the test object stands turned in the tank.
+    missing_row : str
+        Row of rods of the test object that send no echo, by the letters of their names.
     """
 
     missing: int = 0
@@ -34,6 +51,24 @@ class Faults:
     scene: float = 0.0
     bit_errors: int = 0
     lost_rows: int = 0
+    parallax_mm: float = 0.0
+    camera_moved_mm: float = 0.0
+    object_turned_deg: float = 0.0
+    missing_row: str = ""
+
+    def silent(self, names: tuple[str, ...]) -> frozenset[str]:
+        """Those of the rods that send no echo.
+
+        Raises
+        ------
+        UsageError
+            When the missing row is none of theirs.
+        """
+        row = self.missing_row
+        gone = frozenset(name for name in names if row and name.rstrip("0123456789") == row)
+        if row and not gone:
+            raise UsageError("is no row of the test object", where=f"missing row {row!r}")
+        return gone
 
     def transmit(self, pixels: NDArray[Any], bits: int, rng: np.random.Generator) -> NDArray[Any]:
         """What arrives of a frame."""

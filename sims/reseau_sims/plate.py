@@ -46,6 +46,9 @@ class Plate:
     beyond_mm: float = 13.0
     missing: frozenset[str] = frozenset()
     false_marks: Array = field(default_factory=lambda: np.empty((0, 2)))
+    _kept: tuple[tuple[object, ...], Array] = field(
+        default=((None,), np.empty(0)), init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.design.xy).all():
@@ -53,14 +56,25 @@ class Plate:
 
     def over(self, light: Array, camera: Camera, row_shifts: Array | None = None) -> Array:
         """The light (height, width) that reaches the camera past the marks."""
+        share = self._share(camera, row_shifts)
+        if self.design.polarity == "bright":
+            return light + self.brightness * share
+        return light * (1 - self.opacity * share)
+
+    def _share(self, camera: Camera, row_shifts: Array | None) -> Array:
+        """Share (height, width) of the light that falls on marks; the last one is kept."""
+        of = (camera, self.design, self.missing, self.false_marks, self.beyond_mm)
+        # A reseau stays where it is from one photograph to the next, and drawing it is most of the work.
+        if row_shifts is None and all(a is b for a, b in zip(self._kept[0], of, strict=False)):
+            return self._kept[1]
         share = np.zeros(camera.shape)
         for outline in self._outlines(_mm_per_px(camera) * _SPACING_PX * camera.psf_px):
             image = outline.mapped(lambda xy: camera.view.derivatives(xy)[:2]).oriented()
             share += draw(image, camera.shape, camera.psf_px, camera.response, row_shifts)
         np.clip(share, 0.0, 1.0, out=share)
-        if self.design.polarity == "bright":
-            return light + self.brightness * share
-        return light * (1 - self.opacity * share)
+        if row_shifts is None:
+            self._kept = (of, share)
+        return share
 
     def _outlines(self, spacing: float) -> list[Outline]:
         """All marks in the plane of the design, in batches of like outlines."""

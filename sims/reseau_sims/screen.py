@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from reseau.data import Array
 from reseau.optics import PlaneMapping
@@ -54,19 +54,19 @@ class Screen:
 
     def illuminate(
         self,
-        level: float,
+        level: float | NDArray[np.floating],
         rng: np.random.Generator,
         *,
         gradient: tuple[float, float] = (0.06, -0.04),
         falloff: float = 0.10,
         grain: float = 0.001,
     ) -> None:
-        """Light the whole phosphor evenly, as far as a tube can.
+        """Light the phosphor, evenly or with a picture, as far as a tube can.
 
         Parameters
         ----------
-        level : float
-            Grey value at the centre.
+        level : float or ndarray (rows, columns)
+            Grey value that a phosphor as good as that at the centre would give.
         rng : Generator
             Source of the phosphor's grain.
         gradient : (float, float)
@@ -92,7 +92,7 @@ class Screen:
         change = light * (0.5 - 0.5 * np.tanh((distance - radius) / softness))
         self.light = np.maximum(self.light + change, 0).astype(np.float32)
 
-    def seen(self, view: PlaneMapping, shape: tuple[int, int]) -> Array:
+    def seen(self, view: PlaneMapping, shape: tuple[int, int], blur_px: float = 0.0) -> Array:
         """Light that falls on the pixels of a camera.
 
         Parameters
@@ -101,6 +101,9 @@ class Screen:
             From the plane of the screen (mm) to the image (px).
         shape : (int, int)
             Height and width of the image.
+        blur_px : float
+            Width (one sigma) of the point-spread function of the camera; for a picture. An even light needs
+            none, and is sampled linearly.
 
         Returns
         -------
@@ -111,7 +114,8 @@ class Screen:
         x, y = on_lattice(view.inverse, np.arange(float(width)), np.arange(float(height)))
         rows, columns = self.light.shape
         at = np.stack([(rows - 1) / 2 - y / self.pitch_mm, (columns - 1) / 2 + x / self.pitch_mm])
-        # Linear between samples of the size of a pixel: the tube has nothing finer than its spot.
         at = np.nan_to_num(at, nan=-1e9)
-        light: Array = map_coordinates(self.light, at, output=np.float64, order=1, mode="nearest")
-        return light
+        # Samples are as large as a pixel, and the tube has nothing finer than its spot.
+        order = 2 if blur_px else 1
+        light: Array = map_coordinates(self.light, at, output=np.float64, order=order, mode="nearest")
+        return np.maximum(gaussian_filter(light, blur_px, truncate=5.0), 0) if blur_px else light

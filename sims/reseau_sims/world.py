@@ -6,23 +6,40 @@ for. PHOTO I is the same to the bit whether or not another photograph was taken 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from typing import Literal
 
 import numpy as np
 
 from reseau.data import Array, Frame
-from reseau.designs import standard_reseau
+from reseau.designs import standard_reseau, test_object
 from reseau.formats import ReseauDesign
-from reseau.optics import Brown, PixelGrid, PlaneMapping, Pose, Sensor, angles_to_matrix, matrix_to_vector
+from reseau.optics import (
+    Brown,
+    Chain,
+    Inverted,
+    PixelGrid,
+    PlaneMapping,
+    Pose,
+    Sensor,
+    Similarity,
+    angles_to_matrix,
+    matrix_to_vector,
+)
 
 from .camera import Camera, film
+from .display import Display
 from .faults import Faults
 from .plate import Plate
+from .reflectors import Reflectors, body_of, rods_of
+from .scanner import Scanner, Video
 from .screen import Screen
 
 __all__ = ["Truth", "World"]
 
+PHOTO_I, PHOTO_II, PHOTO_III = "PHOTO I", "PHOTO II", "PHOTO III"
+"""What the photographs of the procedure are called."""
 _LEVEL = 190.0
 """Grey value of the lit screen, of 255."""
 
@@ -34,11 +51,13 @@ class Truth:
     Parameters
     ----------
     names : tuple of str (n,)
-        The marks of the design.
+        Marks of the reseau, rods of the test object or points of a body.
     object_xy : ndarray (n, 2)
-        Their coordinates in the plane of the reseau (mm).
+        Their coordinates in the plane of the reseau or of the object (mm). Those of rods are of the rods as
+        they were made, not as they were designed.
     xy : ndarray (n, 2)
-        Their positions in the image without noise (px).
+        Their positions in the image without noise (px). For a rod, that of the middle of its arc: where the
+        line along which the arc is brightest passes the place of the reflector.
     view : PlaneMapping
         From the plane to the image, and by its inverse back.
     """
@@ -51,7 +70,7 @@ class Truth:
 
 @dataclass
 class World:
-    """A screen, a reseau in front of it, and a camera that looks at both.
+    """A scanner and its screen, a reseau in front of it, and a camera that looks at both.
 
     Parameters
     ----------
@@ -63,6 +82,14 @@ class World:
         The reseau.
     camera : Camera
         What photographs them.
+    display : Display
+        The tube that draws on the screen what the scanner sweeps.
+    scanner : Scanner
+        The ultrasonic instrument.
+    test_object : ReseauDesign
+        Its rods, as designed.
+    rods : Reflectors
+        Its rods, as made.
     faults : Faults
         What goes wrong.
 
@@ -72,12 +99,18 @@ class World:
     >>> frame = world.photo_i()
     >>> frame.name, frame.pixels.shape, len(world.truth().names)
     ('PHOTO I', (1200, 1600), 165)
+    >>> world.photo_ii().name, len(world.truth_ii().names), len(world.body(20).names)
+    ('PHOTO II', 38, 20)
     """
 
     seed: int
     screen: Screen
     plate: Plate
     camera: Camera
+    display: Display
+    scanner: Scanner
+    test_object: ReseauDesign
+    rods: Reflectors
     faults: Faults = field(default_factory=Faults)
 
     @classmethod
@@ -88,8 +121,11 @@ class World:
         design: ReseauDesign | None = None,
         faults: Faults | None = None,
         camera: Camera | None = None,
+        display: Display | Literal["wong", "polynomial"] = "wong",
+        scanner: Scanner | None = None,
+        rods: ReseauDesign | None = None,
     ) -> World:
-        """The bench of the oscilloscope procedure: a non-metric camera drawn from the seed.
+        """The bench of the oscilloscope procedure: everything non-metric in it is drawn from the seed.
 
         Parameters
         ----------
@@ -101,13 +137,26 @@ class World:
             None by default.
         camera : Camera, optional
             Instead of the one drawn.
+        display : Display or {"wong", "polynomial"}
+            One of Wong's model, or one that eq. (7a, b) corrects exactly, or this one.
+        scanner : Scanner, optional
+            Instead of the one drawn.
+        rods : ReseauDesign, optional
+            The test object; by default the 100 mm one. The rods as made are drawn from its sigmas.
         """
-        faults = faults or Faults()
+        faults, rods = faults or Faults(), rods or test_object()
+        if not isinstance(display, Display):
+            tube = {"wong": Display.drawn, "polynomial": Display.polynomial}[display]
+            display = tube(_stream(seed, "display"))
         world = cls(
             seed,
             Screen(),
             Plate(design or standard_reseau()),
             camera or _non_metric(_stream(seed, "camera")),
+            display,
+            scanner or Scanner.drawn(_stream(seed, "scanner")),
+            rods,
+            rods_of(rods, _stream(seed, "rods")),
             faults,
         )
         world.screen.illuminate(_LEVEL, world.rng("phosphor"))
@@ -127,10 +176,30 @@ class World:
         """From the plane of the reseau (mm) to the image (px), without noise: the truth."""
         return self.camera.view
 
-    def truth(self) -> Truth:
-        """Exact positions of all marks of the design, also of those that are missing."""
-        design = self.design
-        return Truth(design.ids, design.xy, self.camera.view(design.xy), self.camera.view)
+    def camera_of(self, photo: str) -> Camera:
+        """The camera as it stood for a photograph."""
+        pushed = self.faults.camera_moved_mm
+        if not pushed or photo not in (PHOTO_II, PHOTO_III):
+            return self.camera
+        way = self.rng("push").standard_normal(3)
+        return self.camera.moved(pushed * way / np.hypot(*way[:2]) * (1, 1, 0.2), np.deg2rad(pushed / 20))
+
+    def truth(self, photo: str = PHOTO_I) -> Truth:
+        """Exact positions of all marks of the reseau in a photograph, also of those that are missing."""
+        design, view = self.design, self.camera_of(photo).view
+        return Truth(design.ids, design.xy, view(design.xy), view)
+
+    def truth_ii(self) -> Truth:
+        """Exact positions of the rods' images in PHOTO II, also of those that send no echo."""
+        return self._truth_of(self.rods, PHOTO_II)
+
+    def truth_iii(self, body: Reflectors | None = None) -> Truth:
+        """Exact positions of a body's points in PHOTO III."""
+        return self._truth_of(self.body() if body is None else body, PHOTO_III)
+
+    def body(self, count: int = 24) -> Reflectors:
+        """An invisible body whose points nobody has measured; the world knows them."""
+        return body_of(count, self.rng("body"))
 
     def check_marks(self) -> tuple[str, ...]:
         """Marks spread over the reseau that are meant to be held out of an adjustment: about one in nine."""
@@ -144,16 +213,57 @@ class World:
 
     def photo_i(self) -> Frame:
         """PHOTO I of the procedure: the reseau in front of the evenly lit screen, nothing displayed."""
-        return self.photograph("PHOTO I")
+        return self.photograph(PHOTO_I)
 
-    def photograph(self, name: str) -> Frame:
-        """What the camera sees now; the same name gives the same noise."""
-        rng, camera = self.rng("exposure", name), self.camera
+    def photo_ii(self) -> Frame:
+        """PHOTO II: the reseau in front of the section through the test object."""
+        return self.photograph(PHOTO_II, self.show(self.rods, PHOTO_II))
+
+    def photo_iii(self, body: Reflectors | None = None) -> Frame:
+        """PHOTO III: the reseau in front of the section through a body, by default :meth:`body`."""
+        return self.photograph(PHOTO_III, self.show(self.body() if body is None else body, PHOTO_III))
+
+    def show(self, reflectors: Reflectors, name: str) -> Screen:
+        """The screen while the scanner sweeps over reflectors; the same name gives the same noise."""
+        screen = replace(self.screen)
+        beam = self.scanner.m1, self.scanner.m2
+        self.display.show(self._video(reflectors, name), screen, self.rng("phosphor", name), beam)
+        return screen
+
+    def photograph(self, name: str, screen: Screen | None = None) -> Frame:
+        """What the camera sees of a screen, by default the lit one; the same name gives the same noise."""
+        rng, camera = self.rng("exposure", name), self.camera_of(name)
         jitter = camera.sensor.row_shifts(rng) if camera.sensor.row_jitter_px else None
-        light = self.plate.over(self.screen.seen(camera.view, camera.shape), camera, jitter)
-        exposed = camera.sensor.expose(light, rng)
+        behind = camera.view_at(-self.faults.parallax_mm)
+        if screen is None:
+            seen = self.screen.seen(behind, camera.shape)
+        else:
+            seen = screen.seen(behind, camera.shape, camera.psf_px)
+        exposed = camera.sensor.expose(self.plate.over(seen, camera, jitter), rng)
         pixels = self.faults.transmit(exposed, camera.sensor.bits, rng)
         return Frame(pixels, camera.sensor.full_scale, name, sha256(pixels.tobytes()).hexdigest())
+
+    def _standing(self, photo: str) -> Similarity:
+        """From the system of the object to that of the transducer's way; it may stand turned."""
+        angle = np.deg2rad(self.faults.object_turned_deg if photo == PHOTO_II else 0.0)
+        middle = np.array([0.0, -self.scanner.depth_mm / 2])
+        c, s = np.cos(angle), np.sin(angle)
+        shift = middle - np.array([[c, -s], [s, c]]) @ middle
+        return Similarity(np.array([*shift, c, s]))
+
+    def _video(self, reflectors: Reflectors, photo: str) -> Video:
+        """What the scanner hands to the display of reflectors in the tank, faults included."""
+        silent = self.faults.silent(self.rods.names) if photo == PHOTO_II else frozenset()
+        audible = reflectors.without(silent).moved(self._standing(photo))
+        return self.scanner.sweep(audible, *self.display.raster(self.screen), self.rng("receiver", photo))
+
+    def _truth_of(self, reflectors: Reflectors, photo: str) -> Truth:
+        path = self.display.path(self._video(reflectors, photo), (self.scanner.m1, self.scanner.m2))
+        section = Chain(self._standing(photo), self.scanner.section, ("standing.", "section."))
+        shown = Chain(section, Inverted(path), ("", "display."))
+        camera = self.camera_of(photo).view_at(-self.faults.parallax_mm)
+        view = Chain(shown, camera, ("", "camera."))
+        return Truth(reflectors.names, reflectors.xy, view(reflectors.xy), view)
 
     def _apply_faults(self) -> None:
         rng, ids = self.rng("faults"), self.design.ids

@@ -1,4 +1,4 @@
-"""Regular reseaus: designs made from a few numbers, and the standard one of the oscilloscope procedure."""
+"""Designs made from a few numbers: regular reseaus, and an ultrasonic test object."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from .errors import UsageError
 from .formats import DesignPoint, Mark, ReseauDesign
 
-__all__ = ["regular_reseau", "standard_reseau"]
+__all__ = ["regular_reseau", "standard_reseau", "test_object"]
 
 
 def regular_reseau(
@@ -99,3 +99,68 @@ def standard_reseau() -> ReseauDesign:
     paper does not tell their number.
     """
     return regular_reseau(15, 11, 10.0, Mark(shape="line-grid", line_width=0.3), name="wires-15x11")
+
+
+_ROWS = {
+    "A": (20.0, (-50, -25, 0, 25, 50)),
+    "B": (40.0, (-50, 0, 50)),
+    "C": (60.0, (-50, -25, 0, 25, 50)),
+    "D": (80.0, (-50, 0, 50)),
+    "E": (100.0, (-50, -25, 0, 25, 50)),
+}
+"""Rows of rods: depth under the upper edge, and places along it (mm). Those at 0 are the range group."""
+_GROUPS = {
+    # Ever nearer to each other along the row: from where on are two rods seen as one?
+    "L": ((-39, 90), (-14, 90), (6, 90), (21, 90), (31, 90), (36, 90), (39, 90)),
+    # On an inclined line, ever nearer to each other in depth.
+    "X": ((-38, 28), (-36, 33), (-34, 37), (-32, 40), (-30, 42), (-28, 43)),
+    # Ever nearer to the transducer.
+    "T": ((18, 12), (28, 9), (38, 6), (48, 4)),
+}
+"""Groups that show the lateral and the axial resolution, and the dead zone."""
+
+
+def test_object() -> ReseauDesign:
+    """The 100 mm ultrasonic test object: 38 stainless steel rods of 0.75 mm, each in its place to ± 0.25 mm.
+
+    A test object for pulse-echo apparatus such as Wishahy uses: rows 20 mm apart with rods every 25 or 50 mm
+    (``A1`` … ``E5``), of which the middle ones make the range group, a column down to 100 mm; a row of rods
+    ever nearer to each other for the lateral resolution (``L``), an inclined line for the axial one (``X``),
+    and rods close to the transducer for the dead zone (``T``). The paper tells diameter and tolerance but no
+    places; these are of that kind and not a copy of a standard's drawing.
+
+    Returns
+    -------
+    ReseauDesign
+        Millimetres, x right, y up from the middle of the upper edge, along which the transducer moves: the
+        depth is −y. M and N are the ends of the middle row, ``C1`` and ``C5``.
+
+    Examples
+    --------
+    >>> rods = test_object()
+    >>> len(rods.ids), rods.origin, rods.axis, rods.mark.size, rods.points[0].sigma
+    (38, 'C1', 'C5', 0.75, 0.25)
+    """
+    rods = [
+        (f"{row}{i + 1}", float(x), -depth)
+        for row, (depth, places) in _ROWS.items()
+        for i, x in enumerate(places)
+    ]
+    rods += [
+        (f"{group}{i + 1}", float(x), -float(depth))
+        for group, places in _GROUPS.items()
+        for i, (x, depth) in enumerate(places)
+    ]
+    return ReseauDesign(
+        name="rods-100mm",
+        unit="mm",
+        mark=Mark(shape="rod", size=0.75),
+        polarity="bright",
+        origin="C1",
+        axis="C5",
+        points=tuple(DesignPoint(id=name, x=x, y=y, sigma=0.25) for name, x, y in rods),
+    )
+
+
+# Not one for pytest, which collects what is named so wherever it is imported.
+test_object.__test__ = False  # type: ignore[attr-defined]

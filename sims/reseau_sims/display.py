@@ -1,0 +1,274 @@
+"""A cathode-ray tube: draws video line by line, a little beside its place, with a spot of some size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from reseau.data import Array
+from reseau.errors import UsageError
+from reseau.optics import Chain, Derivatives, PlaneMapping, RationalPolynomial, wong_display
+from reseau.optics.mapping import as_points, as_values
+from reseau.optics.resampling import on_lattice
+
+from .scanner import Video
+from .screen import Screen
+
+__all__ = ["Bending", "Display", "Instrument"]
+
+_SPARE_MM = 6.0
+"""What the raster reaches beyond the phosphor: distortion carries it in from there."""
+_CHARGE_STEP = 10
+"""Samples of the picture for one of the map of its charge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument(PlaneMapping):
+    """Correction of a display with the beam of a scanner: from what is displayed to where it belongs.
+
+    The sum of Wishahy's eq. (6): X = x + (Δx)s + (Δx)d + (Δx)o + m1·x + m2·y, all at the displayed point.
+
+    Parameters
+    ----------
+    display : PlaneMapping
+        Of the tube alone.
+    m1, m2 : float
+        Of the beam.
+
+    Raises
+    ------
+    UsageError
+        When the display has parameters `m1` or `m2` of its own.
+    """
+
+    display: PlaneMapping
+    m1: float = 0.0
+    m2: float = 0.0
+
+    def __post_init__(self) -> None:
+        if {"m1", "m2"} & set(self.display.names):
+            raise UsageError("m1 and m2 belong to the scanner; take them out", where="model of a display")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the display, m1 and m2."""
+        return (*self.display.names, "m1", "m2")
+
+    @property
+    def values(self) -> Array:
+        """Values of the parameters."""
+        return np.append(self.display.values, [self.m1, self.m2])
+
+    def _replaced(self, values: Array) -> Self:
+        display = self.display.with_values(values[:-2])
+        return replace(self, display=display, m1=float(values[-2]), m2=float(values[-1]))
+
+    def _value(self, xy: Array) -> Array:
+        value = self.display(xy)
+        value[:, 0] += xy @ (self.m1, self.m2)
+        return value
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        points = as_points(xy)
+        value, d_xy, d_display = self.display.derivatives(points)
+        value, d_xy, d_beam = value.copy(), d_xy.copy(), np.zeros((len(points), 2, 2))
+        value[:, 0] += points @ (self.m1, self.m2)
+        d_xy[:, 0] += (self.m1, self.m2)
+        d_beam[:, 0] = points
+        return Derivatives(value, d_xy, np.concatenate([d_display, d_beam], axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Bending(PlaneMapping):
+    """What bright areas do to the electron beam near them: from what is displayed to where it was aimed at.
+
+    The charge that a bright area leaves on the phosphor pushes the beam away, by an amount proportional to
+    the gradient of the charge.
+
+    Parameters
+    ----------
+    x, y : ndarray (c,), (r,)
+        Nodes, ascending (mm).
+    shift : ndarray (r, c, 2)
+        To be added to a displayed point (mm).
+    """
+
+    names: ClassVar[tuple[str, ...]] = ()
+    x: Array
+    y: Array
+    shift: Array
+    values: Array = field(default_factory=lambda: np.zeros(0))
+    _splines: tuple[Any, Any] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", as_values(self.names, self.values))
+        splines = tuple(RectBivariateSpline(self.y, self.x, self.shift[..., k]) for k in range(2))
+        object.__setattr__(self, "_splines", splines)
+
+    def _value(self, xy: Array) -> Array:
+        shift: Array = np.stack([s.ev(xy[:, 1], xy[:, 0]) for s in self._splines], axis=-1)
+        return xy + shift
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        points = as_points(xy)
+        x, y = points.T
+        slope = [[s.ev(y, x, dy=1), s.ev(y, x, dx=1)] for s in self._splines]
+        d_xy = np.eye(2) + np.moveaxis(np.array(slope), -1, 0)
+        return Derivatives(self._value(points), d_xy, np.zeros((len(points), 2, 0)))
+
+
+@dataclass(frozen=True)
+class Display:
+    """A cathode-ray tube.
+
+    Parameters
+    ----------
+    correction : PlaneMapping
+        From what is displayed to where it belongs, in the plane of the screen (mm). Drawing is its inverse.
+    line_mm, sample_mm : float
+        Distance of the lines of the raster and of the samples on a line.
+    spot_mm : float
+        Width (one sigma) of the spot across the lines.
+    glow : float
+        Grey value of black: the raster is never quite dark, and the reseau stands out against it.
+    contrast : float
+        Grey values that a signal of 1 adds.
+    grain : float
+        Relative standard deviation of the phosphor's light, from sample to sample.
+    gradient, falloff : (float, float), float
+        Unevenness of its light; see :meth:`reseau_sims.screen.Screen.illuminate`.
+    bending_mm : float
+        How far the beam is pushed away at the edge of a large area of full brightness.
+    bending_reach_mm : float
+        Width (one sigma) over which the charge of a bright area acts.
+    bright : tuple of (float, float, float)
+        Bright disks that the instrument shows: x, y on an ideal screen and radius (mm).
+    """
+
+    correction: PlaneMapping
+    line_mm: float = 0.4
+    sample_mm: float = 0.1
+    spot_mm: float = 0.18
+    glow: float = 42.0
+    contrast: float = 170.0
+    grain: float = 0.005
+    gradient: tuple[float, float] = (0.03, -0.02)
+    falloff: float = 0.05
+    bending_mm: float = 0.0
+    bending_reach_mm: float = 5.0
+    bright: tuple[tuple[float, float, float], ...] = ()
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Display:
+        """A tube of Wong's model with distortions of a millimetre or two at the corners."""
+        values = {
+            "k0": rng.normal(0.0, 4.0e-3),
+            "k1": rng.normal(3.0e-6, 6.0e-7),
+            "h'1": rng.normal(0.0, 3.0e-5),
+            "h'2": rng.normal(0.0, 3.0e-9),
+            "h'3": rng.normal(0.0, 3.0e-5),
+            "h'4": rng.normal(0.0, 3.0e-9),
+            "P0": rng.normal(0.0, 0.6),
+            "P1": rng.normal(0.0, 3.0e-5),
+            "P2": rng.normal(0.0, 3.0e-5),
+            "P3": rng.normal(0.0, 4.0e-3),
+            "P4": rng.normal(0.0, 0.6),
+        }
+        return cls(wong_display().without("k2", "k3", "m1", "m2").with_values(values))
+
+    @classmethod
+    def polynomial(cls, rng: np.random.Generator) -> Display:
+        """A tube that Wishahy's eq. (7a, b) corrects exactly; each coefficient has a value of its own."""
+        mean = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 3.0e-6, 0.0]
+        sigma = [0.6, 4.0e-3, 4.0e-3, 4.0e-5, 4.0e-5, 4.0e-5, 6.0e-7, 3.0e-9]
+        return cls(RationalPolynomial.ultrasonic().with_values(rng.normal([*mean, *mean], [*sigma, *sigma])))
+
+    def raster(self, screen: Screen) -> tuple[Array, Array]:
+        """Coordinates x (samples,) and y (lines,) on an ideal screen (mm) that video has to be given for."""
+        half = np.array([screen.width_mm, screen.height_mm]) / 2 + _SPARE_MM
+        samples, lines = np.ceil(half / (self.sample_mm, self.line_mm)).astype(int)
+        x = np.arange(-samples, samples + 1) * self.sample_mm
+        y = -np.arange(-lines, lines + 1) * self.line_mm
+        return x, y
+
+    def path(self, video: Video, beam: tuple[float, float] = (0.0, 0.0)) -> PlaneMapping:
+        """From what is displayed of a video to where it belongs, with all that acts on it.
+
+        Parameters
+        ----------
+        video : Video
+            Its bright areas bend the beam.
+        beam : (float, float)
+            m1 and m2 of the scanner that made it.
+        """
+        instrument = Instrument(self.correction, *beam)
+        return instrument if not self.bending_mm else Chain(self._bending(video), instrument)
+
+    def show(
+        self, video: Video, screen: Screen, rng: np.random.Generator, beam: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Draw a video on a screen; what was there before is gone.
+
+        Parameters
+        ----------
+        video : Video
+            On the raster of this display.
+        screen : Screen
+            Takes the light.
+        rng : Generator
+            Of the phosphor's grain.
+        beam : (float, float)
+            m1 and m2 of the scanner.
+        """
+        picture = self._picture(video)
+        path, (x, y) = self.path(video, beam), screen.raster()
+        step = screen.pitch_mm
+
+        def aimed(at: Array) -> Array:
+            """Where in the picture the samples (column, row) of the screen look."""
+            belongs = path(np.stack([x[0] + step * at[:, 0], y[0] - step * at[:, 1]], axis=-1))
+            return np.stack([belongs[:, 0] - video.x[0], video.y[0] - belongs[:, 1]], -1) / self.sample_mm
+
+        columns, rows = on_lattice(aimed, np.arange(float(len(x))), np.arange(float(len(y))))
+        # Cubic: with linear interpolation the middle of an echo would depend on how it lies between samples.
+        light = map_coordinates(picture, [rows, columns], output=np.float32, order=3, mode="nearest")
+        screen.illuminate(
+            np.maximum(light, 0), rng, gradient=self.gradient, falloff=self.falloff, grain=self.grain
+        )
+
+    def _picture(self, video: Video) -> NDArray[np.float32]:
+        """Light of the undistorted picture, as finely sampled across the lines as along them."""
+        signal = self._with_disks(video)
+        rows = round((video.y[0] - video.y[-1]) / self.sample_mm) + 1
+        fine = video.y[0] - np.arange(rows) * self.sample_mm
+        z = (fine[:, None] - video.y[None, :]) / self.spot_mm
+        spot = np.exp(-0.5 * z * z) * (self.line_mm / (self.spot_mm * np.sqrt(2 * np.pi)))
+        picture: NDArray[np.float32] = spot.astype(np.float32) @ (self.glow + self.contrast * signal)
+        return np.maximum(picture, 0, out=picture)
+
+    def _with_disks(self, video: Video) -> NDArray[np.float32]:
+        signal = video.signal
+        for x, y, radius in self.bright:
+            distance = np.hypot(video.x[None, :] - x, video.y[:, None] - y)
+            disk = 0.5 - 0.5 * np.tanh((distance - radius) / 0.4)
+            signal = np.maximum(signal, disk.astype(np.float32))
+        return signal
+
+    def _bending(self, video: Video) -> Bending:
+        signal, reach = self._with_disks(video), self.bending_reach_mm
+        steps = np.array([self.line_mm, self.sample_mm])
+        # One node a millimetre is enough for what is blurred over several.
+        every = np.maximum(1, np.rint(_CHARGE_STEP * self.sample_mm / steps)).astype(int)
+        charge = gaussian_filter(signal, reach / steps)[:: every[0], :: every[1]][::-1].astype(np.float64)
+        x, y = video.x[:: every[1]], video.y[:: every[0]][::-1]
+        up, right = np.gradient(charge, y, x)
+        # At the straight edge of a large area the gradient of the charge is 1/(reach·√(2π)).
+        amount = self.bending_mm * reach * np.sqrt(2 * np.pi)
+        return Bending(x, y, amount * np.stack([right, up], axis=-1))
