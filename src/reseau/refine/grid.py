@@ -130,7 +130,9 @@ def _assigned(
     for step, most in enumerate((1, 1, 2, 3, 3, 5, 5, 5)):
         reached = far <= max(3.5 * pitch, np.quantile(far, min(1.0, 0.35 + 0.13 * step)))
         rows = _nearest(tree, candidates, predicted, gate, reached)
-        fitted = _robust_field(source, rows, candidates, min(most, trend_degree(int((rows >= 0).sum()))))
+        fitted = _robust_field(
+            source, rows, candidates, min(most, max(1, trend_degree(int((rows >= 0).sum()))))
+        )
         if fitted is None:
             break
         field, scatter = fitted

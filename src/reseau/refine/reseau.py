@@ -17,12 +17,15 @@ from ..data import Array, Frame, ImagePoints, Mask, Rows
 from ..errors import UsageError
 from ..formats import ReseauDesign, ReseauMeasurement
 from .field import SmoothField
-from .grid import GridOptions
+from .grid import GridOptions, spacing
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .matching import Matches
 from .placing import PlacingOptions, place
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
+
+_DISTORTED = 0.03
+"""Part of the spacing of the marks by which they may lie off their prediction, on the average."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +86,9 @@ class ReseauResult:
         return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
 
     def rms(self) -> Array:
-        """Leave-one-out deviation, root mean square per axis (2,)."""
-        rms: Array = np.sqrt(np.nanmean(self.deviation**2, axis=0))
-        return rms
+        """Leave-one-out deviation, root mean square per axis (2,); NaN with too few marks to predict any."""
+        known = self.deviation[np.isfinite(self.deviation).all(axis=1)]
+        return np.sqrt((known**2).mean(axis=0)) if len(known) else np.full(2, np.nan)
 
     def need(self, trials: int = 499, seed: int = 0) -> Array:
         """Probability, per axis (2,), that white noise alone would ask as much for the local model."""
@@ -143,7 +146,31 @@ def measure_reseau(
         return placed
     measurement = MarkMeasurement(frame, design, source[known], placed, options)
     at, found, judged = measurement.result()
+    why_not = _disagreement(source[known], judged, options)
+    if why_not:
+        return Failure(f"{frame.name}: design {design.name!r} is not to be found in the frame: {why_not}")
     return _columns(frame, design, known, at, found, judged, measurement.field)
+
+
+def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str:
+    """Why what was measured is not this design: its marks do not lie together as they should; else nothing.
+
+    Specks and patterns of a scene look like marks one by one. Laid over enough of them the design finds some
+    near its marks, but no smooth field goes through these.
+    """
+    good = np.flatnonzero(judged.why == "")
+    if len(good) < 4:
+        return f"{len(good)} marks could be measured"
+    if np.isfinite(judged.deviation[good]).all():
+        off = np.sqrt((judged.deviation[good] ** 2).mean(axis=0)).max()
+    elif len(good) > 4:  # too few for the neighbours to judge one another, but not for a plane
+        off = SmoothField.fit(source[good], judged.xy[good], degree=1, local=False).noise.max()
+    else:
+        return ""
+    # Few marks of a strongly distorted image do not predict each other to a pixel.
+    if off <= max(options.neighbour_px, _DISTORTED * spacing(judged.predicted)):
+        return ""
+    return f"{len(good)} places look like its marks, but lie {off:.1f} px off each other's prediction"
 
 
 def _source(design: ReseauDesign) -> Array:
