@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from ..data import Mask
 from .echoes import Grey
@@ -13,8 +14,10 @@ __all__ = ["bridged", "find_cuts"]
 
 _DEPTH = 0.4
 """Share of the light beside it that a wire takes at least."""
-_BESIDE_PX = 5
+_BESIDE_PX = 3
 """Width of the light on either side of a wire; strokes of characters are narrower."""
+_APART_PX = 20.0
+"""Distance within which there may be one gap more, the next wire's, but not two."""
 _AROUND_PX = 9
 """How far beside a gap the light is asked whether it is an echo's."""
 _SOFT = 0.1
@@ -52,13 +55,17 @@ def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
     # An even element would shift what it closes.
     closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((1, most_px + 1 | 1), np.uint8))
     filled = (closed - calm > _DEPTH * closed) & (closed > 8 * noise)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(filled.astype(np.uint8), connectivity=8)
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(filled.astype(np.uint8), connectivity=8)
     upright = stats[:, cv2.CC_STAT_HEIGHT] > _SLENDER * stats[:, cv2.CC_STAT_WIDTH]
     upright &= stats[:, cv2.CC_STAT_HEIGHT] >= 3
     upright[0] = False
     if not upright.any():
         return np.zeros(light.shape, dtype=bool)
     upright &= _soft_around(light, labels.astype(np.int32), count)
+    # Wires stand far apart; between the strokes of characters there is one gap beside the other.
+    at = np.flatnonzero(stats[:, cv2.CC_STAT_HEIGHT] >= 3)[1:]
+    crowd = KDTree(centres[at]).query_ball_point(centres[at], _APART_PX, p=np.inf, return_length=True)
+    upright[at[crowd > 2]] = False
     # The blur of the wire's edges reaches a pixel further.
     cut = cv2.dilate(upright[labels].astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.asarray(cut > 0)

@@ -28,6 +28,7 @@ _GROUND_LENGTHS = 1.0
 """Side of the running median that is the ground, in the greatest lengths of an arc."""
 _LONG_PX = 40.0
 """Length up to which an arc is a pin's in a frame of any size."""
+_IN_ROWS = ("a character in a row of characters", "one of a scale's equally spaced marks")
 _STATIC = 0.7
 """Share of a spot that must be the same in all frames to be no part of the image."""
 
@@ -48,7 +49,7 @@ class PinOptions:
     least_strength : float
         Least brightness over the ground, as a share of that of the brightest echo.
     least_correlation : float
-        Least correlation of a spot with its formed arc.
+        Least correlation of a spot with its formed arc, noise apart.
     most_touching : float
         Share of its height above which a spot must not touch another.
     sharpest_px : float
@@ -172,7 +173,7 @@ def find_pins(
     longest = o.most_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
     light = screened.grey - ground
-    least = max(5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
+    least = max(2.5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
     covered = find_cuts(light, screened.noise, o.most_wire_px)
     if hidden is not None:
         covered |= hidden
@@ -210,6 +211,8 @@ class _Judge:
             (sharp, "sharp all around: drawn by the instrument"),
             (self._static(), "the same in all frames"),
         ]
+        drawn = sharp | looks_sharp(e)
+        coarse += zip(series(e, drawn), _IN_ROWS, strict=True)
         for mask, reason in coarse:
             self._object(np.arange(len(e)), mask, reason)
         open_ = self.why == ""
@@ -222,10 +225,9 @@ class _Judge:
         found = self._match(at)
         for mask, reason in self._objections(at, found):
             self._object(at, mask, reason)
-        characters, scale = series(e, sharp | looks_sharp(e) | self._looks_drawn(at, found))
         every = np.arange(len(e))
-        self._object(every, characters, "a character in a row of characters", also_sharp=sharp)
-        self._object(every, scale, "one of a scale's equally spaced marks", also_sharp=sharp)
+        for mask, reason in zip(series(e, drawn | self._looks_drawn(at, found)), _IN_ROWS, strict=True):
+            self._object(every, mask, reason, also_sharp=sharp)
         brightest = float(e.height[self.why == ""].max(initial=0.0))
         self._object(every, e.height < o.least_strength * brightest, "too faint beside the others")
         return self._columns(at, found, brightest)
@@ -267,7 +269,7 @@ class _Judge:
             (e.joined[at] > o.most_touching, "touches another spot"),
             (~found.converged, "the match does not converge"),
             (found.psf_px < o.sharpest_px, "sharper than an echo: drawn by the instrument"),
-            (found.correlation < o.least_correlation, "not the image of an arc"),
+            (self._likeness(found) < o.least_correlation, "not the image of an arc"),
             (found.rejected > o.most_rejected, "disturbed by something that crosses it"),
             (moved, "the match wanders off"),
             (upright, "stands too steep for the arc of a pin"),
@@ -275,9 +277,15 @@ class _Judge:
             (~(sigma <= o.most_sigma_px), "too uncertain"),
         ]
 
+    def _likeness(self, found: ArcMatches) -> Array:
+        """Correlations with the formed arcs (m,), what the noise takes from them given back."""
+        white = np.clip((self.screened.noise / np.maximum(found.noise, 1e-12)) ** 2, 0, 1)
+        likeness: Array = np.sqrt(1 - (1 - np.clip(found.correlation, 0, 1) ** 2) * (1 - white))
+        return likeness
+
     def _looks_drawn(self, at: Rows, found: ArcMatches) -> Mask:
         suspect = np.zeros(len(self.echoes), dtype=bool)
-        suspect[at] = (found.correlation < self.options.least_correlation) | (
+        suspect[at] = (self._likeness(found) < self.options.least_correlation) | (
             found.psf_px < self.options.sharpest_px
         )
         return suspect

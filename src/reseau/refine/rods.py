@@ -17,6 +17,7 @@ from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
 __all__ = ["PinResult", "measure_pins"]
 
+_AMBIGUOUS = "the design is symmetric and fits in more than one way: taken upright, y up, as far as that goes"
 _BESIDE_PX = 3.0
 """How far from the middle line of an echo, at least, another rod's place counts as covered by it."""
 _ROUNDS = 3
@@ -62,6 +63,8 @@ class PinResult:
         As in :class:`reseau.refine.PinDetections`; NaN where not measured.
     detections : PinDetections
         All spots of the frame.
+    notes : tuple of str
+        What the user should know.
     """
 
     image: str
@@ -84,6 +87,7 @@ class PinResult:
     curvature: Array
     tilt: Array
     detections: PinDetections
+    notes: tuple[str, ...] = ()
 
     @property
     def found(self) -> int:
@@ -192,6 +196,7 @@ class _Rods:
     ) -> None:
         self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
         self.row, self.gate_px = layout.row, layout.gate_px
+        self.notes = (_AMBIGUOUS,) if layout.ambiguous else ()
         self.predicted = layout(source)
         self.why = np.full(len(source), "", dtype=object)
         self.deviation = np.full(source.shape, np.nan)
@@ -281,6 +286,7 @@ class _Rods:
             deviation=spread(self.deviation[found]),
             **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
             detections=self.seen,
+            notes=self.notes,
         )
 
     def _reason(self, rod: int) -> str:

@@ -8,7 +8,7 @@ which takes up different scales in depth and across. The segments are read off t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -27,6 +27,8 @@ _LEAST = 4
 """Fewest points that an affinity is tested by: three make one."""
 _ANISOTROPY = 1.4
 """Greatest ratio of the scales in two directions."""
+_ALIKE = 0.1
+"""Wires found, less half the scatter over the gate, by which two ways to lay a pattern must differ."""
 _BEYOND = 0.15
 """Share of a segment's length by which a wire may be seen beyond its ends."""
 
@@ -99,6 +101,8 @@ class Layout:
         How far a point may lie from its prediction.
     rms_px : float
         Root mean square of the points' distances from the affinity.
+    ambiguous : bool
+        Whether the pattern can be laid in another way as well: it is symmetric.
     """
 
     row: Rows
@@ -106,6 +110,7 @@ class Layout:
     shift: Array
     gate_px: float
     rms_px: float
+    ambiguous: bool = False
 
     def __call__(self, xy: Array) -> Array:
         """Image of points (n, 2) of the pattern."""
@@ -148,7 +153,7 @@ def lay_wires(
     if start is not None:
         near = _refined(wires, seen, *_affinity(points, start[wires.fixed]), o)
         return near or Failure("the nominal positions have fewer than four echoes about them")
-    best: tuple[float, Layout] | None = None
+    tried: list[tuple[float, bool, Layout]] = []
     for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
         linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
         layout = _refined(wires, seen, linear @ np.diag([1.0, -1.0 if mirror else 1.0]), shift, o)
@@ -156,11 +161,16 @@ def lay_wires(
             continue
         found = int((layout.row >= 0).sum())
         score = found - 0.5 * layout.rms_px / layout.gate_px
-        if best is None or score > best[0] + 1e-9:
-            best = score, layout
-    if best is None:
+        # Upright with y up is what is meant where the pattern does not tell: first so, then in any other way.
+        tried.append((score, not mirror or factor.real < 0, layout))
+    if not tried:
         return Failure(f"none of the ways to lay the {len(wires.ids)} wires over {len(seen)} echoes fits")
-    return best[1]
+    highest = max(score for score, _, _ in tried)
+    alike = sorted((one for one in tried if one[0] > highest - _ALIKE), key=lambda one: (one[1], -one[0]))
+    chosen = alike[0][2]
+    there = chosen(points)
+    rivals = any(np.abs(one[2](points) - there).max() > chosen.gate_px for one in alike[1:])
+    return replace(chosen, ambiguous=rivals)
 
 
 def _hypotheses(

@@ -1,0 +1,383 @@
+"""Pins: formed arcs with known truth, what is declined and why, real B-mode frames beside PLUS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.data import Array, Frame
+from reseau.errors import ImageError, UsageError
+from reseau.formats import ReseauDesign
+from reseau.images import read_frame
+from reseau.optics import Strokes
+from reseau.optics.formation import Outline, coverage, coverage_derivatives, draw
+from reseau.refine import PinOptions, Wires, find_pins, lay_wires, measure_pins
+
+GROUND, NOISE, PSF, TAPER = 8.0, 2.55, 1.3, 0.7
+"""Noise of 40 dB below full scale."""
+
+
+def strokes(
+    count: int, length: float = 24.0, thickness: float = 3.0, curvature: float = 0.012, tilt: float = 0.0
+) -> Strokes:
+    return Strokes(*(np.full(count, v) for v in (length, thickness, curvature, tilt)), TAPER)
+
+
+def picture(
+    xy: Array,
+    arcs: Strokes,
+    shape: tuple[int, int],
+    light: Array | float = 140.0,
+    noise: float = NOISE,
+    seed: int = 0,
+) -> Array:
+    """A frame of arcs whose light adds up."""
+    outline = arcs.outline(PSF)
+    canvas = np.full(shape, GROUND)
+    for k, share in enumerate(np.broadcast_to(light, len(xy))):
+        one = Outline(outline.xy[k : k + 1] + xy[k], outline.dxy[k : k + 1])
+        canvas += share * draw(one, shape, PSF)
+    return canvas + noise * np.random.default_rng(seed).standard_normal(shape)
+
+
+def frame(pixels: Array) -> Frame:
+    return Frame(pixels, 255.0, "formed")
+
+
+def nearest(xy: Array, truth: Array) -> Array:
+    """Row of the point nearest to each of the truth."""
+    return np.hypot(*np.moveaxis(truth[:, None] - xy[None], -1, 0)).argmin(axis=1)
+
+
+def bound(xy: Array, arcs: Strokes, light: float) -> Array:
+    """Cramér–Rao bound (k, 2) of the sigmas of positions, with all that is estimated beside them."""
+    half = 30
+    offset = np.arange(-half, half + 1.0)
+    columns, rows = np.rint(xy[:, :1]) + offset, np.rint(xy[:, 1:]) + offset
+    outline = arcs.outline(PSF)
+    placed = Outline(outline.xy + xy[:, None], outline.dxy)
+    share, d = coverage_derivatives(placed, columns, rows, PSF, motions=arcs.motions(PSF))
+    k, plane = len(xy), np.broadcast_to(offset, (len(offset), len(offset)))
+    ground = np.stack([np.ones_like(plane), plane, plane.T]).reshape(1, 3, -1).repeat(k, axis=0)
+    design = np.concatenate([light * d.reshape(k, 7, -1), share.reshape(k, 1, -1), ground], axis=1)
+    fisher = design @ np.swapaxes(design, 1, 2) / NOISE**2
+    return np.sqrt(np.diagonal(np.linalg.inv(fisher), axis1=1, axis2=2)[:, :2])
+
+
+def test_strokes_change_as_their_motions_say():
+    start = np.array([[np.log(20.0), np.log(3.0), 0.02, 0.3], [np.log(12.0), np.log(2.0), -0.01, -0.6]])
+    pixels = np.arange(-20, 21.0)[None].repeat(2, axis=0)
+
+    def arcs(p: Array) -> Strokes:
+        return Strokes(np.exp(p[:, 0]), np.exp(p[:, 1]), p[:, 2], p[:, 3], TAPER)
+
+    _, derivatives = coverage_derivatives(
+        arcs(start).outline(0.7, 120), pixels, pixels, 1.1, motions=arcs(start).motions(0.7, 120)
+    )
+    for k in range(4):
+        step = np.zeros((2, 4))
+        step[:, k] = 1e-5
+        ahead, behind = (
+            coverage(arcs(start + side * step).outline(0.7, 120), pixels, pixels, 1.1) for side in (1, -1)
+        )
+        assert np.abs((ahead - behind) / 2e-5 - derivatives[:, 3 + k]).max() < 1e-6
+
+
+def test_outline_is_exact_at_one_width_of_the_spread():
+    arcs, pixels = strokes(1, 30.0, 2.0, 0.03, 0.4), np.arange(-25, 26.0)
+    fine, coarse = (coverage(arcs.outline(step), pixels, pixels, 1.0) for step in (0.2, 1.0))
+    assert np.abs(fine - coarse).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("length", "thickness", "curvature", "tilt"),
+    [(24.0, 3.0, 0.012, 0.0), (34.0, 2.0, 0.02, 0.5), (16.0, 5.0, -0.01, -0.7)],
+)
+def test_positions_reach_the_bound(length: float, thickness: float, curvature: float, tilt: float):
+    rng = np.random.default_rng(5)
+    grid = np.stack(np.meshgrid(60 + 75 * np.arange(8), 55 + 60 * np.arange(7)), axis=-1).reshape(-1, 2)
+    deviation, limits, own = [], [], []
+    for seed in range(4):
+        truth = grid + rng.uniform(-0.5, 0.5, grid.shape)
+        arcs = strokes(len(truth), length, thickness, curvature, tilt)
+        found = find_pins(frame(picture(truth, arcs, (480, 650), seed=seed)))
+        assert found.ok.sum() == len(truth)
+        rows = nearest(found.xy, truth)
+        deviation.append(found.xy[rows] - truth)
+        limits.append(bound(truth, arcs, 140.0))
+        own.append(np.sqrt(np.diagonal(found.cov[rows], axis1=1, axis2=2)))
+    off, limit, sigma = (np.concatenate(parts) for parts in (deviation, limits, own))
+    ratio = np.sqrt(((off / limit) ** 2).mean(axis=0))
+    assert (ratio <= 1.15).all()
+    assert (ratio >= 0.85).all()
+    assert (np.abs(off.mean(axis=0)) < 4 * limit.mean(axis=0) / np.sqrt(len(off))).all()
+    normalised = np.sqrt(((off / sigma) ** 2).mean(axis=0))
+    assert (np.abs(normalised - 1) < 0.15).all()
+
+
+def test_positions_are_free_of_bias_and_form_is_told():
+    grid = np.stack(np.meshgrid(60 + 75 * np.arange(6), 55 + 60 * np.arange(5)), axis=-1).reshape(-1, 2)
+    truth = grid + np.random.default_rng(1).uniform(-0.5, 0.5, grid.shape)
+    arcs = strokes(len(truth), 26.0, 3.0, 0.015, 0.2)
+    found = find_pins(frame(picture(truth, arcs, (360, 500), noise=0.02)))
+    rows = nearest(found.xy, truth)
+    assert np.abs(found.xy[rows] - truth).max() < 0.003
+    assert np.allclose(found.curvature[rows], 0.015, atol=1e-3)
+    assert np.allclose(found.tilt[rows], 0.2, atol=5e-3)
+    assert np.allclose(found.length[rows], 26.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("apart", [22.0, 30.0, 40.0])
+def test_neighbours_that_touch_do_not_pull_at_each_other(apart: float):
+    truth = np.array([[150.3, 120.2], [150.3 + apart, 121.1]])
+    found = find_pins(frame(picture(truth, strokes(2), (240, 400))))
+    rows = nearest(found.xy, truth)
+    assert found.ok[rows].all()
+    assert len(set(rows)) == 2
+    assert np.abs(found.xy[rows] - truth).max() < 0.25
+
+
+def test_what_is_too_faint_is_declined_and_the_rest_measured_where_it_is():
+    truth = np.stack([60.0 + 70 * np.arange(8), np.full(8, 80.25)], axis=1)
+    light = 150 * np.array([1.0, 0.8, 0.6, 0.45, 0.35, 0.28, 0.17, 0.06])
+    found = find_pins(frame(picture(truth, strokes(8), (160, 620), light)))
+    rows = nearest(found.xy, truth)
+    assert found.ok[rows[:6]].all()
+    assert found.ok.sum() == 6
+    assert np.abs(found.xy[rows[:6]] - truth[:6]).max() < 0.4
+    assert found.why[rows[6]] == "too faint beside the others"
+
+
+@pytest.mark.parametrize("wire", [148, 151, 154])
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_a_wire_across_the_echo_is_seen_and_left_out(wire: int, width: int):
+    truth = np.array([[150.3, 100.2]])
+    pixels = picture(truth, strokes(1, 28.0), (200, 300), noise=0.0)
+    pixels[:, wire : wire + width] *= 0.1
+    pixels += NOISE * np.random.default_rng(wire + width).standard_normal(pixels.shape)
+    found = find_pins(frame(pixels))
+    k = nearest(found.xy, truth)[0]
+    assert found.ok[k]
+    assert (np.abs(found.xy[k] - truth[0]) < 0.4).all()
+    assert (np.abs(found.xy[k] - truth[0]) < 4.5 * found.points.sigma[0]).all()
+
+
+def test_a_wire_whose_place_is_known_does_not_bias_even_where_it_cuts_the_fading_end():
+    truth = np.array([[150.3, 100.2]])
+    hidden = np.zeros((200, 300), dtype=bool)
+    hidden[:, 159:163] = True
+    pixels = picture(truth, strokes(1, 28.0), (200, 300))
+    pixels[hidden] = 0.0
+    told, untold = find_pins(frame(pixels), hidden=hidden), find_pins(frame(pixels))
+    assert np.abs(told.xy[0] - truth[0]).max() < 0.3
+    assert np.abs(told.xy[0] - truth[0]).max() < np.abs(untold.xy[0] - truth[0]).max()
+
+
+@pytest.mark.parametrize("x", [-8.0, -2.0, 3.0, 8.0, 20.0])
+def test_at_the_edge_of_the_screen_measured_rightly_or_declined(x: float):
+    truth = np.array([[x + 0.3, 100.2], [150.0, 60.0]])
+    found = find_pins(frame(picture(truth, strokes(2), (200, 300))))
+    k = nearest(found.xy, truth[:1])[0]
+    near = np.hypot(*(found.xy[k] - truth[0])) < 12
+    if x >= 3:
+        assert near
+        assert found.ok[k]
+        assert (np.abs(found.xy[k] - truth[0]) < 5 * np.sqrt(np.diagonal(found.cov[k]))).all()
+    elif near:
+        assert not found.ok[k]
+        assert found.why[k] == "cut off by the edge of the frame"
+
+
+def test_nothing_is_found_in_noise():
+    rng = np.random.default_rng(2)
+    assert not find_pins(frame(GROUND + NOISE * rng.standard_normal((300, 400)))).ok.any()
+
+
+def test_frames_without_an_image_are_refused():
+    with pytest.raises(ImageError, match="black"):
+        find_pins(Frame(np.zeros((100, 100), np.uint8), 255.0, "dark.png"))
+
+
+@pytest.mark.parametrize("quality", [None, 60])
+@pytest.mark.parametrize("scale", [0.4, 0.6, 1.0])
+def test_what_the_instrument_draws_is_no_pin(scale: float, quality: int | None):
+    truth = np.array([[100.3, 160.2], [300.0, 160.0]])
+    pixels = picture(truth, strokes(2, 28.0), (250, 480), noise=0.0).astype(np.uint8)
+    cv2.putText(pixels, "GAIN: 20 dB  DEPTH-7 cm il1|/", (10, 40), cv2.FONT_HERSHEY_SIMPLEX, scale, 180, 1)
+    cv2.putText(
+        pixels, "FR:NORM 12/04/88", (10, 80), cv2.FONT_HERSHEY_PLAIN, 1.6 * scale, 180, 2, cv2.LINE_AA
+    )
+    cv2.line(pixels, (10, 200), (470, 200), 170, 1)
+    cv2.ellipse(pixels, (240, 460), (260, 260), 0, 225, 315, 120, 5, cv2.LINE_AA)
+    for x in range(20, 470, 50):
+        cv2.line(pixels, (x, 200), (x, 206), 170, 1)
+        cv2.circle(pixels, (x, 225), 2, 170, -1, cv2.LINE_AA)
+    cv2.polylines(pixels, [np.array([[440, 100], [452, 92], [452, 108]])], True, 250, 1, cv2.LINE_AA)
+    if quality is not None:
+        coded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        pixels = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
+    found = find_pins(Frame(pixels, 255.0))
+    assert found.ok.sum() == 2
+    assert np.abs(found.xy[nearest(found.xy, truth)] - truth).max() < 0.3
+
+
+def test_what_stands_still_in_a_sequence_is_no_echo():
+    still, moving = np.array([[90.0, 60.0]]), np.array([[100.0, 140.0], [200.0, 140.0]])
+    frames = [
+        frame(
+            picture(
+                np.concatenate([still, moving + np.array([0.0, 9.0 * k])]),
+                strokes(3),
+                (240, 320),
+                noise=0.5,
+                seed=k,
+            )
+        )
+        for k in range(3)
+    ]
+    alone, together = find_pins(frames[0]), find_pins(frames[0], others=frames[1:])
+    assert alone.ok.sum() == 3
+    assert together.ok.sum() == 2
+    assert together.why[nearest(together.xy, still)[0]] == "the same in all frames"
+
+
+OBJECT = np.array(
+    [(0, y) for y in range(0, 101, 20)]
+    + [(x, y) for y in (0, 100) for x in range(25, 101, 25)]
+    + [(100, y) for y in (20, 40, 60, 80)]
+    + [(30, 70), (36, 62), (43, 55)],
+    dtype=float,
+)
+SYMMETRIC = OBJECT[:-3]
+
+
+def rods(xy: Array = OBJECT, shape: str = "rod", unknown: int | None = None) -> ReseauDesign:
+    points = [
+        {"id": f"R{k}", "x": None if k == unknown else x, "y": None if k == unknown else y}
+        for k, (x, y) in enumerate(xy.tolist())
+    ]
+    mark = {"shape": shape, "size": 0.75}
+    text = json.dumps(
+        {
+            "schema": "reseau-design/1",
+            "name": "object",
+            "unit": "mm",
+            "mark": mark,
+            "polarity": "bright",
+            "points": points,
+        }
+    )
+    return ReseauDesign.parse(text, where="test")
+
+
+def on_screen(matrix: Array) -> Array:
+    """The test object in the image, bent as by a display."""
+    centred = (OBJECT - 50) @ matrix.T
+    return centred * (1 + 0.03 * (centred**2).sum(axis=1, keepdims=True) / 300**2) + [400.2, 300.3]
+
+
+@pytest.mark.parametrize(
+    "matrix", [[[5, 0], [0, -5]], [[-5, 0], [0, -5.2]], [[-5, 0], [0, 5]], [[4.95, -0.5], [-0.5, -4.95]]]
+)
+def test_rods_are_told_apart_mirrored_turned_or_not(matrix: list[list[float]]):
+    truth = on_screen(np.array(matrix))
+    inside = ((truth > 12) & (truth < [788, 588])).all(axis=1)
+    result = measure_pins(frame(picture(truth, strokes(len(truth), 18.0), (600, 800))), rods())
+    assert result
+    assert result.ok[inside].all()
+    assert np.abs(result.xy - truth)[result.ok].max() < 0.25
+    assert len(result.points) == result.found == result.measurement().found
+
+
+def test_a_symmetric_pattern_is_taken_upright_and_said_to_be_ambiguous():
+    truth = (SYMMETRIC - 50) @ np.diag([5.0, -5.0]) + [400.2, 300.3]
+    result = measure_pins(frame(picture(truth, strokes(len(truth), 18.0), (600, 800))), rods(SYMMETRIC))
+    assert result
+    assert np.abs(result.xy - truth).max() < 0.25
+    assert len(result.notes) == 1
+    assert "symmetric" in result.notes[0]
+
+
+def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():
+    close = np.concatenate([OBJECT, [[50.0, 50.0], [51.5, 50.0], [70.0, 50.0]]])
+    truth = (close - 50) @ np.diag([5.0, -5.0]) + [400.2, 300.3]
+    light = np.full(len(truth), 140.0)
+    light[3] = 0.0
+    shown = picture(truth, strokes(len(truth), 20.0), (600, 800), light)
+    result = measure_pins(frame(shown), rods(close, unknown=len(close) - 1))
+    assert result
+    assert result.why[3] == "no echo where the others have it"
+    pair = [len(close) - 3, len(close) - 2]
+    assert [result.ok[k] for k in pair] == [False, False]
+    assert all("touches" in result.why[k] for k in pair)
+    assert result.why[-1] == "the design does not say where"
+    assert result.found == len(close) - 4
+    assert result.notes == ()
+
+
+def test_a_pattern_that_is_not_there_is_a_failure_with_the_reason():
+    truth = np.random.default_rng(4).uniform([40, 40], [600, 440], (5, 2))
+    result = measure_pins(frame(picture(truth, strokes(5), (480, 640))), rods())
+    assert not result
+    assert "not to be found" in result.reason
+    blank = measure_pins(frame(GROUND + NOISE * np.random.default_rng(0).standard_normal((200, 300))), rods())
+    assert not blank
+    assert "0 echoes" in blank.reason
+
+
+def test_misuse_is_said():
+    shown = frame(picture(np.array([[100.0, 100.0]]), strokes(1), (200, 200)))
+    with pytest.raises(UsageError, match="cross"):
+        measure_pins(shown, ReseauDesign.parse(rods().to_json().replace('"rod"', '"cross"'), where="test"))
+    with pytest.raises(UsageError, match="fewer than four"):
+        measure_pins(shown, rods(OBJECT[:3]))
+
+
+def test_slanted_wires_are_read_off_their_segments():
+    start = np.array(
+        [[30, 20], [55, 20], [60, 20], [30, 10], [35, 10], [60, 10], [35, 0], [55, 0], [60, 0.0]]
+    )
+    end = start.copy()
+    end[[1, 4, 7], 0] = [35, 55, 40]
+    wires = Wires(tuple("abcdefghi"), start, end)
+    cut = start + 0.3 * (end - start)
+    seen = cut @ np.array([[-12.7, -0.6], [0.6, -13.3]]) + [950.0, 460.0]
+    order = np.random.default_rng(3).permutation(9)
+    shown = np.concatenate([seen[order], [[500.0, 520.0], [250.0, 530.0]]])
+    layout = lay_wires(wires, shown + 0.5 * np.random.default_rng(1).standard_normal(shown.shape))
+    assert layout
+    assert (order[layout.row] == np.arange(9)).all()
+    assert np.abs(layout.inverse(seen)[wires.fixed] - start[wires.fixed]).max() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("sequence", "every"), [("VLCUS_6pt", 5), ("fCal20_3NWires_cal", 6)], ids=["characters", "plain"]
+)
+def test_real_frames_have_every_wire_that_plus_found(
+    sequence: str, every: int, reference_data: Callable[[str], Path]
+):
+    folder = reference_data("ultrasound_nwire")
+    reference = json.loads((folder / f"{sequence}.reference.json").read_text("utf-8"))
+    deviation = []
+    for record in reference["frames"][::every]:
+        seen = find_pins(read_frame(folder / record["image"]), PinOptions())
+        points = record["points"]
+        wires = np.array(list(points.values()) if isinstance(points, dict) else points, float).reshape(-1, 2)
+        known = np.concatenate([wires, np.array(record.get("candidates", []), float).reshape(-1, 3)[:, :2]])
+        xy = seen.xy[seen.ok]
+        away = np.hypot(*np.moveaxis(xy[:, None] - known[None], -1, 0))
+        assert (away.min(axis=1) > 10).sum() <= 2
+        if len(wires):
+            assert (away.min(axis=0)[: len(wires)] < 10).all()
+            deviation.append(xy[nearest(xy, wires)] - wires)
+        if "phantom_wires" in reference:
+            ends = np.array([reference["phantom_wires"][name] for name in points], float)
+            layout = lay_wires(Wires(tuple(points), ends[:, 0][:, [0, 2]], ends[:, 1][:, [0, 2]]), xy)
+            assert layout
+            assert (np.hypot(*(xy[layout.row] - wires).T) < 10).all()
+    assert (np.sqrt(np.mean(np.concatenate(deviation) ** 2, axis=0)) < [1.5, 0.7]).all()
