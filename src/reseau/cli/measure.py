@@ -10,6 +10,7 @@ import typer
 from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
 
 if TYPE_CHECKING:
+    from ..data import Array
     from ..formats import ReseauMeasurement
 
 __all__ = ["app", "measurement_csv"]
@@ -34,11 +35,11 @@ def reseau(
     as_json: AsJson = False,
 ) -> None:
     """Measure the marks of a reseau."""
-    from ..formats import ReseauDesign, write_whole
+    from ..formats import ReseauDesign
     from ..images import read_frame
     from ..refine import ReseauOptions, measure_reseau
 
-    suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+    suffix = _suffix(out)
     target = ReseauDesign.read(design)
     rms = None
     if is_points(image):
@@ -49,17 +50,74 @@ def reseau(
         with progress(f"measuring {image.name}", 1):
             result = required(measure_reseau(frame, target, options), image)
         found, rms = result.measurement(), result.rms()
+    _deliver(image, found, out, suffix, as_json, rms, "marks")
+
+
+@app.command()
+def pins(
+    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the test object's rods.")],
+    out: Out = None,
+    also: Annotated[
+        list[Path] | None, typer.Option(help="Further image of the sequence: what stands still is no echo.")
+    ] = None,
+    max_length_px: Annotated[
+        float | None, typer.Option(min=1, help="Greatest length of an echo, pixels.")
+    ] = None,
+    max_rotation: Annotated[float, typer.Option(help="Largest rotation of the test object, degrees.")] = 12.0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the rods of an ultrasonic test object."""
+    from ..formats import ReseauDesign
+    from ..images import read_frame
+    from ..refine import PinOptions, measure_pins
+
+    suffix = _suffix(out)
+    target = ReseauDesign.read(design)
+    rms = None
+    notes: tuple[str, ...] = ()
+    if is_points(image):
+        found = read_measurement(image)
+    else:
+        frame, others = read_frame(image), [read_frame(path) for path in also or []]
+        options = PinOptions(most_length_px=max_length_px, max_rotation_deg=max_rotation)
+        with progress(f"measuring {image.name}", 1):
+            result = required(measure_pins(frame, target, options, others), image)
+        found, rms, notes = result.measurement(), result.rms(), result.notes
+    _deliver(image, found, out, suffix, as_json, rms, "rods", notes)
+
+
+def _suffix(out: Path | None) -> str:
+    """Kind of the file to write, asked for before the work begins."""
+    return ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+
+
+def _deliver(
+    image: Path,
+    found: ReseauMeasurement,
+    out: Path | None,
+    suffix: str,
+    as_json: bool,
+    rms: Array | None,
+    marks: str,
+    notes: tuple[str, ...] = (),
+) -> None:
+    """Write the measurement to its file, and say what was and was not measured."""
+    from ..formats import write_whole
+
     if out is not None:
         write_whole(out, measurement_csv(found) if suffix == ".csv" else found.to_json())
     if as_json:
         say(found.to_json())
         return
-    say(f"{image.name}: {found.found} of {found.expected} marks measured\n")
-    if rms is not None:
+    say(f"{image.name}: {found.found} of {found.expected} {marks} measured\n")
+    if rms is not None and rms[0] == rms[0]:  # NaN where too few were measured to tell
         say(f"leave-one-out rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
     for point in found.points:
         if not point.ok:
             say(f"  {point.id}: {point.why}\n")
+    for note in notes:
+        say(f"note: {note}\n")
 
 
 def measurement_csv(found: ReseauMeasurement) -> str:

@@ -1,0 +1,79 @@
+"""`reseau measure pins`: what it writes, and what it says where it cannot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.formats import ReseauDesign, ReseauMeasurement
+from reseau.images import write_image
+from reseau.optics import Strokes
+from reseau.optics.formation import Outline, draw
+
+Run = Callable[..., tuple[int, str, str]]
+
+RODS = np.array([(0, 0), (0, 25), (0, 60), (30, 0), (45, 40), (70, 60), (80, 10)], dtype=float)
+TRUTH = RODS * [5.0, -5.0] + [100.25, 350.4]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """An image of seven rods, the last of them not seen, and their design."""
+    folder = tmp_path_factory.mktemp("pins")
+    outline = Strokes(*(np.full(7, v) for v in (22.0, 3.0, 0.012, 0.0))).outline(1.3)
+    shown = Outline(outline.xy + TRUTH[:, None], outline.dxy)
+    canvas = 5 + 150 * draw(Outline(shown.xy[:-1], shown.dxy[:-1]), (420, 620), 1.3)
+    canvas += 1.5 * np.random.default_rng(0).standard_normal(canvas.shape)
+    write_image(folder / "photo.png", np.clip(np.rint(canvas), 0, 255).astype(np.uint8))
+    points = [{"id": f"R{k}", "x": x, "y": y} for k, (x, y) in enumerate(RODS.tolist())]
+    design = {"schema": "reseau-design/1", "name": "object", "unit": "mm", "polarity": "bright"}
+    design |= {"mark": {"shape": "rod", "size": 0.75}, "points": points}
+    (folder / "rods.json").write_text(json.dumps(design), "utf-8")
+    return folder / "photo.png", folder / "rods.json"
+
+
+def test_rods_are_measured_and_the_missing_one_is_named(
+    reseau: Run, bench: tuple[Path, Path], tmp_path: Path
+) -> None:
+    image, design = bench
+    status, out, _ = reseau("measure", "pins", image, "-d", design, "-o", tmp_path / "m.json")
+    assert status == 0
+    assert "6 of 7 rods measured" in out
+    assert "R6: no echo where the others have it" in out
+    points = ReseauMeasurement.read(tmp_path / "m.json").image_points()
+    assert points.names == tuple(f"R{k}" for k in range(6))
+    assert np.abs(points.xy - TRUTH[:6]).max() < 0.2
+
+
+def test_json_and_csv_hold_the_same(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
+    image, design = bench
+    status, out, _ = reseau("measure", "pins", image, "-d", design, "-o", tmp_path / "m.csv", "--json")
+    assert status == 0
+    told = ReseauMeasurement.parse(out, where="output").image_points()
+    read = ReseauMeasurement.read_csv(tmp_path / "m.csv").image_points()
+    assert told.names == read.names
+    assert np.abs(told.xy - read.xy).max() < 1e-5
+
+
+def test_what_cannot_be_measured_is_one_line(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
+    image, design = bench
+    crossed = ReseauDesign.read(design).to_json().replace('"rod"', '"disk"')
+    (tmp_path / "disks.json").write_text(crossed, "utf-8")
+    write_image(tmp_path / "dark.png", np.zeros((100, 120), np.uint8))
+    noise = np.random.default_rng(0).integers(5, 12, (200, 300)).astype(np.uint8)
+    write_image(tmp_path / "blank.png", noise)
+    for arguments, expected, reason in (
+        ((image, "-d", tmp_path / "disks.json"), 2, "disk"),
+        ((tmp_path / "dark.png", "-d", design), 2, "is all black"),
+        ((tmp_path / "blank.png", "-d", design), 1, "not to be found"),
+        ((image, "-d", tmp_path / "none.json"), 2, "none.json"),
+    ):
+        status, out, err = reseau("measure", "pins", *arguments, "-o", tmp_path / "never.json")
+        assert (status, out) == (expected, "")
+        assert reason in err
+        assert err.count("\n") == 1
+        assert not (tmp_path / "never.json").exists()
