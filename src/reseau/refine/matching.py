@@ -168,11 +168,11 @@ def match(
     found = adjust(every, start)
     for _ in range(2):
         # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
-        sigma = _robust_sigma(found.residuals, used)
-        limit = options.rejection * np.maximum(sigma, noise) + patch.tolerated(found.estimates)
-        kept = patch.weights * (np.abs(found.residuals) < limit)
+        residuals, tolerated = patch.residuals(found.estimates)
+        limit = options.rejection * np.maximum(_robust_sigma(residuals, used), noise) + tolerated
+        kept = patch.weights * (np.abs(residuals) < limit)
         # What the model leaves of a scene counts as noise, or the prior knowledge would weigh nothing there.
-        rougher = np.maximum(noise, _rms(found.residuals, kept, start.shape[1]))
+        rougher = np.maximum(noise, _rms(residuals, kept, start.shape[1]))
         changed = np.flatnonzero((kept != used).any(axis=1) | (rougher > 1.2 * scale)[:, 0])
         if not len(changed):
             break

@@ -250,18 +250,25 @@ class Patches:
             self.form.motions(x[:, self.form_at :], at),
         )
 
-    def tolerated(self, x: Array) -> Array:
-        """Residuals (k, n) that are laid to the model of the mark, not to blunders.
+    def residuals(self, x: Array) -> tuple[Array, Array]:
+        """Formed minus observed grey values of all pixels, in use or not; and what of that is no blunder.
 
         No mark is quite the square or the disk that it should be, and no point-spread function a Gaussian; in
-        a strong mark that shows before the noise does.
+        a strong mark that shows before the noise does. So much is laid to the model of the mark.
+
+        Returns
+        -------
+        residuals, tolerated : ndarray (k, n)
         """
-        share = self.share(x)
-        amplitude = np.abs(x[:, CONTRAST])
+        share = self.share(x).reshape(len(x), -1)
+        plane, contrast = self.background(x).reshape(len(x), -1), x[:, CONTRAST, None]
+        amplitude = np.abs(contrast)
         if self.options.polarity == "dark":
-            amplitude = amplitude * np.abs(x[:, LEVEL])
-        tolerated: Array = _FORM_ERROR * amplitude[:, None] * (share.reshape(len(x), -1) > 0.02)
-        return tolerated
+            formed = plane * (1 - contrast * share)
+            amplitude = amplitude * np.abs(x[:, LEVEL, None])
+        else:
+            formed = plane + contrast * share
+        return formed - self.grey, _FORM_ERROR * amplitude * (share > 0.02)
 
     def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
         """Take an error of each row, jitter × slope along x, into the stochastic model.
