@@ -156,8 +156,8 @@ class Display:
     line_mm: float = 0.4
     sample_mm: float = 0.1
     spot_mm: float = 0.18
-    glow: float = 42.0
-    contrast: float = 170.0
+    glow: float = 45.0
+    contrast: float = 180.0
     grain: float = 0.005
     gradient: tuple[float, float] = (0.03, -0.02)
     falloff: float = 0.05
