@@ -111,11 +111,13 @@ def assign(
     pitch, best = spacing(start), None
     for shift in _common_shifts(start, candidates, pitch, shifts):
         found = _assigned(source, start + shift, candidates, valid, pitch)
-        if found is not None and (best is None or found.score > best.score + 0.75):
-            best = found
-        if best is not None and best.missed <= 0.02 * len(source):
-            break
-    return best
+        if found is None:
+            continue
+        # Half a pitch off, wires have something of a crossing everywhere, but nothing strong.
+        strength = found.score + float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
+        if best is None or strength > best[0] + 0.75:
+            best = strength, found
+    return None if best is None else best[1]
 
 
 def _assigned(
