@@ -196,7 +196,8 @@ def photo_ii(
         seen = measure_reseau(photo, reseau, options)
         if isinstance(seen, Failure):
             return seen
-        found = measure_pins(photo, test_object, pins)
+        hidden = seen.shadow(reseau, photo.pixels.shape)
+        found = measure_pins(photo, test_object, pins, hidden=hidden)
         if isinstance(found, Failure):
             return found
         marks, measured, images = seen.points, found, found.points
@@ -257,7 +258,8 @@ def photo_iii(
         if isinstance(seen, Failure):
             return seen
         marks = seen.points
-        body = find_pins(photo, pins).points if points is None else points
+        hidden = seen.shadow(reseau, photo.pixels.shape)
+        body = find_pins(photo, pins, hidden=hidden).points if points is None else points
     else:
         body = photo
     if not len(body):

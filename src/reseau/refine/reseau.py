@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..adjust import Failure
@@ -94,6 +95,43 @@ class ReseauResult:
         """Probability, per axis (2,), that white noise alone would ask as much for the local model."""
         f = self.field
         return SmoothField.fit(f.source, f.target, sigma=f.sigma, trials=trials, seed=seed).need
+
+    def shadow(self, design: ReseauDesign, shape: tuple[int, int], margin_px: float = 2.0) -> Mask:
+        """Pixels that the reseau hides from what lies behind it.
+
+        Parameters
+        ----------
+        design : ReseauDesign
+            The reseau that was measured.
+        shape : tuple
+            Height and width of the frame.
+        margin_px : float
+            Added on either side of a wire or around a mark, for the blur.
+
+        Returns
+        -------
+        ndarray (h, w) of bool
+        """
+        hidden = np.zeros(shape, dtype=np.uint8)
+        xy = design.xy[np.isfinite(design.xy).all(axis=1)]
+        scale = np.sqrt(np.abs(np.linalg.det(self.field.jacobian(xy)))).max()
+        mark = design.mark
+        size = (mark.line_width if mark.shape == "line-grid" else mark.size) or 0.0
+        width = max(1, round(scale * size + 2 * margin_px))
+        if mark.shape != "line-grid":
+            for centre in self.field(xy):
+                cv2.circle(hidden, tuple(int(c) for c in np.rint(centre)), (width + 1) // 2, 1, -1)
+            return hidden > 0
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        along = np.linspace(-0.06, 1.06, 120)[:, None] * (high - low) + low  # wires run on to their frame
+        for axis in (0, 1):
+            for at in np.unique(np.round(xy[:, axis], 9)):
+                line = along.copy()
+                line[:, axis] = at
+                # Four binary digits behind the point make a smooth line.
+                bent = np.rint(self.field(line) * 16).astype(np.int32)
+                cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
+        return hidden > 0
 
     def measurement(self) -> ReseauMeasurement:
         """The result as the document that others read."""
