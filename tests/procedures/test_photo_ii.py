@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -22,13 +24,9 @@ def test_the_shadow_of_a_reseau_lies_on_its_wires_and_nowhere_else(world):
     wires = world.truth()
     # Along each wire, between two crossings, the middle of the wire is hidden; the middle of a mesh is not.
     x, y = (np.unique(c) for c in wires.object_xy.T)
-    on = np.array([(a, (b + c) / 2) for a in x for b, c in zip(y, y[1:], strict=False)])
+    on = np.array([(a, (b + c) / 2) for a in x for b, c in itertools.pairwise(y)])
     off = np.array(
-        [
-            ((a + d) / 2, (b + c) / 2)
-            for a, d in zip(x, x[1:], strict=False)
-            for b, c in zip(y, y[1:], strict=False)
-        ]
+        [((a + d) / 2, (b + c) / 2) for a, d in itertools.pairwise(x) for b, c in itertools.pairwise(y)]
     )
     for plane, value in ((on, True), (off, False)):
         column, row = np.rint(wires.view(plane)).astype(int).T
