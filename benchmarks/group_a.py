@@ -226,6 +226,7 @@ def print_tests(rates: list[Array], seeds: list[int]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=200, help="worlds through the whole chain")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first of these worlds")
     parser.add_argument("--draws", type=int, default=2000, help="corrections from points, and tests of level")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args()
@@ -248,7 +249,7 @@ def main() -> int:
             ]
             print_tests(rates, seeds)
         if given.frames:
-            print_trials("From frames", spread(from_frame, range(given.frames)))
+            print_trials("From frames", spread(from_frame, range(given.first, given.first + given.frames)))
     print(f"\n{time.perf_counter() - begun:.0f} s")
     return 0
 
