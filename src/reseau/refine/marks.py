@@ -144,7 +144,7 @@ class MarkMeasurement:
         width = self.size if mark.shape == "line-grid" else mark.line_width
         # The wires of a crossing end where the window does not see it, turned by whatever angle.
         reach = (1.5 * options.half_px + 8 * psf_px) / self.px_per_unit
-        outline = mark_outline(mark.shape, self.size, width, 0.45 * psf_px / self.px_per_unit, reach).affine(
+        outline = mark_outline(mark.shape, self.size, width, 0.8 * psf_px / self.px_per_unit, reach).affine(
             jacobian
         )
         # A mapping that mirrors turns the direction of travel around.
