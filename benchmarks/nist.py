@@ -5,32 +5,18 @@ Run from the checkout: ``python benchmarks/nist.py``. The files are looked for i
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 import time
 from decimal import Decimal
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from shared import of_the_tests
 
 from reseau.adjust import adjust
 
 # Below this many digits a problem is solved once more in decimal arithmetic.
 ENOUGH = 8.0
-
-
-def helper() -> ModuleType:
-    """The reader and models, which the tests use too."""
-    path = Path(__file__).resolve().parents[1] / "tests" / "adjust" / "nist.py"
-    spec = importlib.util.spec_from_file_location("nist_problems", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def row(nist: ModuleType, problem: Any, start: int, number: Any) -> tuple[float, float]:
@@ -49,7 +35,7 @@ def row(nist: ModuleType, problem: Any, start: int, number: Any) -> tuple[float,
 
 
 def main() -> int:
-    nist = helper()
+    nist = of_the_tests("adjust/nist.py")
     if not nist.names():
         print(f"no NIST StRD files in {nist.data_directory()}")
         return 1

@@ -8,16 +8,14 @@ and slopes of the background and size as unknown, and all noise that was simulat
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from shared import of_the_tests
 
 from reseau.optics import sigma_of_snr
 
@@ -25,18 +23,6 @@ MOST_RATIO, MOST_BIAS_PX, MOST_BIAS_SIGMA_PX = 1.15, 0.002, 0.0005
 NORMALISED = (0.9, 1.1)
 MOST_SECONDS = 0.3
 BATCH, MOST_FRAMES = 4, 120
-
-
-def helper() -> ModuleType:
-    """Forming and bounds, which the tests use too."""
-    path = Path(__file__).resolve().parents[1] / "tests" / "refine" / "formed.py"
-    spec = importlib.util.spec_from_file_location("reseau_formed_frames", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def scenes(formed: ModuleType) -> Iterator[tuple[str, Any]]:
@@ -129,7 +115,7 @@ def main() -> int:
     parser.add_argument("--least", type=int, default=2000, help="marks per case")
     parser.add_argument("--only", default="", help="cases whose name holds this text")
     arguments = parser.parse_args()
-    formed = helper()
+    formed = of_the_tests("refine/formed.py")
     print(
         f"{'case (40 dB, psf 0.8 px, dark)':<34} {'marks':>6} {'not':>3} {'rms x/y px':>13} "
         f"{'rms/bound':>11} {'bias x/y 1e-3 px':>17} {'by phase':>12} {'norm. rms':>11}"

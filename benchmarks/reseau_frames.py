@@ -7,9 +7,7 @@ for in DATA/reseau, by default $RESEAU_DATA or ../shared/data.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from shared import of_the_tests
 
 from reseau.data import Array
 from reseau.formats import ReseauDesign
@@ -26,18 +25,6 @@ from reseau.refine import ReseauOptions, ReseauResult, SmoothField, measure_rese
 
 TRIALS = 499
 VECTORS = 50
-
-
-def helper() -> ModuleType:
-    """Reading and comparing, which the tests use too."""
-    path = Path(__file__).resolve().parents[1] / "tests" / "refine" / "frames.py"
-    spec = importlib.util.spec_from_file_location("reseau_real_frames", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @dataclass(frozen=True)
@@ -221,7 +208,7 @@ def main() -> int:
     parser.add_argument("--overlay", type=Path, help="folder for pictures of the frames with what was found")
     parser.add_argument("--seed", type=int, default=1, help="of the random systems of the design")
     arguments = parser.parse_args()
-    frames = helper()
+    frames = of_the_tests("refine/frames.py")
     directory = arguments.data / "reseau"
     cases = [frames.load(name, directory) for name in frames.names(directory)]
     if not cases:
