@@ -24,8 +24,6 @@ _SEEN = 0.1
 """Share of a mark that must lie on pixels that carry an image."""
 _BLURRED = 1.55
 """Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
-_BENT = 1.25
-"""Factor on the permitted deviation from the neighbours for marks whose own image is beyond doubt."""
 _LIKE_OTHERS = 4.0
 """Spreads by which the contrast of a mark may differ from that of the others."""
 
@@ -55,8 +53,7 @@ class ReseauOptions:
     most_sigma_px : float
         Largest standard deviation of a coordinate that still counts as measured.
     neighbour_px : float
-        Largest deviation, per axis, from what the neighbours predict. A mark whose own image is beyond doubt
-        may deviate by a quarter more: beside a bright disc a scanned image is bent locally by that much.
+        Largest deviation, per axis, from what the neighbours predict.
     """
 
     nominal: bool = True
@@ -249,9 +246,7 @@ class MarkMeasurement:
     def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
         """Reject, the worst first, what lies where its neighbours do not have it; fit the field anew."""
         deviation = np.full(xy.shape, np.nan)
-        doubtless = np.zeros(len(xy), dtype=bool)
-        doubtless[at] = (found.t > 15) & (found.seen > 0.9)
-        limit = self.options.neighbour_px * np.where(doubtless, _BENT, 1.0)
+        limit = self.options.neighbour_px
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = self._relative(cov[good])
             # The length found first serves all rounds; where there is none yet, the likeliest is taken.
@@ -260,7 +255,7 @@ class MarkMeasurement:
             deviation[:] = np.nan
             deviation[good], sigma = self.field.leave_one_out()
             # Where the neighbours themselves do not know to a pixel, they cannot object.
-            excess = (np.abs(deviation[good]) / np.maximum(limit[good, None], 3 * sigma)).max(axis=1)
+            excess = (np.abs(deviation[good]) / np.maximum(limit, 3 * sigma)).max(axis=1)
             worst = int(excess.argmax())
             if excess[worst] <= 1:
                 break
