@@ -20,7 +20,7 @@ from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
 from .field import SmoothField
-from .fitting import fit_mapping, on_one_line, reduce_mapping, residual_field, tests_of
+from .fitting import carried, fit_mapping, is_mirrored, on_one_line, reduce_mapping, residual_field, tests_of
 
 __all__ = ["CameraCorrection", "correct_camera"]
 
@@ -78,7 +78,7 @@ class CameraCorrection:
             the model; for points that the model was fitted to, the two are correlated, which is left out.
             What the model cannot follow is no part of them: see `CorrectionFit.local` and the global test.
         """
-        photo = _mapped(self.photo_system, points)
+        photo = carried(self.photo_system, points)
         value, slope, by_parameter = self.model.derivatives(photo.xy)
         cov = slope @ photo.cov @ np.swapaxes(slope, 1, 2)
         cov = cov + by_parameter @ self.cofactor @ np.swapaxes(by_parameter, 1, 2)
@@ -256,7 +256,7 @@ def correct_camera(
     if isinstance(systems, Failure):
         return systems
     photo_system, object_system = systems
-    photo, target = _mapped(photo_system, marks), object_system(plane)
+    photo, target = carried(photo_system, marks), object_system(plane)
     used = np.array([name not in held for name in known])
     elimination = reduce_mapping(
         model,
@@ -290,12 +290,6 @@ def correct_camera(
     return CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit, record)
 
 
-def _mapped(system: Similarity, points: ImagePoints) -> ImagePoints:
-    """Points carried through a similarity, with their covariances."""
-    value, slope, _ = system.derivatives(points.xy)
-    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
-
-
 def _common_system(
     marks: ImagePoints, plane: Array, design: ReseauDesign
 ) -> tuple[Similarity, Similarity] | Failure:
@@ -305,8 +299,7 @@ def _common_system(
         return ends
     (o, o1), (s, s1) = ends
     object_system = Similarity.common_system(o1, s1)
-    affine = np.linalg.lstsq(plane - plane.mean(axis=0), marks.xy - marks.xy.mean(axis=0), rcond=None)[0]
-    mirrored = bool(np.linalg.det(affine) < 0)
+    mirrored = is_mirrored(plane, marks.xy)
     turned = Similarity.common_system(o, s, mirrored=mirrored)
     scale = np.hypot(*(s1 - o1)) / np.hypot(*(s - o))
     photo_system = Similarity(turned.values * scale, mirrored=mirrored)

@@ -14,7 +14,15 @@ from ..errors import UsageError
 from ..optics import PlaneMapping, RationalPolynomial
 from .field import SmoothField
 
-__all__ = ["fit_mapping", "mapping_problem", "reduce_mapping", "residual_field", "tests_of"]
+__all__ = [
+    "carried",
+    "fit_mapping",
+    "is_mirrored",
+    "mapping_problem",
+    "reduce_mapping",
+    "residual_field",
+    "tests_of",
+]
 
 
 def mapping_problem(
@@ -203,3 +211,15 @@ def residual_field(
     white -= (white @ taken) @ taken.T
     null = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(points), 2))
     return SmoothField.fit(target, residuals, degree=0, null=null)
+
+
+def carried(mapping: PlaneMapping, points: ImagePoints) -> ImagePoints:
+    """Points carried through a mapping with their covariances; the mapping itself counts as free of error."""
+    value, slope, _ = mapping.derivatives(points.xy)
+    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
+
+
+def is_mirrored(first: Array, second: Array) -> bool:
+    """Whether two sets of the same points (n, 2) differ in handedness, by the affinity between them."""
+    affine = np.linalg.lstsq(first - first.mean(axis=0), second - second.mean(axis=0), rcond=None)[0]
+    return bool(np.linalg.det(affine) < 0)

@@ -29,7 +29,7 @@ from .correction import (
     with_stored_values,
 )
 from .field import SmoothField
-from .fitting import reduce_mapping, residual_field, tests_of
+from .fitting import carried, is_mirrored, reduce_mapping, residual_field, tests_of
 from .rivals import Rivalry, rivals
 
 __all__ = ["InstrumentCorrection", "InstrumentFit", "ObjectPlane", "correct_instrument"]
@@ -302,7 +302,7 @@ def correct_instrument(
     rods = points.select(known)
     table = np.array([coordinates[name] for name in known], dtype=np.float64)
     # (vi) refined of group A; (iv, v) object coordinates scaled, and into the common system
-    refined = _refined(camera, rods)
+    refined = carried(camera.model, carried(camera.photo_system, rods))
     plane = _object_plane(refined, table[:, :2], design)
     if isinstance(plane, Failure):
         return plane
@@ -341,22 +341,13 @@ def correct_instrument(
     return InstrumentCorrection(camera, reduced, plane, covariance, design.unit, record)
 
 
-def _refined(camera: CameraCorrection, points: ImagePoints) -> ImagePoints:
-    """Points refined of group A, with the covariances of their measurement alone."""
-    photo, by_pixel, _ = camera.photo_system.derivatives(points.xy)
-    value, by_photo, _ = camera.model.derivatives(photo)
-    slope = by_photo @ by_pixel
-    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
-
-
 def _object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> ObjectPlane | Failure:
     """Scales λ1, λ2 and the system that M and N define."""
     ends = defining_marks(refined, plane, design)
     if isinstance(ends, Failure):
         return ends
     (m_image, m), (n_image, n) = ends
-    affine = np.linalg.lstsq(plane - plane.mean(axis=0), refined.xy - refined.xy.mean(axis=0), rcond=None)[0]
-    mirrored = bool(np.linalg.det(affine) < 0)
+    mirrored = is_mirrored(plane, refined.xy)
     axes = Similarity.common_system(m, n, mirrored=mirrored)
     inverse = Similarity.common_system(m_image, n_image)
     local, seen = axes(plane), inverse(refined.xy)

@@ -17,7 +17,7 @@ from ..data import Array, ImagePoints
 from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, Similarity
 from .correction import CameraCorrection
-from .fitting import fit_mapping
+from .fitting import carried, fit_mapping
 
 __all__ = ["Registration", "register"]
 
@@ -54,8 +54,7 @@ class Registration:
 
     def apply(self, points: ImagePoints) -> ImagePoints:
         """Points of this photograph as they would be in PHOTO I; the errors of its many marks left out."""
-        value, slope, _ = self.system.derivatives(points.xy)
-        return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
+        return carried(self.system, points)
 
 
 def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection) -> Registration | Failure:
