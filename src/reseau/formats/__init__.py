@@ -1,0 +1,21 @@
+"""The documents that others exchange with us, one module for each kind.
+
+A document is a strict pydantic model: an unknown key is an error that names it, a missing one likewise. A
+file appears whole or not at all.
+"""
+
+from .design import DesignPoint, Mark, ReseauDesign
+from .document import Document, Strict, read_text, write_whole
+from .measurement import MeasuredPoint, ReseauMeasurement
+
+__all__ = [
+    "DesignPoint",
+    "Document",
+    "Mark",
+    "MeasuredPoint",
+    "ReseauDesign",
+    "ReseauMeasurement",
+    "Strict",
+    "read_text",
+    "write_whole",
+]

@@ -1,0 +1,78 @@
+"""``reseau-design/1``: a reseau, or the rods of a test object."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..data import Array
+from .document import Document, Strict
+
+__all__ = ["DesignPoint", "Mark", "ReseauDesign"]
+
+
+class Mark(Strict):
+    """What every mark of a design looks like, in the unit of the design."""
+
+    shape: Literal["cross", "disk", "square", "line-grid", "rod"]
+    size: float | None = Field(default=None, gt=0)
+    line_width: float | None = Field(default=None, gt=0)
+
+
+class DesignPoint(Strict):
+    """One mark of a design: coordinates in its plane, and where in the image it may be expected."""
+
+    id: str = Field(min_length=1)
+    x: float | None
+    y: float | None
+    sigma: float | None = Field(default=None, ge=0)
+    nominal_px: tuple[float, float] | None = None
+
+
+class ReseauDesign(Document):
+    """``reseau-design/1``: a reseau, or the rods of a test object."""
+
+    SCHEMA: ClassVar[str] = "reseau-design/1"
+    name: str
+    unit: str
+    mark: Mark
+    polarity: Literal["dark", "bright"]
+    origin: str | None = None
+    axis: str | None = None
+    points: tuple[DesignPoint, ...]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.points:
+            raise ValueError("the design has no points")
+        names = set()
+        for point in self.points:
+            if point.id in names:
+                raise ValueError(f"the id {point.id!r} stands twice among the points")
+            names.add(point.id)
+            if (point.x is None) != (point.y is None):
+                raise ValueError(f"point {point.id!r} has only one of its two coordinates")
+        for role in ("origin", "axis"):
+            named = getattr(self, role)
+            if named is not None and named not in names:
+                raise ValueError(f"`{role}` names {named!r}, which is none of the points")
+        if self.origin is not None and self.origin == self.axis:
+            raise ValueError(f"`origin` and `axis` both name {self.origin!r}; they must differ")
+        return self
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the points."""
+        return tuple(point.id for point in self.points)
+
+    @property
+    def xy(self) -> Array:
+        """Coordinates in the plane of the design, (n, 2); NaN where unknown."""
+        return np.array([(p.x, p.y) for p in self.points], dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def nominal_px(self) -> Array:
+        """Prior positions in the image, (n, 2); NaN where there is none."""
+        return np.array([p.nominal_px or (np.nan, np.nan) for p in self.points], dtype=np.float64)
