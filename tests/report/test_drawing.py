@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from reseau.designs import regular_reseau, standard_reseau
+from reseau.designs import coded_testfield, regular_reseau, standard_reseau
 from reseau.errors import UsageError
 from reseau.formats import Mark
 from reseau.report.drawing import design_pdf, design_svg
@@ -65,3 +65,24 @@ def test_a_design_without_millimetres_cannot_be_drawn() -> None:
     inches = standard_reseau().model_copy(update={"unit": "inch"})
     with pytest.raises(UsageError, match="no millimetre coordinates"):
         design_svg(inches)
+
+
+def test_every_target_and_line_of_a_testfield_is_drawn_in_its_place() -> None:
+    field = coded_testfield(2, 1)
+    root = ET.fromstring(design_svg(field))
+    circles = np.array([(float(c.get("cx", "")), float(c.get("cy", ""))) for c in root.iter(f"{SVG}circle")])
+    round_ = np.array(field.targets.shape) == "circle"
+    np.testing.assert_allclose(
+        (circles - circles[0]) * [1, -1], field.xy[round_] - field.xy[round_][0], rtol=0, atol=2e-4
+    )
+    paths = re.findall(r'd="M([^"]+)Z"', design_svg(field))
+    assert len(paths) == 3 + 2 + 24  # lines upright and level, targets with corners
+    corners = [np.array([[float(v) for v in pair.split()] for pair in path.split("L")]) for path in paths]
+    np.testing.assert_allclose(np.ptp(corners[0], axis=0), [2.0, 127.0], rtol=0, atol=2e-4)
+    triangles = [c for c in corners if len(c) == 3]
+    # The apex is up: the smallest y on paper, over the middle of the other two.
+    assert len(triangles) == 8
+    for triangle in triangles:
+        top = triangle[triangle[:, 1].argmin()]
+        assert top[0] == pytest.approx(triangle[:, 0].mean(), abs=2e-4)
+    assert b"/MediaBox" in design_pdf(field)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .common import AsJson, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..formats import ReseauDesign, TestfieldDesign
 
 __all__ = ["app"]
 
@@ -57,12 +60,8 @@ def reseau(
 ) -> None:
     """Design a reseau: a regular grid of marks."""
     from ..designs import regular_reseau
-    from ..formats import Mark, write_whole
-    from ..report.drawing import design_pdf, design_svg
+    from ..formats import Mark
 
-    for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
-        if path is not None:
-            suffix_of(writable(path), (suffix,))
     lined = shape in (Shape.LINES, Shape.CROSS)
     diameter = None if shape is Shape.LINES else size or (pitch / 3 if shape is Shape.CROSS else pitch / 5)
     design = regular_reseau(
@@ -75,7 +74,79 @@ def reseau(
         origin=origin,
         axis=axis,
     )
-    # All drawings before the first file: either all are there or none.
+    written = _write(design, svg, pdf, out)
+    if as_json:
+        say(design.to_json())
+    elif written:
+        say("".join(f"{path}\n" for path in written))
+    else:
+        say(f"{name}: {columns} × {rows} marks, pitch {pitch:g} mm; give --svg, --pdf, --out or --json\n")
+
+
+@app.command("testfield")
+def coded_field(
+    columns: Annotated[int, typer.Option(help="Squares in a row.")] = 8,
+    rows: Annotated[int, typer.Option(help="Squares in a column.")] = 8,
+    pitch: Annotated[float, typer.Option(help="Distance of the lines, mm.")] = 125.0,
+    line_width: Annotated[float, typer.Option(help="Width of the lines, mm.")] = 2.0,
+    small: Annotated[
+        tuple[float, float, float, float],
+        typer.Option(help="Small squares, triangles, crosses, circles, mm."),
+    ] = (9.0, 13.0, 15.0, 12.0),
+    large: Annotated[tuple[float, float, float, float], typer.Option(help="Large ones, mm.")] = (
+        17.0,
+        25.0,
+        25.0,
+        22.0,
+    ),
+    spread: Annotated[float, typer.Option(help="Distance of targets in a square, mm.")] = 30.0,
+    turn_seed: Annotated[
+        int | None, typer.Option(help="Turn every target by an angle drawn from this seed.")
+    ] = None,
+    polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
+    name: Annotated[str, typer.Option(help="Name of the design.")] = "testfield",
+    svg: Annotated[Path | None, typer.Option("--svg", help="Drawing to write, SVG.")] = None,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="Drawing to write, PDF.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--json", "--out", "-o", help="Design to write, JSON; - for standard output."),
+    ] = None,
+) -> None:
+    """Design a coded testfield: squares of sixteen targets, told apart by what lies where."""
+    from ..designs import coded_testfield
+
+    to_stdout = out is not None and str(out) == "-"
+    design = coded_testfield(
+        columns,
+        rows,
+        pitch,
+        line_width=line_width,
+        small=small,
+        large=large,
+        spread=spread,
+        turn_seed=turn_seed,
+        polarity=polarity.value,
+        name=name,
+    )
+    written = _write(design, svg, pdf, None if to_stdout else out)
+    if to_stdout:
+        say(design.to_json())
+    elif written:
+        say("".join(f"{path}\n" for path in written))
+    else:
+        say(f"{name}: {columns} × {rows} squares, pitch {pitch:g} mm; give --svg, --pdf or --json\n")
+
+
+def _write(
+    design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None
+) -> list[Path]:
+    """Write drawings and design where they are wanted; either all of them or none."""
+    from ..formats import write_whole
+    from ..report.drawing import design_pdf, design_svg
+
+    for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
+        if path is not None:
+            suffix_of(writable(path), (suffix,))
     files = {
         path: content(design)
         for path, content in ((svg, design_svg), (pdf, design_pdf), (out, lambda d: d.to_json()))
@@ -83,9 +154,4 @@ def reseau(
     }
     for path, content in files.items():
         write_whole(path, content)
-    if as_json:
-        say(design.to_json())
-    elif files:
-        say("".join(f"{path}\n" for path in files))
-    else:
-        say(f"{name}: {columns} × {rows} marks, pitch {pitch:g} mm; give --svg, --pdf, --out or --json\n")
+    return list(files)

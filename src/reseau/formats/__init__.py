@@ -7,15 +7,20 @@ file appears whole or not at all.
 from .design import DesignPoint, Mark, ReseauDesign
 from .document import Document, Strict, read_text, write_whole
 from .measurement import MeasuredPoint, ReseauMeasurement
+from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign
 
 __all__ = [
+    "SHAPES",
     "DesignPoint",
     "Document",
+    "FieldLines",
+    "FieldTargets",
     "Mark",
     "MeasuredPoint",
     "ReseauDesign",
     "ReseauMeasurement",
     "Strict",
+    "TestfieldDesign",
     "read_text",
     "write_whole",
 ]

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..data import Array
 from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..formats import ReseauDesign, TestfieldDesign
+from ..optics.targets import target_corners
 from .style import drawing as house_style
 
 __all__ = ["design_pdf", "design_svg"]
@@ -55,7 +56,31 @@ class _Sheet:
     texts: list[tuple[float, float, str, str]]
 
 
-def _sheet(design: ReseauDesign) -> _Sheet:
+@dataclass(frozen=True)
+class _Content:
+    """What of a design goes on paper, in its own plane: millimetres, y up.
+
+    Parameters
+    ----------
+    low, high : ndarray (2,)
+        Lower left and upper right corner of the target.
+    polygons, circles
+        As in :class:`_Sheet`.
+    title : str
+        What it is, in a line.
+    letters : dict
+        Labels, and where their lower left corners are.
+    """
+
+    low: Array
+    high: Array
+    polygons: list[Array]
+    circles: list[tuple[float, float, float]]
+    title: str
+    letters: dict[str, Array]
+
+
+def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
     """Lay the design out on paper.
 
     Raises
@@ -63,40 +88,84 @@ def _sheet(design: ReseauDesign) -> _Sheet:
     UsageError
         When coordinates are missing, or the unit is not the millimetre.
     """
-    xy = design.xy
-    if design.unit != "mm" or not np.isfinite(xy).all():
-        raise UsageError("has no millimetre coordinates for all marks", where=f"design {design.name}")
-    mark = design.mark
-    size = mark.size or mark.line_width or 0.0
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    around = max(size, 0.5 * _gap(xy))
-    width, height = high - low + 2 * (around + _MARGIN)
+    content = _testfield(design) if isinstance(design, TestfieldDesign) else _reseau(design)
+    size = content.high - content.low
+    width, height = size + 2 * _MARGIN
     # A narrow target has a sheet that still takes the bar.
     width = max(width, _BAR + 2 * _MARGIN)
-    left = float((width - (high - low)[0]) / 2 - around)
-    target = (left, _MARGIN, float(width - left), float(_MARGIN + (high - low)[1] + 2 * around))
-    paper = np.stack([xy[:, 0] - low[0] + left + around, high[1] - xy[:, 1] + _MARGIN + around], axis=1)
-    polygons, circles = _marks(design, paper, target)
-    lines = [*_crop_marks(target), *_bar(width, target[3])]
-    name_of = dict(zip(design.ids, paper, strict=True))
+    left = float(width - size[0]) / 2
+    corner = np.array([left - content.low[0], _MARGIN + content.high[1]])
+
+    def on_paper(at: Array) -> Array:
+        return np.asarray(corner + at * [1, -1])
+
+    target = (left, _MARGIN, float(width - left), float(_MARGIN + size[1]))
     texts = [
-        (target[0], target[1] - 7.5, "start", f"{design.name}: {len(xy)} marks, {_describe(design)}"),
-        (width / 2, target[3] + 15.2, "middle", "100 mm: measure it before you trust the print"),
+        (target[0], target[1] - 7.5, "start", content.title),
+        (float(width / 2), target[3] + 15.2, "middle", "100 mm: measure it before you trust the print"),
     ]
-    for letter, mark_id in (("O", design.origin), ("S", design.axis)):
-        if mark_id is not None:
-            x, y = name_of[mark_id]
-            offset = 0.5 * size + 1.0
-            texts.append((float(x + offset), float(y - offset), "start", letter))
+    for letter, at in content.letters.items():
+        x, y = on_paper(at)
+        texts.append((float(x), float(y), "start", letter))
     return _Sheet(
         float(width),
         float(height + 8),
         target,
-        polygons,
-        circles,
-        lines,
+        [on_paper(polygon) for polygon in content.polygons],
+        [(*map(float, on_paper(np.array([x, y]))), radius) for x, y, radius in content.circles],  # type: ignore[misc]
+        [*_crop_marks(target), *_bar(width, target[3])],
         texts,
     )
+
+
+def _reseau(design: ReseauDesign) -> _Content:
+    """The marks of a reseau, and half a pitch around them."""
+    xy, mark = design.xy, design.mark
+    if design.unit != "mm" or not np.isfinite(xy).all():
+        raise UsageError("has no millimetre coordinates for all marks", where=f"design {design.name}")
+    size = mark.size or mark.line_width or 0.0
+    around = max(size, 0.5 * _gap(xy))
+    low, high = xy.min(axis=0) - around, xy.max(axis=0) + around
+    polygons, circles = [], []
+    if mark.shape == "line-grid":
+        w = (mark.line_width or 0.0) / 2
+        polygons = [_box(x - w, low[1], x + w, high[1]) for x in np.unique(xy[:, 0])]
+        polygons += [_box(low[0], y - w, high[0], y + w) for y in np.unique(xy[:, 1])]
+    elif mark.shape in ("disk", "rod"):
+        circles = [(float(x), float(y), size / 2) for x, y in xy]
+    else:
+        corners = target_corners(mark.shape, size, arm=mark.line_width)
+        polygons = [point + corners for point in xy]
+    beside = np.full(2, 0.5 * size + 1.0)
+    letters = {
+        letter: xy[design.ids.index(mark_id)] + beside
+        for letter, mark_id in (("O", design.origin), ("S", design.axis))
+        if mark_id is not None
+    }
+    title = f"{design.name}: {len(xy)} marks, {_describe(design)}"
+    return _Content(low, high, polygons, circles, title, letters)
+
+
+def _testfield(design: TestfieldDesign) -> _Content:
+    """Lines and targets, and the best part of a square around them."""
+    lines, targets = design.lines, design.targets
+    x0, y0, x1, y1 = lines.extent
+    around, w = 0.8 * design.pitch, lines.width / 2
+    polygons = [_box(x - w, y0, x + w, y1) for x in lines.vertical_x]
+    polygons += [_box(x0, y - w, x1, y + w) for y in lines.horizontal_y]
+    circles = []
+    for at, shape, size, angle in zip(design.xy, targets.shape, targets.size, targets.angle, strict=True):
+        corners = target_corners(shape, size, angle)
+        if corners is None:
+            circles.append((float(at[0]), float(at[1]), size / 2))
+        else:
+            polygons.append(at + corners)
+    title = (
+        f"{design.name}: {design.squares[0]} × {design.squares[1]} squares of {design.pitch:g} mm, "
+        f"{len(targets.id)} targets"
+    )
+    low, high = np.array([x0, y0]) - around, np.array([x1, y1]) + around
+    return _Content(low, high, polygons, circles, title, {})
 
 
 def _gap(xy: Array) -> float:
@@ -113,38 +182,6 @@ def _describe(design: ReseauDesign) -> str:
     if mark.line_width:
         parts.append(f"lines {mark.line_width:g} mm")
     return f"{' '.join(parts)}, O = {design.origin or '–'}, S = {design.axis or '–'}"
-
-
-def _marks(
-    design: ReseauDesign, at: Array, target: tuple[float, ...]
-) -> tuple[list[Array], list[tuple[float, float, float]]]:
-    mark = design.mark
-    if mark.shape == "line-grid":
-        w = (mark.line_width or 0.0) / 2
-        upright = [_box(x - w, target[1], x + w, target[3]) for x in np.unique(at[:, 0])]
-        level = [_box(target[0], y - w, target[2], y + w) for y in np.unique(at[:, 1])]
-        return upright + level, []
-    r = (mark.size or 0.0) / 2
-    if mark.shape in ("disk", "rod"):
-        return [], [(float(x), float(y), r) for x, y in at]
-    if mark.shape == "square":
-        return [_box(x - r, y - r, x + r, y + r) for x, y in at], []
-    w = (mark.line_width or 0.0) / 2
-    arm = [
-        (-w, -r),
-        (w, -r),
-        (w, -w),
-        (r, -w),
-        (r, w),
-        (w, w),
-        (w, r),
-        (-w, r),
-        (-w, w),
-        (-r, w),
-        (-r, -w),
-        (-w, -w),
-    ]
-    return [np.array(arm) + point for point in at], []
 
 
 def _box(x0: float, y0: float, x1: float, y1: float) -> Array:
@@ -168,7 +205,7 @@ def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, flo
         yield left + 10 * k, y - tall, left + 10 * k, y + tall
 
 
-def _colours(design: ReseauDesign) -> tuple[str, str]:
+def _colours(design: ReseauDesign | TestfieldDesign) -> tuple[str, str]:
     """Of the ground and of the marks."""
     return ("#ffffff", "#000000") if design.polarity == "dark" else ("#000000", "#ffffff")
 
@@ -177,7 +214,7 @@ def _number(value: float) -> str:
     return f"{value:.4f}".rstrip("0").rstrip(".")
 
 
-def design_svg(design: ReseauDesign) -> str:
+def design_svg(design: ReseauDesign | TestfieldDesign) -> str:
     """The target as SVG in true size.
 
     Raises
@@ -211,7 +248,7 @@ def design_svg(design: ReseauDesign) -> str:
     return "\n".join(parts) + "</g></svg>\n"
 
 
-def design_pdf(design: ReseauDesign) -> bytes:
+def design_pdf(design: ReseauDesign | TestfieldDesign) -> bytes:
     """The target as a PDF of one page in true size, all of it vectors.
 
     Raises

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from .errors import UsageError
-from .formats import DesignPoint, Mark, ReseauDesign
+from ..errors import UsageError
+from ..formats import DesignPoint, Mark, ReseauDesign
 
 __all__ = ["regular_reseau", "standard_reseau", "test_object"]
 

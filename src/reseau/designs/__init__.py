@@ -1,0 +1,15 @@
+"""Designs made from a few numbers: reseaus, an ultrasonic test object, the coded testfield and its code."""
+
+from .reseaus import regular_reseau, standard_reseau, test_object
+from .testfield import coded_testfield
+from .topology import HIDDEN, Decoded, TopologicalCode
+
+__all__ = [
+    "HIDDEN",
+    "Decoded",
+    "TopologicalCode",
+    "coded_testfield",
+    "regular_reseau",
+    "standard_reseau",
+    "test_object",
+]

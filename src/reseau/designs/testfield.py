@@ -1,0 +1,120 @@
+"""The coded testfield of Vosselman and Förstner: squares of sixteen targets, bounded by straight lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from ..errors import UsageError
+from ..formats import SHAPES, FieldLines, FieldTargets, TestfieldDesign
+from .topology import words
+
+__all__ = ["coded_testfield"]
+
+_SMALL = (9.0, 13.0, 15.0, 12.0)
+_LARGE = (17.0, 25.0, 25.0, 22.0)
+"""Sizes of squares, triangles, crosses and circles. The areas of the first two are a little smaller than
+those of the others (the paper's table 3), and those of the small ones a third of those of the large."""
+
+
+def coded_testfield(
+    columns: int = 8,
+    rows: int = 8,
+    pitch: float = 125.0,
+    *,
+    line_width: float = 2.0,
+    small: Sequence[float] = _SMALL,
+    large: Sequence[float] = _LARGE,
+    spread: float = 30.0,
+    turn_seed: int | None = None,
+    polarity: Literal["dark", "bright"] = "dark",
+    name: str = "testfield",
+) -> TestfieldDesign:
+    """A testfield with its targets coded by topology; the dimensions of the paper (tables 1, 2) by default.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Number of squares; at most 168 in all, which is what the code can tell apart.
+    pitch : float
+        Distance of the lines, mm.
+    line_width : float
+        Of the straight lines, mm.
+    small, large : sequence of 4 float
+        Sizes of squares, triangles, crosses and circles, mm.
+    spread : float
+        Distance of neighbouring targets in a square, mm.
+    turn_seed : int, optional
+        Turns every target by an angle of its own, drawn from this seed; all are upright without it.
+    polarity : {"dark", "bright"}
+        Dark on a bright ground, or the other way round.
+
+    Returns
+    -------
+    TestfieldDesign
+        Millimetres, the origin in the middle. Squares are numbered in rows from the upper left, and so are
+        the targets of a square: ``23.01`` to ``23.16``.
+
+    Raises
+    ------
+    UsageError
+        When a number is impossible, or targets would touch each other or the lines.
+
+    Examples
+    --------
+    >>> field = coded_testfield()
+    >>> len(field.ids), field.ids[0], field.lines.extent, field.targets.shape[0]
+    (1024, '1.01', (-501.0, -501.0, 501.0, 501.0), 'cross')
+    """
+    where = f"design {name}"
+    if min(columns, rows) < 1 or not min(pitch, line_width, spread, *small, *large) > 0:
+        raise UsageError(f"cannot have {columns} × {rows} squares at {pitch} mm", where=where)
+    if len(small) != 4 or len(large) != 4 or not (np.array(large) > np.array(small)).all():
+        raise UsageError("needs a size for each of four shapes, the large ones above the small", where=where)
+    _check_room(pitch, line_width, large, spread, where)
+    symbol = words(columns * rows)
+    x, y = (np.round((np.arange(n + 1) - n / 2) * pitch, 6) for n in (columns, rows))
+    in_square = np.stack(np.meshgrid(np.arange(4) - 1.5, 1.5 - np.arange(4)), axis=-1).reshape(16, 2) * spread
+    middle = np.stack(np.meshgrid(x[:-1] + pitch / 2, y[::-1][1:] + pitch / 2), axis=-1).reshape(-1, 1, 2)
+    xy = np.round(middle + in_square, 6).reshape(-1, 2)
+    shape, is_large = symbol.ravel() >> 1, symbol.ravel() & 1
+    size = np.where(is_large, np.array(large)[shape], np.array(small)[shape])
+    angle = np.zeros(len(size))
+    if turn_seed is not None:
+        angle = np.round(np.random.default_rng(turn_seed).uniform(0, 360, len(size)), 3)
+    half = line_width / 2
+    extent = (float(x[0] - half), float(y[0] - half), float(x[-1] + half), float(y[-1] + half))
+    lines = FieldLines(
+        width=line_width, vertical_x=tuple(x.tolist()), horizontal_y=tuple(y.tolist()), extent=extent
+    )
+    targets = FieldTargets(
+        id=tuple(f"{s + 1}.{k + 1:02d}" for s in range(columns * rows) for k in range(16)),
+        square=tuple(np.repeat(np.arange(columns * rows) + 1, 16).tolist()),
+        shape=tuple(SHAPES[k] for k in shape),
+        x=tuple(xy[:, 0].tolist()),
+        y=tuple(xy[:, 1].tolist()),
+        size=tuple(size.tolist()),
+        angle=tuple(angle.tolist()),
+    )
+    return TestfieldDesign(
+        name=name,
+        unit="mm",
+        squares=(columns, rows),
+        pitch=pitch,
+        lines=lines,
+        targets=targets,
+        polarity=polarity,
+    )
+
+
+def _check_room(pitch: float, line_width: float, large: Sequence[float], spread: float, where: str) -> None:
+    """Refuse targets that would touch, however they are turned."""
+    # Radii of the circles around them; a cross's arms are a third of its length wide.
+    around = np.array([1 / np.sqrt(2), 1 / np.sqrt(3), np.hypot(1, 1 / 3) / 2, 0.5]) * np.array(large)
+    widest = float(around.max())
+    if 2 * widest >= spread:
+        raise UsageError(f"targets of {2 * widest:.4g} mm across do not fit {spread:g} mm", where=where)
+    if 1.5 * spread + widest + line_width / 2 >= pitch / 2:
+        raise UsageError(f"targets {spread:g} mm apart do not fit squares of {pitch:g} mm", where=where)

@@ -1,0 +1,38 @@
+"""`reseau design testfield`: what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from reseau.designs import coded_testfield
+from reseau.formats import TestfieldDesign
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def test_a_testfield_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> None:
+    files = [tmp_path / f"field{suffix}" for suffix in (".svg", ".pdf", ".json")]
+    svg, pdf, json = files
+    status, out, err = reseau("design", "testfield", "--svg", svg, "--pdf", pdf, "--json", json)
+    assert (status, err) == (0, "")
+    assert out.split() == [str(path) for path in files]
+    assert TestfieldDesign.read(json) == coded_testfield()
+    assert svg.read_text().startswith("<svg")
+    assert pdf.read_bytes().startswith(b"%PDF")
+
+
+def test_the_design_goes_to_standard_output_where_it_is_asked_for(reseau: Run) -> None:
+    status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--json", "-")
+    assert status == 0
+    assert TestfieldDesign.parse(out, where="stdout") == coded_testfield(2, 1)
+
+
+def test_what_does_not_fit_is_said_in_one_line(reseau: Run, tmp_path: Path) -> None:
+    status, out, err = reseau("design", "testfield", "--pitch", 90, "--json", tmp_path / "f.json")
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "do not fit squares of 90 mm" in err
+    assert not (tmp_path / "f.json").exists()
+    status, _, err = reseau("design", "testfield", "--json", tmp_path / "f.txt")
+    assert (status, "use .json" in err) == (2, True)
