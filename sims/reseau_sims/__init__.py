@@ -7,6 +7,7 @@ from .plate import Plate
 from .reflectors import Reflectors
 from .scanner import Scanner, Video
 from .screen import Screen
+from .testfield import FieldBench, FieldTruth, Stain, Station, paper_stations
 from .world import Truth, World
 
 __all__ = [
@@ -14,15 +15,20 @@ __all__ = [
     "Camera",
     "Display",
     "Faults",
+    "FieldBench",
+    "FieldTruth",
     "Instrument",
     "Plate",
     "Reflectors",
     "Scanner",
     "Screen",
+    "Stain",
+    "Station",
     "Truth",
     "Video",
     "World",
     "film",
+    "paper_stations",
     "simulated_bench",
     "swapped",
 ]

@@ -35,6 +35,7 @@ from .plate import Plate
 from .reflectors import Reflectors, body_of, rods_of
 from .scanner import Scanner, Video
 from .screen import Screen
+from .streams import stream
 
 __all__ = ["Truth", "World"]
 
@@ -147,16 +148,16 @@ class World:
         faults, rods = faults or Faults(), rods or test_object()
         if not isinstance(display, Display):
             tube = {"wong": Display.drawn, "polynomial": Display.polynomial}[display]
-            display = tube(_stream(seed, "display"))
+            display = tube(stream(seed, "display"))
         world = cls(
             seed,
             Screen(),
             Plate(design or standard_reseau()),
-            camera or _non_metric(_stream(seed, "camera")),
+            camera or _non_metric(stream(seed, "camera")),
             display,
-            scanner or Scanner.drawn(_stream(seed, "scanner")),
+            scanner or Scanner.drawn(stream(seed, "scanner")),
             rods,
-            rods_of(rods, _stream(seed, "rods")),
+            rods_of(rods, stream(seed, "rods")),
             faults,
         )
         world.screen.illuminate(_LEVEL, world.rng("phosphor"))
@@ -165,7 +166,7 @@ class World:
 
     def rng(self, *purpose: str | int) -> np.random.Generator:
         """The stream of random numbers for one purpose."""
-        return _stream(self.seed, *purpose)
+        return stream(self.seed, *purpose)
 
     @property
     def design(self) -> ReseauDesign:
@@ -273,11 +274,6 @@ class World:
         for sign in (1, -1, 1) if self.faults.scene else ():
             x, y = rng.uniform(-0.35, 0.35, 2) * (self.screen.width_mm, self.screen.height_mm)
             self.screen.draw_disk(x, y, rng.uniform(8, 22), sign * self.faults.scene)
-
-
-def _stream(seed: int, *purpose: str | int) -> np.random.Generator:
-    words = sha256(repr(purpose).encode()).digest()
-    return np.random.default_rng([seed, *np.frombuffer(words, dtype="<u4").tolist()])
 
 
 def _between_marks(xy: Array, count: int, rng: np.random.Generator) -> Array:

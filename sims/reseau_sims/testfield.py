@@ -1,0 +1,303 @@
+"""The coded testfield on a turntable, and the camera of Vosselman and Förstner that records it.
+
+The board is tilted by φ about the vertical axis of its mount and turned by κ in its own plane; the camera
+looks at it from 5 m and is turned about its axis. It is no plane: it bends, and as in the paper the bend
+depends on the tilt and keeps its direction in the mount when the board is turned in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from reseau.data import Array, Frame, Mask
+from reseau.designs import coded_testfield
+from reseau.formats import TestfieldDesign
+from reseau.optics import (
+    Brown,
+    PixelGrid,
+    Pose,
+    Sensor,
+    illumination,
+    matrix_to_vector,
+    project,
+    rotation_matrix,
+    sigma_of_snr,
+)
+from reseau.optics.formation import Outline, PixelResponse, draw
+from reseau.optics.grids import line_grid
+from reseau.optics.targets import target_outline
+
+from .streams import stream
+
+__all__ = ["FieldBench", "FieldTruth", "Stain", "Station", "paper_stations"]
+
+PITCH_MM, PIXELS, C_MM, DISTANCE_MM = 0.027, 240, 57.5, 5000.0
+"""The paper's camera: table 1 and section 2.2."""
+JITTER_PX = 0.0086
+"""Row jitter by which the bound of x is 1.3 × that of y, over all targets recorded at right angles."""
+_SPACING_PX = 0.7
+"""Distance of nodes on an outline in widths of the point-spread function."""
+
+
+class Station(NamedTuple):
+    """One recording: tilt and turn of the board, turn of the camera about its axis, all in degrees."""
+
+    phi: float
+    kappa: float = 0.0
+    camera_kappa: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """What the recording is called."""
+        return f"phi {self.phi:g} kappa {self.kappa:g} camera {self.camera_kappa:g}"
+
+
+def paper_stations(tilts: tuple[float, ...] = (0.0, 30.0, 45.0)) -> tuple[Station, ...]:
+    """The paper's recordings, 36 of them: from nine positions, with the camera turned by 0, 90, 180, 270°.
+
+    A board that is not tilted is recorded from one position, another from four, as it is turned in its mount.
+    """
+    quarters = (0.0, 90.0, 180.0, 270.0)
+    return tuple(
+        Station(phi, kappa, camera)
+        for phi in tilts
+        for kappa in (quarters if phi else (0.0,))
+        for camera in quarters
+    )
+
+
+class Stain(NamedTuple):
+    """A round spot in the image: centre and radius in pixels, and the grey value seen there.
+
+    An opaque one hides what is behind it; otherwise it is glare, whose light is added and falls off as a
+    Gaussian of this width.
+    """
+
+    x: float
+    y: float
+    radius: float
+    grey: float
+    opaque: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class FieldTruth:
+    """Where everything really is in a recording.
+
+    Parameters
+    ----------
+    names : tuple of str (n,)
+        The targets.
+    xyz : ndarray (n, 3)
+        Their centroids on the bent board, in its system (mm).
+    xy : ndarray (n, 2)
+        The images of these (px), inside the frame or not.
+    pose : Pose
+        Of the camera in the system of the board.
+    view : callable
+        From the plane of the design (n, 2) to the image (n, 2), and its Jacobian (n, 2, 2).
+    """
+
+    names: tuple[str, ...]
+    xyz: Array
+    xy: Array
+    pose: Pose
+    view: Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldBench:
+    """The testfield in its mount, the light on it, and the camera; by default those of the paper.
+
+    Parameters
+    ----------
+    seed : int
+        Where all that is random begins: noise, jitter, and how exactly things were set up.
+    design : TestfieldDesign
+        What stands on the board.
+    bend_mm : float
+        By how much the edges of the paper's 4 × 4 squares lie behind the middle at a tilt of 45°. It grows
+        with the sine of the tilt.
+    bend_with : {"mount", "board"}
+        What the direction of the bend is fixed to.
+    distance_mm : float
+        From the camera to the middle of the board.
+    camera : Brown
+        From ideal directions to pixels.
+    sensor : Sensor
+        What noise there is, and the jitter of the rows.
+    psf_px : float
+        Width (one sigma) of the point-spread function.
+    response : PixelResponse
+        21.6 of 27 µm are sensitive to light.
+    level, contrast : float
+        Grey value of the bright, and the share of it that the dark lacks.
+    gradient : (float, float)
+        Relative change of the light from the middle of the frame to its edges.
+    stains : tuple of Stain
+        Hidden parts and glare.
+    missing : frozenset of str
+        Targets that are not there.
+    mirrored : bool
+        Whether the frame is seen in a mirror, left to right.
+
+    Examples
+    --------
+    >>> bench = FieldBench(seed=1)
+    >>> station = paper_stations()[4]
+    >>> frame, truth = bench.record(station), bench.truth(station)
+    >>> station.name, frame.pixels.shape, int(bench.inside(truth, 8.0).sum())
+    ('phi 30 kappa 0 camera 0', (240, 240), 312)
+    """
+
+    seed: int = 0
+    design: TestfieldDesign = field(default_factory=coded_testfield)
+    bend_mm: float = 0.8
+    bend_with: Literal["mount", "board"] = "mount"
+    distance_mm: float = DISTANCE_MM
+    camera: Brown = field(
+        default_factory=lambda: Brown(
+            side="object", grid=PixelGrid(PIXELS, PIXELS, (PITCH_MM, PITCH_MM))
+        ).with_values({"c": C_MM})
+    )
+    sensor: Sensor = field(
+        # The noise of 46 dB is that of reading and of rounding.
+        default_factory=lambda: Sensor(
+            PIXELS,
+            PIXELS,
+            shot_noise=False,
+            read_noise=float(np.sqrt(sigma_of_snr(46.0) ** 2 - 1 / 12)),
+            row_jitter_px=JITTER_PX,
+        )
+    )
+    psf_px: float = 0.7
+    response: PixelResponse = field(default_factory=lambda: PixelResponse(0.8))
+    level: float = 200.0
+    contrast: float = 0.85
+    gradient: tuple[float, float] = (0.0, 0.0)
+    stains: tuple[Stain, ...] = ()
+    missing: frozenset[str] = frozenset()
+    mirrored: bool = False
+
+    def distorted(self, edge_px: float) -> FieldBench:
+        """The bench with a lens whose radial distortion moves the middles of the frame's edges by so much."""
+        half = (self.sensor.width / 2) * PITCH_MM
+        k1 = edge_px * PITCH_MM / half**3
+        return replace(self, camera=self.camera.with_values({"K1": k1}))
+
+    def pose(self, station: Station) -> Pose:
+        """Of the camera in the system of the board; things are set up to some millimetres."""
+        rng = stream(self.seed, "setup", *station)
+        turn = np.deg2rad(station.camera_kappa) + rng.normal(0, 5e-3)
+        roll = rotation_matrix(np.array([0, 0, turn]))
+        x0 = np.array([*rng.normal(0, 3, 2), self.distance_mm + rng.normal(0, 5)])
+        looks = roll @ np.diag([1.0, -1.0, -1.0])
+        board = rotation_matrix(np.array([0, np.deg2rad(station.phi), 0])) @ self._turn(station)
+        return Pose(matrix_to_vector(looks @ board), board.T @ x0)
+
+    def truth(self, station: Station) -> FieldTruth:
+        """Exact positions of all targets in a recording, and the mapping that forms it."""
+        pose, surface = self.pose(station), self.surface(station)
+
+        def view(xy: Array) -> tuple[Array, Array]:
+            points, slope = surface(xy)
+            seen = project(self.camera, pose, points)
+            image, jacobian = seen.xy.copy(), seen.d_point @ slope
+            if self.mirrored:
+                image[:, 0] = self.sensor.width - 1 - image[:, 0]
+                jacobian[:, 0] *= -1
+            return image, jacobian
+
+        xy = self.design.xy
+        return FieldTruth(self.design.ids, surface(xy)[0], view(xy)[0], pose, view)
+
+    def inside(self, truth: FieldTruth, margin_px: float) -> Mask:
+        """Which targets (n,) have their centre in the frame, at least so far from its edges."""
+        size = np.array([self.sensor.width, self.sensor.height]) - 1
+        within: Mask = (truth.xy >= margin_px) & (truth.xy <= size - margin_px)
+        return np.asarray(within.all(axis=1))
+
+    def record(self, station: Station) -> Frame:
+        """Record the testfield; the same seed and station give the same frame to the bit."""
+        rng = stream(self.seed, "exposure", *station)
+        shifts = self.sensor.row_shifts(rng) if self.sensor.row_jitter_px else None
+        pixels = self.sensor.expose(self.light(station, shifts), rng)
+        return Frame(pixels, self.sensor.full_scale, station.name, sha256(pixels.tobytes()).hexdigest())
+
+    def light(self, station: Station, row_shifts: Array | None = None) -> Array:
+        """Light on each pixel, (height, width), in grey values and without noise."""
+        shape = (self.sensor.height, self.sensor.width)
+        view = self.truth(station).view
+        share = np.zeros(shape)
+        for outline in self._outlines():
+            image = outline.mapped(view).oriented()
+            share += draw(image, shape, self.psf_px, self.response, row_shifts)
+        if self.design.polarity == "bright":
+            share = 1 - share
+        even = illumination(self.sensor.width, self.sensor.height, gradient=self.gradient)
+        light: Array = self.level * even * (1 - self.contrast * share)
+        for stain in self.stains:
+            light = self._stained(light, stain)
+        return np.maximum(light, 0.0)
+
+    def _turn(self, station: Station) -> Array:
+        return rotation_matrix(np.array([0, 0, np.deg2rad(station.kappa)]))
+
+    def surface(self, station: Station) -> Callable[[Array], tuple[Array, Array]]:
+        """The bent board: from its plane (n, 2) to points (n, 3) in its system, and the slope (n, 3, 2)."""
+        reach = 2 * self.design.pitch
+        sag = self.bend_mm * np.sin(np.deg2rad(station.phi)) / np.sin(np.pi / 4)
+        # The direction across the bend, in the system of the board.
+        way = np.array([1.0, 0.0])
+        if self.bend_with == "mount":
+            way = self._turn(station)[:2, :2].T @ way
+
+        def surface(xy: Array) -> tuple[Array, Array]:
+            along = xy @ way / reach
+            points = np.column_stack([xy, -sag * along**2])
+            slope = np.tile(np.eye(3)[:, :2], (len(xy), 1, 1))
+            slope[:, 2] = -2 * sag * along[:, None] * way / reach
+            return points, slope
+
+        return surface
+
+    def _outlines(self) -> list[Outline]:
+        """All that stands on the board, in its plane, in batches of like outlines."""
+        spacing = _SPACING_PX * self.psf_px * self._mm_per_px()
+        targets, xy = self.design.targets, self.design.xy
+        there = np.array([name not in self.missing for name in targets.id])
+        kinds: dict[tuple[str, float, float], list[int]] = {}
+        for k in np.flatnonzero(there):
+            kinds.setdefault((targets.shape[k], targets.size[k], targets.angle[k]), []).append(int(k))
+        outlines = [
+            target_outline(*kind, spacing).affine(np.tile(np.eye(2), (len(rows), 1, 1)), xy[rows])
+            for kind, rows in kinds.items()
+        ]
+        lines = self.design.lines
+        beyond = max(
+            lines.vertical_x[0] - lines.extent[0], lines.horizontal_y[0] - lines.extent[1], lines.width / 2
+        )
+        return [
+            *outlines,
+            *line_grid(lines.vertical_x, lines.horizontal_y, lines.width, spacing, beyond=beyond),
+        ]
+
+    def _mm_per_px(self) -> float:
+        """Length on a board at right angles that a pixel sees."""
+        assert self.camera.grid is not None
+        return float(self.distance_mm / (self.camera.values[0] * self.camera.grid.pixels_per_mm[0]))
+
+    def _stained(self, light: Array, stain: Stain) -> Array:
+        rows, columns = np.indices(light.shape)
+        distance = np.hypot(columns - stain.x, rows - stain.y)
+        if stain.opaque:
+            over = 0.5 - 0.5 * np.tanh((distance - stain.radius) / self.psf_px)
+            stained: Array = light * (1 - over) + stain.grey * over
+        else:
+            stained = light + stain.grey * np.exp(-0.5 * (distance / stain.radius) ** 2)
+        return stained
