@@ -1,22 +1,26 @@
-"""`reseau demo`: the whole way from a simulated bench to a calibration and its report."""
+"""`reseau demo`: the whole oscilloscope procedure on a simulated bench, and what it is worth."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from .common import AsJson, progress, required, say
+from .common import AsJson, points_csv, progress, required, say
 
 if TYPE_CHECKING:
     from ..data import Frame
-    from ..formats import ReseauDesign
+    from ..formats import ReseauDesign, ReseauMeasurement
     from ..optics import PlaneMapping
+    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+    from ..provenance import Provenance
+    from ..report.truth import Comparison, KnownPoints
 
 __all__ = ["demo"]
 
@@ -30,8 +34,18 @@ class Bench(Protocol):
     def design(self) -> ReseauDesign:
         """The reseau in front of the screen."""
 
+    @property
+    def test_object(self) -> ReseauDesign:
+        """The rods of the test object, as designed."""
+
     def photo_i(self) -> Frame:
         """PHOTO I."""
+
+    def photo_ii(self) -> Frame:
+        """PHOTO II."""
+
+    def photo_iii(self) -> Frame:
+        """PHOTO III, of a body that nobody has measured."""
 
     def check_marks(self) -> tuple[str, ...]:
         """Marks to hold out."""
@@ -39,63 +53,53 @@ class Bench(Protocol):
     def view(self) -> PlaneMapping:
         """The truth: from the plane of the reseau to the image."""
 
+    def truth_ii(self) -> KnownPoints:
+        """The truth: the rods as they were made, and where PHOTO II shows them."""
+
+    def truth_iii(self) -> KnownPoints:
+        """The truth: the points of the body."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Done:
+    """The three photographs and what came out."""
+
+    frames: tuple[Frame, Frame, Frame]
+    first: PhotoI
+    second: PhotoII
+    third: PhotoIII
+
 
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out"),
     seed: Annotated[int, typer.Option(min=0, help="Of all that is random; same seed, same bytes.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Photograph a simulated reseau, correct the camera, and report."""
+    """Refine the photographs of a simulated bench factor by factor, and compare with the truth."""
     from ..errors import InputError
     from ..provenance import canonical_json
-    from ..report import photo_i_report
-    from ..report.comparison import compare_with_truth, comparison_table
-    from ..report.overview import overview_png
+    from ..report.comparison import compare_with_truth
+    from ..report.summary import comparison_table
+    from ..report.truth import Known
 
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=out, do="name a folder")
     if not out.absolute().parent.is_dir():
         raise InputError("has no such folder", where=out.parent, do="create it first")
-    with progress("photographing the reseau", 4) as step:
+    with progress("photographing", 6) as step:
         bench = _bench(seed)
-        frame, check = bench.photo_i(), bench.check_marks()
-        step("measuring its marks")
-        found, provenance = _refined(bench, frame, check, seed)
+        done = _refined(bench, step)
         step("comparing with the truth")
-        truth = compare_with_truth(found, bench.design, bench.view())
+        known = Known(bench.view(), bench.truth_ii(), (bench.truth_iii(),))
+        truth = compare_with_truth(
+            known, done.first, bench.design, done.second, bench.test_object, (done.third,)
+        )
         step("writing the report")
-        calibration = found.camera.calibration(
-            name=f"simulated bench, seed {seed}",
-            provenance=provenance.to_dict(),
-            times={"computed": datetime.now(UTC).isoformat(timespec="seconds")},
-        )
-        page = photo_i_report(
-            found,
-            bench.design,
-            frame=frame,
-            title=f"PHOTO I of the simulated bench, seed {seed}",
-            provenance=provenance,
-            truth=truth,
-        )
-        assert found.measured is not None  # from a frame it was measured
-        measurement = found.measured.measurement()
-        _write_folder(
-            out,
-            frame,
-            {
-                "report.html": page,
-                "overview.png": overview_png(found, frame, bench.design.unit),
-                "calibration.json": calibration.to_json(),
-                "measurement.json": measurement.to_json(),
-                "design.json": bench.design.to_json(),
-                "comparison.json": canonical_json(truth.to_dict()),
-            },
-        )
+        _write_folder(out, done.frames, _documents(bench, done, truth, seed))
         step()
     if as_json:
         say(canonical_json(truth.to_dict()))
     else:
-        say(f"{measurement.found} of {measurement.expected} marks measured\n\n")
         say(comparison_table(truth))
         say(f"\nopen {out / 'report.html'}\n")
 
@@ -119,16 +123,90 @@ def _bench(seed: int) -> Bench:
     return bench
 
 
-def _refined(bench: Bench, frame: Frame, check: tuple[str, ...], seed: int) -> tuple[Any, Any]:
-    from ..procedures.oscilloscope import photo_i
+def _refined(bench: Bench, step: Any) -> _Done:
+    """PHOTO I, II and III, one after the other."""
+    from ..procedures.oscilloscope import photo_i, photo_ii, photo_iii
+
+    one = bench.photo_i()
+    step("PHOTO I: the camera")
+    first = required(photo_i(one, bench.design, check=bench.check_marks()), one.name)
+    two = bench.photo_ii()
+    step("PHOTO II: the ultrasonic instrument")
+    second = required(photo_ii(two, bench.design, bench.test_object, first.camera), two.name)
+    three = bench.photo_iii()
+    step("PHOTO III: the body")
+    third = required(photo_iii(three, second.instrument, bench.design), three.name)
+    return _Done((one, two, three), first, second, third)
+
+
+def _documents(bench: Bench, done: _Done, truth: Comparison, seed: int) -> dict[str, str | bytes]:
+    """All that is written beside the photographs, by the names of the files."""
+    from ..provenance import canonical_json
+    from ..report import oscilloscope_report
+    from ..report.overview import overview_png
+
+    provenance = _provenance(bench, done, seed)
+    calibration = done.second.instrument.calibration(
+        bench.design,
+        bench.test_object,
+        name=f"simulated bench, seed {seed}",
+        provenance=provenance.to_dict(),
+        times={"computed": datetime.now(UTC).isoformat(timespec="seconds")},
+    )
+    page = oscilloscope_report(
+        done.first,
+        bench.design,
+        done.second,
+        bench.test_object,
+        (done.third,),
+        frames=done.frames,
+        title=f"The simulated bench, seed {seed}",
+        provenance=provenance,
+        truth=truth,
+    )
+    overview = overview_png(done.first, done.second, bench.test_object, done.third, done.frames, truth)
+    return {
+        "report.html": page,
+        "overview.png": overview,
+        "calibration.json": calibration.to_json(),
+        "reseau.json": bench.design.to_json(),
+        "rods.json": bench.test_object.to_json(),
+        "true.csv": points_csv(done.third.true),
+        "comparison.json": canonical_json(truth.to_dict()),
+        **{f"{name}.json": document.to_json() for name, document in _measurements(done).items()},
+    }
+
+
+def _measurements(done: _Done) -> dict[str, ReseauMeasurement]:
+    """Image coordinates of the marks in PHOTO I, the rods in PHOTO II and the points in PHOTO III."""
+    import numpy as np
+
+    from ..formats import ReseauMeasurement
+
+    marks, rods, body = done.first.measured, done.second.measured, done.third.measured
+    # From frames they were measured.
+    assert marks is not None
+    assert rods is not None
+    assert body is not None
+    points = body.points
+    every = np.ones(len(points), dtype=bool)
+    seen = ReseauMeasurement.from_columns(
+        body.image, body.sha256, points.names, points.xy, points.cov, every, [""] * len(points)
+    )
+    return {"marks_i": marks.measurement(), "rods_ii": rods.measurement(), "points_iii": seen}
+
+
+def _provenance(bench: Bench, done: _Done, seed: int) -> Provenance:
     from ..provenance import Provenance, sha256_of
 
-    found = required(photo_i(frame, bench.design, check=check), frame.name)
-    inputs = {frame.name: frame.sha256, bench.design.name: sha256_of(bench.design.to_json().encode())}
-    return found, Provenance(inputs, {"seed": seed, "check": list(check), "alpha": 0.05})
+    inputs = {frame.name: frame.sha256 for frame in done.frames}
+    inputs |= {
+        design.name: sha256_of(design.to_json().encode()) for design in (bench.design, bench.test_object)
+    }
+    return Provenance(inputs, {"seed": seed, "check": list(bench.check_marks()), "alpha": 0.05})
 
 
-def _write_folder(out: Path, frame: Frame, documents: dict[str, str | bytes]) -> None:
+def _write_folder(out: Path, frames: tuple[Frame, ...], documents: dict[str, str | bytes]) -> None:
     """Write all files beside their place first, then move them there: an error leaves what was before.
 
     Raises
@@ -145,7 +223,8 @@ def _write_folder(out: Path, frame: Frame, documents: dict[str, str | bytes]) ->
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", where=out) from None
     try:
-        write_image(draft / "photo_i.png", frame.pixels)
+        for number, frame in zip(("i", "ii", "iii"), frames, strict=True):
+            write_image(draft / f"photo_{number}.png", frame.pixels)
         for name, content in documents.items():
             write_whole(draft / name, content)
         draft.chmod(0o755)

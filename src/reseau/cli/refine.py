@@ -12,6 +12,7 @@ import typer
 from .common import (
     AsJson,
     Out,
+    is_points,
     points_csv,
     points_document,
     progress,
@@ -25,7 +26,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
-    from ..data import ImagePoints
+    from ..data import Frame, ImagePoints
     from ..formats import ReseauDesign
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
     from ..provenance import Provenance
@@ -57,6 +58,13 @@ class _Files:
         inputs = {path.name: sha256_of(path) for path in paths}
         return Provenance(inputs, {"alpha": self.alpha, "check": list(self.check)})
 
+    def frames(self) -> list[Frame | None]:
+        """The photographs in their order; None for those that are given as coordinates."""
+        from ..images import read_frame
+
+        paths = (self.photo_i, self.photo_ii, *self.photo_iii)
+        return [None if path is None or is_points(path) else read_frame(path) for path in paths]
+
 
 def refine(
     photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
@@ -72,7 +80,7 @@ def refine(
     points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
     out: Out = None,
     true: Annotated[Path | None, typer.Option(help="True coordinates to write (CSV, JSON).")] = None,
-    report: Annotated[Path | None, typer.Option(help="Report on PHOTO I to write, HTML.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     alpha: Annotated[float, typer.Option(help="Level of the tests of the coefficients.")] = 0.05,
     check: Annotated[str, typer.Option(help="Marks and rods held out for a check: A1,B2,…")] = "",
     as_json: AsJson = False,
@@ -126,7 +134,6 @@ def _by_photographs(
     files: _Files, out: Path | None, true: Path | None, report: Path | None, as_json: bool
 ) -> None:
     """PHOTO I, and PHOTO II and III where they are given."""
-    from ..data import Frame
     from ..errors import UsageError
     from ..formats import ReseauDesign, write_whole
     from ..procedures.oscilloscope import photo_i
@@ -157,10 +164,12 @@ def _by_photographs(
         )
     page = None
     if report is not None:
-        from ..report import photo_i_report
+        from ..report import oscilloscope_report
 
-        frame = photo if isinstance(photo, Frame) else None
-        page = photo_i_report(first, design, frame=frame, title=files.photo_i.name, provenance=provenance)
+        bodies = [found for _, found in third]
+        page = oscilloscope_report(
+            first, design, second, rods, bodies, frames=files.frames(), title=name, provenance=provenance
+        )
     if out is not None:
         write_whole(out, result.to_json())
     if page is not None and report is not None:

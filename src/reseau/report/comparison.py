@@ -1,78 +1,22 @@
-"""PHOTO I against the truth, where a simulator knows it."""
+"""What was found against the truth, where a simulator knows it."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..data import Array, ImagePoints
 from ..errors import UsageError
 from ..formats import ReseauDesign
-from ..optics import PlaneMapping, RationalPolynomial
-from ..procedures.oscilloscope import PhotoI
+from ..optics import PlaneMapping
+from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import fit_mapping
+from .factors import best_similarity, factor_by_factor, identified
+from .tables import rms_pair
+from .truth import BodyComparison, CameraComparison, Comparison, Known, KnownPoints, RodComparison, Stage
 
-__all__ = ["Comparison", "Stage", "compare_with_truth", "comparison_table", "similarity_residuals"]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Root mean square of what is left of the errors of some marks, per axis, in the unit of the design."""
-
-    name: str
-    fitted: tuple[float, float]
-    check: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What the truth says about a correction.
-
-    Parameters
-    ----------
-    unit : str
-        Of the design.
-    marks, checked : int
-        Marks that were fitted, and marks held out.
-    position_px : (float, float)
-        Root mean square error of the measured positions.
-    position_normalised : (float, float)
-        The same in units of their standard deviations: 1 where those are right.
-    stages : tuple of Stage
-        Marks against their designed coordinates: in the common system only, after the best similarity, and
-        corrected.
-    approximation : (float, float)
-        What the model leaves of noise-free positions: its own error, apart from that of the measurement.
-    check_normalised : (float, float)
-        Corrected check marks against the same adjustment of noise-free positions, in units of their
-        standard deviations.
-    coefficients_normalised : float
-        The same of the coefficients.
-    """
-
-    unit: str
-    marks: int
-    checked: int
-    position_px: tuple[float, float]
-    position_normalised: tuple[float, float]
-    stages: tuple[Stage, ...]
-    approximation: tuple[float, float]
-    check_normalised: tuple[float, float]
-    coefficients_normalised: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready data."""
-        return asdict(self)
-
-
-def _rms(values: Array) -> tuple[float, float]:
-    """Root mean square per axis of (n, 2); NaN-free zero for none."""
-    if not len(values):
-        return 0.0, 0.0
-    x, y = np.sqrt((values**2).mean(axis=0))
-    return float(x), float(y)
+__all__ = ["compare_camera", "compare_with_truth", "similarity_residuals"]
 
 
 def similarity_residuals(
@@ -92,14 +36,48 @@ def similarity_residuals(
     ndarray (n, 2), ndarray (m, 2)
         Transformed minus designed.
     """
-    model = RationalPolynomial.similarity()
-    fitted = fit_mapping(model, ImagePoints.with_sigma(points.names, points.xy, 1.0), target).required()
-    best = model.with_values(fitted.values)
+    best = best_similarity(points.xy, target)
     return best(points.xy) - target, best(others.xy) - others_target
 
 
-def compare_with_truth(found: PhotoI, design: ReseauDesign, view: PlaneMapping) -> Comparison:
-    """Compare a correction with the truth.
+def compare_with_truth(
+    known: Known,
+    first: PhotoI,
+    reseau: ReseauDesign,
+    second: PhotoII | None = None,
+    test_object: ReseauDesign | None = None,
+    third: Sequence[PhotoIII] = (),
+) -> Comparison:
+    """Compare what the procedure found with the truth.
+
+    Parameters
+    ----------
+    known : Known
+        The truth.
+    first, second, third : PhotoI, PhotoII, sequence of PhotoIII
+        What was found in the photographs.
+    reseau, test_object : ReseauDesign
+        The designs.
+
+    Raises
+    ------
+    UsageError
+        When a correction comes from a file and not from a fit.
+    """
+    camera = compare_camera(first, reseau, known.view)
+    if second is None or test_object is None:
+        return Comparison(reseau.unit, camera)
+    return Comparison(
+        reseau.unit,
+        camera,
+        None if known.rods is None else _compare_rods(second, test_object, known.rods),
+        tuple(_compare_body(found, body) for found, body in zip(third, known.bodies, strict=False)),
+        factor_by_factor(second, test_object, third, known),
+    )
+
+
+def compare_camera(found: PhotoI, design: ReseauDesign, view: PlaneMapping) -> CameraComparison:
+    """Compare group A with the truth.
 
     Parameters
     ----------
@@ -137,40 +115,50 @@ def compare_with_truth(found: PhotoI, design: ReseauDesign, view: PlaneMapping) 
     sigma = np.sqrt(np.diagonal(camera.cofactor))
     free = sigma > 0
     shift = (camera.model.values - ideal.values)[free] / sigma[free]
-    return Comparison(
-        unit=design.unit,
+    return CameraComparison(
         marks=len(fit.points),
         checked=len(fit.check),
-        position_px=_rms(errors),
-        position_normalised=_rms(errors / marks.sigma),
+        position_px=rms_pair(errors),
+        position_normalised=rms_pair(errors / marks.sigma),
         stages=(
-            Stage("common system only", _rms(raw), _rms(raw_check)),
-            Stage("best similarity", _rms(best), _rms(best_check)),
-            Stage("corrected", _rms(fit.residuals), _rms(fit.check.xy - fit.check_target)),
+            Stage("common system only", rms_pair(raw), rms_pair(raw_check)),
+            Stage("best similarity", rms_pair(best), rms_pair(best_check)),
+            Stage("corrected", rms_pair(fit.residuals), rms_pair(fit.check.xy - fit.check_target)),
         ),
-        approximation=_rms(ideal(exact.xy) - fit.target),
-        check_normalised=_rms((fit.check.xy - ideal(true_photo(fit.check.names))) / fit.check.sigma),
+        approximation=rms_pair(ideal(exact.xy) - fit.target),
+        check_normalised=rms_pair((fit.check.xy - ideal(true_photo(fit.check.names))) / fit.check.sigma),
         coefficients_normalised=float(np.sqrt((shift**2).mean())),
     )
 
 
-def comparison_table(truth: Comparison) -> str:
-    """The comparison as a short table of text."""
-    unit = truth.unit
-    lines = [f"rms against the design, {unit:<12}     fitted marks        check marks"]
-    lines.append(f"{'':31}" + 2 * f"{'x':>10}{'y':>9}")
-    for stage in truth.stages:
-        numbers = "".join(f"{x:10.4f}{y:9.4f}" for x, y in (stage.fitted, stage.check))
-        lines.append(f"  {stage.name:29}{numbers}")
-    x, y = truth.approximation
-    lines.append(f"  {'approximation by the model':29}{x:10.4f}{y:9.4f}")
-    lines.append("against the truth")
-    x, y = truth.position_px
-    lines.append(f"  {'measured positions, px':29}{x:10.4f}{y:9.4f}")
-    for label, values in (
-        ("… in their sigmas", truth.position_normalised),
-        ("check marks in their sigmas", truth.check_normalised),
-    ):
-        lines.append(f"  {label:29}{values[0]:10.2f}{values[1]:9.2f}")
-    lines.append(f"  {'coefficients in their sigmas':29}{truth.coefficients_normalised:10.2f}")
-    return "\n".join(lines) + "\n"
+def _compare_rods(second: PhotoII, test_object: ReseauDesign, made: KnownPoints) -> RodComparison:
+    pins = second.pins if second.measured is None else second.measured.points
+    row_of = {name: i for i, name in enumerate(made.names)}
+    at = [row_of[name] for name in pins.names]
+    errors = pins.xy - made.xy[at]
+    designed = dict(zip(test_object.ids, test_object.xy, strict=True))
+    off = made.object_xy[at] - np.array([designed[name] for name in pins.names])
+    return RodComparison(
+        len(pins), len(made.names), rms_pair(errors), rms_pair(errors / pins.sigma), rms_pair(off)
+    )
+
+
+def _compare_body(found: PhotoIII, known: KnownPoints) -> BodyComparison:
+    row = identified(found.true, known)
+    is_one = row >= 0
+    at, names = row[is_one], [name for name, one in zip(found.true.names, is_one, strict=True) if one]
+    true = found.true.select(names)
+    seen = (found.points if found.measured is None else found.measured.points).select(names)
+    position, error = seen.xy - known.xy[at], true.xy - known.object_xy[at]
+    return BodyComparison(
+        points=len(names),
+        known=len(known.names),
+        strays=int((~is_one).sum()),
+        position_px=rms_pair(position),
+        position_normalised=rms_pair(position / seen.sigma),
+        error=rms_pair(error),
+        error_normalised=rms_pair(error / true.sigma),
+        sigma=rms_pair(true.sigma),
+        identity={name: known.names[i] for name, i in zip(names, at, strict=True)},
+        errors={name: (float(x), float(y)) for name, (x, y) in zip(names, error, strict=True)},
+    )

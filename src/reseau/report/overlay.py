@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import dataclass, field
+from html import escape
 
 import cv2
 import numpy as np
@@ -11,10 +13,58 @@ from numpy.typing import NDArray
 from ..data import Array, Frame, Mask
 from .style import ACCENT
 
-__all__ = ["frame_overlay", "preview"]
+__all__ = ["Arcs", "Marks", "frame_overlay", "preview"]
 
 _WIDTH = 1200
 _FOUND, _CHECK = "#1f8a70", "#e0a100"
+_ON_DARK = ("#35c79f", "#f0603f")
+"""Found and declined, over the dark screen of an instrument."""
+
+_AROUND = np.array([(0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, -1), (1, 1), (-1, 1)])
+"""Directions in which a label may stand from its mark."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """Middle lines of the arcs of pins, in columns over n of them: v = ½·curvature·u² along a chord.
+
+    Parameters
+    ----------
+    length, curvature, tilt : ndarray (n,)
+        Of the chord (px), in the middle (1/px), of the chord against the rows (rad).
+    """
+
+    length: Array
+    curvature: Array
+    tilt: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """What is drawn over a frame.
+
+    Parameters
+    ----------
+    ids : tuple of str (n,)
+        Marks.
+    xy : ndarray (n, 2)
+        Positions of those measured, predictions of the others; NaN where there is neither.
+    ok : ndarray of bool (n,)
+        Which were measured.
+    check : tuple of str
+        Which were held out.
+    arcs : Arcs, optional
+        Where the marks are arcs: drawn instead of circles.
+    labels : dict
+        What is written beside some of them, by their names.
+    """
+
+    ids: tuple[str, ...]
+    xy: Array
+    ok: Mask
+    check: tuple[str, ...] = ()
+    arcs: Arcs | None = None
+    labels: dict[str, str] = field(default_factory=dict)
 
 
 def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
@@ -30,21 +80,15 @@ def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
     return grey
 
 
-def frame_overlay(frame: Frame, ids: tuple[str, ...], xy: Array, ok: Mask, check: tuple[str, ...]) -> str:
-    """Draw the marks over the frame.
+def frame_overlay(frame: Frame, marks: Marks) -> str:
+    """Draw marks over the frame.
 
     Parameters
     ----------
     frame : Frame
         What was measured in.
-    ids : tuple of str (n,)
-        Marks.
-    xy : ndarray (n, 2)
-        Positions of those measured, predictions of the others; NaN where there is neither.
-    ok : ndarray of bool (n,)
-        Which were measured.
-    check : tuple of str
-        Which were held out.
+    marks : Marks
+        What was found, and what was not.
 
     Returns
     -------
@@ -60,19 +104,80 @@ def frame_overlay(frame: Frame, ids: tuple[str, ...], xy: Array, ok: Mask, check
         f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" '
         f'href="data:image/jpeg;base64,{picture}"/>',
     ]
-    held = set(check)
-    for name, (x, y), found in zip(ids, xy, ok, strict=True):
+    held = set(marks.check)
+    good, bad = (_FOUND, ACCENT) if marks.arcs is None else _ON_DARK
+    colours = [
+        (_CHECK if name in held else good) if found else bad
+        for name, found in zip(marks.ids, marks.ok, strict=True)
+    ]
+    for i, (x, y) in enumerate(marks.xy):
         if not np.isfinite([x, y]).all():
             continue
-        colour = (_CHECK if name in held else _FOUND) if found else ACCENT
-        r = 7.5 * unit
-        if found:
-            shape = f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{r:.2f}"/>'
+        if not marks.ok[i]:
+            shape = _cross(x, y, 6.0 * unit)
+        elif marks.arcs is None:
+            shape = f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{7.5 * unit:.2f}"/>'
         else:
-            d = r * 0.8
-            shape = (
-                f'<path d="M{x - d:.2f} {y - d:.2f}l{2 * d:.2f} {2 * d:.2f}m0 {-2 * d:.2f}'
-                f'l{-2 * d:.2f} {2 * d:.2f}"/>'
-            )
-        parts.append(f'<g fill="none" stroke="{colour}" stroke-width="{1.7 * unit:.2f}">{shape}</g>')
+            shape = _arc(x, y, marks.arcs, i, 3.5 * unit)
+        parts.append(f'<g fill="none" stroke="{colours[i]}" stroke-width="{1.7 * unit:.2f}">{shape}</g>')
+    for row, x, y in _placed(marks, 12.0 * unit):
+        parts.append(_label(x, y, marks.labels[marks.ids[row]], colours[row], 12.0 * unit))
     return "".join(parts) + "</svg>"
+
+
+def _placed(marks: Marks, size: float) -> list[tuple[int, float, float]]:
+    """Rows of marks and the middles of their labels, where these cover neither a mark nor one another.
+
+    The first free place of those around is taken, above before below, beside, and farther off; where there is
+    none, that above.
+    """
+    known = np.flatnonzero(np.isfinite(marks.xy).all(axis=1))
+    half = np.full((len(marks.xy), 2), 0.5 * size)
+    if marks.arcs is not None:
+        half[:, 0] = np.where(marks.ok, np.nan_to_num(marks.arcs.length) / 2, half[:, 0])
+    taken = [(*marks.xy[i], *half[i]) for i in known]
+    found = []
+    for i in known:
+        text = marks.labels.get(marks.ids[i], "")
+        if not text:
+            continue
+        box = np.array([0.33 * size * len(text), 0.42 * size])
+        away = half[i] + box + 0.25 * size
+        places = [marks.xy[i] + reach * away * way for reach in (1.0, 1.9) for way in _AROUND]
+        free = [place for place in places if not _covers(place, box, taken)]
+        x, y = (free or places)[0]
+        taken.append((x, y, *box))
+        found.append((int(i), float(x), float(y)))
+    return found
+
+
+def _covers(place: Array, box: Array, taken: list[tuple[float, ...]]) -> bool:
+    others = np.array(taken)
+    return bool((np.abs(others[:, :2] - place) < others[:, 2:] + box).all(axis=1).any())
+
+
+def _cross(x: float, y: float, d: float) -> str:
+    return (
+        f'<path d="M{x - d:.2f} {y - d:.2f}l{2 * d:.2f} {2 * d:.2f}m0 {-2 * d:.2f}'
+        f'l{-2 * d:.2f} {2 * d:.2f}"/>'
+    )
+
+
+def _arc(x: float, y: float, arcs: Arcs, row: int, tick: float) -> str:
+    """The middle line of an arc, a parabola, and a tick across its middle."""
+    half, bend, tilt = arcs.length[row] / 2, arcs.curvature[row], arcs.tilt[row]
+    c, s = np.cos(tilt), np.sin(tilt)
+    # A parabola is a quadratic Bézier curve; its third point lies as far above the vertex as the ends below.
+    u = np.array([-half, 0.0, half, 0.0, 0.0])
+    v = np.array([bend * half**2 / 2, -bend * half**2 / 2, bend * half**2 / 2, -tick, tick])
+    px, py = x + c * u - s * v, y + s * u + c * v
+    points = [f"{a:.2f} {b:.2f}" for a, b in zip(px, py, strict=True)]
+    return f'<path d="M{points[0]}Q{points[1]} {points[2]}M{points[3]}L{points[4]}"/>'
+
+
+def _label(x: float, y: float, text: str, colour: str, size: float) -> str:
+    return (
+        f'<text x="{x:.2f}" y="{y + 0.35 * size:.2f}" fill="{colour}" font-size="{size:.1f}" '
+        f'text-anchor="middle" stroke="#000" stroke-width="{0.16 * size:.2f}" stroke-opacity="0.6" '
+        f'paint-order="stroke">{escape(text)}</text>'
+    )

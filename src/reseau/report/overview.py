@@ -1,34 +1,49 @@
-"""One picture that shows a correction at a glance: the photograph, and what is left before and after."""
+"""One picture that shows the procedure at a glance: the photographs, and below each what came out."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..data import Frame, ImagePoints
+from ..data import Array, Frame
 from ..errors import UsageError
-from ..procedures.oscilloscope import PhotoI
-from .comparison import similarity_residuals
-from .figures import draw_vectors
+from ..formats import ReseauDesign
+from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+from .figures import Panel, draw_distortion, draw_vectors, length
+from .maps import PROBABILITY, draw_body
 from .overlay import preview
-from .style import BLUE, drawing
+from .photo_iii import errors_of
+from .style import ACCENT, BLUE, drawing
+from .tables import rms
+from .truth import Comparison
 
 __all__ = ["overview_png"]
 
 
-def overview_png(found: PhotoI, frame: Frame, unit: str) -> bytes:
+def overview_png(
+    first: PhotoI,
+    second: PhotoII,
+    test_object: ReseauDesign,
+    third: PhotoIII,
+    frames: Sequence[Frame],
+    truth: Comparison | None = None,
+) -> bytes:
     """Draw the overview.
 
     Parameters
     ----------
-    found : PhotoI
-        The correction, fitted here.
-    frame : Frame
-        The photograph.
-    unit : str
-        Of the design.
+    first, second, third : PhotoI, PhotoII, PhotoIII
+        What was found.
+    test_object : ReseauDesign
+        The rods.
+    frames : sequence of Frame (3)
+        The photographs.
+    truth : Comparison, optional
+        What a simulator knows.
 
     Returns
     -------
@@ -38,35 +53,55 @@ def overview_png(found: PhotoI, frame: Frame, unit: str) -> bytes:
     Raises
     ------
     UsageError
-        When the correction was read from a file.
+        When a correction was read from a file.
     """
-    fit = found.camera.fit
-    if fit is None:
+    fit, instrument = first.camera.fit, second.instrument
+    if fit is None or instrument.fit is None:
         raise UsageError("was read from a file and has no residuals", where="correction")
-    marks = found.points.select(fit.check.names)
-    check_photo = ImagePoints(marks.names, found.camera.photo_system(marks.xy), marks.cov)
-    before, before_check = similarity_residuals(fit.points, fit.target, check_photo, fit.check_target)
-    after_check = fit.check.xy - fit.check_target
+    unit = test_object.unit
     with drawing():
-        figure = Figure(figsize=(10.4, 2.75), layout="constrained", facecolor="white")
-        picture, left, right = figure.subplots(1, 3, width_ratios=(1.02, 1, 1))
-        grey = preview(frame, 640)
-        extent = (-0.5, frame.width - 0.5, frame.height - 0.5, -0.5)
-        picture.imshow(grey, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
-        picture.plot(*found.points.xy.T, "o", ms=4, mfc="none", mec=BLUE, mew=0.7)
-        picture.set_title("the photograph, marks measured", loc="left")
-        picture.set_xticks([])
-        picture.set_yticks([])
-        pairs = (
-            (left, before, before_check, "best similarity"),
-            (right, fit.residuals, after_check, "corrected"),
+        figure = Figure(figsize=(10.4, 6.2), layout="constrained", facecolor="white")
+        photos, results = figure.subplots(2, 3, height_ratios=(1, 1.16))
+        _photo(photos[0], frames[0], first.points.xy, "PHOTO I: the reseau")
+        _photo(photos[1], frames[1], second.pins.xy, "PHOTO II: a test object behind it")
+        _photo(photos[2], frames[2], third.points.xy, "PHOTO III: a body nobody has measured")
+        after_check = fit.check.xy - fit.check_target
+        left = length(float(f"{rms(fit.residuals):.2g}"), unit)
+        draw_vectors(
+            results[0],
+            (fit.target, fit.residuals),
+            (fit.check_target, after_check),
+            Panel(unit),
+            f"camera corrected: rms {left}",
         )
-        for axes, residuals, held, title in pairs:
-            rms = np.sqrt((residuals**2).sum(axis=1).mean())
-            shown = f"{rms * 1000:.3g} µm" if unit == "mm" else f"{rms:.3g} {unit}"
-            draw_vectors(
-                axes, (fit.target, residuals), (fit.check_target, held), unit, f"{title}: rms {shown}"
-            )
+        draw_distortion(
+            results[1],
+            instrument.model,
+            instrument.fit.target,
+            Panel(unit, 10.0, labels=("x", "y")),
+            "distortion of the instrument",
+        )
+        _body(results[2], third, test_object, truth)
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=120, metadata={"Software": None})
     return stream.getvalue()
+
+
+def _photo(axes: Axes, frame: Frame, at: Array, title: str) -> None:
+    extent = (-0.5, frame.width - 0.5, frame.height - 0.5, -0.5)
+    axes.imshow(
+        preview(frame, 640), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased"
+    )
+    axes.plot(*at.T, "o", ms=4.5, mfc="none", mec=BLUE if np.median(frame.pixels) > 128 else ACCENT, mew=0.7)
+    axes.set_title(title, loc="left")
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _body(axes: Axes, third: PhotoIII, test_object: ReseauDesign, truth: Comparison | None) -> None:
+    known = None if truth is None or not truth.bodies else truth.bodies[0]
+    errors = None if known is None else errors_of(third, known)
+    enlarged = draw_body(axes, third.true, test_object.xy, test_object.unit, errors, named=False)
+    axes.set_title(
+        f"true coordinates, {PROBABILITY * 100:g} % ellipses {enlarged:g} times enlarged", loc="left"
+    )

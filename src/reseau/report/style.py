@@ -9,9 +9,9 @@ from contextlib import contextmanager
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-__all__ = ["ACCENT", "BLUE", "FAINT", "INK", "drawing", "to_svg"]
+__all__ = ["ACCENT", "BLUE", "FAINT", "INK", "PALE", "drawing", "to_svg"]
 
-INK, FAINT, ACCENT, BLUE = "#22272b", "#9aa3a8", "#b3402a", "#2f5d7c"
+INK, FAINT, PALE, ACCENT, BLUE = "#22272b", "#9aa3a8", "#e9edef", "#b3402a", "#2f5d7c"
 
 _STYLE = {
     "font.family": "STIXGeneral",

@@ -1,0 +1,201 @@
+"""Factor by factor: what is left of the errors of points as one cause after the other is taken off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..adjust import Failure
+from ..data import Array, ImagePoints
+from ..errors import UsageError
+from ..formats import ReseauDesign
+from ..optics import PlaneMapping, RationalPolynomial
+from ..procedures.oscilloscope import PhotoII, PhotoIII
+from ..refine import fit_mapping
+from ..refine.instrument import InstrumentCorrection, correct_instrument
+from .tables import rms_pair
+from .truth import Factor, Known, KnownPoints
+
+__all__ = [
+    "FACTORS",
+    "Corrector",
+    "best_similarity",
+    "correctors",
+    "factor_by_factor",
+    "identified",
+    "rods_of",
+]
+
+FACTORS = ("scales and best similarity", "group A", "group B", "groups A and B", "(7a, b) without group A")
+"""What is taken off; the last for comparison, one polynomial fitted to photo-coordinates as they are."""
+
+Corrector = Callable[[Array], Array]
+"""From pixels of PHOTO I to object coordinates, (n, 2)."""
+
+_GATE = 0.3
+"""How far off a known point a found one may lie to be taken for it, in the least distance of known points."""
+
+
+def best_similarity(source: Array, target: Array) -> PlaneMapping:
+    """The similarity that takes points nearest to their targets, all of one weight.
+
+    Raises
+    ------
+    EstimationError
+        When there is none.
+    """
+    model = RationalPolynomial.similarity()
+    names = [str(i) for i in range(len(source))]
+    return model.with_values(
+        fit_mapping(model, ImagePoints.with_sigma(names, source, 1.0), target).required().values
+    )
+
+
+def rods_of(second: PhotoII) -> ImagePoints:
+    """Images of the rods that group B was fitted to, in pixels of PHOTO I.
+
+    Raises
+    ------
+    UsageError
+        When the correction was read from a file.
+    """
+    fit = second.instrument.fit
+    if fit is None:
+        raise UsageError("was read from a file and has no residuals", where="correction of the instrument")
+    return second.pins.select(fit.points.names)
+
+
+def correctors(instrument: InstrumentCorrection, rods: ImagePoints, target: Array) -> dict[str, Corrector]:
+    """Ways to object coordinates that take off more and more.
+
+    Each but the whole and the last is followed by the best similarity of the rods: what a correction leaves
+    of position, rotation and scale is not held against it. All use the scales λ1 and λ2.
+
+    Parameters
+    ----------
+    instrument : InstrumentCorrection
+        Groups A and B.
+    rods : ImagePoints
+        The rods' images in pixels of PHOTO I.
+    target : ndarray (n, 2)
+        Their coordinates in the common system.
+
+    Returns
+    -------
+    dict
+        By the names of `FACTORS`; without the last where it cannot be fitted.
+    """
+    photo, camera = instrument.camera.photo_system, instrument.camera.model
+    model, plane = instrument.model, instrument.plane
+
+    def aligned(correct: Corrector) -> Corrector:
+        similarity = best_similarity(correct(rods.xy), target)
+        return lambda xy: plane.from_common(similarity(correct(xy)))
+
+    found = dict(
+        zip(
+            FACTORS,
+            (
+                aligned(photo),
+                aligned(lambda xy: camera(photo(xy))),
+                aligned(lambda xy: model(photo(xy))),
+                lambda xy: plane.from_common(model(camera(photo(xy)))),
+            ),
+            strict=False,
+        )
+    )
+    alone = fit_mapping(model, ImagePoints.with_sigma(rods.names, photo(rods.xy), 1.0), target)
+    if not isinstance(alone, Failure):
+        direct = model.with_values(alone.values)
+        found[FACTORS[-1]] = lambda xy: plane.from_common(direct(photo(xy)))
+    return {name: _quiet(corrector) for name, corrector in found.items()}
+
+
+def _quiet(corrector: Corrector) -> Corrector:
+    """No points, no coordinates; a mapping wants at least one."""
+    return lambda xy: corrector(xy) if len(xy) else np.zeros((0, 2))
+
+
+def factor_by_factor(
+    second: PhotoII,
+    test_object: ReseauDesign,
+    third: Sequence[PhotoIII] = (),
+    known: Known | None = None,
+) -> tuple[Factor, ...]:
+    """What is left of the errors as one cause after the other is taken off.
+
+    Parameters
+    ----------
+    second : PhotoII
+        Groups A and B.
+    test_object : ReseauDesign
+        The rods.
+    third : sequence of PhotoIII
+        Points of bodies.
+    known : Known, optional
+        The truth; without it there are the rods alone.
+
+    Raises
+    ------
+    UsageError
+        When the correction was read from a file.
+    """
+    instrument, rods, fit = second.instrument, rods_of(second), second.instrument.fit
+    assert fit is not None  # asked by `rods_of`
+    designed = dict(zip(test_object.ids, test_object.xy, strict=True))
+    xy = np.array([designed[name] for name in rods.names])
+    held, body = second.pins.select(fit.check.names), _known_body(third, known)
+    ways = correctors(instrument, rods, fit.target)
+    ideal = _with_rods_as_made(second, test_object, known)
+    return tuple(
+        Factor(
+            name,
+            rms_pair(way(rods.xy) - xy),
+            rms_pair(way(held.xy) - fit.check_target) if len(held) else None,
+            rms_pair(way(body[0]) - body[1]) if body else None,
+            rms_pair(ideal[name](body[0]) - body[1]) if body and name in ideal else None,
+        )
+        for name, way in ways.items()
+    )
+
+
+def _known_body(third: Sequence[PhotoIII], known: Known | None) -> tuple[Array, Array] | None:
+    """Pixels and true coordinates of all points of bodies that the truth knows."""
+    pixels, true = [], []
+    for found, body in zip(third, () if known is None else known.bodies, strict=False):
+        row = identified(found.true, body)
+        pixels.append(found.points.xy[row >= 0])
+        true.append(body.object_xy[row[row >= 0]])
+    return (np.concatenate(pixels), np.concatenate(true)) if sum(map(len, pixels)) else None
+
+
+def _with_rods_as_made(
+    second: PhotoII, test_object: ReseauDesign, known: Known | None
+) -> dict[str, Corrector]:
+    """The ways to object coordinates had the rods been measured where they truly are."""
+    if known is None or known.rods is None:
+        return {}
+    made = dict(zip(known.rods.names, known.rods.object_xy.tolist(), strict=True))
+    points = tuple(
+        point.model_copy(update={"x": made[point.id][0], "y": made[point.id][1], "sigma": None})
+        for point in test_object.points
+    )
+    exact = test_object.model_copy(update={"points": points})
+    rods = rods_of(second)
+    found = correct_instrument(rods, exact, second.instrument.camera)
+    if isinstance(found, Failure) or found.fit is None:
+        return {}
+    return correctors(found, rods.select(found.fit.points.names), found.fit.target)
+
+
+def identified(true: ImagePoints, known: KnownPoints) -> Array:
+    """For each point found the row of the known one that it is, −1 where it is none, (n,)."""
+    apart = np.hypot(*(known.object_xy[:, None] - known.object_xy[None]).transpose(2, 0, 1))
+    np.fill_diagonal(apart, np.inf)
+    off = np.hypot(*(true.xy[:, None] - known.object_xy[None]).transpose(2, 0, 1))
+    row = off.argmin(axis=1)
+    # Each takes the nearest, if no other lies nearer to that.
+    mine = off.argmin(axis=0)[row] == np.arange(len(true))
+    near = off.min(axis=1) < _GATE * apart.min()
+    return np.where(mine & near, row, -1)

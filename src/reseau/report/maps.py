@@ -1,0 +1,125 @@
+"""Maps of true coordinates with their error ellipses."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.stats
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+
+from ..data import Array, ImagePoints
+from .figures import Panel, length, nice, plane_axes
+from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
+
+__all__ = ["PROBABILITY", "body_map", "draw_body"]
+
+PROBABILITY = 0.95
+"""That a point lies within its ellipse."""
+_SIZE = (4.1, 4.1)
+_SHOWN = 4.0
+"""Semi-axis of a median ellipse, per hundred of the extent of the map."""
+
+
+def body_map(true: ImagePoints, rods: Array, unit: str, errors: Array | None = None) -> tuple[str, float]:
+    """Draw points with their ellipses.
+
+    Parameters
+    ----------
+    true : ImagePoints
+        True coordinates with covariances.
+    rods : ndarray (m, 2)
+        The rods of the test object, which mark out where the correction holds.
+    unit : str
+        Of the coordinates.
+    errors : ndarray (n, 2), optional
+        Of the coordinates, where the truth is known; NaN where not.
+
+    Returns
+    -------
+    svg : str
+        An SVG element.
+    enlarged : float
+        How many times the ellipses are enlarged.
+    """
+    with drawing():
+        figure = Figure(figsize=_SIZE, layout="constrained")
+        axes = figure.subplots()
+        enlarged = draw_body(axes, true, rods, unit, errors)
+        axes.set_ylabel(f"$Y$ / {unit}")
+        return to_svg(figure), enlarged
+
+
+def draw_body(
+    axes: Axes,
+    true: ImagePoints,
+    rods: Array,
+    unit: str,
+    errors: Array | None = None,
+    *,
+    named: bool = True,
+) -> float:
+    """Draw into axes what :func:`body_map` draws; returns how many times the ellipses are enlarged."""
+    variance, axis = np.linalg.eigh(true.cov)
+    semi = np.sqrt(variance * scipy.stats.chi2.ppf(PROBABILITY, 2))
+    both = np.concatenate([true.xy, rods])
+    low, high = both.min(axis=0), both.max(axis=0)
+    extent = float((high - low).max())
+    enlarged = nice(max(_SHOWN / 100 * extent / max(float(np.median(semi[:, 1])), 1e-12), 1e-3))
+    margin = 0.06 * extent
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - 2.2 * margin, high[1] + margin)
+    plane_axes(axes, Panel(unit, labels=("X", "Y")), "")
+    axes.plot(*rods.T, "+", color=FAINT, markersize=4, markeredgewidth=0.6, zorder=0)
+    turned = np.rad2deg(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
+    ellipses = EllipseCollection(
+        2 * enlarged * semi[:, 1],
+        2 * enlarged * semi[:, 0],
+        turned,
+        units="xy",
+        offsets=true.xy,
+        offset_transform=axes.transData,
+    )
+    ellipses.set(facecolor=BLUE + "18", edgecolor=BLUE, linewidth=0.7)
+    axes.add_collection(ellipses)
+    axes.plot(*true.xy.T, ".", color=INK, markersize=2.2)
+    if errors is not None:
+        ends = true.xy - enlarged * errors
+        lines = np.stack([true.xy, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 2)
+        axes.plot(*lines.T, color=ACCENT, lw=0.8)
+        axes.plot(*ends.T, "o", color=ACCENT, markersize=1.8)
+    if named:
+        reach = enlarged * np.sqrt(np.diagonal(true.cov, axis1=1, axis2=2) * -2 * np.log(1 - PROBABILITY))
+        for name, (x, y), (dx, dy) in zip(true.names, true.xy, reach, strict=True):
+            axes.annotate(
+                name,
+                (x + 0.75 * dx, y + 0.75 * dy),
+                xytext=(1, 0.5),
+                textcoords="offset points",
+                fontsize=7.5,
+            )
+    _scale_bar(axes, enlarged, nice(float(np.median(semi[:, 1])) * 2), unit)
+    return enlarged
+
+
+def _scale_bar(axes: Axes, enlarged: float, shown: float, unit: str) -> None:
+    """A bar below right that is `shown` long in the scale of the ellipses."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    end, y = right - 0.02 * (right - left), low + 0.045 * (high - low)
+    tick = 0.008 * (high - low)
+    start = end - shown * enlarged
+    axes.plot(
+        [start, start, start, end, end, end],
+        [y - tick, y + tick, y, y, y - tick, y + tick],
+        color=INK,
+        lw=0.8,
+    )
+    axes.annotate(
+        length(shown, unit),
+        (start, y),
+        xytext=(-4, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=8.5,
+    )

@@ -1,0 +1,282 @@
+"""What the report says about PHOTO II: the ultrasonic instrument, group B."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+from markupsafe import Markup
+
+from ..data import Array, Frame
+from ..formats import ReseauDesign
+from ..optics import RationalPolynomial, wong_display
+from ..procedures.oscilloscope import PhotoII
+from ..refine.causes import CAUSES, Causes
+from ..refine.correction import unit_of
+from ..refine.instrument import InstrumentCorrection, InstrumentFit
+from ..refine.rivals import Rivalry
+from .equations import equations
+from .factors import FACTORS, correctors, rods_of
+from .figures import Panel, distortion_figure, residual_figure
+from .numbers import aligned, power
+from .overlay import Arcs, Marks, frame_overlay
+from .tables import (
+    Estimates,
+    Item,
+    Row,
+    axis_rows,
+    coefficient_rows,
+    declined_rows,
+    model_tests,
+    probability,
+    rms,
+    step_rows,
+    symbol,
+    unit_markup,
+)
+from .truth import RodComparison
+
+__all__ = ["photo_ii_section"]
+
+_PITCH = 0.1
+"""Of the grid of the distortion and of the longest vectors, in the extent of the rods."""
+
+_MEANING = {
+    "P0": ("orientation", "displacement of the picture in x"),
+    "P1": ("orientation", "obliquity of the camera’s axis to the tube’s: xy in X, y² in Y"),
+    "P2": ("orientation", "obliquity of the camera’s axis to the tube’s: x² in X, xy in Y"),
+    "P3": ("orientation", "rotation of the picture"),
+    "P4": ("orientation", "displacement of the picture in y"),
+    "k0": ("symmetric", "scale of the deflection"),
+    "k1": ("symmetric", "radial distortion r³: deflection lens and field, curved screen"),
+    "h'1": ("asymmetric", "decentred deflection in x, with r²"),
+    "h'2": ("asymmetric", "decentred deflection in x, with r⁴"),
+    "h'3": ("asymmetric", "decentred deflection in y, with r²"),
+    "h'4": ("asymmetric", "decentred deflection in y, with r⁴"),
+    "m1": ("beam", "diameter and frequency of the transducer, with x"),
+    "m2": ("beam", "divergence of the sound beam, with the depth y"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Rods against their designed object coordinates: places, before and after group B; the same held out."""
+
+    fitted: tuple[Array, Array, Array]
+    check: tuple[Array, Array, Array]
+
+
+def photo_ii_section(
+    found: PhotoII, design: ReseauDesign, frame: Frame | None, truth: RodComparison | None
+) -> Row:
+    """Everything its template shows.
+
+    Parameters
+    ----------
+    found : PhotoII
+        What the procedure found.
+    design : ReseauDesign
+        The rods of the test object.
+    frame : Frame or None
+        The photograph; without it there is no picture.
+    truth : RodComparison or None
+        What a simulator knows.
+
+    Raises
+    ------
+    UsageError
+        When the correction was read from a file: it has no residuals to show.
+    """
+    left, instrument = _residuals(found, design), found.instrument
+    fit = instrument.fit
+    assert fit is not None  # asked with the residuals
+    tolerance = np.array([point.sigma or 0.0 for point in design.points])
+    extent = float(np.ptp(left.fitted[0], axis=0).max())
+    typical = float(np.quantile(np.hypot(*left.fitted[1].T), 0.9))
+    sigma = float(np.sqrt((tolerance**2).mean()))
+    panel = Panel(design.unit, _PITCH * extent, max(typical, 1e-12), sigma, ("X", "Y"))
+    titles = ("before: group A and the scales", "after: group B")
+    return {
+        "summary": _summary(found, design, left, sigma),
+        "frame": None if frame is None else Markup(_overlay(found, frame)),
+        "missing": [] if found.measured is None else declined_rows(found.measured),
+        "setup": _setup(found),
+        "notes": [*(() if found.measured is None else found.measured.notes), *found.notes],
+        "residuals": Markup(residual_figure(left.fitted, left.check, panel, titles)),
+        "stages": axis_rows(
+            [(title, [left.fitted[k], left.check[k]]) for k, title in ((1, titles[0]), (2, titles[1]))],
+            3,
+            largest=True,
+        ),
+        "tolerance": f"{sigma:.2f}",
+        "field": Markup(
+            distortion_figure(
+                instrument.model, fit.target, Panel(design.unit, panel.pitch, labels=("x", "y"))
+            )
+        ),
+        "coefficients": coefficient_rows(fit.elimination, _estimates(instrument)),
+        "steps": step_rows(fit.elimination),
+        "tests": model_tests(fit.elimination.full, fit.elimination.alpha, fit.local),
+        "reduced": _reduced(instrument.model, fit),
+        "causes": None if found.causes is None else _causes(found.causes, fit, design.unit),
+        "displays": None if fit.displays is None else _displays(fit.displays),
+        "truth": None if truth is None else _truth(truth, design.unit),
+        "rods": len(fit.points),
+        "held": len(fit.check),
+        "alpha": f"{fit.elimination.alpha:g}",
+        "design": design,
+    }
+
+
+def _residuals(found: PhotoII, design: ReseauDesign) -> _Residuals:
+    rods, fit = rods_of(found), found.instrument.fit
+    assert fit is not None  # asked by `rods_of`
+    place = dict(zip(design.ids, design.xy, strict=True))
+    ways = correctors(found.instrument, rods, fit.target)
+    groups = []
+    for points in (rods, found.pins.select(fit.check.names)):
+        xy = np.array([place[name] for name in points.names]).reshape(-1, 2)
+        groups.append((xy, ways[FACTORS[1]](points.xy) - xy, ways[FACTORS[3]](points.xy) - xy))
+    return _Residuals(groups[0], groups[1])
+
+
+def _summary(found: PhotoII, design: ReseauDesign, left: _Residuals, tolerance: float) -> list[Item]:
+    unit, measured = design.unit, found.measured
+    expected = len(design.ids) if measured is None else len(measured.ids)
+    return [
+        (f"{len(found.pins)}\u2009/\u2009{expected}", "", "rods measured"),
+        (f"{np.sqrt((found.pins.sigma**2).mean()):.3f}", "px", "standard deviation of a coordinate"),
+        (f"{rms(left.fitted[1]):.3f}", unit, "rms before: group A and the scales"),
+        (f"{rms(left.fitted[2]):.3f}", unit, "rms after group B"),
+        (f"{np.sqrt(2) * tolerance:.3f}", unit, "what the rods’ tolerance amounts to"),
+    ]
+
+
+def _overlay(found: PhotoII, frame: Frame) -> str:
+    """Rods with the middle lines of their arcs; those declined with their names."""
+    measured, fit = found.measured, found.instrument.fit
+    check = () if fit is None else fit.check.names
+    if measured is None:
+        names, xy = found.pins.names, found.pins.xy
+        return frame_overlay(frame, Marks(names, xy, np.ones(len(names), dtype=bool), check))
+    xy = np.where(measured.ok[:, None], measured.xy, measured.predicted)
+    arcs = Arcs(measured.length, measured.curvature, measured.tilt)
+    labels = {name: name for name in measured.ids}
+    return frame_overlay(frame, Marks(measured.ids, xy, measured.ok, check, arcs, labels))
+
+
+def _setup(found: PhotoII) -> list[tuple[Markup, str, str]]:
+    """Scales and rotation of the photograph: symbol, value, what it is."""
+    plane, registration = found.instrument.plane, found.registration
+    rows = [
+        (Markup("<i>λ</i><sub>1</sub>"), f"{plane.scale[0]:.5f}", "scale along M′N′"),
+        (Markup("<i>λ</i><sub>2</sub>"), f"{plane.scale[1]:.5f}", "scale across it"),
+        (Markup("<i>κ</i>"), aligned([np.rad2deg(plane.rotation)], 3)[0] + "°", "rotation of the object"),
+    ]
+    if registration is not None:
+        shown = f"{registration.displacement_px:.3f} px (p = {probability(registration.p)})"
+        rows.append((Markup("<i>d</i>"), shown, "displacement since PHOTO I"))
+    return rows
+
+
+def _estimates(instrument: InstrumentCorrection) -> Estimates:
+    """Of the coefficients that are applied, with what group A leaves of doubt in them."""
+    names, first = instrument.model.names, len(instrument.camera.model.names)
+    sigma = np.sqrt(np.diagonal(instrument.covariance))[first:]
+    return Estimates(
+        dict(zip(names, map(float, instrument.model.values), strict=True)),
+        dict(zip(names, map(float, sigma), strict=True)),
+        {name: unit_of(instrument.model, name, instrument.unit) for name in names},
+    )
+
+
+def _reduced(model: RationalPolynomial, fit: InstrumentFit) -> Row:
+    """The model that the tests leave, as two equations."""
+    reduced = fit.elimination.adjustment
+    kept = [name for name in reduced.names if name not in fit.elimination.dropped]
+    value = {name: reduced[name] for name in kept}
+    sigma = {name: reduced.sigma_of(name) for name in kept}
+    return {
+        "equations": equations(model, value, sigma),
+        "kept": len(kept),
+        "dropped": len(fit.elimination.dropped),
+        "sigma0": f"{reduced.sigma0:.3f}",
+        "full_sigma0": f"{fit.elimination.full.sigma0:.3f}",
+    }
+
+
+def _causes(causes: Causes, fit: InstrumentFit, unit: str) -> Row:
+    """The causes with their standard deviations, tests and largest effects; the conditions."""
+    adjustment, display = causes.adjustment, wong_display()
+    globally = adjustment.global_test()
+    rows = []
+    for name in CAUSES:
+        value = adjustment[name]
+        # The coefficients' covariance is taken at its word: three conditions are too few to scale it by.
+        sigma = float(np.sqrt(adjustment.cofactor[adjustment.index(name), adjustment.index(name)]))
+        alone = RationalPolynomial({name: display.terms[name]}, np.array([value]))
+        p = float(scipy.special.chdtrc(1, (value / sigma) ** 2))
+        rows.append(
+            {
+                "name": symbol(name),
+                "group": _MEANING[name][0],
+                "value": power(value, sigma),
+                "unit": unit_markup(unit_of(display, name, unit)),
+                "effect": f"{np.hypot(*alone(fit.points.xy).T).max():.3f}",
+                "p": probability(p),
+                "significant": p < fit.elimination.alpha,
+                "meaning": _MEANING[name][1],
+            }
+        )
+    conditions = [
+        {
+            "name": _condition(test.condition),
+            "misclosure": power(test.misclosure, test.sigma),
+            "statistic": f"{test.statistic:.2f}",
+            "critical": f"{test.critical:.2f}",
+            "p": probability(test.p),
+            "verdict": "holds" if test.holds else "does not hold",
+        }
+        for test in causes.conditions
+    ]
+    together = {
+        "statistic": f"{globally.statistic:.2f}",
+        "critical": f"{scipy.special.chdtri(globally.redundancy, 0.05):.2f}",
+        "p": probability(float(scipy.special.chdtrc(globally.redundancy, globally.statistic))),
+    }
+    return {"rows": rows, "conditions": conditions, "together": together}
+
+
+def _condition(text: str) -> Markup:
+    """A condition with its coefficients as they are printed."""
+    words = [Markup("<i>{}</i>").format(symbol(word)) if word.isalnum() else word for word in text.split()]
+    return Markup(" ").join(words)
+
+
+def _displays(found: Rivalry) -> Row:
+    """The polynomials and Wong's model: number of parameters, sigma0, leave-one-out rms; the verdict."""
+    models = ((found.first, "polynomials (7a, b)"), (found.second, "Wong’s display model"))
+    columns = [aligned(found.rms[:, k], 3) for k in range(2)]
+    rows = [
+        (name, str(len(fit.names)), str(fit.redundancy), f"{fit.sigma0:.3f}", *cells)
+        for (fit, name), *cells in zip(models, *columns, strict=True)
+    ]
+    verdict = {
+        "first": "The polynomials predict the rods significantly better.",
+        "second": "Wong’s model predicts the rods significantly better.",
+    }
+    return {
+        "rows": rows,
+        "p": probability(found.p),
+        "verdict": verdict.get(found.verdict, "Neither model predicts the rods significantly better."),
+    }
+
+
+def _truth(truth: RodComparison, unit: str) -> list[tuple[str, ...]]:
+    """What the simulator knows: quantity, x, y, unit."""
+    return [
+        ("error of the measured positions", *aligned(truth.position_px, 3), "px"),
+        ("the same in their standard deviations", *aligned(truth.position_normalised, 2), ""),
+        ("rods as they were made less as designed", *aligned(truth.made, 3), unit),
+    ]

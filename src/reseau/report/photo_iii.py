@@ -1,0 +1,121 @@
+"""What the report says about PHOTO III: true coordinates of a body without control points."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from markupsafe import Markup
+
+from ..data import Array, Frame
+from ..formats import ReseauDesign
+from ..procedures.oscilloscope import PhotoIII
+from .maps import PROBABILITY, body_map
+from .numbers import aligned
+from .overlay import Arcs, Marks, frame_overlay
+from .tables import Item, Row
+from .truth import BodyComparison
+
+__all__ = ["errors_of", "photo_iii_section"]
+
+_SHOWN_FROM = 0.2
+"""Brightness beside the brightest echo from which a declined spot is crossed out in the picture."""
+
+
+def photo_iii_section(
+    found: PhotoIII, design: ReseauDesign, frame: Frame | None, truth: BodyComparison | None
+) -> Row:
+    """Everything its template shows.
+
+    Parameters
+    ----------
+    found : PhotoIII
+        What the procedure found.
+    design : ReseauDesign
+        The rods of the test object.
+    frame : Frame or None
+        The photograph; without it there is no picture.
+    truth : BodyComparison or None
+        What a simulator knows.
+    """
+    errors = None if truth is None else errors_of(found, truth)
+    drawn, enlarged = body_map(found.true, design.xy, design.unit, errors)
+    measured = found.measured
+    declined = Counter() if measured is None else Counter(why for why in measured.why if why)
+    return {
+        "name": "PHOTO III" if frame is None else frame.name,
+        "summary": _summary(found, design.unit, truth),
+        "frame": None if frame is None else Markup(_overlay(found, frame)),
+        "crossed": measured is not None and bool((~measured.ok & (measured.strength >= _SHOWN_FROM)).any()),
+        "declined": declined.most_common(),
+        "notes": found.notes,
+        "map": Markup(drawn),
+        "enlarged": f"{enlarged:g}",
+        "probability": f"{PROBABILITY * 100:g}",
+        "points": _points(found, truth),
+        "truth": None if truth is None else _truth(truth, design.unit),
+        "strays": 0 if truth is None else truth.strays,
+    }
+
+
+def errors_of(found: PhotoIII, truth: BodyComparison) -> Array:
+    """Errors of the true coordinates in their order, NaN where the truth knows no such point, (n, 2)."""
+    unknown = (np.nan, np.nan)
+    return np.array([truth.errors.get(name, unknown) for name in found.true.names]).reshape(-1, 2)
+
+
+def _summary(found: PhotoIII, unit: str, truth: BodyComparison | None) -> list[Item]:
+    sigma = np.sqrt((found.true.sigma**2).mean(axis=0))
+    number = str(len(found.true)) if truth is None else f"{truth.points}\u2009/\u2009{truth.known}"
+    items = [
+        (number, "", "points of the body measured"),
+        (f"{np.sqrt((found.points.sigma**2).mean()):.3f}", "px", "standard deviation of a coordinate"),
+        (f"{sigma[0]:.3f}", unit, "standard deviation of X"),
+        (f"{sigma[1]:.3f}", unit, "standard deviation of Y"),
+    ]
+    if truth is not None:
+        items.append((f"{np.hypot(*truth.error):.3f}", unit, "rms error of a point"))
+    return items
+
+
+def _overlay(found: PhotoIII, frame: Frame) -> str:
+    """Points with their names; declined spots as bright as a point may be, crossed out."""
+    measured = found.measured
+    if measured is None:
+        names, xy = found.points.names, found.points.xy
+        shown = Marks(names, xy, np.ones(len(names), dtype=bool), labels={name: name for name in names})
+        return frame_overlay(frame, shown)
+    points = measured.points
+    show = measured.ok | (measured.strength >= _SHOWN_FROM)
+    every = np.full(len(measured), "", dtype=object)
+    every[measured.ok] = points.names
+    arcs = Arcs(*(column[show] for column in (measured.length, measured.curvature, measured.tilt)))
+    labels = {name: name for name in points.names}
+    return frame_overlay(
+        frame, Marks(tuple(every[show]), measured.xy[show], measured.ok[show], (), arcs, labels)
+    )
+
+
+def _points(found: PhotoIII, truth: BodyComparison | None) -> list[tuple[str, ...]]:
+    """True coordinates with sigmas; with the truth the point's own name and the errors."""
+    true = found.true
+    columns = [
+        *(aligned(true.xy[:, k], 3) for k in range(2)),
+        *(aligned(true.sigma[:, k], 3) for k in range(2)),
+    ]
+    if truth is not None:
+        errors = errors_of(found, truth)
+        columns += [[truth.identity.get(name, "–") for name in true.names]]
+        columns += [aligned(errors[:, k], 3) for k in range(2)]
+    return [(name, *cells) for name, *cells in zip(true.names, *columns, strict=True)]
+
+
+def _truth(truth: BodyComparison, unit: str) -> list[tuple[str, ...]]:
+    """What the simulator knows: quantity, x, y, unit."""
+    return [
+        ("error of the measured positions", *aligned(truth.position_px, 3), "px"),
+        ("the same in their standard deviations", *aligned(truth.position_normalised, 2), ""),
+        ("error of the true coordinates", *aligned(truth.error, 3), unit),
+        ("their standard deviations", *aligned(truth.sigma, 3), unit),
+        ("the errors in their standard deviations", *aligned(truth.error_normalised, 2), ""),
+    ]
