@@ -76,6 +76,7 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Refine the photographs of a simulated bench factor by factor, and compare with the truth."""
+    from ..adjust.threads import one_thread
     from ..errors import InputError
     from ..provenance import canonical_json
     from ..report.comparison import compare_with_truth
@@ -86,7 +87,8 @@ def demo(
         raise InputError("is a file", where=out, do="name a folder")
     if not out.absolute().parent.is_dir():
         raise InputError("has no such folder", where=out.parent, do="create it first")
-    with progress("photographing", 6) as step:
+    # Small matrices throughout, from drawing the wires on: several threads only wait for one another.
+    with one_thread(), progress("photographing", 6) as step:
         bench = _bench(seed)
         done = _refined(bench, step)
         step("comparing with the truth")

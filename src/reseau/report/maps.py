@@ -98,7 +98,7 @@ def draw_body(
                 textcoords="offset points",
                 fontsize=7.5,
             )
-    _scale_bar(axes, enlarged, nice(float(np.median(semi[:, 1])) * 2), unit)
+    _scale_bar(axes, enlarged, nice(float(np.median(semi[:, 1])) * 3), unit)
     return enlarged
 
 

@@ -14,7 +14,7 @@ from ..errors import UsageError
 from ..formats import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .figures import Panel, draw_distortion, draw_vectors, length
-from .maps import PROBABILITY, draw_body
+from .maps import draw_body
 from .overlay import preview
 from .photo_iii import errors_of
 from .style import ACCENT, BLUE, drawing
@@ -102,6 +102,4 @@ def _body(axes: Axes, third: PhotoIII, test_object: ReseauDesign, truth: Compari
     known = None if truth is None or not truth.bodies else truth.bodies[0]
     errors = None if known is None else errors_of(third, known)
     enlarged = draw_body(axes, third.true, test_object.xy, test_object.unit, errors, named=False)
-    axes.set_title(
-        f"true coordinates, {PROBABILITY * 100:g} % ellipses {enlarged:g} times enlarged", loc="left"
-    )
+    axes.set_title(f"true coordinates, ellipses {enlarged:g} times enlarged", loc="left")

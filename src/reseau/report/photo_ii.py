@@ -109,7 +109,7 @@ def photo_ii_section(
             3,
             largest=True,
         ),
-        "tolerance": f"{sigma:.2f}",
+        "tolerance": f"{sigma:.2f}\u00a0{design.unit}" if sigma else None,
         "field": Markup(
             distortion_figure(
                 instrument.model, fit.target, Panel(design.unit, panel.pitch, labels=("x", "y"))
@@ -122,6 +122,7 @@ def photo_ii_section(
         "causes": None if found.causes is None else _causes(found.causes, fit, design.unit),
         "displays": None if fit.displays is None else _displays(fit.displays),
         "truth": None if truth is None else _truth(truth, design.unit),
+        "all_terms": set(fit.elimination.full.names) <= set(instrument.model.names),
         "rods": len(fit.points),
         "held": len(fit.check),
         "alpha": f"{fit.elimination.alpha:g}",
@@ -144,13 +145,15 @@ def _residuals(found: PhotoII, design: ReseauDesign) -> _Residuals:
 def _summary(found: PhotoII, design: ReseauDesign, left: _Residuals, tolerance: float) -> list[Item]:
     unit, measured = design.unit, found.measured
     expected = len(design.ids) if measured is None else len(measured.ids)
-    return [
+    items = [
         (f"{len(found.pins)}\u2009/\u2009{expected}", "", "rods measured"),
         (f"{np.sqrt((found.pins.sigma**2).mean()):.3f}", "px", "standard deviation of a coordinate"),
         (f"{rms(left.fitted[1]):.3f}", unit, "rms before: group A and the scales"),
         (f"{rms(left.fitted[2]):.3f}", unit, "rms after group B"),
-        (f"{np.sqrt(2) * tolerance:.3f}", unit, "what the rods’ tolerance amounts to"),
     ]
+    if tolerance:
+        items.append((f"{np.sqrt(2) * tolerance:.3f}", unit, "what the rods’ tolerance amounts to"))
+    return items
 
 
 def _overlay(found: PhotoII, frame: Frame) -> str:
