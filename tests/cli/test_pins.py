@@ -11,8 +11,7 @@ import pytest
 
 from reseau.formats import ReseauDesign, ReseauMeasurement
 from reseau.images import write_image
-from reseau.optics import Strokes
-from reseau.optics.formation import Outline, draw
+from reseau.optics import Arcs
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -24,9 +23,9 @@ TRUTH = RODS * [5.0, -5.0] + [100.25, 350.4]
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An image of seven rods, the last of them not seen, and their design."""
     folder = tmp_path_factory.mktemp("pins")
-    outline = Strokes(*(np.full(7, v) for v in (22.0, 3.0, 0.012, 0.0))).outline(1.3)
-    shown = Outline(outline.xy + TRUTH[:, None], outline.dxy)
-    canvas = 5 + 150 * draw(Outline(shown.xy[:-1], shown.dxy[:-1]), (420, 620), 1.3)
+    arcs = Arcs(*(np.full(6, v) for v in (7.0, 1.6, 0.012, 0.0)))
+    columns, rows = (np.broadcast_to(np.arange(n, dtype=float), (6, n)) for n in (620, 420))
+    canvas = 5 + 150 * arcs.image(TRUTH[:-1], columns, rows).sum(axis=0)
     canvas += 1.5 * np.random.default_rng(0).standard_normal(canvas.shape)
     write_image(folder / "photo.png", np.clip(np.rint(canvas), 0, 255).astype(np.uint8))
     points = [{"id": f"R{k}", "x": x, "y": y} for k, (x, y) in enumerate(RODS.tolist())]

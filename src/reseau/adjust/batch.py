@@ -53,7 +53,9 @@ class BatchOptions:
         Evaluations of the function after that at the initial values.
     tolerance : array_like (u,) or float, optional
         A problem has converged when no parameter is corrected by more than this, in the parameter's unit.
-        By default when the whole correction is less than 1e-4 of its own standard deviation.
+        By default when the whole correction is small against its own standard deviation, see `share`.
+    share : float
+        That share; what is left then adds its square to the variance.
     damping : float
         Initial Levenberg–Marquardt damping, relative to the unit diagonal of the scaled normal equations.
     reweight : callable, optional
@@ -64,6 +66,7 @@ class BatchOptions:
 
     max_iterations: int = 20
     tolerance: ArrayLike | None = None
+    share: float = 1e-4
     damping: float = 1e-3
     reweight: Reweight | None = None
 
@@ -393,7 +396,7 @@ class _Work:
         if self.tolerance is not None:
             return np.asarray((np.abs(step) <= self.tolerance).all(axis=1))
         variance = self.cost[rows] / np.maximum(self.redundancy[rows], 1)
-        return np.asarray(predicted <= 1e-8 * variance)
+        return np.asarray(predicted <= self.options.share**2 * variance)
 
     def _leave(self, rows: Rows, reason: BatchReason) -> None:
         self.active[rows] = False

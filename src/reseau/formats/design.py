@@ -76,3 +76,12 @@ class ReseauDesign(Document):
     def nominal_px(self) -> Array:
         """Prior positions in the image, (n, 2); NaN where there is none."""
         return np.array([p.nominal_px or (np.nan, np.nan) for p in self.points], dtype=np.float64)
+
+    def expected_at(self, nominal_px: Array) -> Self:
+        """The same design with prior positions in an image (n, 2); NaN where a mark has none."""
+        places = [(float(x), float(y)) if np.isfinite([x, y]).all() else None for x, y in nominal_px]
+        points = [
+            point.model_copy(update={"nominal_px": place})
+            for point, place in zip(self.points, places, strict=True)
+        ]
+        return self.model_copy(update={"points": tuple(points)})

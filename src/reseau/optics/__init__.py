@@ -1,5 +1,6 @@
 """Image formation: cameras, distortions, displays, sensors and target images."""
 
+from .arcs import Arcs
 from .cameras import Brown, OpenCV, PixelGrid
 from .composition import Chain, Identity, Inverted, Similarity
 from .displays import DecenteredDisplay, wong_display
@@ -17,9 +18,9 @@ from .poses import (
     rotation_matrix,
 )
 from .sensor import Sensor, illumination, jpeg, sigma_of_snr, snr_db
-from .strokes import Strokes
 
 __all__ = [
+    "Arcs",
     "Brown",
     "BrownDistortion",
     "Chain",
@@ -36,7 +37,6 @@ __all__ = [
     "RationalPolynomial",
     "Sensor",
     "Similarity",
-    "Strokes",
     "angles_to_matrix",
     "illumination",
     "jpeg",

@@ -9,7 +9,7 @@ any control point gets its true coordinates. The steps carry the paper's numbers
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from ..formats import ReseauDesign
 from ..optics import RationalPolynomial
 from ..refine import (
     CameraCorrection,
+    PinDetections,
     PinOptions,
     PinResult,
     ReseauOptions,
@@ -37,6 +38,8 @@ __all__ = ["PhotoI", "PhotoII", "PhotoIII", "photo_i", "photo_ii", "photo_iii"]
 
 _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
+_STOOD_STILL_PX = 6.0
+"""How far the reseau is looked for from where PHOTO I had it, before it is looked for everywhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +148,15 @@ class PhotoIII:
         How the photograph was referred to PHOTO I.
     notes : tuple of str
         What the user should look into.
+    measured : PinDetections, optional
+        How the points were measured; None where they came from elsewhere.
     """
 
     points: ImagePoints
     true: ImagePoints
     registration: Registration | None
     notes: tuple[str, ...]
+    measured: PinDetections | None = None
 
 
 def photo_ii(
@@ -193,7 +199,7 @@ def photo_ii(
     # (iv) photo-coordinates of the test object
     measured = None
     if isinstance(photo, Frame):
-        seen = measure_reseau(photo, reseau, options)
+        seen = _reseau_in(photo, reseau, camera, options)
         if isinstance(seen, Failure):
             return seen
         hidden = seen.shadow(reseau, photo.pixels.shape)
@@ -253,13 +259,17 @@ def photo_iii(
     PhotoIII or Failure
         A failure when the reseau is not found, or the photograph shows nothing.
     """
+    measured = None
     if isinstance(photo, Frame):
-        seen = measure_reseau(photo, reseau, options)
+        seen = _reseau_in(photo, reseau, instrument.camera, options)
         if isinstance(seen, Failure):
             return seen
         marks = seen.points
         hidden = seen.shadow(reseau, photo.pixels.shape)
-        body = find_pins(photo, pins, hidden=hidden).points if points is None else points
+        if points is None:
+            measured = find_pins(photo, pins, hidden=hidden)
+            points = measured.points
+        body = points
     else:
         body = photo
     if not len(body):
@@ -271,7 +281,25 @@ def photo_iii(
             return registered
         registration, body = registered, registered.apply(body)
     notes = _of_the_camera(instrument.camera, registration)
-    return PhotoIII(body, instrument.apply(body), registration, notes)
+    return PhotoIII(body, instrument.apply(body), registration, notes, measured)
+
+
+def _reseau_in(
+    photo: Frame, reseau: ReseauDesign, camera: CameraCorrection, options: ReseauOptions | None
+) -> ReseauResult | Failure:
+    """The reseau where PHOTO I had it; found anew where that leaves out what may be a row of it.
+
+    A camera that was moved by the pitch of the reseau shows its marks where others stood.
+    """
+    o = options or ReseauOptions()
+    expected = camera.to_pixels(camera.object_system(reseau.xy))
+    near = replace(o, nominal=True, nominal_within_px=_STOOD_STILL_PX)
+    known = measure_reseau(photo, reseau.expected_at(expected), near)
+    found = known.found if isinstance(known, ReseauResult) else 0
+    if len(reseau.ids) - found <= 0.5 * np.sqrt(len(reseau.ids)):
+        return known
+    anew = measure_reseau(photo, reseau, o)
+    return anew if isinstance(anew, ReseauResult) and anew.found > found else known
 
 
 def _causes(instrument: InstrumentCorrection) -> Causes | None:

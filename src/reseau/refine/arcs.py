@@ -1,4 +1,4 @@
-"""Echoes matched with formed arcs: place, length, curvature, tilt, width, brightness and ground together."""
+"""Echoes matched with formed arcs: place, widths, curvature, tilt, brightness and ground together."""
 
 from __future__ import annotations
 
@@ -8,75 +8,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Array, Mask, Rows
-from ..optics.formation import Outline
-from ..optics.strokes import Strokes
+from ..optics import Arcs
 from .echoes import Echoes
 from .matching import Matches, MatchOptions, match
+from .shapes import Window
 
 __all__ = ["ArcMatches", "ArcShape", "match_arcs"]
 
-_WINDOWS = (8, 12, 17, 24, 34, 48, 68)
-"""Half sides of windows, pixels; arcs of like size are matched in one batch."""
-_MARGIN_PX = 5
+_WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
+"""Halves of windows' sides, pixels; arcs of like size are matched in one batch."""
+_SURE = 8.0
+"""Contrast over its standard deviation of an arc whose light is taken off another."""
+_MARGIN_PX = 4.0
 """What a window shows of the ground around an arc."""
-_FORM_SIGMA = np.array([0.5, 0.5, 0.3, 0.3])
-"""Prior standard deviations: log length, log thickness, curvature × length, tilt (rad)."""
+_FORM_SIGMA = np.array([0.5, 0.05, 0.3])
+"""Prior standard deviations: logarithm of the width along, sag at that width over it, tilt (rad)."""
+_ACROSS_SIGMA = 0.5
+"""Prior standard deviation of the logarithm of the width across."""
 _LAGS = 4
 """Distance, in pixels along both axes, to which residuals are asked whether they go together."""
-_NUMBERS = ("psf_px", "contrast", "t", "noise", "correlation", "seen", "rejected")
+_NUMBERS = ("contrast", "t", "noise", "correlation", "seen", "rejected")
 _HELD = 0.2
 """Share of those for a second attempt where the first did not converge."""
 _ROUND = 1.5
 """Length over thickness below which a spot shows no direction."""
-_LENGTH, _THICKNESS = 1.3, 0.6
-"""Outline over four standard deviations of the light that stands out, about."""
+_OF_MOMENTS = 1.7
+"""Width of a Gaussian over that of what stands out of it above a third of its height, about."""
+_REACH = 2.6
+"""Widths to both sides that a window shows."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArcShape:
-    """Arcs as functions of what is estimated: logarithms of length and thickness, curvature × length, tilt.
+    """Arcs as functions of corrections: logarithm of the width along, sag over that width, tilt.
+
+    The width of the point-spread function is here that of the arc across.
 
     Parameters
     ----------
-    start : Strokes
-        Approximate arcs, (k,); the parameters are corrections to them.
-    spacing : float
-        Largest distance of nodes, pixels.
+    start : Arcs (k,)
+        Approximate arcs.
     """
 
-    start: Strokes
-    spacing: float
+    start: Arcs
 
     @property
     def parameters(self) -> int:
         """Number of parameters of the form."""
-        return 4
+        return 3
 
-    def strokes(self, form: Array, at: Rows) -> Strokes:
-        """The arcs `at` with the corrections (m, 4)."""
+    def arcs(self, width: Array, form: Array, at: Rows) -> Arcs:
+        """The arcs `at` with widths across (m,) and corrections (m, 3)."""
         s = self.start
-        return Strokes(
-            s.length[at] * np.exp(form[:, 0]),
-            s.thickness[at] * np.exp(form[:, 1]),
-            s.curvature[at] + form[:, 2] / s.length[at],
-            s.tilt[at] + form[:, 3],
-            s.taper,
+        return Arcs(
+            s.along[at] * np.exp(form[:, 0]),
+            width,
+            s.curvature[at] + form[:, 1] / s.along[at],
+            s.tilt[at] + form[:, 2],
         )
 
-    def outline(self, form: Array, at: Rows) -> Outline:
-        """Outlines of the arcs `at`."""
-        return self.strokes(form, at).outline(self.spacing, self._nodes)
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`reseau.refine.shapes.Shape`."""
+        return self.arcs(width, form, at).image(xy, window.columns, window.rows)
 
-    def motions(self, form: Array, at: Rows) -> Array:
-        """Velocities of their nodes, (m, 4, j, 2)."""
-        moved = self.strokes(form, at).motions(self.spacing, self._nodes)
-        moved[:, 2] /= self.start.length[at, None, None]
-        return moved
-
-    @property
-    def _nodes(self) -> int:
-        # Arcs may turn out half as long again as they seemed.
-        return int(1.5 * self.start.nodes(self.spacing))
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`reseau.refine.shapes.Shape`."""
+        image, parts = self.arcs(width, form, at).derivatives(xy, window.columns, window.rows)
+        parts[:, 4] /= self.start.along[at, None, None]
+        return image, parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +86,14 @@ class ArcMatches:
 
     Parameters
     ----------
-    xy, cov, psf_px, contrast, t, noise, correlation, seen, rejected, converged : ndarray
+    xy, cov, contrast, t, noise, correlation, seen, rejected, converged : ndarray
         As in :class:`reseau.refine.matching.Matches`; `cov` allows for residuals that go together.
-    form : Strokes
+    form : Arcs
         The arcs found.
     """
 
     xy: Array
     cov: Array
-    psf_px: Array
     contrast: Array
     t: Array
     noise: Array
@@ -101,7 +101,7 @@ class ArcMatches:
     seen: Array
     rejected: Array
     converged: Mask
-    form: Strokes
+    form: Arcs
 
 
 def match_arcs(
@@ -120,66 +120,137 @@ def match_arcs(
     at : ndarray of int (m,)
         Which are to be matched.
     options : MatchOptions
-        How; the window is set here.
+        How; window and widths are set here.
     noise : float
         Standard deviation of the grey values.
     """
-    start = _start(echoes, at, options.psf_px)
-    half = _half_sides(start)
-    parts: list[tuple[Rows, Matches, Strokes]] = []
-    for side in np.unique(half):
-        rows = np.flatnonzero(half == side)
-        windowed = replace(options, half_px=int(side), polarity="bright")
-
-        def adjusted(
-            rows: Rows, form_sigma: Array, windowed: MatchOptions = windowed
-        ) -> tuple[Rows, Matches, Strokes]:
-            shape = ArcShape(_rows(start, rows), options.psf_px)
-            own = echoes.claimed, at[rows]
-            found = match(
-                grey,
-                valid,
-                shape,
-                echoes.xy[at[rows]],
-                windowed,
-                noise=noise,
-                form_sigma=form_sigma,
-                claims=own,
-            )
-            return rows, found, shape.strokes(found.form, np.arange(len(rows)))
-
-        parts.append(adjusted(rows, _FORM_SIGMA))
-        # A round spot has no tilt: what does not converge is held closer to how a rod's echo lies.
-        again = rows[~parts[-1][1].converged]
-        if len(again):
-            parts.append(adjusted(again, _HELD * _FORM_SIGMA))
-    return _together(parts, len(at), start.taper)
+    work = _Matching(grey, valid, echoes, at, options, noise)
+    found = _together(work.all(), len(at))
+    touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
+    if len(touching):
+        # How light adds up where two echoes meet is the instrument's secret: the stronger is seen, behind a
+        # logarithmic amplifier, or both. The first match took the one for true; how far the other would
+        # carry the arc is not known better.
+        pulled = work.without_others(touching, found)
+        found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
+    return found
 
 
-def _start(echoes: Echoes, at: Rows, psf_px: float) -> Strokes:
-    """Outlines to begin with, from the moments of the light."""
+class _Matching:
+    """Arcs of a frame and their windows."""
+
+    def __init__(
+        self,
+        grey: NDArray[np.float32],
+        valid: Mask,
+        echoes: Echoes,
+        at: Rows,
+        options: MatchOptions,
+        noise: float,
+    ) -> None:
+        self.grey, self.valid, self.echoes, self.at = grey, valid, echoes, at
+        self.options, self.noise = options, noise
+        self.start = _start(echoes, at)
+        self.half = _half_sides(self.start)
+
+    def all(self) -> list[tuple[Rows, Matches, Arcs]]:
+        """Every arc, each kept off what belongs to another."""
+        parts = []
+        for rows in self._of_like_size(np.arange(len(self.at))):
+            parts.append(self._adjusted(rows, self.start, self.echoes.xy[self.at], _FORM_SIGMA))
+            # A round spot has no tilt: what does not converge is held closer to how a rod's echo lies.
+            again = rows[~parts[-1][1].converged]
+            if len(again):
+                parts.append(self._adjusted(again, self.start, self.echoes.xy[self.at], _HELD * _FORM_SIGMA))
+        return parts
+
+    def without_others(self, touching: Rows, found: ArcMatches) -> Array:
+        """By how much (m, 2) arcs move when the light of the others is taken off instead of left out."""
+        modelled = found.converged & (found.t > _SURE)
+        pulled = np.zeros((len(touching), 2))
+        for rows in self._of_like_size(touching):
+            others = np.stack([self._light_of_others(k, found, modelled) for k in rows])
+            _, again, _ = self._adjusted(rows, found.form, found.xy, _FORM_SIGMA, others, modelled)
+            moved = np.where(again.converged[:, None], again.xy - found.xy[rows], np.nan)
+            pulled[np.searchsorted(touching, rows)] = moved
+        return pulled
+
+    def _of_like_size(self, rows: Rows) -> list[Rows]:
+        sizes = np.unique(self.half[rows], axis=0)
+        return [rows[(self.half[rows] == size).all(axis=1)] for size in sizes]
+
+    def _light_of_others(self, arc: int, found: ArcMatches, modelled: Mask) -> Array:
+        """What the other arcs give to the window of one, (rows, columns)."""
+        (half_x, half_y), centre = self.half[arc], np.rint(found.xy[arc])
+        columns = centre[0] + np.arange(-half_x, half_x + 1.0)
+        rows = centre[1] + np.arange(-half_y, half_y + 1.0)
+        reach = 5 * found.form.along + 5 * found.form.across
+        near = (np.abs(found.xy - centre) < reach[:, None] + (half_x, half_y)).all(axis=1) & modelled
+        near[arc] = False
+        others = np.flatnonzero(near)
+        image = found.form.select(others).image(
+            found.xy[others], *(np.broadcast_to(axis, (len(others), len(axis))) for axis in (columns, rows))
+        )
+        return np.asarray(np.tensordot(found.contrast[others], image, axes=1))
+
+    def _adjusted(
+        self,
+        rows: Rows,
+        start: Arcs,
+        xy: Array,
+        form_sigma: Array,
+        others: Array | None = None,
+        modelled: Mask | None = None,
+    ) -> tuple[Rows, Matches, Arcs]:
+        """Match the arcs `rows`, all of one size of window."""
+        shape = ArcShape(start.select(rows))
+        owner = self.echoes.claimed
+        if modelled is not None:
+            open_ = np.append(np.zeros(len(self.echoes), dtype=bool), True)
+            open_[self.at[modelled]] = True
+            owner = np.where(open_[owner], -1, owner)
+        windowed = replace(
+            self.options,
+            half_px=(int(self.half[rows[0], 0]), int(self.half[rows[0], 1])),
+            psf_px=shape.start.across,
+            psf_log_sigma=_ACROSS_SIGMA,
+            polarity="bright",
+        )
+        found = match(
+            self.grey,
+            self.valid,
+            shape,
+            xy[rows],
+            windowed,
+            noise=self.noise,
+            form_sigma=form_sigma,
+            claims=(owner, self.at[rows]),
+            others=others,
+        )
+        return rows, found, shape.arcs(found.psf_px, found.form, np.arange(len(rows)))
+
+
+def _start(echoes: Echoes, at: Rows) -> Arcs:
+    """Arcs to begin with, from the moments of the light."""
     long, wide, tilt = echoes.length[at], echoes.thickness[at], echoes.tilt[at]
     # What has no direction of its own begins level, as the echo of a rod lies.
     round_ = long < _ROUND * wide
     tilt = np.where(round_, 0.0, tilt)
     wide = np.where(round_, np.sqrt(long * wide), wide)
     long = np.where(round_, wide, long)
-    thin = np.sqrt(np.maximum(wide**2 - (4 * psf_px) ** 2, psf_px**2))
-    length = np.maximum(_LENGTH * long, 4 * psf_px)
+    along, across = (_OF_MOMENTS / 4 * values for values in (long, wide))
     # A region's moments know the bend of a short arc badly; its matching begins with a straight one.
-    bend = np.clip(echoes.curvature[at] * length, -0.6, 0.6) * (long > 2 * wide)
-    return Strokes(length, np.minimum(_THICKNESS * thin, length), bend / length, tilt)
+    bend = np.clip(echoes.curvature[at] * along, -0.3, 0.3) * (long > 2 * wide)
+    return Arcs(along, across, bend / along, tilt)
 
 
-def _half_sides(start: Strokes) -> Rows:
-    """Half sides of the windows, from a few sizes."""
-    reach = np.maximum(start.length, 2 * start.thickness) / 2 + _MARGIN_PX
-    return np.array(_WINDOWS)[np.minimum(np.searchsorted(_WINDOWS, reach), len(_WINDOWS) - 1)]
-
-
-def _rows(strokes: Strokes, rows: Rows) -> Strokes:
-    s = strokes
-    return Strokes(s.length[rows], s.thickness[rows], s.curvature[rows], s.tilt[rows], s.taper)
+def _half_sides(start: Arcs) -> Rows:
+    """Halves of the sides of the windows (k, 2), from a few sizes."""
+    u, v = _REACH * start.along, _REACH * start.across
+    v = v + 0.5 * np.abs(start.curvature) * u**2
+    c, s = np.abs(np.cos(start.tilt)), np.abs(np.sin(start.tilt))
+    reach = np.stack([np.hypot(c * u, s * v), np.hypot(s * u, c * v)], axis=1) + _MARGIN_PX
+    return _WINDOWS[np.minimum(np.searchsorted(_WINDOWS, reach), len(_WINDOWS) - 1)]
 
 
 def _inflation(residuals: Array) -> Array:
@@ -206,13 +277,13 @@ def _inflation(residuals: Array) -> Array:
     return total
 
 
-def _together(parts: list[tuple[Rows, Matches, Strokes]], count: int, taper: float) -> ArcMatches:
+def _together(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches:
     """Columns in the order of the echoes again."""
 
     def column(name: str, tail: tuple[int, ...] = ()) -> Array:
         values = np.empty((count, *tail))
-        for rows, found, strokes in parts:
-            values[rows] = getattr(found if hasattr(found, name) else strokes, name)
+        for rows, found, arcs in parts:
+            values[rows] = getattr(found if hasattr(found, name) else arcs, name)
         return values
 
     cov = column("cov", (2, 2))
@@ -227,5 +298,5 @@ def _together(parts: list[tuple[Rows, Matches, Strokes]], count: int, taper: flo
         cov=cov,
         **{name: column(name) for name in _NUMBERS},
         converged=column("converged") > 0,
-        form=Strokes(column("length"), column("thickness"), curvature, tilt, taper),
+        form=Arcs(column("along"), column("across"), curvature, tilt),
     )

@@ -47,7 +47,7 @@ class Echoes:
     length, thickness : ndarray (m,)
         Four standard deviations of the light along and across, pixels.
     curvature, tilt : ndarray (m,)
-        As in :class:`reseau.optics.Strokes`.
+        As in :class:`reseau.optics.Arcs`.
     joined : ndarray (m,)
         Level at which it touches another spot, as a share of its height.
     level : ndarray (m,)

@@ -83,7 +83,12 @@ def spacing(xy: Array) -> float:
 
 
 def assign(
-    source: Array, start: Array, candidates: Candidates, valid: Mask, shifts: int = 4
+    source: Array,
+    start: Array,
+    candidates: Candidates,
+    valid: Mask,
+    shifts: int = 4,
+    within_px: float | None = None,
 ) -> Assignment | None:
     """Give marks their candidates, beginning from approximate positions.
 
@@ -100,6 +105,8 @@ def assign(
     shifts : int
         At most so many common shifts are tried: a grid that lies half a pitch away or more agrees almost as
         well with one of its neighbours in the place of each mark, but misses those at its border.
+    within_px : float, optional
+        How far the approximate positions may be off at most, where that is known; no shift is tried then.
 
     Returns
     -------
@@ -109,8 +116,10 @@ def assign(
     if len(candidates) < 4:
         return None
     pitch, best = spacing(start), None
+    if within_px is not None:
+        return _assigned(source, start, candidates, valid, pitch, min(within_px, 0.2 * pitch))
     for shift in _common_shifts(start, candidates, pitch, shifts):
-        found = _assigned(source, start + shift, candidates, valid, pitch)
+        found = _assigned(source, start + shift, candidates, valid, pitch, 0.2 * pitch)
         if found is None:
             continue
         # Half a pitch off, wires have something of a crossing everywhere, but nothing strong.
@@ -121,12 +130,12 @@ def assign(
 
 
 def _assigned(
-    source: Array, start: Array, candidates: Candidates, valid: Mask, pitch: float
+    source: Array, start: Array, candidates: Candidates, valid: Mask, pitch: float, widest: float
 ) -> Assignment | None:
     """Give marks their candidates, beginning from positions that a smooth distortion alone makes wrong."""
     centre = _densest(start, candidates, pitch)
     far = np.hypot(*(start - centre).T)
-    tree, predicted, gate = KDTree(candidates.xy), start, 0.2 * pitch
+    tree, predicted, gate = KDTree(candidates.xy), start, widest
     field: SmoothField | None = None
     rows = np.full(len(start), -1)
     for step, most in enumerate((1, 1, 2, 3, 3, 5, 5, 5)):
@@ -139,7 +148,7 @@ def _assigned(
             break
         field, scatter = fitted
         predicted = field(source)
-        gate = float(np.clip(4 * scatter, max(2.0, 0.03 * pitch), 0.2 * pitch))
+        gate = float(np.clip(4 * scatter, min(max(2.0, 0.03 * pitch), widest), widest))
     if field is None:
         return None
     rows = _nearest(tree, candidates, predicted, gate, np.ones(len(start), dtype=bool))

@@ -36,6 +36,8 @@ class ReseauOptions:
     ----------
     nominal : bool
         Whether the design's nominal positions are used, where it has them.
+    nominal_within_px : float, optional
+        How far they may be off, where that is known; by default by any smooth distortion and up to a pitch.
     mirrored : bool, optional
         See :class:`reseau.refine.grid.GridOptions`.
     max_rotation_deg : float
@@ -57,6 +59,7 @@ class ReseauOptions:
     """
 
     nominal: bool = True
+    nominal_within_px: float | None = None
     mirrored: bool | None = None
     max_rotation_deg: float = 12.0
     mark_px: float | None = None
@@ -135,12 +138,12 @@ class MarkMeasurement:
 
     def _outline(self, at: Rows, options: MatchOptions) -> Outline:
         """Outlines of the marks `at` in pixels, as the field maps them."""
-        psf_px = options.psf_px
+        psf_px = float(np.max(options.psf_px))
         jacobian = self.field.jacobian(self.source[at])
         mark = self.design.mark
         width = self.size if mark.shape == "line-grid" else mark.line_width
         # The wires of a crossing end where the window does not see it, turned by whatever angle.
-        reach = (1.5 * options.half_px + 8 * psf_px) / self.px_per_unit
+        reach = (1.5 * max(options.half) + 8 * psf_px) / self.px_per_unit
         outline = mark_outline(mark.shape, self.size, width, 0.8 * psf_px / self.px_per_unit, reach).affine(
             jacobian
         )

@@ -13,17 +13,21 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjust import BatchAdjustment, BatchOptions, adjust_batch
+from ..adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline
-from .patches import CONTRAST, LEVEL, WIDTH, GrownOutline, MatchOptions, Patches, Shape, X, Y
+from .patches import CONTRAST, WIDTH, MatchOptions, Patches, X, Y
+from .shapes import GrownOutline, Shape
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "match"]
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
-_STEP_PX = 1e-4
-"""Corrections of a position that end the iterations; far below any noise."""
+_SETTLED = 0.01
+"""Corrections, as a share of their standard deviation, that end the iterations."""
+
+_FIRST, _MOST = 10, 100
+"""Iterations before blunders have been looked for, and at most."""
 
 SIZE = np.eye(2)[None]
 """The form's one parameter for a mark of unknown size: the local frame grows by its share."""
@@ -106,6 +110,7 @@ def match(
     form: Array | None = None,
     form_sigma: Array | None = None,
     claims: tuple[NDArray[Any], Rows] | None = None,
+    others: Array | None = None,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
 
@@ -131,6 +136,8 @@ def match(
     claims : tuple, optional
         Whose each pixel is, (h, w) of int, below 0 for nobody's; and the number (k,) under which each mark
         claims its own. What belongs to another is not looked at.
+    others : ndarray (k, rows, columns), optional
+        Light of others in each window, which is taken off first.
 
     Returns
     -------
@@ -139,45 +146,42 @@ def match(
     """
     if isinstance(outline, Outline):
         outline = GrownOutline(outline, np.zeros((0, 2, 2)) if form is None else form)
-    patch = Patches(pixels, valid, outline, xy, options, claims)
+    patch = Patches(pixels, valid, outline, xy, options, claims, others)
     free = np.full(patch.form_at + patch.forms, np.inf)
-    free[[X, Y]], free[WIDTH] = options.half_px / 2, options.psf_log_sigma
+    free[[X, Y]], free[WIDTH] = np.array(options.half) / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
     if form_sigma is not None:
         free[patch.form_at :] = form_sigma
     start = patch.start(noise)
-    # Only the position must be sharp; the others are symmetric about it and do not pull at it.
-    tolerance = np.full(start.shape[1], 0.01)
-    tolerance[[X, Y]] = _STEP_PX
-    tolerance[LEVEL : patch.form_at] = 0.05 * noise
-    if options.polarity == "bright":
-        tolerance[CONTRAST] = 0.05 * noise
 
-    def adjust(rows: Rows, start_at: Array) -> BatchAdjustment:
+    def adjust(rows: Rows, start_at: Array, most: int = _MOST) -> BatchAdjustment:
         return adjust_batch(
             lambda x, at: patch.form_image(x, rows[at]),
             start_at[rows],
             patch.grey[rows],
             weights=used[rows] * patch.course[rows] / scale[rows] ** 2,
             prior=(start[rows], free),
-            options=BatchOptions(tolerance=tolerance, max_iterations=40),
+            options=BatchOptions(share=_SETTLED, max_iterations=most),
         )
 
     every = np.arange(len(xy))
     used, scale = patch.weights, np.full((len(xy), 1), noise)
-    found = adjust(every, start)
-    for _ in range(2):
+    # Before the blunders are out there is nothing to settle.
+    found = adjust(every, start, _FIRST)
+    for most in (_FIRST, _MOST):
         # Only around a mark that has been found are large residuals blunders; before, the mark itself is one.
         residuals, tolerated = patch.residuals(found.estimates)
         limit = options.rejection * np.maximum(_robust_sigma(residuals, used), noise) + tolerated
         kept = patch.weights * (np.abs(residuals) < limit)
         # What the model leaves of a scene counts as noise, or the prior knowledge would weigh nothing there.
         rougher = np.maximum(noise, _rms(residuals, kept, start.shape[1]))
-        changed = np.flatnonzero((kept != used).any(axis=1) | (rougher > 1.2 * scale)[:, 0])
+        renewed = (kept != used).any(axis=1) | (rougher > 1.2 * scale)[:, 0]
+        renewed |= found.reasons == BatchReason.MAX_ITERATIONS
+        changed = np.flatnonzero(renewed)
         if not len(changed):
             break
         used, scale = kept, np.where(np.isin(every, changed)[:, None], rougher, scale)
-        found = _with_rows(found, changed, adjust(changed, found.estimates))
+        found = _with_rows(found, changed, adjust(changed, found.estimates, most))
     for _ in range(2 if options.row_jitter_px > 0 else 0):
         # The residuals hold the jitter the first time; then they are whitened, and tell the noise alone.
         patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
@@ -215,7 +219,7 @@ def _columns(patch: Patches, found: BatchAdjustment, used: Mask, scale: Array) -
     return Matches(
         xy=patch.xy + x[:, :2],
         cov=cov[:, :2, :2],
-        psf_px=patch.width(x),
+        psf_px=patch.width(x, np.arange(k)),
         contrast=x[:, CONTRAST],
         t=np.nan_to_num(t),
         form=x[:, patch.form_at :],

@@ -39,9 +39,10 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     (a, b) or None
         The variance a + b·grey; None where it does not grow with the grey values.
     """
-    half = residuals.shape[1] // 2
-    offset = np.arange(-half, half + 1)
-    column, row = (np.rint(start[:, axis]).astype(np.intp)[:, None] + offset for axis in (0, 1))
+    column, row = (
+        np.rint(start[:, axis]).astype(np.intp)[:, None] + np.arange(size) - size // 2
+        for axis, size in enumerate(residuals.shape[:0:-1])
+    )
     h, w = pixels.shape
     observed = pixels[np.clip(row, 0, h - 1)[:, :, None], np.clip(column, 0, w - 1)[:, None, :]]
     used = np.isfinite(residuals)

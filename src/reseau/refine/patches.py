@@ -7,16 +7,17 @@ coefficients of the background, and those of the form, in this order.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Array, Mask, Rows
-from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
+from ..optics.formation import PixelResponse
 from .noise import course
+from .shapes import Shape, Window
 
-__all__ = ["CONTRAST", "LEVEL", "WIDTH", "GrownOutline", "MatchOptions", "Patches", "Shape", "X", "Y"]
+__all__ = ["CONTRAST", "LEVEL", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
 
 X, Y, WIDTH, CONTRAST, LEVEL = range(5)
 
@@ -33,10 +34,10 @@ class MatchOptions:
 
     Parameters
     ----------
-    half_px : int
-        Half side of the square window around a mark.
-    psf_px : float
-        Expected width (one sigma) of the point-spread function.
+    half_px : int or (int, int)
+        Half side of the square window around a mark, or half its width and height.
+    psf_px : float or ndarray (k,)
+        Expected width (one sigma) of the point-spread function, or of each mark's.
     psf_log_sigma : float
         How far that may be wrong, as the standard deviation of its logarithm.
     contrast : float, optional
@@ -63,8 +64,8 @@ class MatchOptions:
         :func:`reseau.refine.noise.grey_variance`. By default all are alike.
     """
 
-    half_px: int = 6
-    psf_px: float = 0.8
+    half_px: int | tuple[int, int] = 6
+    psf_px: float | Array = 0.8
     psf_log_sigma: float = 0.5
     contrast: float | None = None
     contrast_sigma: float = np.inf
@@ -76,52 +77,10 @@ class MatchOptions:
     start_px: float = 1.0
     variance: tuple[float, float] | None = None
 
-
-class Shape(Protocol):
-    """What the marks look like: outlines around their points, as functions of parameters of the form."""
-
     @property
-    def parameters(self) -> int:
-        """Number of parameters of the form; all are 0 to begin with."""
-
-    def outline(self, form: Array, at: Rows) -> Outline:
-        """Outlines (m, j, 2) in pixels of the marks `at` with the parameters (m, p)."""
-
-    def motions(self, form: Array, at: Rows) -> Array | None:
-        """Velocities of their nodes for each parameter, (m, p, j, 2); None without parameters."""
-
-
-@dataclass(frozen=True, eq=False)
-class GrownOutline:
-    """Outlines that are multiplied by 1 + Σ p_i F_i.
-
-    Parameters
-    ----------
-    nodes : Outline
-        Outlines (k, j, 2) in pixels.
-    generators : ndarray (p, 2, 2)
-        The F.
-    """
-
-    nodes: Outline
-    generators: Array
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters of the form."""
-        return len(self.generators)
-
-    def outline(self, form: Array, at: Rows) -> Outline:
-        """Outlines with the parameters (m, p)."""
-        xy, dxy = self.nodes.xy[at], self.nodes.dxy[at]
-        if self.parameters:
-            grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
-            xy, dxy = xy @ grown, dxy @ grown
-        return Outline(xy, dxy)
-
-    def motions(self, form: Array, at: Rows) -> Array | None:
-        """Velocities of the nodes."""
-        return np.einsum("pij,knj->kpni", self.generators, self.nodes.xy[at]) if self.parameters else None
+    def half(self) -> tuple[int, int]:
+        """Half the width and half the height of the window."""
+        return (self.half_px, self.half_px) if isinstance(self.half_px, int) else self.half_px
 
 
 class Patches:
@@ -135,24 +94,28 @@ class Patches:
         xy: Array,
         options: MatchOptions,
         claims: tuple[NDArray[Any], Rows] | None = None,
+        others: Array | None = None,
     ) -> None:
         self.form, self.xy, self.options = shape, xy, options
         self.forms = shape.parameters
-        self.offset = np.arange(-options.half_px, options.half_px + 1)
-        u, v = self.offset[None, :] / options.half_px, self.offset[:, None] / options.half_px
+        self.psf = np.broadcast_to(np.asarray(options.psf_px, dtype=np.float64), (len(xy),))
+        (right, down) = (np.arange(-half, half + 1) for half in options.half)
+        u, v = right[None, :] / right[-1], down[:, None] / down[-1]
         powers = [(i, j) for i in range(options.background + 1) for j in range(options.background + 1 - i)]
         # Monomials (n, b) of the background over the window.
         self.monomials = np.stack([(u**i * v**j).ravel() for i, j in powers], axis=1)
         self.form_at = LEVEL + len(powers)
         self.centre = np.rint(xy).astype(np.intp)
-        columns, rows = self.centre[:, :1] + self.offset, self.centre[:, 1:] + self.offset
-        self.columns, self.rows = columns.astype(float), rows.astype(float)
+        columns, rows = self.centre[:, :1] + right, self.centre[:, 1:] + down
+        self.window = Window(columns.astype(float), rows.astype(float), options.response)
         h, w = pixels.shape
         c, r = np.clip(columns, 0, w - 1)[:, None, :], np.clip(rows, 0, h - 1)[:, :, None]
         inside = ((rows >= 0) & (rows < h))[:, :, None] & ((columns >= 0) & (columns < w))[:, None, :]
         k = len(xy)
-        self.shape = (k, len(self.offset), len(self.offset))
+        self.shape = (k, len(down), len(right))
         self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
+        if others is not None:
+            self.grey -= others.reshape(k, -1)
         usable = inside & valid[r, c]
         if claims is not None:
             owner, mine = claims
@@ -168,9 +131,9 @@ class Patches:
         tightened from step to step.
         """
         x = np.zeros((len(self.xy), self.form_at + self.forms))
-        x[:, WIDTH] = np.log(np.hypot(self.options.psf_px, 0.7 * self.options.start_px))
+        x[:, WIDTH] = np.log(np.hypot(self.psf, 0.7 * self.options.start_px))
         share = self.share(x)
-        x[:, WIDTH] = np.log(self.options.psf_px)
+        x[:, WIDTH] = np.log(self.psf)
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs a value
         design = self.monomials
@@ -198,14 +161,17 @@ class Patches:
             self.course = course(grey, self.options.variance)
         return x
 
-    def width(self, x: Array) -> Array:
-        """Width of the point-spread function (k,): its logarithm is estimated, above a least one."""
-        width: Array = np.hypot(_SHARPEST * self.options.psf_px, np.exp(x[:, WIDTH]))
+    def width(self, x: Array, at: Rows) -> Array:
+        """Width of the point-spread function (m,): its logarithm is estimated, above a least one."""
+        width: Array = np.hypot(_SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
         return width
 
     def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
-        share, d_share = self._derivatives(x, at)
+        width = self.width(x, at)
+        share, d_share = self.form.derivatives(
+            self.xy[at] + x[:, :2], width, x[:, self.form_at :], at, self.window.select(at)
+        )
         plane, contrast = self.background(x), x[:, CONTRAST, None, None]
         if self.options.polarity == "dark":
             rest = 1 - contrast * share
@@ -216,7 +182,7 @@ class Patches:
         jacobian = np.empty((*share.shape, x.shape[1]))
         shape_columns = [X, Y, WIDTH, *range(self.form_at, x.shape[1])]
         jacobian[..., shape_columns] = np.moveaxis(by_share[:, None] * d_share, 1, -1)
-        jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / self.width(x))[:, None, None]
+        jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / width)[:, None, None]
         jacobian[..., CONTRAST] = by_contrast
         grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
         jacobian[..., LEVEL : self.form_at] = rest.reshape(len(x), -1, 1) * self.monomials
@@ -229,25 +195,11 @@ class Patches:
         grey: Array = (x[:, LEVEL : self.form_at] @ self.monomials.T).reshape(len(x), *self.shape[1:])
         return grey
 
-    def _placed(self, x: Array, at: Rows) -> Outline:
-        """Outlines of the patches `at` where the parameters (m, u) have them."""
-        formed = self.form.outline(x[:, self.form_at :], at)
-        return Outline(formed.xy + (self.xy[at] + x[:, :2])[:, None, :], formed.dxy)
-
     def share(self, x: Array) -> Array:
         """Share of each pixel that the marks take, all patches, (k, rows, columns)."""
-        outline = self._placed(x, np.arange(len(x)))
-        return coverage(outline, self.columns, self.rows, self.width(x), self.options.response)
-
-    def _derivatives(self, x: Array, at: Rows) -> tuple[Array, Array]:
-        """That share for the patches `at`, and its derivatives by position, width and form."""
-        return coverage_derivatives(
-            self._placed(x, at),
-            self.columns[at],
-            self.rows[at],
-            self.width(x),
-            self.options.response,
-            self.form.motions(x[:, self.form_at :], at),
+        every = np.arange(len(x))
+        return self.form.image(
+            self.xy + x[:, :2], self.width(x, every), x[:, self.form_at :], every, self.window
         )
 
     def residuals(self, x: Array) -> tuple[Array, Array]:

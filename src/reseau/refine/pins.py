@@ -40,7 +40,7 @@ class PinOptions:
     Parameters
     ----------
     psf_px : float
-        First guess of the width (one sigma) of the point-spread function; estimated.
+        Width (one sigma) of the Gaussian that smooths the frame for finding echoes.
     most_length_px : float, optional
         Greatest length of a pin's arc; by default 6 % of the frame's diagonal, not below 40 px. What is
         longer is an edge of the sector, the face of the transducer or an interface.
@@ -53,7 +53,7 @@ class PinOptions:
     most_touching : float
         Share of its height above which a spot must not touch another.
     sharpest_px : float
-        Width of the point-spread function below which a spot is drawn and no echo.
+        Width (one sigma) of a line across below which it is drawn and no echo.
     least_seen, most_rejected : float
         Share of an arc that must lie in the frame, that may be left out as disturbed.
     most_wire_px : int
@@ -103,8 +103,9 @@ class PinDetections:
     strength : ndarray (m,)
         Brightness over the ground, as a share of the brightest echo.
     length, thickness, curvature, tilt : ndarray (m,)
-        Of the outline (px, px, 1/px, rad): see :class:`reseau.optics.Strokes`; NaN where not matched.
-    psf_px, contrast, t, noise, correlation : ndarray (m,)
+        Of the arc (px, px, 1/px, rad): four widths along and across, see :class:`reseau.optics.Arcs`; NaN
+        where not matched.
+    contrast, t, noise, correlation : ndarray (m,)
         Of the match: see :class:`reseau.refine.matching.Matches`; NaN where not matched.
     centroid : ndarray (m, 2)
         Centre of gravity of the region above a fifth of the height, for comparison with programs that measure
@@ -122,7 +123,6 @@ class PinDetections:
     thickness: Array
     curvature: Array
     tilt: Array
-    psf_px: Array
     contrast: Array
     t: Array
     noise: Array
@@ -209,6 +209,7 @@ class _Judge:
                 "longer than a pin: an edge of the sector, a transducer's face or an interface",
             ),
             (sharp, "sharp all around: drawn by the instrument"),
+            (e.joined > o.most_touching, "touches another spot"),
             (self._static(), "the same in all frames"),
         ]
         drawn = sharp | looks_sharp(e)
@@ -248,8 +249,9 @@ class _Judge:
         return np.asarray(same > _STATIC * e.area)
 
     def _match(self, at: Rows) -> ArcMatches:
-        options = MatchOptions(psf_px=self.options.psf_px, psf_log_sigma=0.5, polarity="bright")
         s = self.screened
+        # No echo is far brighter than what is seen of it; one that is hidden would be found to be.
+        options = MatchOptions(contrast_sigma=self.frame.full_scale)
         return match_arcs(s.grey, s.valid, self.echoes, at, options, max(s.noise, 0.3))
 
     def _objections(self, at: Rows, found: ArcMatches) -> list[tuple[Mask, str]]:
@@ -261,19 +263,18 @@ class _Judge:
         moved = np.hypot(*(found.xy - e.xy[at]).T) > np.maximum(3.0, 0.5 * e.length[at])
         border = np.array([self.frame.width, self.frame.height]) - 1
         outside = ((found.xy < 0) | (found.xy > border)).any(axis=1)
-        near = (np.minimum(found.xy, border - found.xy) < found.form.length[:, None] / 2 + 2).any(axis=1)
+        near = (np.minimum(found.xy, border - found.xy) < 2 * found.form.along[:, None] + 2).any(axis=1)
         unseen = found.seen < o.least_seen
         return [
             (outside | (unseen & near), "cut off by the edge of the frame"),
             (unseen, "hidden in good part by a wire or a neighbour"),
-            (e.joined[at] > o.most_touching, "touches another spot"),
             (~found.converged, "the match does not converge"),
-            (found.psf_px < o.sharpest_px, "sharper than an echo: drawn by the instrument"),
+            (found.form.across < o.sharpest_px, "sharper than an echo: drawn by the instrument"),
             (self._likeness(found) < o.least_correlation, "not the image of an arc"),
             (found.rejected > o.most_rejected, "disturbed by something that crosses it"),
             (moved, "the match wanders off"),
             (upright, "stands too steep for the arc of a pin"),
-            (found.form.length > 1.6 * self.longest, "longer than a pin"),
+            (4 * found.form.along > 1.6 * self.longest, "longer than a pin"),
             (~(sigma <= o.most_sigma_px), "too uncertain"),
         ]
 
@@ -286,7 +287,7 @@ class _Judge:
     def _looks_drawn(self, at: Rows, found: ArcMatches) -> Mask:
         suspect = np.zeros(len(self.echoes), dtype=bool)
         suspect[at] = (self._likeness(found) < self.options.least_correlation) | (
-            found.psf_px < self.options.sharpest_px
+            found.form.across < self.options.sharpest_px
         )
         return suspect
 
@@ -302,9 +303,7 @@ class _Judge:
         xy[at] = np.where(np.isfinite(found.xy), found.xy, e.xy[at])
         names = [f.name for f in fields(found) if f.name in PinDetections.__dataclass_fields__]
         columns = {name: spread(getattr(found, name)) for name in names if name != "xy"}
-        form = {
-            name: spread(getattr(found.form, name)) for name in ("length", "thickness", "curvature", "tilt")
-        }
+        arcs = found.form
         return PinDetections(
             image=self.frame.name,
             sha256=self.frame.sha256,
@@ -313,6 +312,9 @@ class _Judge:
             why=tuple(self.why),
             strength=e.height / max(brightest, 1e-12),
             centroid=e.centroid,
+            length=spread(4 * arcs.along),
+            thickness=spread(4 * arcs.across),
+            curvature=spread(arcs.curvature),
+            tilt=spread(arcs.tilt),
             **columns,
-            **form,
         )

@@ -28,6 +28,8 @@ class PlacingOptions:
     ----------
     nominal : ndarray (n, 2), optional
         Approximate positions in pixels.
+    within_px : float, optional
+        How far they may be off, where that is known.
     mark_px : float, optional
         Size of a mark in the image.
     psf_px : float
@@ -37,6 +39,7 @@ class PlacingOptions:
     """
 
     nominal: Array | None
+    within_px: float | None
     mark_px: float | None
     psf_px: float
     grid: GridOptions
@@ -142,7 +145,7 @@ def _lay(
     options: PlacingOptions,
 ) -> Assignment | None:
     if options.nominal is not None:
-        return assign(source, options.nominal, candidates, screened.valid)
+        return assign(source, options.nominal, candidates, screened.valid, within_px=options.within_px)
     found = lay_out(source, candidates, screened.valid, options.grid)
     if found is None or size is None or options.mark_px is not None:
         return found

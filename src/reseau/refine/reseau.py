@@ -178,7 +178,13 @@ def measure_reseau(
         frame,
         design,
         source[known],
-        PlacingOptions(nominal if use_nominal else None, options.mark_px, options.psf_px, grid),
+        PlacingOptions(
+            nominal if use_nominal else None,
+            options.nominal_within_px,
+            options.mark_px,
+            options.psf_px,
+            grid,
+        ),
     )
     if isinstance(placed, Failure):
         return placed

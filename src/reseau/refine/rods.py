@@ -23,7 +23,6 @@ _BESIDE_PX = 3.0
 _ROUNDS = 3
 """Times that the field is fitted and the pattern laid again by it; the second settles it as a rule."""
 _COLUMNS = (
-    "psf_px",
     "contrast",
     "t",
     "noise",
@@ -59,7 +58,7 @@ class PinResult:
     deviation : ndarray (n, 2)
         Measured minus predicted from all *other* rods (leave-one-out); NaN where not measured, and where
         fewer than five are.
-    psf_px, contrast, t, noise, correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
+    contrast, t, noise, correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
         As in :class:`reseau.refine.PinDetections`; NaN where not measured.
     detections : PinDetections
         All spots of the frame.
@@ -76,7 +75,6 @@ class PinResult:
     why: tuple[str, ...]
     predicted: Array
     deviation: Array
-    psf_px: Array
     contrast: Array
     t: Array
     noise: Array
