@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,16 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from reseau.data import Array
 from reseau.errors import UsageError
 
-from .engine import Options, adjust
-from .problem import Problem
-from .result import Adjustment, Failure
+from .engine import Options
+from .fitted import Adjustable, F, Failure
 from .stochastic import blocks_of
 
 __all__ = ["VarianceComponents", "variance_components"]
 
 
 @dataclass(frozen=True, eq=False)
-class VarianceComponents:
+class VarianceComponents(Generic[F]):
     """Estimated factors on the standard deviations of groups; truthy.
 
     Parameters
@@ -43,7 +43,7 @@ class VarianceComponents:
     factors: Array
     sigma: Array
     redundancy: Array
-    adjustment: Adjustment
+    adjustment: F
     iterations: int
 
     def __bool__(self) -> bool:
@@ -52,23 +52,23 @@ class VarianceComponents:
     def __getitem__(self, name: str) -> float:
         return float(self.factors[self.names.index(name)])
 
-    def required(self) -> VarianceComponents:
+    def required(self) -> VarianceComponents[F]:
         """The components themselves; see :meth:`Failure.required`."""
         return self
 
 
 def variance_components(
-    problem: Problem,
+    problem: Adjustable[F],
     groups: Mapping[str, ArrayLike],
     options: Options | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 100,
-) -> VarianceComponents | Failure:
+) -> VarianceComponents[F] | Failure:
     """Estimate one variance factor for each group of observations.
 
     Parameters
     ----------
-    problem : GaussMarkov or GaussHelmert
+    problem : GaussMarkov, GaussHelmert, or any Adjustable
         With the covariance as far as it is known.
     groups : mapping of str to array_like of bool
         Masks of the observations' shape. Observations in no group keep their variance.
@@ -95,15 +95,15 @@ def variance_components(
     Kovarianzkomponenten*, AVN 86); at convergence that of Helmert and of restricted maximum likelihood.
     """
     names, label = tuple(groups), _labels(problem, groups)
-    base = np.ones(problem.size) if problem.weights is None else problem.weights.ravel()
-    variance, origin = np.ones(len(names)), problem.parameters
+    base = np.ones(problem.observations.size) if problem.weights is None else problem.weights.ravel()
+    variance, start = np.ones(len(names)), problem
     for iteration in range(1, max_iterations + 1):
         inverse = np.append(1.0 / variance, 1.0)
         weights = (base * inverse[label]).reshape(problem.observations.shape)
-        fit = adjust(problem.with_weights(weights).with_parameters(origin), options)
-        if not isinstance(fit, Adjustment):
+        fit = start.with_weights(weights).adjusted(options)
+        if isinstance(fit, Failure):
             return fit
-        origin = origin if problem.datum else fit.parameters
+        start = start.continued(fit)
         numbers, squares = fit.redundancy_numbers.ravel(), fit.weighted_squares.ravel()
         r: Array = np.bincount(label, numbers, len(names) + 1)[:-1].astype(np.float64)
         if r.min() < 1e-6:
@@ -119,9 +119,9 @@ def variance_components(
     return Failure(f"the variance components have not settled in {max_iterations} adjustments")
 
 
-def _labels(problem: Problem, groups: Mapping[str, ArrayLike]) -> NDArray[np.intp]:
+def _labels(problem: Adjustable[F], groups: Mapping[str, ArrayLike]) -> NDArray[np.intp]:
     """Number of the group of each observation (n,); one more for none."""
-    label = np.full(problem.size, len(groups), dtype=np.intp)
+    label = np.full(problem.observations.size, len(groups), dtype=np.intp)
     for number, (name, given) in enumerate(groups.items()):
         mask = np.asarray(given)
         if mask.dtype != bool or mask.shape != problem.observations.shape or not mask.any():

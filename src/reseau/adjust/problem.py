@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,11 @@ from reseau.errors import UsageError
 
 from .parameters import Constraint, Parameters
 from .stochastic import Covariance, blocks_of
+
+if TYPE_CHECKING:
+    from .engine import Options
+    from .fitted import Failure
+    from .result import Adjustment
 
 __all__ = ["GaussHelmert", "GaussMarkov", "Problem"]
 
@@ -60,6 +65,24 @@ class _Common:
     def with_weights(self, weights: ArrayLike | None) -> Self:
         """The same problem with other factors on the weights of the observations."""
         return replace(self, weights=weights)  # type: ignore[type-var]
+
+    def continued(self, fit: Adjustment) -> Self:
+        """The same problem, to be begun at the estimates of an adjustment of it.
+
+        Inner constraints refer to the approximate values, which therefore stay.
+        """
+        return self if self.datum else self.with_parameters(fit.parameters)
+
+    def adjusted(self, options: Options | None = None) -> Adjustment | Failure:
+        """Adjust it; see :func:`adjust`."""
+        from .engine import adjust
+
+        return adjust(self, options)  # type: ignore[arg-type]
+
+    @property
+    def marks(self) -> NDArray[np.intp] | None:
+        """Numbers alike for observations that leave together; None where each is alone."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +185,17 @@ class GaussHelmert(_Common):
         if self.observations.ndim not in (1, 2) or self.observations.dtype != np.float64:
             raise UsageError("observations must be numbers (n,) or (m, k)", where="GaussHelmert")
         self._check()
+
+    @property
+    def marks(self) -> NDArray[np.intp] | None:
+        """Numbers of the marks, where each has conditions and a covariance of its own."""
+        if self.observations.ndim != 2:
+            return None
+        m, k = self.observations.shape
+        blocks = blocks_of(self.covariance, self.observations.shape)
+        if not all(part.shape[1] in (1, k) for part in blocks):
+            return None
+        return np.broadcast_to(np.arange(m)[:, None], (m, k))
 
 
 def _tidy(problem: _Common) -> None:

@@ -7,17 +7,17 @@ hides it: therefore neither leaves out more than a given part, and the global te
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reseau.data import Array, Mask
 from reseau.errors import UsageError
 
 from .engine import Options
-from .problem import Problem
+from .fitted import Adjustable, F, Failure, Fitted
 from .reliability import critical_tau, critical_w
-from .result import Adjustment, Failure
 from .rounds import Rounds
 
 __all__ = ["Rejection", "SnoopingStep", "data_snooping", "reject_outliers"]
@@ -46,7 +46,7 @@ class SnoopingStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Rejection:
+class Rejection(Generic[F]):
     """An adjustment after observations have been left out; truthy.
 
     Parameters
@@ -61,7 +61,7 @@ class Rejection:
         Adjustments needed.
     """
 
-    adjustment: Adjustment
+    adjustment: F
     rejected: Mask
     steps: tuple[SnoopingStep, ...]
     rounds: int
@@ -69,23 +69,23 @@ class Rejection:
     def __bool__(self) -> bool:
         return True
 
-    def required(self) -> Rejection:
+    def required(self) -> Rejection[F]:
         """The rejection itself; see :meth:`Failure.required`."""
         return self
 
 
 def reject_outliers(
-    problem: Problem,
+    problem: Adjustable[F],
     k: float = 3.0,
     max_fraction: float = 0.25,
     max_rounds: int = 30,
     options: Options | None = None,
-) -> Rejection | Failure:
+) -> Rejection[F] | Failure:
     """Leave out all observations whose residual exceeds k standard deviations, until none does.
 
     Parameters
     ----------
-    problem : GaussMarkov or GaussHelmert
+    problem : GaussMarkov, GaussHelmert, or any Adjustable
         What is to be adjusted.
     k : float
         Bound of |v| over σ·sigma0, with sigma0 from the observations still in.
@@ -114,7 +114,7 @@ def reject_outliers(
     seen = {out.tobytes()}
     for rounds in range(1, max_rounds + 1):
         fit = runs.adjust(out)
-        if not isinstance(fit, Adjustment):
+        if isinstance(fit, Failure):
             return fit
         sigma0 = fit.sigma0 if fit.redundancy > 0 else 1.0
         judged = runs.whole((runs.standardised(fit) > k * sigma0) & runs.eligible)
@@ -129,17 +129,18 @@ def reject_outliers(
 
 
 def data_snooping(
-    problem: Problem,
+    problem: Adjustable[F],
     alpha: float = 0.001,
     test: Literal["w", "tau"] = "w",
     max_fraction: float = 0.25,
     options: Options | None = None,
-) -> Rejection | Failure:
+    groups: NDArray[np.intp] | None = None,
+) -> Rejection[F] | Failure:
     """Leave out the observation of the greatest significant test value, one at a time (Baarda 1968).
 
     Parameters
     ----------
-    problem : GaussMarkov or GaussHelmert
+    problem : GaussMarkov, GaussHelmert, or any Adjustable
         What is to be adjusted.
     alpha : float
         Level of the single test.
@@ -149,6 +150,9 @@ def data_snooping(
         Part of the observations that may be left out.
     options : Options, optional
         How to adjust.
+    groups : ndarray of int, optional
+        Numbers of the observations' shape: in each round the greatest of every number leaves or comes back,
+        where observations of different numbers hardly know of each other.
 
     Returns
     -------
@@ -164,33 +168,43 @@ def data_snooping(
     if test not in ("w", "tau") or not 0 < max_fraction < 1 or not 0 < alpha < 1:
         raise UsageError("needs test 'w' or 'tau', alpha and max_fraction in (0, 1)", where="data_snooping")
     runs = Rounds(problem, options)
+    label = np.zeros(problem.observations.shape, np.intp) if groups is None else np.asarray(groups)
     out = np.zeros(problem.observations.shape, dtype=bool)
     seen, steps, rounds = {out.tobytes()}, list[SnoopingStep](), 1
     fit = runs.adjust(out)
-    while isinstance(fit, Adjustment):
+    while not isinstance(fit, Failure):
         values, critical = _tests(fit, test, alpha)
-        index = np.unravel_index(int(np.argmax(values)), values.shape)
-        place = tuple(int(i) for i in index)
-        if values[place] > critical:
+        leaving = _foremost(np.where(values > critical, values, 0.0), label)
+        if leaving:
             out = out.copy()
-            out[runs.mark(place)] = True
+            for place in leaving:
+                out[runs.mark(place)] = True
+                steps.append(SnoopingStep(place, float(values[place]), critical, restored=False))
             if out.sum() > max_fraction * runs.eligible.sum():
                 return _too_many(int(out.sum()), runs)
             seen.add(out.tobytes())
-            steps.append(SnoopingStep(place, float(values[place]), critical, restored=False))
             fit, rounds = runs.adjust(out), rounds + 1
             continue
-        restored = _restored(runs, fit, out, seen, test, alpha)
+        restored = _restored(runs, fit, out, seen, (test, alpha), label)
         if restored is None:
             return Rejection(fit, out, tuple(steps), rounds)
-        fit, out, step = restored
+        fit, out, back = restored
         seen.add(out.tobytes())
-        steps.append(step)
+        steps += back
         rounds += 1
     return fit
 
 
-def _tests(fit: Adjustment, test: str, alpha: float) -> tuple[Array, float]:
+def _foremost(values: Array, label: NDArray[np.intp]) -> list[tuple[int, ...]]:
+    """Where the greatest value of each label stands, of those that have one above zero; greatest first."""
+    order = np.argsort(-values, axis=None, kind="stable")
+    order = order[: int((values > 0).sum())]
+    _, first = np.unique(label.ravel()[order], return_index=True)
+    places = np.unravel_index(order[np.sort(first)], values.shape)
+    return [tuple(int(i) for i in place) for place in zip(*places, strict=True)]
+
+
+def _tests(fit: Fitted, test: str, alpha: float) -> tuple[Array, float]:
     values = np.nan_to_num(np.abs(fit.w), nan=0.0)
     if test == "w":
         return values, critical_w(alpha)
@@ -200,28 +214,40 @@ def _tests(fit: Adjustment, test: str, alpha: float) -> tuple[Array, float]:
 
 
 def _restored(
-    runs: Rounds, fit: Adjustment, out: Mask, seen: set[bytes], test: str, alpha: float
-) -> tuple[Adjustment, Mask, SnoopingStep] | None:
-    """The adjustment with the best fitting of those left out taken back, if it passes."""
+    runs: Rounds[F], fit: F, out: Mask, seen: set[bytes], level: tuple[str, float], label: NDArray[np.intp]
+) -> tuple[F, Mask, list[SnoopingStep]] | None:
+    """The adjustment with the best fitting of those left out taken back, one of each label, if they pass."""
     if not out.any():
         return None
-    t = np.where(out, runs.standardised(fit), np.inf)
-    place = tuple(int(i) for i in np.unravel_index(int(np.argmin(t)), t.shape))
+    size = np.where(out, 1.0 / np.maximum(runs.standardised(fit), np.finfo(float).tiny), 0.0)
+    several = label.any()
+    best = _foremost(size, label)
     fewer = out.copy()
-    fewer[runs.mark(place)] = False
+    for place in best:
+        fewer[runs.mark(place)] = False
     if fewer.tobytes() in seen:
         return None
     again = runs.adjust(fewer)
-    if not isinstance(again, Adjustment):
+    if isinstance(again, Failure):
         return None
-    values, critical = _tests(again, test, alpha)
-    own = float(values[runs.mark(place)].max())
-    if own > critical:
+    values, critical = _tests(again, *level)
+    own = [float(values[runs.mark(place)].max()) for place in best]
+    passed = [place for place, value in zip(best, own, strict=True) if value <= critical]
+    if not passed:
         return None
-    return again, fewer, SnoopingStep(place, own, critical, restored=True)
+    steps = [
+        SnoopingStep(p, v, critical, restored=True) for p, v in zip(best, own, strict=True) if v <= critical
+    ]
+    if len(passed) == len(best) or not several:
+        return again, fewer, steps
+    fewer = out.copy()
+    for place in passed:
+        fewer[runs.mark(place)] = False
+    fit_again = None if fewer.tobytes() in seen else runs.adjust(fewer)
+    return None if fit_again is None or isinstance(fit_again, Failure) else (fit_again, fewer, steps)
 
 
-def _too_many(count: int, runs: Rounds) -> Failure:
+def _too_many(count: int, runs: Rounds[F]) -> Failure:
     total = int(runs.eligible.sum())
     reason = f"{count} of {total} observations would have to be left out"
     return Failure(f"{reason}: look at the model before the observations")

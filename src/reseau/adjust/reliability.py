@@ -7,6 +7,8 @@ conventional alternative hypothesis) the test value is w = (P v)ᵢ / √(P Qᵥ
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +20,15 @@ from reseau.errors import UsageError
 
 from .stochastic import Blocks
 
-__all__ = ["ExternalReliability", "Solution", "Standardised", "critical_tau", "critical_w", "noncentrality"]
+__all__ = [
+    "ExternalReliability",
+    "Solution",
+    "Standardised",
+    "Whitened",
+    "critical_tau",
+    "critical_w",
+    "noncentrality",
+]
 
 # A redundancy number below this is rounding: nothing controls the observation.
 _UNCONTROLLED = 1e-10
@@ -64,9 +74,47 @@ class ExternalReliability:
     lengths: Array
 
 
+class Whitened(ABC):
+    """The whitened linear problem at the estimates, as far as reliability asks for it.
+
+    Subclasses have `whitened` (N',), the whitened residuals; `influence`, the blocks of T with P v = T r; and
+    `cofactors`, the covariances of the observations and observed parameters that belong to these blocks.
+    """
+
+    whitened: Array
+    influence: tuple[Blocks, ...]
+    cofactors: tuple[Blocks, ...]
+
+    @abstractmethod
+    def hats(self) -> Iterator[Array]:
+        """For each part of `influence` the diagonal blocks (b, k, k) of T A Q Aᵀ Tᵀ = P Q_l̂l̂ P."""
+
+    def standardise(self) -> Standardised:
+        """Redundancy numbers and test values."""
+        numbers, tests, errors = [], [], []
+        for turn, cofactor, hat in zip(self.influence, self.cofactors, self.hats(), strict=True):
+            t = turn.matrices
+            k = t.shape[1]
+            own = t @ np.swapaxes(t, 1, 2)
+            controlled = own - hat
+            number = np.einsum("bij,bji->bi", cofactor.matrices, controlled).ravel()
+            diagonal = np.diagonal(controlled, axis1=1, axis2=2).ravel()
+            before = np.diagonal(own, axis1=1, axis2=2).ravel()
+            known = diagonal > _UNCONTROLLED * before
+            size = np.sqrt(np.where(known, diagonal, 1.0))
+            numbers.append(np.clip(number, 0.0, None) if k == 1 else number)
+            tests.append(np.where(known, turn.times(self.whitened) / size, np.nan))
+            errors.append(np.where(known, 1.0 / size, np.inf))
+        return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
+
+    def weighted_residuals(self) -> Array:
+        """P v of the observations and observed parameters (N,)."""
+        return np.concatenate([turn.times(self.whitened) for turn in self.influence])
+
+
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """The whitened linear problem at the estimates.
+class Solution(Whitened):
+    """The whitened linear problem at the estimates, with its design.
 
     Parameters
     ----------
@@ -88,29 +136,13 @@ class Solution:
     influence: tuple[Blocks, ...]
     cofactors: tuple[Blocks, ...]
 
-    def standardise(self) -> Standardised:
-        """Redundancy numbers and test values."""
+    def hats(self) -> Iterator[Array]:
+        """See :meth:`Whitened.hats`."""
         through = self.design @ self.factor
-        numbers, tests, errors = [], [], []
-        for turn, cofactor in zip(self.influence, self.cofactors, strict=True):
-            t = turn.matrices
-            b, k, _ = t.shape
+        for turn in self.influence:
+            b, k, _ = turn.matrices.shape
             a = turn.times(through).reshape(b, k, -1)
-            own = t @ np.swapaxes(t, 1, 2)
-            controlled = own - a @ np.swapaxes(a, 1, 2)
-            number = np.einsum("bij,bji->bi", cofactor.matrices, controlled).ravel()
-            diagonal = np.diagonal(controlled, axis1=1, axis2=2).ravel()
-            before = np.diagonal(own, axis1=1, axis2=2).ravel()
-            known = diagonal > _UNCONTROLLED * before
-            size = np.sqrt(np.where(known, diagonal, 1.0))
-            numbers.append(np.clip(number, 0.0, None) if k == 1 else number)
-            tests.append(np.where(known, turn.times(self.whitened) / size, np.nan))
-            errors.append(np.where(known, 1.0 / size, np.inf))
-        return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
-
-    def weighted_residuals(self) -> Array:
-        """P v of the observations and observed parameters (N,)."""
-        return np.concatenate([turn.times(self.whitened) for turn in self.influence])
+            yield a @ np.swapaxes(a, 1, 2)
 
     def effects(self, standardised: Standardised, delta: float) -> tuple[Array, Array]:
         """Changes (N, f) of the parameters, and their lengths, for errors of delta times the unit error."""

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array, Mask
-from reseau.errors import EstimationError, UsageError
+from reseau.data import Array
+from reseau.errors import UsageError
 
+from .fitted import Failure, Fitted, NullVector
 from .parameters import Parameters
 from .problem import Problem
-from .reliability import ExternalReliability, Solution, Standardised, noncentrality
-from .significance import CoefficientTest, GlobalTest, coefficient_test, global_test
+from .reliability import ExternalReliability, Solution, noncentrality
+from .significance import CoefficientTest, coefficient_test
 
 if TYPE_CHECKING:
     from .engine import Options
@@ -24,50 +24,9 @@ from .threads import one_thread
 
 __all__ = ["Adjustment", "Failure", "NullVector", "Solution"]
 
-NullVector = Mapping[str, float]
-
 
 @dataclass(frozen=True, eq=False)
-class Failure:
-    """An adjustment that gave no estimate; falsy.
-
-    Parameters
-    ----------
-    reason : str
-        One line for the user.
-    values : mapping of str to float
-        Parameters where it stopped; for a diagnosis, not for use.
-    iterations : int
-        Corrections tried.
-    costs : tuple of float
-        Weighted sums of squares on the way.
-    null_space : tuple of mapping of str to float
-        For a rank defect, combinations of parameters that the observations do not determine: each may change
-        by any multiple of these corrections.
-    """
-
-    reason: str
-    values: Mapping[str, float] = field(default_factory=dict)
-    iterations: int = 0
-    costs: tuple[float, ...] = ()
-    null_space: tuple[NullVector, ...] = ()
-
-    def __bool__(self) -> bool:
-        return False
-
-    def required(self) -> NoReturn:
-        """Raise, for those who must have the estimate.
-
-        Raises
-        ------
-        EstimationError
-            With the reason.
-        """
-        raise EstimationError(self.reason, where="adjustment")
-
-
-@dataclass(frozen=True, eq=False)
-class Adjustment:
+class Adjustment(Fitted):
     """An adjustment that converged; truthy.
 
     What stands in columns over the observations has their shape: residuals, redundancy numbers, test values.
@@ -121,24 +80,12 @@ class Adjustment:
     options: Options
     solution: Solution
 
-    def __bool__(self) -> bool:
-        return True
-
     def __getitem__(self, name: str) -> float:
         return float(self.values[self.index(name)])
-
-    def required(self) -> Adjustment:
-        """The adjustment itself; see :meth:`Failure.required`."""
-        return self
 
     def index(self, name: str) -> int:
         """Where a parameter stands; raises UsageError when there is none of this name."""
         return self.problem.parameters.index(name)
-
-    @property
-    def converged(self) -> bool:
-        """True: what has not converged is a :class:`Failure`."""
-        return True
 
     @cached_property
     def values(self) -> Array:
@@ -209,78 +156,6 @@ class Adjustment:
         np.fill_diagonal(correlation, 1.0)
         return correlation
 
-    @property
-    def adjusted(self) -> Array:
-        """Adjusted observations, observed + residuals."""
-        adjusted: Array = self.problem.observations.astype(np.float64) + self.residuals
-        return adjusted
-
-    @property
-    def rejected(self) -> Mask:
-        """Which observations were left out."""
-        if self.problem.weights is None:
-            return np.zeros(self.problem.observations.shape, dtype=bool)
-        return np.asarray(self.problem.weights == 0)
-
-    @cached_property
-    def standardised(self) -> Standardised:
-        """Redundancy numbers and test values of observations and then of observed parameters, flat."""
-        with one_thread():
-            return self.solution.standardise()
-
-    def _of_observations(self, flat: Array) -> Array:
-        shape = self.problem.observations.shape
-        return flat[: self.problem.size].reshape(*shape, *flat.shape[1:])
-
-    @property
-    def redundancy_numbers(self) -> Array:
-        """How much of each observation's error shows in its own residual; they sum to the redundancy."""
-        return self._of_observations(self.standardised.redundancy_numbers)
-
-    @property
-    def prior_redundancy_numbers(self) -> Array:
-        """Redundancy numbers of the observed parameters that are free."""
-        return self.standardised.redundancy_numbers[self.problem.size :]
-
-    @property
-    def weighted_squares(self) -> Array:
-        """Each observation's part vᵢ (P v)ᵢ of vᵀPv; zero where it was left out."""
-        weighted = self._of_observations(self.solution.weighted_residuals())
-        return np.where(self.rejected, 0.0, self.residuals * weighted)
-
-    @property
-    def w(self) -> Array:
-        """Baarda's test value of each observation, N(0, 1) when the covariance is true."""
-        return self._of_observations(self.standardised.w)
-
-    @property
-    def prior_w(self) -> Array:
-        """Baarda's test value of the observed parameters that are free."""
-        return self.standardised.w[self.problem.size :]
-
-    @property
-    def tau(self) -> Array:
-        """Pope's test value of each observation, w over the estimated sigma0."""
-        return self.w / self.sigma0
-
-    def minimal_detectable_errors(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """Errors of single observations that the w-test finds with the given power (Baarda 1968).
-
-        Parameters
-        ----------
-        alpha : float
-            Level of the two-sided test.
-        power : float
-            Probability of finding the error.
-
-        Returns
-        -------
-        ndarray
-            In the units of the observations, of their shape; infinite where nothing controls one. For a
-            variance factor of one.
-        """
-        return self._of_observations(noncentrality(alpha, power) * self.standardised.unit_error)
-
     def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> ExternalReliability:
         """What an undetected error as large as the minimal detectable one does to the parameters.
 
@@ -299,10 +174,6 @@ class Adjustment:
         full = np.zeros((len(effects), len(self.names)))
         full[:, self.problem.parameters.mask] = effects
         return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))
-
-    def global_test(self, alpha: float = 0.05) -> GlobalTest:
-        """Two-sided χ² test of the variance factor against one (Koch 1999, ch. 4)."""
-        return global_test(self.cost, self.redundancy, alpha)
 
     def test_of(self, name: str, value: float = 0.0, alpha: float = 0.05) -> CoefficientTest:
         """Test one parameter against a value: Student's t a posteriori, χ² a priori, as `scale` says."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from reseau.data import Array
 from reseau.errors import UsageError
 
 from .engine import Options
-from .problem import Problem
-from .result import Adjustment, Failure
+from .fitted import Adjustable, F, Failure
 from .rounds import Rounds
 
 __all__ = ["Robust", "robust", "weight_function"]
@@ -23,7 +22,7 @@ _TUNING = {"huber": 1.345, "tukey": 4.685, "danish": 2.0}
 
 
 @dataclass(frozen=True, eq=False)
-class Robust:
+class Robust(Generic[F]):
     """An adjustment with robust weights; truthy.
 
     Parameters
@@ -38,7 +37,7 @@ class Robust:
         Adjustments needed.
     """
 
-    adjustment: Adjustment
+    adjustment: F
     factors: Array
     scale: float
     iterations: int
@@ -46,7 +45,7 @@ class Robust:
     def __bool__(self) -> bool:
         return True
 
-    def required(self) -> Robust:
+    def required(self) -> Robust[F]:
         """The robust adjustment itself; see :meth:`Failure.required`."""
         return self
 
@@ -100,19 +99,19 @@ def weight_function(name: WeightName, tuning: float | None = None) -> Callable[[
 
 
 def robust(
-    problem: Problem,
+    problem: Adjustable[F],
     weights: WeightName = "huber",
     tuning: float | None = None,
     scale: Literal["mad", "a-priori"] = "mad",
     max_iterations: int = 100,
     tolerance: float = 1e-4,
     options: Options | None = None,
-) -> Robust | Failure:
+) -> Robust[F] | Failure:
     """Adjust with weights that fall with the residuals, by iteration (Holland & Welsch 1977).
 
     Parameters
     ----------
-    problem : GaussMarkov or GaussHelmert
+    problem : GaussMarkov, GaussHelmert, or any Adjustable
         What is to be adjusted.
     weights : {"huber", "tukey", "danish"}
         See :func:`weight_function`. Those that have several minima begin at Huber's estimate.
@@ -143,13 +142,13 @@ def robust(
     stages: list[WeightName] = ["huber"] if weights == "huber" else ["huber", weights]
     runs, unit, total = Rounds(problem, options), 1.0, 0
     factors = np.ones(problem.observations.shape)
-    fit: Adjustment | Failure = Failure("no adjustment was asked for")
+    fit: F | Failure = Failure("no adjustment was asked for")
     for stage in stages:
         function = weight_function(stage, tuning if stage == weights else None)
         for _ in range(max_iterations):
             total += 1
             fit = runs.adjust(factors == 0, factors)
-            if not isinstance(fit, Adjustment):
+            if isinstance(fit, Failure):
                 return fit
             t = runs.standardised(fit)
             if scale == "mad":
@@ -160,4 +159,4 @@ def robust(
                 break
         else:
             return Failure(f"the robust weights have not settled in {max_iterations} adjustments")
-    return Robust(fit, factors, unit, total) if isinstance(fit, Adjustment) else fit
+    return fit if isinstance(fit, Failure) else Robust(fit, factors, unit, total)

@@ -2,54 +2,52 @@
 
 from __future__ import annotations
 
+from typing import Generic
+
 import numpy as np
 import scipy.special
 
 from reseau.data import Array, Mask
 
-from .engine import Options, adjust
-from .problem import GaussHelmert, Problem
-from .result import Adjustment, Failure
+from .engine import Options
+from .fitted import Adjustable, F, Failure
+from .problem import GaussHelmert
 from .stochastic import Weighting, blocks_of
 
 __all__ = ["Rounds"]
 
 
-class Rounds:
+class Rounds(Generic[F]):
     """A problem adjusted again and again with other weights, each time from the last estimates."""
 
-    def __init__(self, problem: Problem, options: Options | None) -> None:
-        self.problem, self.options = problem, options
+    def __init__(self, problem: Adjustable[F], options: Options | None) -> None:
+        self.problem, self.options, self.start = problem, options, problem
         shape = problem.observations.shape
         self.base = np.ones(shape) if problem.weights is None else problem.weights
-        self.marks = isinstance(problem, GaussHelmert) and len(shape) == 2
+        self.marks = problem.marks
         blocks = blocks_of(problem.covariance, shape)
-        self.marks = self.marks and all(part.shape[1] in (1, shape[1]) for part in blocks)
         self.whitening = Weighting(blocks)
         diagonal = [np.diagonal(part, axis1=1, axis2=2).ravel() for part in blocks]
         self.sigma: Array = np.sqrt(np.concatenate(diagonal)).reshape(shape)
-        self.parameters = problem.parameters
         self.eligible: Mask = ~self.whole(np.asarray(self.base == 0, dtype=bool))
         # Median of what `standardised` gives for normal errors: of χ with one degree of freedom.
         self.median = float(scipy.special.ndtri(0.75))
 
-    def adjust(self, out: Mask, factors: Array | None = None) -> Adjustment | Failure:
+    def adjust(self, out: Mask, factors: Array | None = None) -> F | Failure:
         """The adjustment with some left out, and with factors on the weights of the others."""
         weights = np.where(out, 0.0, self.base if factors is None else self.base * factors)
-        problem = self.problem.with_weights(weights).with_parameters(self.parameters)
-        fit = adjust(problem, self.options)
-        # Inner constraints refer to the approximate values, which therefore stay.
-        if isinstance(fit, Adjustment) and not self.problem.datum:
-            self.parameters = fit.parameters
+        fit = self.start.with_weights(weights).adjusted(self.options)
+        if not isinstance(fit, Failure):
+            self.start = self.start.continued(fit)
         return fit
 
-    def standardised(self, fit: Adjustment) -> Array:
+    def standardised(self, fit: F) -> Array:
         """|v|/σ of each observation, with σ as it was given.
 
-        For marks √(vᵀPv / c) of their c conditions, the same for all coordinates of the mark.
+        For marks of conditions √(vᵀPv / c) of their c conditions, the same for all coordinates of the mark.
         """
         base = np.sqrt(np.where(self.eligible, self.base, 1.0))
-        if not self.marks:
+        if self.marks is None or not isinstance(self.problem, GaussHelmert):
             return np.abs(fit.residuals) / self.sigma * base
         v, k = fit.residuals * base, self.base.shape[1]
         conditions = fit.solution.influence[0].matrices.shape[2]
@@ -60,11 +58,13 @@ class Rounds:
 
     def whole(self, mask: Mask) -> Mask:
         """The mask with whole marks."""
-        if not self.marks:
+        if self.marks is None:
             return mask
-        whole: Mask = np.repeat(mask.any(axis=1, keepdims=True), mask.shape[1], axis=1)
+        touched = np.zeros(int(self.marks.max(initial=-1)) + 1, dtype=bool)
+        touched[self.marks[mask]] = True
+        whole: Mask = touched[self.marks]
         return whole
 
-    def mark(self, place: tuple[int, ...]) -> tuple[int, ...]:
+    def mark(self, place: tuple[int, ...]) -> Mask | tuple[int, ...]:
         """What leaves together with one observation."""
-        return place[:1] if self.marks else place
+        return place if self.marks is None else np.asarray(self.marks == self.marks[place])

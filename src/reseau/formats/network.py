@@ -1,0 +1,250 @@
+"""``reseau-network/1``: cameras, images, points and what was observed of them, for a bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar, Literal, Self, TypeVar
+
+from pydantic import ConfigDict, Field, model_validator
+
+from .document import Document, Strict
+
+__all__ = [
+    "CAMERA_PARAMETERS",
+    "AdditionalParameters",
+    "CameraEntry",
+    "DistanceColumns",
+    "ImageColumns",
+    "Network1",
+    "ObservationColumns",
+    "PointColumns",
+]
+
+CAMERA_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"),
+    "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_REQUIRED = {"brown": ("c",), "opencv": ("fx", "fy", "cx", "cy")}
+
+T = TypeVar("T")
+Triple = tuple[float, float, float]
+
+
+class AdditionalParameters(Strict):
+    """Further parameters of the image, in sets of their own."""
+
+    model: Literal["ebner12"]
+    base_mm: float = Field(gt=0)
+    free: bool
+    per: Literal["camera", "group", "image"] = "camera"
+
+
+class CameraEntry(Strict):
+    """One camera: its pixels, its model, and what is known of its interior orientation."""
+
+    id: str = Field(min_length=1)
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    pitch_mm: tuple[float, float] | None = None
+    model: Literal["brown", "opencv"]
+    side: Literal["image", "object"] | None = None
+    balance_radius_mm: float = Field(default=0.0, ge=0)
+    parameters: dict[str, float]
+    free: tuple[str, ...]
+    sigma: dict[str, float] | None = None
+    additional: AdditionalParameters | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        known = CAMERA_PARAMETERS[self.model]
+        who = f"camera {self.id!r}"
+        if self.pitch_mm is not None and min(self.pitch_mm) <= 0:
+            raise ValueError(f"{who}: `pitch_mm` must be above zero")
+        for key in ("pitch_mm", "side") if self.model == "brown" else ():
+            if getattr(self, key) is None:
+                raise ValueError(f"{who}: missing key `{key}`")
+        for key, names in (("parameters", self.parameters), ("free", self.free), ("sigma", self.sigma or {})):
+            for name in names:
+                if name not in known:
+                    raise ValueError(
+                        f"{who}: `{key}` names {name!r}, which is no parameter of {self.model!r}"
+                    )
+        for name in _REQUIRED[self.model]:
+            if name not in self.parameters:
+                raise ValueError(f"{who}: parameter {name!r} is missing")
+            if name in ("c", "fx", "fy") and self.parameters[name] <= 0:
+                raise ValueError(f"{who}: parameter {name!r} is not above zero")
+        twice = _twice(self.free)
+        if twice is not None:
+            raise ValueError(f"{who}: `free` names {twice!r} twice")
+        for name, sigma in (self.sigma or {}).items():
+            if sigma <= 0:
+                raise ValueError(f"{who}: the sigma of {name!r} is not above zero")
+            if name not in self.free:
+                raise ValueError(f"{who}: {name!r} has a sigma and is not free")
+        if self.additional is not None and self.model != "brown":
+            raise ValueError(f"{who}: `additional` parameters go with the model 'brown' alone")
+        return self
+
+
+class _Columns(Strict):
+    """Columns of one length."""
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        length = None
+        for name, info in type(self).model_fields.items():
+            column = getattr(self, name)
+            if column is None:
+                continue
+            length = len(column) if length is None else length
+            if len(column) != length:
+                raise ValueError(
+                    f"column `{info.alias or name}` has {len(column)} entries, the first {length}"
+                )
+        return self
+
+
+class ImageColumns(_Columns):
+    """Images: the camera each was taken with, and its pose where it is known."""
+
+    id: tuple[str, ...]
+    camera: tuple[str, ...]
+    X0: tuple[Triple | None, ...]
+    rotation: tuple[Triple | None, ...]
+    file: tuple[str | None, ...] | None = None
+    group: tuple[str | None, ...] | None = None
+
+
+class PointColumns(_Columns):
+    """Points of the object: coordinates where they are known, and how well."""
+
+    id: tuple[str, ...]
+    xyz: tuple[Triple | None, ...]
+    sigma: tuple[tuple[float | None, float | None, float | None] | None, ...]
+    role: tuple[Literal["tie", "control", "check"], ...]
+
+
+class ObservationColumns(_Columns):
+    """Image coordinates in pixels."""
+
+    image: tuple[str, ...]
+    point: tuple[str, ...]
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    sx: tuple[float, ...]
+    sy: tuple[float, ...]
+    rho: tuple[float, ...] | None = None
+
+
+class DistanceColumns(_Columns):
+    """Distances between points, as of scale bars."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    from_: tuple[str, ...] = Field(alias="from")
+    to: tuple[str, ...]
+    length: tuple[float, ...]
+    sigma: tuple[float, ...]
+
+
+class Network1(Document):
+    """``reseau-network/1``: the input of a bundle adjustment.
+
+    Unknown coordinates and poses are null; `sigma` of a coordinate is 0 where it is held, null where it is
+    free, and otherwise that of an observation.
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-network/1"
+    unit: str
+    cameras: tuple[CameraEntry, ...]
+    images: ImageColumns
+    points: PointColumns
+    observations: ObservationColumns
+    distances: DistanceColumns | None = None
+    datum: Literal["control", "minimal", "free"]
+    datum_points: tuple[str, ...] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        cameras = [camera.id for camera in self.cameras]
+        for what, ids in (("cameras", cameras), ("images", self.images.id), ("points", self.points.id)):
+            twice = _twice(ids)
+            if twice is not None:
+                raise ValueError(f"the id {twice!r} stands twice among the {what}")
+            if not ids:
+                raise ValueError(f"the network has no {what}")
+        images, points = set(self.images.id), set(self.points.id)
+        _named("images.camera", self.images.camera, set(cameras), "cameras")
+        _named("observations.image", self.observations.image, images, "images")
+        _named("observations.point", self.observations.point, points, "points")
+        if self.distances is not None:
+            _named("distances.from", self.distances.from_, points, "points")
+            _named("distances.to", self.distances.to, points, "points")
+        _named("datum_points", self.datum_points or (), points, "points")
+        self._check_points()
+        self._check_observations()
+        self._check_groups()
+        return self
+
+    def _check_points(self) -> None:
+        for name, xyz, sigma, role in zip(
+            self.points.id, self.points.xyz, self.points.sigma, self.points.role, strict=True
+        ):
+            if sigma is not None and any(s is not None and s < 0 for s in sigma):
+                raise ValueError(f"point {name!r} has a negative sigma")
+            if xyz is None and sigma is not None and any(s is not None for s in sigma):
+                raise ValueError(f"point {name!r} has sigmas and no coordinates")
+            if role == "check" and xyz is None:
+                raise ValueError(f"check point {name!r} has no coordinates to check against")
+
+    def _check_observations(self) -> None:
+        table = self.observations
+        for k, (image, point, sx, sy) in enumerate(
+            zip(table.image, table.point, table.sx, table.sy, strict=True)
+        ):
+            if sx <= 0 or sy <= 0:
+                raise ValueError(f"point {point!r} in image {image!r}: its sigmas are not above zero")
+            if table.rho is not None and not -1 < table.rho[k] < 1:
+                raise ValueError(f"point {point!r} in image {image!r}: rho is not between -1 and 1")
+        twice = _twice(zip(table.image, table.point, strict=True))
+        if twice is not None:
+            raise ValueError(f"point {twice[1]!r} stands twice in image {twice[0]!r}")
+        if self.distances is not None:
+            columns = self.distances
+            for a, b, length, sigma in zip(
+                columns.from_, columns.to, columns.length, columns.sigma, strict=True
+            ):
+                if a == b or length <= 0 or sigma <= 0:
+                    raise ValueError(
+                        f"the distance from {a!r} to {b!r} needs two points, a length and a sigma above zero"
+                    )
+
+    def _check_groups(self) -> None:
+        per_group = {c.id for c in self.cameras if c.additional is not None and c.additional.per == "group"}
+        groups = self.images.group or (None,) * len(self.images.id)
+        for image, camera, group in zip(self.images.id, self.images.camera, groups, strict=True):
+            if camera in per_group and group is None:
+                raise ValueError(
+                    f"image {image!r} has no group, but camera {camera!r} has parameters per group"
+                )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file; keys that may be missing and say nothing are left out."""
+        return {"schema": self.SCHEMA} | self.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def _twice(names: Iterable[T]) -> T | None:
+    """The first name that stands twice."""
+    seen: set[T] = set()
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None
+
+
+def _named(column: str, names: Sequence[str], known: set[str], what: str) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"`{column}` names {name!r}, which is none of the {what}")
