@@ -203,6 +203,9 @@ def test_factor_by_factor_the_page_has_the_numbers_of_the_comparison(bench: Benc
         assert factor.ideal is not None
         shown = numbers(reader.row(factor.name))
         assert shown == pytest.approx([*factor.rods, *factor.body, *factor.ideal], abs=6e-4)
+    both = bench.truth.factors[3]
+    assert both.body is not None
+    assert f"leave {np.hypot(*both.body):.3f}\u00a0mm" in whole_page(bench).replace("&nbsp;", "\u00a0")
 
 
 def test_without_the_truth_there_are_the_rods_alone(bench: Bench) -> None:

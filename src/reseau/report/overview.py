@@ -13,6 +13,7 @@ from ..data import Array, Frame
 from ..errors import UsageError
 from ..formats import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+from ..refine.correction import CorrectionFit
 from .figures import Panel, draw_distortion, draw_vectors, length
 from .maps import draw_body
 from .overlay import preview
@@ -65,15 +66,7 @@ def overview_png(
         _photo(photos[0], frames[0], first.points.xy, "PHOTO I: the reseau")
         _photo(photos[1], frames[1], second.pins.xy, "PHOTO II: a test object behind it")
         _photo(photos[2], frames[2], third.points.xy, "PHOTO III: a body nobody has measured")
-        after_check = fit.check.xy - fit.check_target
-        left = length(float(f"{rms(fit.residuals):.2g}"), unit)
-        draw_vectors(
-            results[0],
-            (fit.target, fit.residuals),
-            (fit.check_target, after_check),
-            Panel(unit),
-            f"camera corrected: rms {left}",
-        )
+        _camera(results[0], fit, unit)
         draw_distortion(
             results[1],
             instrument.model,
@@ -96,6 +89,13 @@ def _photo(axes: Axes, frame: Frame, at: Array, title: str) -> None:
     axes.set_title(title, loc="left")
     axes.set_xticks([])
     axes.set_yticks([])
+
+
+def _camera(axes: Axes, fit: CorrectionFit, unit: str) -> None:
+    """What group A leaves of the marks."""
+    left = length(float(f"{rms(fit.residuals):.2g}"), unit)
+    check = (fit.check_target, fit.check.xy - fit.check_target)
+    draw_vectors(axes, (fit.target, fit.residuals), check, Panel(unit), f"camera corrected: rms {left}")
 
 
 def _body(axes: Axes, third: PhotoIII, test_object: ReseauDesign, truth: Comparison | None) -> None:

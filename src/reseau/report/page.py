@@ -7,13 +7,14 @@ from functools import partial
 from itertools import count, zip_longest
 
 import jinja2
+import numpy as np
 
 from ..data import Frame
 from ..errors import UsageError
 from ..formats import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..provenance import Provenance
-from .factors import factor_by_factor
+from .factors import FACTORS, factor_by_factor
 from .numbers import aligned
 from .photo_i import photo_i_section
 from .photo_ii import photo_ii_section
@@ -51,8 +52,7 @@ def oscilloscope_report(
     third : sequence of PhotoIII
         Bodies measured by both.
     frames : sequence of Frame or None
-        The photographs in their order, PHOTO I, PHOTO II, and those of `third`; where one is lacking or None
-        the page has no picture of it.
+        The photographs in their order; where one is lacking or None the page has no picture of it.
     title : str
         Its heading.
     provenance : Provenance, optional
@@ -68,38 +68,38 @@ def oscilloscope_report(
     Raises
     ------
     UsageError
-        When a correction was read from a file: it has no residuals to show; when a photograph is given
-        without those before it.
+        When a correction was read from a file and has no residuals, or a photograph lacks those before it.
     """
     if (second is None) != (test_object is None):
         raise UsageError("and its test object go together", where="PHOTO II")
     if third and second is None:
         raise UsageError("needs PHOTO II before it", where="PHOTO III")
-    known = () if truth is None else truth.bodies
     pictures = [frame for _, frame in zip_longest(range(2 + len(third)), frames)]
     one = photo_i_section(first, reseau, pictures[0], None if truth is None else truth.camera)
-    two, three, factors = None, [], None
+    more: Row = {"two": None, "three": [], "factors": None}
     if second is not None and test_object is not None:
-        two = photo_ii_section(second, test_object, pictures[1], None if truth is None else truth.rods)
-        three = [
+        more = _of_the_instrument(second, test_object, third, pictures[1:], truth)
+    facts = (provenance or Provenance()).to_dict()
+    return _render(title=title, reseau=reseau, unit=reseau.unit, one=one, provenance=facts, **more)
+
+
+def _of_the_instrument(
+    second: PhotoII,
+    test_object: ReseauDesign,
+    third: Sequence[PhotoIII],
+    pictures: Sequence[Frame | None],
+    truth: Comparison | None,
+) -> Row:
+    """The sections of PHOTO II and III, and the table factor by factor."""
+    rods, bodies, factors = (None, (), ()) if truth is None else (truth.rods, truth.bodies, truth.factors)
+    return {
+        "two": photo_ii_section(second, test_object, pictures[0], rods),
+        "three": [
             photo_iii_section(found, test_object, frame, body)
-            for found, frame, body in zip_longest(third, pictures[2 : 2 + len(third)], known[: len(third)])
-        ]
-        found_factors = truth.factors if truth is not None and truth.factors else ()
-        factors = _factors(found_factors or factor_by_factor(second, test_object))
-    return _render(
-        title=title,
-        reseau=reseau,
-        unit=reseau.unit,
-        one=one,
-        two=two,
-        three=three,
-        factors=factors,
-        provenance=(provenance or Provenance()).to_dict(),
-        simulated=truth is not None,
-        figure=partial(next, count(1)),
-        table=partial(next, count(1)),
-    )
+            for found, frame, body in zip_longest(third, pictures[1 : 1 + len(third)], bodies[: len(third)])
+        ],
+        "factors": _factors(factors or factor_by_factor(second, test_object)),
+    }
 
 
 def _render(**content: object) -> str:
@@ -110,7 +110,9 @@ def _render(**content: object) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    return environment.get_template("oscilloscope.html.j2").render(content)
+    # Numbered as they come: which there are depends on what was done.
+    counters = {"figure": partial(next, count(1)), "table": partial(next, count(1))}
+    return environment.get_template("oscilloscope.html.j2").render(content, **counters)
 
 
 def _factors(factors: Sequence[Factor]) -> Row:
@@ -131,6 +133,13 @@ def _factors(factors: Sequence[Factor]) -> Row:
     return {
         "groups": [(name, what) for name, what, _ in shown],
         "rows": rows,
-        "body": any(factor.body is not None for factor in factors),
-        "ideal": any(factor.ideal is not None for factor in factors),
+        "left": _left(factors),
     }
+
+
+def _left(factors: Sequence[Factor]) -> tuple[str, str] | None:
+    """What both groups leave of a point's error, and what they would with rods free of error."""
+    both = next((factor for factor in factors if factor.name == FACTORS[3]), None)
+    if both is None or both.body is None or both.ideal is None:
+        return None
+    return f"{np.hypot(*both.body):.3f}", f"{np.hypot(*both.ideal):.3f}"

@@ -115,18 +115,26 @@ def photo_ii_section(
                 instrument.model, fit.target, Panel(design.unit, panel.pitch, labels=("x", "y"))
             )
         ),
-        "coefficients": coefficient_rows(fit.elimination, _estimates(instrument)),
-        "steps": step_rows(fit.elimination),
-        "tests": model_tests(fit.elimination.full, fit.elimination.alpha, fit.local),
-        "reduced": _reduced(instrument.model, fit),
-        "causes": None if found.causes is None else _causes(found.causes, fit, design.unit),
-        "displays": None if fit.displays is None else _displays(fit.displays),
         "truth": None if truth is None else _truth(truth, design.unit),
-        "all_terms": set(fit.elimination.full.names) <= set(instrument.model.names),
         "rods": len(fit.points),
         "held": len(fit.check),
-        "alpha": f"{fit.elimination.alpha:g}",
         "design": design,
+        **_model(found, fit, design.unit),
+    }
+
+
+def _model(found: PhotoII, fit: InstrumentFit, unit: str) -> Row:
+    """The coefficients and their tests, the causes, and the model's rival."""
+    instrument, elimination = found.instrument, fit.elimination
+    return {
+        "coefficients": coefficient_rows(elimination, _estimates(instrument)),
+        "steps": step_rows(elimination),
+        "tests": model_tests(elimination.full, elimination.alpha, fit.local),
+        "reduced": _reduced(instrument.model, fit),
+        "causes": None if found.causes is None else _causes(found.causes, fit, unit),
+        "displays": None if fit.displays is None else _displays(fit.displays),
+        "all_terms": set(elimination.full.names) <= set(instrument.model.names),
+        "alpha": f"{elimination.alpha:g}",
     }
 
 
