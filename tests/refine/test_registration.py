@@ -36,11 +36,22 @@ def test_a_moved_camera_is_noticed_and_its_photograph_carried_back():
     assert np.abs(back).max() < 5 * SIGMA_PX
 
 
-def test_a_tilted_photograph_shows_in_the_standard_deviation_of_unit_weight():
+def test_a_tilted_photograph_is_carried_back_as_well():
     xy = pixels(RESEAU.xy)
-    tilted = xy * (1 + 2e-6 * (xy[:, :1] - 800))
-    found = register(measured(RESEAU.ids, tilted, np.random.default_rng(2)), RESEAU, _camera())
-    assert found.sigma0 > 5
+    tilted = measured(RESEAU.ids, xy * (1 + 2e-5 * (xy[:, :1] - 800)), np.random.default_rng(2))
+    found = register(tilted, RESEAU, _camera())
+    assert found.moved
+    assert not found.similar
+    # One of equations (5a, b) after another is nearly one of them.
+    assert found.left_px < 0.05
+    assert np.abs(found.apply(tilted).xy - xy).max() < 0.2
+
+
+def test_a_reseau_of_another_shape_shows_in_what_is_left():
+    xy = pixels(RESEAU.xy)
+    wavy = xy + 0.5 * np.sin(xy[:, ::-1] / 60)
+    found = register(measured(RESEAU.ids, wavy, np.random.default_rng(2)), RESEAU, _camera())
+    assert 0.3 < found.left_px < 0.6
 
 
 def test_three_marks_do_not_refer_a_photograph():

@@ -274,13 +274,15 @@ def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
 
 def _say_second(path: Path, second: PhotoII) -> None:
     instrument = second.instrument
-    kept, (along, across) = len(instrument.model.names), instrument.plane.scale
-    say(f"{path.name}: {len(second.pins)} rods, {kept} coefficients kept, λ = {along:.5f}, {across:.5f}\n")
+    fit, (along, across) = instrument.fit, instrument.plane.scale
+    insignificant = () if fit is None else fit.elimination.dropped
+    say(f"{path.name}: {len(second.pins)} rods, λ = {along:.5f}, {across:.5f}\n")
+    if insignificant:
+        say(f"  not significant: {', '.join(insignificant)}\n")
     if second.causes is not None:
         for test in second.causes.conditions:
             verdict = "holds" if test.holds else "does not hold"
             say(f"  {test.condition} {verdict} (χ² = {test.statistic:.2f}, p = {test.p:.3f})\n")
-    fit = instrument.fit
     if fit is not None and fit.displays is not None:
         better = {"first": "the polynomials explain", "second": "Wong's model explains"}
         verdict = better.get(fit.displays.verdict, "neither the polynomials nor Wong's model explains")

@@ -40,6 +40,8 @@ _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
 _STOOD_STILL_PX = 6.0
 """How far the reseau is looked for from where PHOTO I had it, before it is looked for everywhere."""
+_ANOTHER_SHAPE_PX = 0.3
+"""What may remain at the marks of a photograph referred to PHOTO I."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,10 +330,10 @@ def _of_the_camera(camera: CameraCorrection, registration: Registration | None) 
             f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
             "the photograph was carried back"
         )
-    if registration is not None and registration.sigma0 > 3:
+    if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
         notes.append(
-            "the reseau has another shape than in PHOTO I "
-            f"({registration.sigma0:.1f} times its standard deviations): take PHOTO I anew"
+            f"the reseau has another shape than in PHOTO I (by {registration.left_px:.2f} px, rms): "
+            "take PHOTO I anew"
         )
     return tuple(notes)
 

@@ -8,7 +8,7 @@ the beam, the electronics, the display.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -84,7 +84,7 @@ class InstrumentFit:
     Parameters
     ----------
     elimination : Elimination
-        The record of the tests of all coefficients.
+        The record of the tests of all coefficients; what is left of them is the reduced model.
     points : ImagePoints
         Photo-coordinates of the rods in the common system, refined of group A; covariances of the measurement
         alone.
@@ -111,8 +111,8 @@ class InstrumentFit:
 
     @property
     def adjustment(self) -> Adjustment:
-        """With the coefficients that remained."""
-        return self.elimination.adjustment
+        """With all coefficients, as the correction applies them."""
+        return self.elimination.full
 
     def tests(self) -> tuple[dict[str, Any], ...]:
         """Tests of all coefficients as in the calibration file."""
@@ -128,7 +128,9 @@ class InstrumentCorrection:
     camera : CameraCorrection
         Group A.
     model : RationalPolynomial
-        Group B: refined photo-coordinates to coordinates of the object, both in the common system.
+        Group B: refined photo-coordinates to coordinates of the object, both in the common system. With all
+        its coefficients: rods good to a quarter of a millimetre make many insignificant that are there all
+        the same, and a coordinate without them would be wrong by more than its standard deviation says.
     plane : ObjectPlane
         Between the common system and object coordinates.
     covariance : ndarray (a + b, a + b)
@@ -321,13 +323,10 @@ def correct_instrument(
     )
     if isinstance(elimination, Failure):
         return elimination
-    fit = elimination.adjustment
-    full = model.with_values(fit.values)
-    rows = [full.names.index(name) for name in full.names if name not in elimination.dropped]
-    covariance = _joint_covariance(camera, rods.select(used), full, fit, rows)
-    reduced = full.without(*elimination.dropped)
-    correction = InstrumentCorrection(camera, reduced, plane, covariance, design.unit)
-    fitted, sigma = refined.select(used), table[used, 2:] * plane.scale
+    fit, sigma = elimination.full, table[used, 2:] * plane.scale
+    full, fitted = model.with_values(fit.values), refined.select(used)
+    covariance = _joint_covariance(camera, rods.select(used), full, fit)
+    correction = InstrumentCorrection(camera, full, plane, covariance, design.unit)
     displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
     record = InstrumentFit(
         elimination,
@@ -335,10 +334,10 @@ def correct_instrument(
         target[used],
         correction.apply(rods.select(~used)),
         table[~used, :2],
-        residual_field(reduced, fitted, target[used], reduced(fitted.xy) - target[used], sigma, trials),
+        residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials),
         None if isinstance(displays, Failure) else displays,
     )
-    return InstrumentCorrection(camera, reduced, plane, covariance, design.unit, record)
+    return replace(correction, fit=record)
 
 
 def _object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> ObjectPlane | Failure:
@@ -361,7 +360,7 @@ def _object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> O
 
 
 def _joint_covariance(
-    camera: CameraCorrection, rods: ImagePoints, model: RationalPolynomial, fit: Adjustment, rows: list[int]
+    camera: CameraCorrection, rods: ImagePoints, model: RationalPolynomial, fit: Adjustment
 ) -> Array:
     """Covariance of the coefficients of both groups.
 
@@ -375,8 +374,8 @@ def _joint_covariance(
     conditions = by_refined @ by_a
     cofactors = by_refined @ np.asarray(fit.problem.covariance) @ np.swapaxes(by_refined, 1, 2)
     weights = np.linalg.inv(cofactors)
-    q_b = fit.cofactor[np.ix_(rows, rows)]
-    moved = -q_b @ np.einsum("nib,nij,nja->ba", by_b[:, :, rows], weights, conditions)
+    q_b = fit.cofactor
+    moved = -q_b @ np.einsum("nib,nij,nja->ba", by_b, weights, conditions)
     q_a = camera.cofactor
     cross = moved @ q_a
     return np.block([[q_a, cross.T], [cross, q_b + cross @ moved.T]])
