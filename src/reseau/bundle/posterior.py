@@ -1,0 +1,176 @@
+"""Cofactors after the adjustment: of all unknowns, of all adjusted observations, in any datum.
+
+With Q⁻ of any datum, that of inner constraints over chosen unknowns is S Q⁻ Sᵀ,
+S = I − G (GᵀEG)⁻¹ Gᵀ E (Baarda 1973), of which every block needs only G, Q⁻EG and Q⁻ of the block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..adjust.reliability import Whitened
+from ..adjust.stochastic import Blocks, Weighting
+from ..data import Array, Mask
+from .arrow import Singular
+from .compiled import in_parallel
+from .datum import Freedom, held_for
+from .normal import posterior
+from .system import Linear, Normal
+
+__all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
+
+# Least pivot of the normal equations scaled to ones that is no rounding.
+_RANK = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSolution(Whitened):
+    """Whitened residuals, and the cofactors of the adjusted observations in blocks.
+
+    Parameters
+    ----------
+    whitened : ndarray (N,)
+        Weighted residuals.
+    influence, cofactors : tuple of Blocks
+        See :class:`~reseau.adjust.reliability.Whitened`.
+    adjusted : tuple of ndarray (b, k, k)
+        Cofactors of the adjusted observations, whitened, of the same blocks.
+    """
+
+    whitened: Array
+    influence: tuple[Blocks, ...]
+    cofactors: tuple[Blocks, ...]
+    adjusted: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, weightings: list[Weighting], whitened: Array, adjusted: list[Array]) -> BlockSolution:
+        """From the weights of image coordinates and of further observations, one after the other."""
+        influence, cofactors, start = [], [], 0
+        for weighting in weightings:
+            for root, cofactor in zip(weighting.roots, weighting.cofactors, strict=True):
+                turned = np.swapaxes(root.matrices, 1, 2)
+                influence.append(Blocks(start + root.row, start + root.column, turned))
+                cofactors.append(Blocks(start + root.row, start + root.row, cofactor.matrices))
+            start += weighting.n
+        return cls(whitened, tuple(influence), tuple(cofactors), tuple(adjusted))
+
+    def hats(self) -> Iterator[Array]:
+        """See :meth:`Whitened.hats`."""
+        for turn, block in zip(self.influence, self.adjusted, strict=True):
+            t = turn.matrices
+            yield t @ block @ np.swapaxes(t, 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Cofactors:
+    """Cofactors after the adjustment.
+
+    Parameters
+    ----------
+    reduced : ndarray (u, u)
+        Of the reduced unknowns.
+    points : ndarray (p, 3, 3)
+        Of the points; zero for those held or not adjusted.
+    seen : ndarray (n, 2, 2)
+        Of the adjusted image coordinates, whitened, by points.
+    further : ndarray
+        Of the further adjusted observations, over their variances.
+    normal : Normal
+        Undamped normal equations, which joint cofactors are made of.
+    """
+
+    reduced: Array
+    points: Array
+    seen: Array
+    further: Array
+    normal: Normal
+
+
+def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_part: Mask) -> Cofactors:
+    """Cofactors of everything, at the estimates.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem there.
+    freedom : Freedom
+        Similarities that no observation opposes.
+    datum : ndarray of bool (p,), optional
+        Points over which inner constraints hold; by default the held unknowns of the system are the datum.
+    taking_part : ndarray of bool (p,)
+        Points that are adjusted.
+
+    Raises
+    ------
+    Singular
+        When the observations leave more undetermined than the datum.
+    """
+    system = linear.system
+    normal = linear.normal(0.0)
+    diagonal = normal.sums.diagonal.copy()
+    held = system.held.copy()
+    if datum is not None:
+        held[held_for(freedom, system.unknowns, diagonal)] = True
+        normal.hold(held)
+    arrow = normal.factorise()
+    if arrow.weakest < _RANK or normal.least < _RANK:
+        raise Singular
+    z = arrow.inverse()
+    z[held] = 0.0
+    z[:, held] = 0.0
+    points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
+
+    def work(_: int, a: int, b: int) -> None:
+        posterior(a, b, linear.rows, system.pattern, normal.inverse, z, points, seen)
+
+    in_parallel(work, system.chunks)
+    points *= system.movable[:, :, None] * system.movable[:, None, :]
+    points[~taking_part] = 0.0
+    kept = np.flatnonzero(system.unknowns.kept >= 0)
+    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    further = _further(linear, z, points)
+    if datum is not None and freedom.defect:
+        z, points = _in_datum(normal, freedom, datum & taking_part, z, points)
+        points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    return Cofactors(z, points, seen, further, normal)
+
+
+def _further(linear: Linear, z: Array, points: Array) -> Array:
+    """Cofactors of distances, observed coordinates and interior orientation, over their variances."""
+    system = linear.system
+    hats = np.zeros(len(system.sigma_root))
+    j, axis = system.further.coordinate.T
+    _, coordinates, _ = system.further.slices
+    hats[coordinates] = points[j, axis, axis]
+    _, _, rows, columns = system.prior_column
+    hats[rows] = z[columns, columns]
+    hats *= system.sigma_root**2
+    for k, column, slope in linear.distance_slopes():
+        hats[k] = slope @ z[np.ix_(column, column)] @ slope
+    return hats
+
+
+def _in_datum(normal: Normal, freedom: Freedom, chosen: Mask, z: Array, points: Array) -> tuple[Array, Array]:
+    """Cofactors referred to inner constraints over the chosen points."""
+    system = normal.linear.system
+    unknowns, d = system.unknowns, freedom.defect
+    g = np.where(chosen[:, None, None], freedom.points, 0.0)
+    g_reduced = np.zeros((unknowns.size, d))
+    kept = np.flatnonzero((unknowns.kept >= 0) & chosen)
+    columns = unknowns.kept[kept, None] + np.arange(3)
+    g_reduced[columns] = freedom.reduced[columns]
+    h = z @ (g_reduced + normal.reduced_sides(g))
+    h_points = normal.points(g, h) * system.movable[:, :, None]
+    inner = g.reshape(-1, d).T @ g.reshape(-1, d) + g_reduced.T @ g_reduced
+    weight = np.linalg.inv(inner)
+    m = weight @ (np.einsum("pad,pae->de", g, h_points) + g_reduced.T @ h) @ weight
+    one = freedom.reduced @ weight
+    z = z - one @ h.T - h @ one.T + freedom.reduced @ m @ freedom.reduced.T
+    cross = np.einsum("pad,de,pbe->pab", freedom.points, weight, h_points, optimize=True)
+    points = points - cross - np.swapaxes(cross, 1, 2)
+    points += np.einsum("pad,de,pbe->pab", freedom.points, m, freedom.points, optimize=True)
+    return z, points

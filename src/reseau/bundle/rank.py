@@ -1,0 +1,99 @@
+"""What the observations do not determine, by name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..adjust import Failure
+from ..data import Array
+from .datum import Freedom, held_for
+from .system import Linear
+
+__all__ = ["undetermined"]
+
+# Eigenvalues of the scaled normal equations that count as zero.
+_ZERO = 1e-11
+_LISTED = 8
+
+
+def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> Failure:
+    """A failure that names points, or combinations of the other unknowns, that nothing determines.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem at the estimates.
+    freedom : Freedom
+        Similarities that the datum takes care of.
+    costs : tuple of float
+        vᵀPv on the way.
+    """
+    weak = _weak_points(linear)
+    if weak:
+        listed = ", ".join(weak[:_LISTED]) + (" …" if len(weak) > _LISTED else "")
+        return Failure(f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}", costs=costs)
+    vectors = _null_vectors(linear, freedom)
+    if not vectors:
+        return Failure("the normal equations are singular to rounding", costs=costs)
+    listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
+    reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
+    return Failure(reason, costs=costs, null_space=tuple(vectors))
+
+
+def _weak_points(linear: Linear) -> list[str]:
+    """Points whose own normal equations are singular: rays along one line."""
+    system = linear.system
+    network, pattern, last = system.unknowns.network, system.pattern, linear.rows.shape[2] - 3
+    names = []
+    b = linear.rows[:, :, last:].reshape(-1, 2, 3)
+    v = np.zeros((len(network.points), 3, 3))
+    np.add.at(v, system.seen.point, np.swapaxes(b, 1, 2) @ b)
+    v[:, np.arange(3), np.arange(3)] += linear.prior[:, :, 0]
+    size = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
+    known = (size > 0).all(axis=1) & (pattern.eliminated == 1)
+    scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
+    least = np.linalg.eigvalsh(scaled[known])[:, 0]
+    for j in np.flatnonzero(known)[least < _ZERO]:
+        names.append(network.points[j])
+    return names
+
+
+def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
+    """A basis of what is left undetermined among the reduced unknowns, with as many zeros as may be."""
+    system = linear.system
+    normal = linear.normal(0.0)
+    held = system.held.copy()
+    held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
+    diagonal = normal.sums.diagonal
+    normal.hold(held)
+    s = _full(normal.sums.band, normal.sums.border)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = s * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(scaled)
+    null = vectors[:, values < _ZERO * max(values[-1], 1.0)]
+    count = null.shape[1]
+    for column in range(count):
+        rest = null[:, column:]
+        row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
+        null[:, [column, column + pick]] = null[:, [column + pick, column]]
+        null[:, column] /= null[row, column]
+        others = np.arange(count) != column
+        null[:, others] -= np.outer(null[:, column], null[row, others])
+    named = []
+    for vector in null.T:
+        strong = np.flatnonzero(np.abs(vector) > 1e-3)
+        strong = strong[np.argsort(-np.abs(vector[strong]))]
+        named.append({system.unknowns.names[i]: float(vector[i] * scale[i]) for i in strong})
+    return named
+
+
+def _full(band: Array, border: Array) -> Array:
+    """An arrow as a full symmetric matrix."""
+    b, u = len(band), len(band) + len(border)
+    full = np.zeros((u, u))
+    for k in range(band.shape[1] if b else 0):
+        at = np.arange(b - k)
+        full[at + k, at] = band[: b - k, k]
+    full[b:] = border
+    lower = np.tril(full)
+    return lower + np.tril(lower, -1).T

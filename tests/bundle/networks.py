@@ -1,0 +1,151 @@
+"""Synthetic networks whose truth is known: points before a ring of cameras, observed with noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from reseau.bundle import Additional, BundleProblem, Camera, Network, approximate
+from reseau.bundle.unknowns import Unknowns
+from reseau.bundle.values import Values
+from reseau.data import Array
+from reseau.optics import Brown, OpenCV, PixelGrid
+from reseau.optics.poses import Pose, matrix_to_vector, project
+
+BROWN = (8.0, 0.03, -0.02, 2e-3, -3e-5, 0.0, 4e-5, -3e-5, 2e-4, -1e-4)
+OPENCV = (810.0, 805.0, 321.0, 238.0, -0.2, 0.05, 4e-4, -3e-4, 0.01, 0.0, 0.0, 0.0)
+RATIONAL = (810.0, 805.0, 321.0, 238.0, 0.2, -0.05, 4e-4, -3e-4, 0.01, 0.4, 0.03, -0.005)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A network without noise, and the truth of it."""
+
+    network: Network
+    rotation: Array
+    x0: Array
+    xyz: Array
+
+    def noisy(self, seed: int, factor: float = 1.0) -> Network:
+        """The network observed with noise of its covariances; observed coordinates and distances too."""
+        network, rng = self.network, np.random.default_rng(seed)
+        root = np.linalg.cholesky(network.cov)
+        noise = (root @ rng.normal(size=(*network.xy.shape, 1)))[:, :, 0]
+        observed = np.where(network.observed, network.sigma, 0.0)
+        more = rng.normal(size=network.xyz.shape) * np.nan_to_num(observed)
+        distance = network.distance.copy()
+        distance[:, 0] += factor * distance[:, 1] * rng.normal(size=len(distance))
+        return replace(
+            network, xy=network.xy + factor * noise, xyz=network.xyz + factor * more, distance=distance
+        )
+
+    def problem(self, network: Network | None = None, **options: Any) -> BundleProblem:
+        """The problem begun at the truth."""
+        network = self.network if network is None else network
+        unknowns = Unknowns.of(network, np.ones(len(network.images), dtype=bool))
+        start = Values.of_cameras(unknowns, self.rotation, self.x0, self.xyz)
+        return BundleProblem(network, start, self.xyz, **options)
+
+
+def by_itself(network: Network, **options: Any) -> BundleProblem:
+    """The problem with approximate values found from the network alone."""
+    found = approximate(network)
+    unknowns = Unknowns.of(network, np.isfinite(found.x0).all(axis=1))
+    start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
+    return BundleProblem(network, start, found.xyz, **options)
+
+
+def looking_at(x0: Array, target: Array, roll: float) -> Array:
+    """Rotation of a camera at x0 that looks at a point."""
+    z = (target - x0) / np.linalg.norm(target - x0)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * x + s * y, -s * x + c * y, z])
+
+
+def camera(model: str = "brown-object", free: tuple[str, ...] | None = None, **more: Any) -> Camera:
+    """A camera of 640×480 pixels of 0.01 mm."""
+    if model.startswith("opencv"):
+        values = np.array(RATIONAL if model == "opencv-8" else OPENCV)
+        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+        return Camera(
+            "cam", 640, 480, (0.01, 0.01), "opencv", values, names if free is None else free, **more
+        )
+    names = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "B1", "B2")
+    side: Any = model.removeprefix("brown-")
+    return Camera(
+        "cam", 640, 480, (0.01, 0.01), "brown", np.array(BROWN), names if free is None else free, side, **more
+    )
+
+
+def world(
+    images: int = 6,
+    points: int = 25,
+    datum: Any = "control",
+    cameras: tuple[Camera, ...] | None = None,
+    sigma_px: float = 0.05,
+    control: int = 5,
+    seed: int = 0,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> World:
+    """Points in a box of 2 m, images on a ring around and above it; the first points are held control."""
+    rng = np.random.default_rng(seed)
+    cameras = cameras or (camera(),)
+    xyz = rng.uniform(-1, 1, (points, 3)) * [1.0, 1.0, 0.4]
+    angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
+    x0 = np.stack([3.6 * np.cos(angle), 3.6 * np.sin(angle), 2.0 + 0.6 * np.sin(3 * angle)], axis=1)
+    rotation = np.stack([looking_at(x, np.zeros(3), 0.8 * k) for k, x in enumerate(x0)])
+    camera_of = np.arange(images) % len(cameras)
+    image_of, point_of = (a.ravel() for a in np.meshgrid(np.arange(images), np.arange(points), indexing="ij"))
+    xy = np.zeros((len(image_of), 2))
+    for i in range(images):
+        rows = image_of == i
+        xy[rows] = image_points(cameras[camera_of[i]], rotation[i], x0[i], xyz)
+    inside = np.isfinite(xy).all(axis=1) & (xy > 0).all(axis=1) & (xy < [639, 479]).all(axis=1)
+    sigma = np.full((points, 3), np.nan)
+    sigma[:control] = 0.0
+    moved = np.asarray(shift)
+    network = Network(
+        cameras=cameras,
+        images=tuple(f"i{k}" for k in range(images)),
+        camera_of=camera_of,
+        x0=np.full((images, 3), np.nan),
+        rotation=np.full((images, 3), np.nan),
+        points=tuple(f"p{k}" for k in range(points)),
+        xyz=np.where(sigma == 0, xyz + moved, np.nan),
+        sigma=sigma,
+        role=tuple("control" if k < control else "tie" for k in range(points)),
+        image_of=image_of[inside],
+        point_of=point_of[inside],
+        xy=xy[inside],
+        cov=np.tile(np.array([[1.0, 0.3], [0.3, 1.5]]) * sigma_px**2, (int(inside.sum()), 1, 1)),
+        distance_of=np.zeros((0, 2), dtype=np.intp),
+        distance=np.zeros((0, 2)),
+        datum=datum,
+        datum_points=np.ones(points, dtype=bool),
+        groups=tuple(f"g{k % 2}" for k in range(images)),
+        files=(None,) * images,
+        unit="m",
+    )
+    return World(network, rotation, x0 + moved, xyz + moved)
+
+
+def image_points(cam: Camera, rotation: Array, x0: Array, xyz: Array) -> Array:
+    """Image coordinates (px) by :mod:`reseau.optics`, an implementation of its own."""
+    return project(mapping_of(cam), Pose(matrix_to_vector(rotation), x0), xyz).xy
+
+
+def mapping_of(cam: Camera) -> Brown | OpenCV:
+    """The camera as :mod:`reseau.optics` has it."""
+    if cam.model == "opencv":
+        return OpenCV(cam.values)
+    return Brown(cam.values, cam.side, cam.balance_radius_mm, PixelGrid(cam.width, cam.height, cam.pitch_mm))
+
+
+def with_ebner(per: Any, base_mm: float = 1.2) -> Camera:
+    """A camera with Ebner's parameters beside c, x0, y0."""
+    return camera(free=(), additional=Additional(base_mm, True, per))

@@ -1,0 +1,147 @@
+"""The compiled cameras against those of optics, and all derivatives against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.adjust.stochastic import Weighting
+from reseau.bundle.further import Further
+from reseau.bundle.system import Linear, System, residuals
+from reseau.bundle.unknowns import Unknowns
+from reseau.bundle.values import Correction, Values
+from reseau.data import Array
+
+from . import networks
+
+MODELS = ("brown-object", "opencv", "opencv-8")
+
+
+def system_of(world: networks.World) -> tuple[System, Values]:
+    network = world.network
+    unknowns = Unknowns.of(network, np.ones(len(network.images), dtype=bool))
+    further = Further.of(network, np.ones(len(network.points), dtype=bool), world.xyz)
+    system = System(
+        unknowns,
+        further,
+        Weighting([network.cov]),
+        np.ones(len(further.value)),
+        np.zeros(unknowns.size, bool),
+    )
+    return system, Values.of_cameras(unknowns, world.rotation, world.x0, world.xyz)
+
+
+def dense(linear: Linear) -> Array:
+    """The weighted derivatives of the image coordinates by all unknowns, points last."""
+    unknowns, pattern = linear.system.unknowns, linear.system.pattern
+    n, last = len(linear.misfits), linear.rows.shape[2] - 3
+    full = np.zeros((n, 2, unknowns.size + 3 * len(linear.prior)))
+    for k in range(n):
+        for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
+            full[k, :, start : start + width] = linear.rows[k, :, column : column + width]
+        j = linear.system.seen.point[k]
+        if pattern.eliminated[j]:
+            full[k, :, unknowns.size + 3 * j : unknowns.size + 3 * j + 3] = linear.rows[k, :, last:]
+    return full.reshape(2 * n, -1)
+
+
+def by_differences(system: System, values: Values) -> Array:
+    u, p = system.unknowns.size, len(values.xyz)
+    columns = []
+    kept = system.unknowns.kept
+    movable = np.where(kept[:, None] >= 0, 0.0, system.movable)
+    at = np.flatnonzero(kept >= 0)
+    still = (kept[at, None] + np.arange(3))[system.movable[at] == 0]
+    size = np.abs(dense(system.linearise(values))).max(axis=0)
+    for k in range(u + 3 * p):
+        h = 1e-2 / size[k] if size[k] > 0 else 1.0
+
+        def moved(times: float, k: int = k, h: float = h) -> Array:
+            step = np.zeros(u + 3 * p)
+            step[k] = times * h
+            step[still] = 0.0
+            points = step[u:].reshape(p, 3) * movable
+            return system.misfits(values.moved(system.unknowns, Correction(step[:u], points, 0.0)))[0].ravel()
+
+        columns.append((8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * h))
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_images_are_those_of_optics(model: str) -> None:
+    world = networks.world(cameras=(networks.camera(model),))
+    network = replace(world.network, xy=np.zeros_like(world.network.xy))
+    system, values = system_of(replace(world, network=network))
+    ours = residuals(network, system.unknowns, np.arange(len(network.xy)), values)
+    np.testing.assert_allclose(ours, world.network.xy, rtol=0, atol=1e-9)
+
+
+def test_image_side_reckons_with_the_corrected_image_point() -> None:
+    """The published convention: v = xs − (xm + Δ(xm)), so that the true image has no residual."""
+    world = networks.world(cameras=(networks.camera("brown-image"),))
+    system, values = system_of(world)
+    rows = np.arange(len(world.network.xy))
+    assert np.abs(residuals(world.network, system.unknowns, rows, values)).max() < 1e-9
+    # A measured point moved by a pixel moves the corrected one by 1 + dΔ/dx of it.
+    moved = replace(world.network, xy=np.add(world.network.xy, [1e-3, 0.0]))
+    cam = world.network.cameras[0]
+    lens = networks.mapping_of(cam).distortion  # type: ignore[union-attr]
+    photo = (world.network.xy - [319.5, 239.5]) * [0.01, -0.01] - cam.values[1:3]
+    slope = lens.derivatives(photo).d_xy
+    off = residuals(moved, system.unknowns, rows, values)
+    np.testing.assert_allclose(off[:, 0], -1e-3 * slope[:, 0, 0], rtol=0, atol=1e-8)
+
+
+CASES = {
+    "brown on the object side": (networks.camera("brown-object"),),
+    "brown on the image side": (networks.camera("brown-image", balance_radius_mm=2.0),),
+    "opencv": (networks.camera("opencv"),),
+    "opencv rational": (networks.camera("opencv-8", ("fx", "fy", "cx", "k1", "k3", "k4", "k5", "k6")),),
+    "ebner for all": (networks.with_ebner("camera"),),
+    "ebner per group": (networks.with_ebner("group"),),
+    "ebner per image, image side": (replace(networks.with_ebner("image"), side="image"),),
+    "two cameras": (networks.camera("brown-image"), networks.camera("opencv", ("fx", "k1"))),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_by_every_unknown_are_those_of_differences(name: str) -> None:
+    world = networks.world(images=4, points=8, cameras=CASES[name])
+    network = replace(
+        world.network, distance_of=np.array([[0, 6], [6, 7]]), distance=np.array([[1.0, 0.1], [1.0, 0.1]])
+    )
+    system, values = system_of(replace(world, network=network))
+    values = replace(values, extra=np.random.default_rng(1).normal(0, 1e-4, values.extra.shape))
+    analytic, numeric = dense(system.linearise(values)), by_differences(system, values)
+    size = np.maximum(np.abs(numeric).max(axis=0), 1e-30)
+    assert np.abs((analytic - numeric) / size).max() < 1e-8
+
+
+def test_ebner_is_orthogonal_over_its_grid_and_as_defined() -> None:
+    """On the 3×3 grid of base b all twelve effects are orthogonal; b3 shifts by −(2x² − 4b²/3) there."""
+    world = networks.world(images=1, points=9, cameras=(networks.with_ebner("camera", 1.0),), control=9)
+    system, values = system_of(world)
+    pixels = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
+    # Cameras without any distortion, c = 1 mm, and points that are seen at the grid.
+    plain = replace(world.network.cameras[0], values=np.array([1.0] + 9 * [0.0]), pitch_mm=(1.0, 1.0))
+    network = replace(
+        world.network,
+        cameras=(plain,),
+        image_of=np.zeros(9, dtype=np.intp),
+        point_of=np.arange(9),
+        xy=pixels * [1, -1] + [319.5, 239.5],
+        cov=np.tile(np.eye(2), (9, 1, 1)),
+    )
+    xyz = np.column_stack([pixels * [1, -1], np.ones(9)])
+    system, values = system_of(
+        networks.World(network, np.eye(3)[None], np.zeros((1, 3)), xyz),
+    )
+    linear = system.linearise(values)
+    at = system.unknowns.extra[0]
+    effects = dense(linear)[:, at : at + 12]
+    gram = effects.T @ effects
+    assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-12
+    x = pixels[:, 0]
+    np.testing.assert_allclose(effects.reshape(9, 2, 12)[:, 0, 2], -(2 * x**2 - 4 / 3), atol=1e-12)

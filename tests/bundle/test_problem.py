@@ -1,0 +1,212 @@
+"""The sparse adjustment against the dense engine, against published results, and against simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.adjust import GaussMarkov, Options, Parameters, Prior, adjust
+from reseau.bundle import BundleFit, BundleProblem, Network
+from reseau.data import Array
+from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
+
+from . import networks
+
+TOLERANCE = {"tolerance": 1e-10}
+
+
+def required(problem: BundleProblem) -> BundleFit:
+    fit = problem.adjusted()
+    assert isinstance(fit, BundleFit), fit
+    return fit
+
+
+def dense_twin(world: networks.World, network: Network) -> Any:
+    """The same network given to the dense engine, with optics' projection and numeric derivatives."""
+    cam = network.cameras[0]
+    names = [*cam.free]
+    start = [cam.parameters[name] for name in cam.free]
+    for i, name in enumerate(network.images):
+        names += [f"{name}.{k}" for k in range(6)]
+        start += [*matrix_to_vector(world.rotation[i]), *world.x0[i]]
+    unknown = ~network.held
+    at = np.argwhere(unknown)
+    names += [f"{network.points[j]}.{axis}" for j, axis in at]
+    start += [world.xyz[j, axis] for j, axis in at]
+
+    def computed(x: Array) -> Array:
+        f, m = len(cam.free), len(network.images)
+        mapping = networks.mapping_of(cam).with_values(dict(zip(cam.free, x[:f], strict=True)))
+        pose = x[f : f + 6 * m].reshape(m, 6)
+        xyz = world.xyz.copy()
+        xyz[unknown] = x[f + 6 * m :]
+        rows = network.image_of
+        xy = project(mapping, Pose(pose[rows, :3], pose[rows, 3:]), xyz[network.point_of]).xy
+        ends = network.distance_of
+        length = np.linalg.norm(xyz[ends[:, 0]] - xyz[ends[:, 1]], axis=1)
+        return np.concatenate([xy.ravel(), length])
+
+    prior_names, prior_values, prior_sigma = [], [], []
+    for j, axis in np.argwhere(network.observed):
+        prior_names.append(f"{network.points[j]}.{axis}")
+        prior_values.append(network.xyz[j, axis])
+        prior_sigma.append(network.sigma[j, axis])
+    for name, sigma in cam.sigma.items():
+        prior_names.append(name)
+        prior_values.append(cam.parameters[name])
+        prior_sigma.append(sigma)
+    observed = np.concatenate([network.xy.ravel(), network.distance[:, 0]])
+    prior = Prior(prior_names, prior_values, prior_sigma) if prior_names else None
+    return adjust(
+        GaussMarkov(
+            computed, observed, [network.cov, network.distance[:, 1]], Parameters(names, start, prior=prior)
+        ),
+        Options(tolerance=1e-7),
+    ).required()
+
+
+def mixed() -> networks.World:
+    """Held, partly observed and free coordinates, an observed camera parameter, two distances."""
+    cam = networks.camera(free=("c", "x0", "y0", "K1"), sigma={"x0": 0.01})
+    world = networks.world(images=4, points=12, cameras=(cam,), control=4, sigma_px=0.2)
+    network = world.network
+    sigma = network.sigma.copy()
+    sigma[1] = [0.002, 0.002, np.nan]
+    sigma[2] = [np.nan, np.nan, 0.003]
+    sigma[3] = [0.0, 0.001, np.nan]
+    xyz = network.xyz.copy()
+    xyz[:4] = world.xyz[:4]
+    ends = np.array([[0, 8], [9, 10]])
+    length = np.linalg.norm(world.xyz[ends[:, 0]] - world.xyz[ends[:, 1]], axis=1)
+    distance = np.column_stack([length, [0.003, 0.001]])
+    return replace(world, network=replace(network, sigma=sigma, xyz=xyz, distance_of=ends, distance=distance))
+
+
+def test_the_dense_engine_gives_the_same_estimates_and_statistics() -> None:
+    world = mixed()
+    network = world.noisy(3)
+    fit, twin = required(world.problem(network, **TOLERANCE)), dense_twin(world, network)
+    assert fit.redundancy == twin.redundancy
+    assert fit.sigma0 == pytest.approx(twin.sigma0, rel=1e-9)
+    cam = network.cameras[0]
+    ours = fit.values.cameras[0, [cam.names.index(name) for name in cam.free]]
+    np.testing.assert_allclose(ours, [twin[name] for name in cam.free], rtol=1e-7, atol=1e-9)
+    free = ~network.held
+    points = [f"{network.points[j]}.{axis}" for j, axis in np.argwhere(free)]
+    np.testing.assert_allclose(fit.values.xyz[free], [twin[name] for name in points], rtol=0, atol=1e-9)
+    for i, name in enumerate(network.images):
+        rotation = rotation_matrix([twin[f"{name}.{k}"] for k in range(3)])
+        np.testing.assert_allclose(fit.values.rotation[i], rotation, rtol=0, atol=1e-9)
+    at = fit.unknowns.camera[0]
+    mine = np.diag(fit.cofactors.reduced)[at : at + len(cam.free)]
+    theirs = [twin.cofactor[twin.index(name), twin.index(name)] for name in cam.free]
+    np.testing.assert_allclose(mine, theirs, rtol=1e-6)
+    j = 7
+    block = twin.covariance_of(*[f"p{j}.{axis}" for axis in range(3)], scaled=False)
+    np.testing.assert_allclose(fit.cofactors.points[j], block, rtol=0, atol=1e-6 * np.abs(block).max())
+
+
+def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> None:
+    world = mixed()
+    network = world.noisy(3)
+    fit, twin = required(world.problem(network, **TOLERANCE)), dense_twin(world, network)
+    n = 2 * len(network.xy) + len(network.distance)
+    np.testing.assert_allclose(fit.redundancy_numbers[:n], twin.redundancy_numbers, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(fit.w[:n], twin.w, rtol=0, atol=1e-5)
+    mine, theirs = fit.minimal_detectable_errors()[:n], twin.minimal_detectable_errors()
+    np.testing.assert_allclose(mine, theirs, rtol=1e-5)
+    # Observed coordinates first, then the observed camera parameter, as the twin's prior has them.
+    np.testing.assert_allclose(fit.redundancy_numbers[n:], twin.prior_redundancy_numbers, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(fit.w[n:], twin.prior_w, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("datum", ["control", "minimal", "free"])
+@pytest.mark.parametrize("model", ["brown-object", "brown-image", "opencv", "ebner"])
+def test_redundancy_numbers_sum_to_the_redundancy(datum: str, model: str) -> None:
+    cam = networks.with_ebner("group") if model == "ebner" else networks.camera(model)
+    world = networks.world(images=8, datum=datum, cameras=(cam,), control=5 if datum == "control" else 0)
+    fit = required(world.problem(world.noisy(1)))
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
+    assert fit.counts[2] == (0 if datum == "control" else 7)
+
+
+def test_inner_constraints_have_the_least_trace_over_the_chosen_points() -> None:
+    """No other datum gives the chosen points a smaller sum of variances; the images are the same."""
+    chosen = np.arange(25) < 10
+    world = networks.world(datum="free", control=0)
+    network = replace(world.noisy(2), datum_points=chosen)
+    inner = required(world.problem(network, **TOLERANCE))
+    minimal = required(world.problem(replace(network, datum="minimal"), **TOLERANCE))
+    every = required(world.problem(replace(network, datum_points=np.ones(25, bool)), **TOLERANCE))
+
+    def trace(fit: BundleFit) -> float:
+        return float(np.trace(fit.cofactors.points[chosen], axis1=1, axis2=2).sum())
+
+    assert trace(inner) < trace(every) < trace(minimal)
+    np.testing.assert_allclose(inner.residuals, minimal.residuals, atol=1e-6)
+    np.testing.assert_allclose(inner.w, minimal.w, atol=1e-5)
+    # G^T (x − x0) = 0 over the chosen: no shift, no rotation, no change of scale.
+    off = inner.values.xyz[chosen] - world.xyz[chosen]
+    about = inner.values.xyz[chosen] - inner.values.xyz[chosen].mean(axis=0)
+    assert np.abs(off.mean(axis=0)).max() < 1e-12
+    assert abs(float((off * about).sum())) < 1e-9
+    assert np.abs(np.cross(about, off).sum(axis=0)).max() < 1e-9
+
+
+def test_large_coordinates_lose_nothing() -> None:
+    near, far = networks.world(), networks.world(shift=(4.5e6, 5.6e6, 300.0))
+    one = required(near.problem(near.noisy(5), **TOLERANCE))
+    network = replace(far.network, xy=near.noisy(5).xy)
+    other = required(networks.by_itself(network, **TOLERANCE))
+    # The control itself is rounded to 1e-9 m.
+    assert other.sigma0 == pytest.approx(one.sigma0, rel=1e-7)
+    np.testing.assert_allclose(other.values.xyz - [4.5e6, 5.6e6, 300.0], one.values.xyz, atol=5e-9)
+    np.testing.assert_allclose(other.cofactors.points, one.cofactors.points, atol=1e-12)
+
+
+def test_camcal_has_its_published_result_from_no_initial_poses(published: Callable[[str], Network]) -> None:
+    fit = required(networks.by_itself(published("camcal")))
+    assert fit.counts == (4148, 422, 0)
+    assert fit.redundancy == 3726
+    assert f"{fit.sigma0:.5f}" == "1.68901"
+    assert f"{np.sqrt(fit.cost):.3f}" == "103.099"
+    width, height = 2272 * 0.0031911032863849768, 1704 * 0.0031911032863849768
+    c, x0, y0, k1, k2, k3, p1, p2 = fit.values.cameras[0, :8]
+    printed = [f"{v:.6g}" for v in (c, x0 + width / 2, height / 2 - y0, k1, k2, k3, p1, p2)]
+    assert printed == [
+        "7.4574", "3.61589", "2.60842", "0.00457215", "-4.26222e-05", "-2.16112e-06", "-6.56706e-05",
+        "-2.96421e-05",
+    ]  # fmt: skip
+    at = fit.unknowns.camera[0]
+    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced)[at : at + 8])
+    assert [f"{s:.3g}" for s in sigma] == [
+        "0.00109", "0.000858", "0.000988", "2.31e-05", "2.76e-06", "1.05e-07", "3.67e-06", "4.05e-06",
+    ]  # fmt: skip
+
+
+def test_roma_has_its_published_result(published: Callable[[str], Network]) -> None:
+    fit = required(networks.by_itself(published("roma")))
+    assert fit.redundancy == 101801
+    assert fit.counts == (181122, 79328, 7)
+    assert f"{np.sqrt(fit.costs[0]):.2f}" == "8641.39"
+    assert f"{np.sqrt(fit.cost):.2f}" == "185.94"
+    assert f"{fit.sigma0:.6f}" == "0.582769"
+    c, _, _, k1, k2 = fit.values.cameras[0, :5]
+    assert (f"{c:.4f}", f"{k1:.5e}", f"{k2:.5e}") == ("24.5425", "2.21523e-04", "-1.86985e-07")
+    at = fit.unknowns.camera[0]
+    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced)[at : at + 5])
+    assert (f"{sigma[0]:.5f}", f"{sigma[3]:.2e}", f"{sigma[4]:.2e}") == ("0.00254", "2.54e-07", "5.85e-10")
+    assert fit.redundancy_numbers.sum() == pytest.approx(101801, abs=1e-6)
+
+
+def test_a_block_without_datum_is_refused_with_what_is_missing(published: Callable[[str], Network]) -> None:
+    network = published("camcal")
+    nothing = np.full_like(network.sigma, np.nan)
+    fit = networks.by_itself(replace(network, xyz=nothing, sigma=nothing)).adjusted()
+    assert not fit
+    for word in ("rank defect 7", "position in X", "rotation about Z", "scale"):
+        assert word in fit.reason
