@@ -185,10 +185,14 @@ class FieldBench:
     mirrored: bool = False
 
     def distorted(self, edge_px: float) -> FieldBench:
-        """The bench with a lens whose radial distortion moves the middles of the frame's edges by so much."""
-        half = (self.sensor.width / 2) * PITCH_MM
-        k1 = edge_px * PITCH_MM / half**3
-        return replace(self, camera=self.camera.with_values({"K1": k1}))
+        """The bench with a lens whose radial distortion moves the middles of the frame's edges by so much.
+
+        Outwards it is a polynomial of the ideal point, inwards the inverse of one: neither folds.
+        """
+        half, moved = (self.sensor.width / 2) * PITCH_MM, edge_px * PITCH_MM
+        at = half if edge_px > 0 else half + moved
+        camera = replace(self.camera, side="object" if edge_px > 0 else "image")
+        return replace(self, camera=camera.with_values({"K1": abs(moved) / at**3}))
 
     def pose(self, station: Station) -> Pose:
         """Of the camera in the system of the board; things are set up to some millimetres."""

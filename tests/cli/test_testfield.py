@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from reseau.designs import coded_testfield
-from reseau.formats import TestfieldDesign
+from reseau.formats import ReseauMeasurement, TestfieldDesign
+from reseau.images import write_image
+from reseau_sims import FieldBench, Station
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -36,3 +40,28 @@ def test_what_does_not_fit_is_said_in_one_line(reseau: Run, tmp_path: Path) -> N
     assert not (tmp_path / "f.json").exists()
     status, _, err = reseau("design", "testfield", "--json", tmp_path / "f.txt")
     assert (status, "use .json" in err) == (2, True)
+
+
+def test_a_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
+    bench = FieldBench()
+    write_image(tmp_path / "frame.png", bench.record(Station(30)).pixels)
+    bench.design.write(tmp_path / "field.json")
+    arguments = ("measure", "testfield", tmp_path / "frame.png", "-d", tmp_path / "field.json", "--fill", 0.8)
+    status, out, err = reseau(*arguments, "-o", tmp_path / "marks.json")
+    assert (status, err) == (0, "")
+    assert "of 1024 targets measured" in out
+    found = ReseauMeasurement.read(tmp_path / "marks.json")
+    truth = bench.truth(Station(30))
+    at = dict(zip(truth.names, truth.xy, strict=True))
+    points = found.image_points()
+    assert len(points) == found.found > 340
+    error = points.xy - np.array([at[name] for name in points.names])
+    assert np.abs(error).max() < 0.05  # px
+
+
+def test_a_frame_without_the_testfield_is_said_to_be_so(reseau: Run, tmp_path: Path) -> None:
+    write_image(tmp_path / "ramp.png", np.tile(np.arange(200, dtype=np.uint8), (200, 1)))
+    coded_testfield().write(tmp_path / "field.json")
+    status, out, err = reseau("measure", "testfield", tmp_path / "ramp.png", "-d", tmp_path / "field.json")
+    assert (status, out) == (1, "")
+    assert "ramp.png: no straight lines are to be found" in err

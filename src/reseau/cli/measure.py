@@ -87,6 +87,36 @@ def pins(
     _deliver(image, found, out, suffix, as_json, rms, "rods", notes)
 
 
+@app.command("testfield")
+def coded_field(
+    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield.")],
+    out: Out = None,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    fill: Annotated[
+        float, typer.Option(min=0, max=1, help="Light-sensitive part of the pitch of the pixels.")
+    ] = 1.0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the targets of a coded testfield."""
+    from ..formats import TestfieldDesign
+    from ..images import read_frame
+    from ..refine import TestfieldOptions, measure_testfield
+
+    suffix = _suffix(out)
+    target = TestfieldDesign.read(design)
+    rms = None
+    if is_points(image):
+        found = read_measurement(image)
+    else:
+        frame = read_frame(image)
+        with progress(f"measuring {image.name}", 1):
+            options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
+            result = required(measure_testfield(frame, target, options), image)
+        found, rms = result.measurement(), result.rms()
+    _deliver(image, found, out, suffix, as_json, rms, "targets", spread="deviation from their mapping")
+
+
 def _suffix(out: Path | None) -> str:
     """Kind of the file to write, asked for before the work begins."""
     return ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
@@ -101,6 +131,7 @@ def _deliver(
     rms: Array | None,
     marks: str,
     notes: tuple[str, ...] = (),
+    spread: str = "leave-one-out",
 ) -> None:
     """Write the measurement to its file, and say what was and was not measured."""
     from ..formats import write_whole
@@ -112,7 +143,7 @@ def _deliver(
         return
     say(f"{image.name}: {found.found} of {found.expected} {marks} measured\n")
     if rms is not None and rms[0] == rms[0]:  # NaN where too few were measured to tell
-        say(f"leave-one-out rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
+        say(f"{spread} rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
     for point in found.points:
         if not point.ok:
             say(f"  {point.id}: {point.why}\n")

@@ -25,6 +25,7 @@ from scipy.special import ndtr
 
 from ..data import Array
 from ..errors import UsageError
+from .normal import normal_single
 
 __all__ = [
     "Outline",
@@ -237,9 +238,11 @@ class PixelResponse:
 def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
     """The blurred step's integral, the step and its derivatives at offsets `t`."""
     z = t / sigma
-    found: list[Array] = [ndtr(z)]
-    if integral or highest:
-        bell = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    if t.dtype == np.float32:
+        step, bell = normal_single(z)
+    else:
+        step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z
+    found: list[Array] = [step]
     if integral:
         found.insert(0, t * found[0] + sigma * bell)
     # Derivatives of a Gaussian: Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
@@ -273,7 +276,7 @@ def coverage(
     -------
     ndarray (..., r, c)
     """
-    width = np.asarray(sigma, dtype=np.float64)[..., None, None]
+    width = np.asarray(sigma, dtype=outline.xy.dtype)[..., None, None]
     h_x = response.orders(columns, outline.xy[..., 0], width, 0)[0]
     h_y = response.orders(rows, outline.xy[..., 1], width, 0, integral=False)[0]
     share: Array = np.swapaxes(h_y * -outline.dxy[..., :, 1:], -1, -2) @ h_x
@@ -303,7 +306,7 @@ def coverage_derivatives(
     derivatives : ndarray (..., 3 + m, r, c)
         With respect to a shift along x, a shift along y, `sigma`, and the further parameters.
     """
-    width = np.asarray(sigma, dtype=np.float64)[..., None, None]
+    width = np.asarray(sigma, dtype=outline.xy.dtype)[..., None, None]
     big_x, h_x, d_x = response.orders(columns, outline.xy[..., 0], width, 1)
     h_y, d_y = response.orders(rows, outline.xy[..., 1], width, 1, integral=False)
     dx, dy = outline.dxy[..., :, :1], outline.dxy[..., :, 1:]

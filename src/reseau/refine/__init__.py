@@ -7,6 +7,7 @@ from .matching import Matches, MatchOptions, match
 from .pins import PinDetections, PinOptions, find_pins
 from .reseau import ReseauOptions, ReseauResult, measure_reseau
 from .rods import PinResult, measure_pins
+from .testfield import TestfieldOptions, TestfieldResult, measure_testfield
 from .wires import Layout, LayoutOptions, Wires, lay_wires
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "ReseauOptions",
     "ReseauResult",
     "SmoothField",
+    "TestfieldOptions",
+    "TestfieldResult",
     "Wires",
     "correct_camera",
     "find_pins",
@@ -31,5 +34,6 @@ __all__ = [
     "match",
     "measure_pins",
     "measure_reseau",
+    "measure_testfield",
     "reduce_mapping",
 ]

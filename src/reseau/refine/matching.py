@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline
-from .patches import CONTRAST, WIDTH, MatchOptions, Patches, X, Y
+from .patches import CONTRAST, LEVEL, WIDTH, MatchOptions, Patches, X, Y
 from .shapes import GrownOutline, Shape
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "match"]
@@ -47,6 +47,8 @@ class Matches:
         Widths of the point-spread function.
     contrast : ndarray (k,)
         Share of the light that a dark mark takes; grey values that a bright one adds.
+    level : ndarray (k,)
+        Grey value of the background there.
     t : ndarray (k,)
         Contrast over its standard deviation, width and form given.
     form : ndarray (k, m)
@@ -69,6 +71,7 @@ class Matches:
     cov: Array
     psf_px: Array
     contrast: Array
+    level: Array
     t: Array
     form: Array
     noise: Array
@@ -221,6 +224,7 @@ def _columns(patch: Patches, found: BatchAdjustment, used: Mask, scale: Array) -
         cov=cov[:, :2, :2],
         psf_px=patch.width(x, np.arange(k)),
         contrast=x[:, CONTRAST],
+        level=x[:, LEVEL],
         t=np.nan_to_num(t),
         form=x[:, patch.form_at :],
         noise=found.sigma0 * scale,

@@ -1,0 +1,382 @@
+"""Targets of a testfield matched with their formed images, all of a frame together.
+
+A target's image is formed as the mapping through the lines has it there, to second order: the image of its
+centroid is estimated, so that the perspective, which puts the centroid of the image elsewhere, does no harm.
+What its neighbours and the lines take of the light in its window is formed too, and taken off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ..data import Array, Mask, Rows
+from ..formats import TestfieldDesign
+from ..optics import Chain
+from ..optics.formation import Outline, PixelResponse
+from ..optics.targets import target_outline
+from .lattice import second_order
+from .matching import SIZE, Matches, MatchOptions, match
+from .shapes import GrownOutline, Window
+
+__all__ = ["Light", "Scene", "TargetImages", "match_targets", "merged"]
+
+_SPACING = 0.9
+"""Distance of nodes on an outline in widths of the point-spread function: good to 1e-4 of the light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """How a testfield is lit, as polynomials of second degree over the frame.
+
+    Parameters
+    ----------
+    level, contrast : ndarray (6,)
+        Coefficients of the grey value of the ground, and of what a mark takes of it or adds.
+    size : (float, float)
+        Width and height of the frame.
+    """
+
+    level: Array
+    contrast: Array
+    size: tuple[float, float]
+
+    @classmethod
+    def through(cls, xy: Array, level: Array, contrast: Array, size: tuple[float, float]) -> Light:
+        """Fit to what was found at points (n, 2), twice: the second time without what is far off."""
+        design = _quadratic(xy, size)
+        found = []
+        for values in (level, contrast):
+            keep = np.isfinite(values)
+            for _ in range(3):
+                fitted: Array = np.linalg.lstsq(design[keep], values[keep], rcond=1e-6)[0].astype(np.float64)
+                off = np.abs(values - design @ fitted)
+                keep = np.isfinite(values) & (off <= 4 * np.nanmedian(off[keep]) + 1e-9)
+            found.append(fitted)
+        return cls(found[0], found[1], size)
+
+    def at(self, xy: Array) -> tuple[Array, Array]:
+        """Level and contrast (n,) at points (n, 2)."""
+        design = _quadratic(xy, self.size)
+        return design @ self.level, design @ self.contrast
+
+
+def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
+    u, v = (2 * xy / np.array(size) - 1).T
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetImages:
+    """Images of unlike targets, each kind with as many nodes as it needs; a shape for the matcher.
+
+    Parameters
+    ----------
+    kinds : tuple of GrownOutline
+        Outlines of the targets of each kind.
+    kind, row : ndarray of int (k,)
+        Of which kind each target is, and which of that kind.
+    """
+
+    kinds: tuple[GrownOutline, ...]
+    kind: Rows
+    row: Rows
+
+    @property
+    def parameters(self) -> int:
+        """One: all grow."""
+        return len(SIZE)
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`reseau.refine.shapes.Shape`."""
+        share = np.empty((len(at), window.rows.shape[1], window.columns.shape[1]))
+        for k, of in self.sorted(at):
+            share[of] = self.kinds[k].image(xy[of], width[of], form[of], self.row[at[of]], window.select(of))
+        return share
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`reseau.refine.shapes.Shape`."""
+        share = np.empty((len(at), window.rows.shape[1], window.columns.shape[1]))
+        slopes = np.empty((len(at), 3 + self.parameters, *share.shape[1:]))
+        for k, of in self.sorted(at):
+            share[of], slopes[of] = self.kinds[k].derivatives(
+                xy[of], width[of], form[of], self.row[at[of]], window.select(of)
+            )
+        return share, slopes
+
+    def sorted(self, at: Rows) -> list[tuple[int, Rows]]:
+        """The kinds of the targets `at`, and which of these are of each."""
+        kind = self.kind[at]
+        return [(int(k), np.flatnonzero(kind == k)) for k in np.unique(kind)]
+
+
+def form_targets(
+    design: TestfieldDesign, rows: Rows, mapping: Chain, frame: Array, at: Array, psf_px: float
+) -> tuple[TargetImages, Array, Array]:
+    """The images of targets around the images of their centroids.
+
+    Parameters
+    ----------
+    rows : ndarray of int (k,)
+        Targets of the design.
+    mapping : Chain
+        From lattice coordinates to the image.
+    frame : ndarray (2, 2)
+        Lattice coordinates of a millimetre along x and y of the design, in columns.
+    at : ndarray (k, 2)
+        Lattice coordinates of the centroids.
+
+    Returns
+    -------
+    images : TargetImages
+    xy : ndarray (k, 2)
+        Images of the centroids.
+    reach : ndarray (k, 2)
+        Half the width and half the height of each image.
+    """
+    value, slope, bend = second_order(mapping, at)
+    scale = float(np.sqrt(np.abs(np.linalg.det(slope @ frame))).min())
+    targets = design.targets
+    keys = [(targets.shape[k], targets.size[k], targets.angle[k]) for k in rows]
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    kind = np.array([number[key] for key in keys], dtype=np.intp)
+    row, reach, kinds = np.empty(len(rows), dtype=np.intp), np.empty((len(rows), 2)), []
+    for key, i in number.items():
+        of = np.flatnonzero(kind == i)
+        row[of] = np.arange(len(of))
+        flat = target_outline(*key, _SPACING * psf_px / scale)
+        step, tangent = flat.xy @ frame.T, flat.dxy @ frame.T
+        # F(s + d) − F(s) = J d + ½ d H d, and its derivative J + H d.
+        curved = np.einsum("kabc,jc->kjab", bend[of], step)
+        nodes = step @ np.swapaxes(slope[of], 1, 2) + 0.5 * np.einsum("kjab,jb->kja", curved, step)
+        tangents = tangent @ np.swapaxes(slope[of], 1, 2) + np.einsum("kjab,jb->kja", curved, tangent)
+        kinds.append(GrownOutline(Outline(nodes, tangents).oriented(), SIZE))
+        reach[of] = np.abs(nodes).max(axis=1)
+    return TargetImages(tuple(kinds), kind, row), value, reach
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A frame, and what is known of the testfield in it when targets are matched.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    valid : ndarray (h, w) of bool
+        Pixels that may be used.
+    noise : float
+        Standard deviation of the grey values.
+    design : TestfieldDesign
+        What stands on the board.
+    mapping : Chain
+        From lattice coordinates to the image.
+    frame, origin : ndarray (2, 2), (2,)
+        Lattice coordinates are `frame` times those of the design, plus `origin`.
+    light : Light
+        How it is lit.
+    psf_px : float
+        Width of the point-spread function.
+    response : PixelResponse
+        The pixel.
+    row_jitter_px : float
+        Standard deviation of the shift of a row.
+    """
+
+    grey: NDArray[np.float32]
+    valid: Mask
+    noise: float
+    design: TestfieldDesign
+    mapping: Chain
+    frame: Array
+    origin: Array
+    light: Light
+    psf_px: float
+    response: PixelResponse
+    row_jitter_px: float
+
+    def lattice(self, xy: Array) -> Array:
+        """Lattice coordinates (n, 2) of points of the design (n, 2)."""
+        return np.asarray(xy @ self.frame.T + self.origin)
+
+
+def match_targets(scene: Scene, rows: Rows, inside: Mask, background: int = 1) -> Matches:
+    """Match targets of the design.
+
+    Parameters
+    ----------
+    scene : Scene
+        The frame.
+    rows : ndarray of int (k,)
+        All targets whose light falls into the frame.
+    inside : ndarray of bool (k,)
+        Which of them are wanted.
+    background : int
+        Degree of the polynomial that the ground around each is.
+
+    Returns
+    -------
+    Matches
+        Of the n that are wanted, in their order; residuals are in windows of the largest size.
+    """
+    at = scene.lattice(scene.design.xy[rows])
+    images, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+    canvas = _Canvas(scene, images, xy, reach)
+    wanted = np.flatnonzero(inside)
+    large = scene.design.large[rows[wanted]]
+    found: list[tuple[Rows, Matches]] = []
+    for size in (False, True):
+        part = wanted[large == size]
+        if len(part):
+            found.append((part, canvas.match(part, background)))
+    return merged([part for part, _ in found], [matches for _, matches in found])
+
+
+class _Canvas:
+    """Light that the marks of a testfield take or add, and the matching of each without the others."""
+
+    def __init__(self, scene: Scene, images: TargetImages, xy: Array, reach: Array) -> None:
+        self.scene, self.images, self.xy = scene, images, xy
+        self.reach = np.ceil(reach + 2.5 * scene.psf_px + 1.0).astype(np.intp)
+        self.amplitude = scene.light.at(xy)[1]
+        self.total = _line_light(scene)
+        every = np.arange(len(xy))
+        h, w = self.total.shape
+        for _, of in images.sorted(every):
+            half = self.reach[of].max(axis=0)
+            window = self._window(of, half)
+            own = self.amplitude[of, None, None] * self._own(of, window)
+            column, row = window.columns.astype(np.intp), window.rows.astype(np.intp)
+            seen = ((row >= 0) & (row < h))[:, :, None] & ((column >= 0) & (column < w))[:, None, :]
+            flat = (row[:, :, None] * w + column[:, None, :])[seen]
+            self.total += np.bincount(flat, own[seen], minlength=h * w).reshape(h, w)
+
+    def match(self, part: Rows, background: int) -> Matches:
+        """Match some targets in windows of one size, the light of all else taken off."""
+        scene = self.scene
+        half = self.reach[part].max(axis=0)
+        window = self._window(part, half)
+        h, w = self.total.shape
+        row, column = (
+            window.rows.astype(np.intp).clip(0, h - 1),
+            window.columns.astype(np.intp).clip(0, w - 1),
+        )
+        own = self.amplitude[part, None, None] * self._own(part, window)
+        others = self.total[row[:, :, None], column[:, None, :]] - own
+        sign = -1.0 if scene.design.polarity == "dark" else 1.0
+        options = MatchOptions(
+            half_px=(int(half[0]), int(half[1])),
+            psf_px=scene.psf_px,
+            psf_log_sigma=0.3,
+            response=scene.response,
+            polarity=scene.design.polarity,
+            row_jitter_px=scene.row_jitter_px,
+            start_px=0.3,
+            background=background,
+        )
+        some = TargetImages(self.images.kinds, self.images.kind[part], self.images.row[part])
+        return match(
+            scene.grey,
+            scene.valid,
+            some,
+            self.xy[part],
+            options,
+            noise=scene.noise,
+            form_sigma=np.array([0.05]),
+            others=sign * others,
+        )
+
+    def _window(self, of: Rows, half: Rows) -> Window:
+        centre = np.rint(self.xy[of])
+        right, down = (np.arange(-n, n + 1.0) for n in half)
+        return Window(centre[:, :1] + right, centre[:, 1:] + down, self.scene.response)
+
+    def _own(self, of: Rows, window: Window) -> Array:
+        width, form = np.full(len(of), self.scene.psf_px), np.zeros((len(of), self.images.parameters))
+        return self.images.image(self.xy[of], width, form, of, window)
+
+
+def _line_light(scene: Scene) -> Array:
+    """Grey values that the lines take or add, (h, w).
+
+    Across a line the image is that of a strip; along it nothing changes but slowly.
+    """
+    h, w = scene.grey.shape
+    lines = scene.design.lines
+    x0, y0, x1, y1 = lines.extent
+    free = np.ones((h, w))
+    count = 2 * max(h, w)
+    for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
+        ends = (y0, y1) if axis == 0 else (x0, x1)
+        for place in places:
+            on = np.full((count, 2), place)
+            on[:, 1 - axis] = np.linspace(*ends, count)
+            xy = scene.mapping(scene.lattice(on))
+            if not ((xy > -5) & (xy < [w + 5, h + 5])).all(axis=1).any():
+                continue
+            across = np.zeros(2)
+            across[axis] = lines.width
+            end = scene.mapping(scene.lattice(on + across))
+            free *= 1 - _strip(xy, end - xy, scene, (h, w))
+    rows, columns = np.indices((h, w))
+    amplitude = scene.light.at(np.stack([columns.ravel(), rows.ravel()], axis=1))[1].reshape(h, w)
+    taken: Array = amplitude * (1 - free)
+    return taken
+
+
+def _strip(xy: Array, across: Array, scene: Scene, shape: tuple[int, int]) -> Array:
+    """Share of the pixels (h, w) on which a narrow line falls."""
+    share = np.zeros(shape)
+    way = np.diff(xy, axis=0, append=2 * xy[-1:] - xy[-2:-1])
+    # Seen from its steeper side: the line as a function of the rows or of the columns.
+    steep = np.abs(way[:, 1]).sum() > np.abs(way[:, 0]).sum()
+    main, other = (1, 0) if steep else (0, 1)
+    order = np.argsort(xy[:, main], kind="stable")
+    # A pixel's square has its variance in whatever direction.
+    sigma = np.hypot(scene.psf_px, scene.response.fill / np.sqrt(12))
+    first, last = xy[order[0], main], xy[order[-1], main]
+    steps = np.arange(max(0, np.ceil(first - 4 * sigma)), min(shape[1 - main], last + 4 * sigma))
+    if not len(steps):
+        return share
+    middle = np.interp(steps, xy[order, main], xy[order, other])
+    normal = np.stack([-way[:, 1], way[:, 0]], axis=1)
+    normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
+    cosine = np.interp(steps, xy[order, main], np.abs(normal[order, other]))
+    width = np.interp(steps, xy[order, main], np.abs((across * normal).sum(axis=1))[order])
+    reach = np.arange(-int(4 * scene.psf_px + 3), int(4 * scene.psf_px + 3) + 1)
+    beside = np.rint(middle)[:, None] + reach
+    distance = (beside - middle[:, None]) * cosine[:, None]
+    half = width[:, None] / 2
+    seen = ndtr((distance + half) / sigma) - ndtr((distance - half) / sigma)
+    seen *= (ndtr((steps - first) / sigma) * ndtr((last - steps) / sigma))[:, None]
+    keep = (beside >= 0) & (beside < shape[main])
+    along = np.broadcast_to(steps[:, None], beside.shape)[keep].astype(np.intp)
+    at = beside[keep].astype(np.intp)
+    share[(along, at) if steep else (at, along)] = seen[keep]
+    return share
+
+
+def merged(parts: list[Rows], found: list[Matches]) -> Matches:
+    """Matches of several parts in the order of their rows; smaller windows are filled up with NaN."""
+    order = np.argsort(np.concatenate(parts), kind="stable")
+    most = np.max([matches.residuals.shape[1:] for matches in found], axis=0)
+    columns: dict[str, Any] = {}
+    for name in Matches.__dataclass_fields__:
+        values = [getattr(matches, name) for matches in found]
+        if name == "residuals":
+            values = [
+                np.pad(
+                    v,
+                    [(0, 0), *([(n - m) // 2] * 2 for m, n in zip(v.shape[1:], most, strict=True))],
+                    constant_values=np.nan,
+                )
+                for v in values
+            ]
+        columns[name] = np.concatenate(values)[order]
+    return Matches(**columns)
