@@ -20,26 +20,32 @@ import io
 import sys
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
-from scipy.stats import binom, ncx2, norm
+from scipy.stats import ncx2, norm
+from tables import ALPHA, SIZES, judged, print_power, rms
 
-from reseau.adjust import adjust
+from reseau.adjust import Adjustment, adjust
 from reseau.data import Array, ImagePoints
 from reseau.designs import standard_reseau
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import CorrectionFit, correct_camera, fit_mapping, mapping_problem, measure_reseau
+from reseau.refine import (
+    CameraCorrection,
+    CorrectionFit,
+    correct_camera,
+    fit_mapping,
+    mapping_problem,
+    measure_reseau,
+)
 from reseau_sims import World
 
 COEFFICIENTS = RationalPolynomial.camera().names
 INVARIANT = ("a0", "b0", "d1", "d2", "k", "h1", "h2")
 """Coefficients that errors of O and S, which turn, shift and scale the common system, do not make up."""
-SIZES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 NOISE_PX = 0.007
-ALPHA = 0.05
 EVERYTHING = 1 - 1e-12
 """A level at which every coefficient is significant: nothing is eliminated."""
 
@@ -68,6 +74,27 @@ class Trial:
     px_per_mm: float
 
 
+def without_noise(
+    points: ImagePoints, exact: dict[str, Array], mapping: Callable[[Array], Array]
+) -> ImagePoints:
+    """The same points where they really are, carried by a mapping, with the covariances they have."""
+    return ImagePoints(points.names, mapping(np.array([exact[name] for name in points.names])), points.cov)
+
+
+def camera_without_noise(camera: CameraCorrection, exact: dict[str, Array]) -> Adjustment:
+    """The adjustment of noise-free positions: the same model, weights and common system."""
+    assert camera.fit is not None
+    used = without_noise(camera.fit.points, exact, camera.photo_system)
+    return adjust(mapping_problem(camera.model, used, camera.fit.target)).required()
+
+
+def coefficient_errors(camera: CameraCorrection, true_fit: Adjustment) -> Array:
+    """Errors of the coefficients over their sigmas, in the order of `COEFFICIENTS`; NaN where dropped."""
+    sigma = np.sqrt(np.diagonal(camera.cofactor))
+    errors = dict(zip(camera.model.names, (camera.model.values - true_fit.values) / sigma, strict=True))
+    return np.array([errors.get(name, np.nan) for name in COEFFICIENTS])
+
+
 def trial(world: World, points: ImagePoints, seed: int) -> Trial | str:
     """Correct the camera by these points and compare."""
     camera = correct_camera(points, world.design, check=world.check_marks(), trials=0)
@@ -75,16 +102,9 @@ def trial(world: World, points: ImagePoints, seed: int) -> Trial | str:
         return f"seed {seed}: {camera.reason}"
     fit, truth = camera.fit, world.truth()
     exact = dict(zip(truth.names, truth.xy, strict=True))
-
-    def noise_free(some: ImagePoints) -> ImagePoints:
-        pixels = np.array([exact[name] for name in some.names])
-        return ImagePoints(some.names, camera.photo_system(pixels), some.cov)
-
-    used, check = noise_free(fit.points), noise_free(fit.check)
-    true_fit = adjust(mapping_problem(camera.model, used, fit.target)).required()
+    true_fit = camera_without_noise(camera, exact)
     true_model = camera.model.with_values(true_fit.values)
-    sigma = np.sqrt(np.diagonal(camera.cofactor))
-    errors = dict(zip(camera.model.names, (camera.model.values - true_fit.values) / sigma, strict=True))
+    used, check = (without_noise(some, exact, camera.photo_system) for some in (fit.points, fit.check))
     global_test = fit.adjustment.global_test(ALPHA)
     noncentral = partial(ncx2.cdf, df=fit.adjustment.redundancy, nc=max(true_fit.cost, 1e-9))
     px = points.xy - np.array([exact[name] for name in points.names])
@@ -92,7 +112,7 @@ def trial(world: World, points: ImagePoints, seed: int) -> Trial | str:
         seed=seed,
         marks=len(points),
         point_errors=px / points.sigma,
-        coefficients=np.array([errors.get(name, np.nan) for name in COEFFICIENTS]),
+        coefficients=coefficient_errors(camera, true_fit),
         check=(fit.check.xy - true_model(check.xy)) / fit.check.sigma,
         check_design=(fit.check.xy - fit.check_target) / fit.check.sigma,
         check_mm={
@@ -165,14 +185,6 @@ def tested(seed: int, size: float) -> Array:
     return np.array([full.test_of(name, 0.0, ALPHA).significant for name in INVARIANT])
 
 
-def rms(values: Array, axis: int | None = None) -> Array:
-    return np.sqrt(np.nanmean(np.square(values), axis=axis))
-
-
-def judged(value: float, low: float = 0.9, high: float = 1.1) -> str:
-    return f"{value:.3f}" + ("" if low <= value <= high else " !")
-
-
 def print_trials(title: str, found: list[Trial | str]) -> None:
     """The table of a chain."""
     done = [t for t in found if isinstance(t, Trial)]
@@ -210,17 +222,16 @@ def print_trials(title: str, found: list[Trial | str]) -> None:
         print(f"    {label:<11} {value:.5f} mm = {px * value:.4f} px")
 
 
-def print_tests(rates: list[Array], seeds: list[int]) -> None:
-    """Level and power."""
-    low, high = (binom.ppf(q, seeds[0], ALPHA) / seeds[0] for q in (0.005, 0.995))
-    print(f"\nFirst χ² test of each coefficient at {100 * ALPHA:.0f} %: share called significant, in %")
-    print(f"  at size 0 over {seeds[0]} seeds (99 % band {100 * low:.1f}–{100 * high:.1f}), ", end="")
-    print(f"else over {seeds[-1]}")
-    print("  size/σ  " + "".join(f"{name:>7}" for name in INVARIANT) + "  theory")
-    threshold = norm.isf(ALPHA / 2)
-    for size, rate in zip(SIZES, rates, strict=True):
-        theory = norm.sf(threshold - size) + norm.cdf(-threshold - size)
-        print(f"  {size:<8.0f}" + "".join(f"{100 * r:7.1f}" for r in rate) + f"{100 * theory:8.1f}")
+def first_tests(pool: Executor, draws: int) -> None:
+    """Level and power of the first test of each coefficient: drawn, and printed."""
+    seeds = [draws] + [max(1, draws // 4)] * (len(SIZES) - 1)
+    rates = [
+        np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=50)), axis=0)
+        for size, n in zip(SIZES, seeds, strict=True)
+    ]
+    threshold, sizes = norm.isf(ALPHA / 2), np.array(SIZES)
+    theory = norm.sf(threshold - sizes) + norm.cdf(-threshold - sizes)
+    print_power("Group A, first χ² test of each coefficient", INVARIANT, rates, seeds, theory)
 
 
 def main() -> int:
@@ -242,12 +253,7 @@ def main() -> int:
         if given.draws:
             each = partial(from_points, draws=-(-given.draws // worlds))
             print_trials("From points with normal noise", spread(each, range(worlds)))
-            seeds = [given.draws] + [max(1, given.draws // 4)] * (len(SIZES) - 1)
-            rates = [
-                np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=50)), axis=0)
-                for size, n in zip(SIZES, seeds, strict=True)
-            ]
-            print_tests(rates, seeds)
+            first_tests(pool, given.draws)
         if given.frames:
             print_trials("From frames", spread(from_frame, range(given.first, given.first + given.frames)))
     print(f"\n{time.perf_counter() - begun:.0f} s")
