@@ -25,6 +25,7 @@ __all__ = [
     "factor_by_factor",
     "identified",
     "rods_of",
+    "with_rods_as_made",
 ]
 
 FACTORS = ("scales and best similarity", "group A", "group B", "groups A and B", "(7a, b) without group A")
@@ -147,7 +148,7 @@ def factor_by_factor(
     xy = np.array([designed[name] for name in rods.names])
     held, body = second.pins.select(fit.check.names), _known_body(third, known)
     ways = correctors(instrument, rods, fit.target)
-    ideal = _with_rods_as_made(second, test_object, known)
+    ideal = _had_rods_been_known(second, test_object, known)
     return tuple(
         Factor(
             name,
@@ -170,23 +171,28 @@ def _known_body(third: Sequence[PhotoIII], known: Known | None) -> tuple[Array, 
     return (np.concatenate(pixels), np.concatenate(true)) if sum(map(len, pixels)) else None
 
 
-def _with_rods_as_made(
+def _had_rods_been_known(
     second: PhotoII, test_object: ReseauDesign, known: Known | None
 ) -> dict[str, Corrector]:
     """The ways to object coordinates had the rods been measured where they truly are."""
     if known is None or known.rods is None:
         return {}
-    made = dict(zip(known.rods.names, known.rods.object_xy.tolist(), strict=True))
-    points = tuple(
-        point.model_copy(update={"x": made[point.id][0], "y": made[point.id][1], "sigma": None})
-        for point in test_object.points
-    )
-    exact = test_object.model_copy(update={"points": points})
+    exact = with_rods_as_made(test_object, known.rods)
     rods = rods_of(second)
     found = correct_instrument(rods, exact, second.instrument.camera)
     if isinstance(found, Failure) or found.fit is None:
         return {}
     return correctors(found, rods.select(found.fit.points.names), found.fit.target)
+
+
+def with_rods_as_made(test_object: ReseauDesign, made: KnownPoints) -> ReseauDesign:
+    """The test object with the coordinates that its rods truly have, free of tolerance."""
+    true = dict(zip(made.names, made.object_xy.tolist(), strict=True))
+    points = tuple(
+        point.model_copy(update={"x": true[point.id][0], "y": true[point.id][1], "sigma": None})
+        for point in test_object.points
+    )
+    return test_object.model_copy(update={"points": points})
 
 
 def identified(true: ImagePoints, known: KnownPoints) -> Array:
