@@ -13,7 +13,7 @@ from reseau.errors import UsageError
 if TYPE_CHECKING:
     from .result import Adjustment
 
-__all__ = ["CoefficientTest", "GlobalTest", "NestedTest", "coefficient_test", "compare", "global_test"]
+__all__ = ["CoefficientTest", "GlobalTest", "NestedTest", "coefficient_test", "compare", "global_test", "ratio_test"]
 
 
 @dataclass(frozen=True)
@@ -126,18 +126,45 @@ def coefficient_test(
     UsageError
         When the parameter was fixed or is unknown.
     """
-    _level(alpha)
     at = fit.index(name)
     if name not in fit.free or not fit.cofactor[at, at] > 0:
         raise UsageError("was not estimated", where=name)
     ratio = (float(fit.values[at]) - value) / float(np.sqrt(fit.cofactor[at, at]))
-    if (scale or fit.scale) == "a-priori":
+    sigma0 = None if (scale or fit.scale) == "a-priori" else fit.sigma0
+    return ratio_test(name, ratio, sigma0, fit.redundancy, alpha)
+
+
+def ratio_test(
+    name: str, ratio: float, sigma0: float | None, redundancy: int, alpha: float = 0.05
+) -> CoefficientTest:
+    """Test of an estimate whose difference from a value is `ratio` times the root of its cofactor.
+
+    Parameters
+    ----------
+    name : str
+        What was estimated.
+    ratio : float
+        Difference over the root of the cofactor.
+    sigma0 : float, optional
+        Standard deviation of unit weight a posteriori, for Student's t; without it χ² a priori.
+    redundancy : int
+        Degrees of freedom of sigma0.
+    alpha : float
+        Level.
+
+    Examples
+    --------
+    >>> ratio_test("K3", 3.0, 1.0, 100).significant
+    True
+    """
+    _level(alpha)
+    if sigma0 is None:
         statistic, critical = ratio**2, float(scipy.special.chdtri(1, alpha))
         p = float(scipy.special.chdtrc(1, statistic))
         return CoefficientTest(name, "chi2", statistic, critical, p, statistic > critical)
-    statistic = abs(ratio) / fit.sigma0 if fit.sigma0 > 0 else (np.inf if ratio else 0.0)
-    critical = float(scipy.special.stdtrit(fit.redundancy, 1.0 - alpha / 2.0))
-    p = float(2.0 * scipy.special.stdtr(fit.redundancy, -statistic))
+    statistic = abs(ratio) / sigma0 if sigma0 > 0 else (np.inf if ratio else 0.0)
+    critical = float(scipy.special.stdtrit(redundancy, 1.0 - alpha / 2.0))
+    p = float(2.0 * scipy.special.stdtr(redundancy, -statistic))
     return CoefficientTest(name, "t", statistic, critical, p, bool(statistic > critical))
 
 

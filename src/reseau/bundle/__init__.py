@@ -2,8 +2,24 @@
 
 from __future__ import annotations
 
+from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
+from .document import to_document
 from .network import Additional, Camera, Network
 from .problem import BundleFit, BundleProblem
+from .result import Result
 
-__all__ = ["Additional", "Approximate", "BundleFit", "BundleProblem", "Camera", "Network", "approximate"]
+__all__ = [
+    "Additional",
+    "Approximate",
+    "BundleFit",
+    "BundleProblem",
+    "Camera",
+    "Network",
+    "Options",
+    "Result",
+    "adjust_network",
+    "approximate",
+    "problem_of",
+    "to_document",
+]

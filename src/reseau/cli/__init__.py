@@ -14,7 +14,7 @@ import typer
 
 from .. import __version__
 from ..errors import ReseauError
-from . import apply, demo, design, measure, refine
+from . import apply, bundle, demo, design, measure, refine
 
 __all__ = ["app", "main"]
 
@@ -31,6 +31,7 @@ app.add_typer(design.app, name="design")
 app.add_typer(measure.app, name="measure")
 app.command()(refine.refine)
 app.command()(apply.apply)
+app.command()(bundle.bundle)
 
 
 def _version(wanted: bool) -> None:

@@ -1,0 +1,194 @@
+"""What deserves attention in an adjustment: each remark names what it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..adjust import critical_w
+from ..data import Rows
+from .network import Network
+from .problem import BundleFit
+from .result import Result
+
+__all__ = ["LISTED", "gaps", "listed", "remarks"]
+
+LISTED = 8
+_CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
+# A corner is this part of width and height.
+_CORNER = 0.2
+
+
+def listed(names: Iterable[object]) -> str:
+    """Names, the first few of many."""
+    every = [str(name) for name in names]
+    more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
+    return ", ".join(every[:LISTED]) + more
+
+
+def gaps(network: Network, fit: BundleFit) -> list[str]:
+    """Points, images and cameras that were left out, and why."""
+    found = []
+    part, rays = fit.usable.points, network.rays
+    lost = ~part & ~network.held.all(axis=1)
+    nowhere = np.flatnonzero(lost & (rays == 0))
+    if len(nowhere):
+        defect = int((~network.held & ~network.observed)[nowhere].sum())
+        found.append(f"rank defect {defect}: {_points(network, nowhere)} in no image; left out")
+    single = np.flatnonzero(lost & (rays == 1))
+    if len(single):
+        of = {int(j): network.images[i] for i, j in zip(network.image_of, network.point_of, strict=True)}
+        where = [f"{network.points[j]} (image {of[int(j)]})" for j in single]
+        found.append(
+            f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
+            f"{listed(where)}; left out"
+        )
+    few = np.flatnonzero(lost & (rays > 1))
+    if len(few):
+        found.append(f"{_points(network, few)} not seen by two images that are oriented; left out")
+    images = np.flatnonzero(~fit.usable.images)
+    for i in images[:LISTED]:
+        name, seen = network.images[i], int(network.seen[i])
+        why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
+        enough = "three are needed" if seen < 3 else "no position could be computed from them"
+        found.append(f"image {name} has {why}; {enough}; left out")
+    if len(images) > LISTED:
+        found.append(f"{len(images) - LISTED} more images are left out")
+    used = np.bincount(network.camera_of[fit.usable.images], minlength=len(network.cameras))
+    for c in np.flatnonzero(used == 0):
+        found.append(f"camera {network.cameras[c].id} has no image; its parameters stay as they are given")
+    return found
+
+
+def remarks(result: Result) -> list[str]:
+    """Correlations, weak points, uncovered corners, test values, and the global test."""
+    network, fit = result.network, result.fit
+    return [
+        *gaps(network, fit),
+        *_global(result),
+        *_large(result),
+        *_correlations(result),
+        *_weak(result),
+        *_behind(network, fit),
+        *_corners(network, fit),
+    ]
+
+
+def _plural(word: str, rows: Rows) -> str:
+    return word if len(rows) == 1 else f"{word}s"
+
+
+def _points(network: Network, rows: Rows) -> str:
+    verb = "is" if len(rows) == 1 else "are"
+    return f"{_plural('point', rows)} {listed(network.points[int(j)] for j in rows)} {verb}"
+
+
+def _global(result: Result) -> list[str]:
+    test = result.global_test()
+    if test is None:
+        return ["no observation is redundant: nothing is checked, and sigmas are a priori"]
+    if test.passed:
+        return []
+    side = "larger" if test.statistic > test.upper else "smaller"
+    return [
+        f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
+        "the sigmas of the observations are not true, or the model is not"
+    ]
+
+
+def _large(result: Result) -> list[str]:
+    """Image points whose test value is too large for the best of so many."""
+    w = np.nan_to_num(result.test_values).max(axis=1)
+    critical = critical_w(_ALPHA / max(1, 2 * len(w)))
+    rows = np.flatnonzero(w > critical)
+    if not len(rows):
+        return []
+    rows = rows[np.argsort(-w[rows], kind="stable")]
+    network = result.network
+    names = [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]} (w {w[k]:.1f})"
+        for k in rows
+    ]
+    return [
+        f"{len(rows)} image {_plural('point', rows)} with test values above {critical:.1f}: {listed(names)}"
+    ]
+
+
+def _correlations(result: Result) -> list[str]:
+    found = []
+    for c, camera in enumerate(result.network.cameras):
+        names, _, _ = result.camera_columns(c)
+        if not names:
+            continue
+        q = result.camera_covariance(c)
+        size = np.sqrt(np.diag(q))
+        size = np.where(size > 0, size, 1.0)
+        r = q / np.outer(size, size)
+        for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
+            found.append(f"camera {camera.id}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}")
+    if len(found) > LISTED:
+        found = [
+            *found[:LISTED],
+            f"{len(found) - LISTED} more camera parameters correlate above {_CORRELATED}",
+        ]
+    q = result.pose_covariance[result.fit.usable.images]
+    size = np.sqrt(np.maximum(np.diagonal(q, axis1=1, axis2=2), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    r = np.abs(np.tril(q / (size[:, :, None] * size[:, None, :]), -1)).max(axis=(1, 2), initial=0.0)
+    images = np.flatnonzero(result.fit.usable.images)[r > _CORRELATED]
+    if len(images):
+        names_of = listed(result.network.images[i] for i in images)
+        found.append(
+            f"position and rotation correlate above {_CORRELATED} in {_plural('image', images)} {names_of}"
+        )
+    return found
+
+
+def _weak(result: Result) -> list[str]:
+    """Points much less certain than the others."""
+    network = result.network
+    free = result.fit.usable.points & ~network.held.all(axis=1)
+    sigma = np.sqrt((result.point_sigma**2).sum(axis=1))
+    if not free.any():
+        return []
+    median = float(np.median(sigma[free]))
+    rows = np.flatnonzero(free & (sigma > _WEAK * median))
+    if not len(rows) or median == 0:
+        return []
+    rows = rows[np.argsort(-sigma[rows], kind="stable")]
+    names = [f"{network.points[j]} ({sigma[j]:.3g} {network.unit}, {network.rays[j]} rays)" for j in rows]
+    return [f"weak {_plural('point', rows)}, sigma above {_WEAK:g} times the median: {listed(names)}"]
+
+
+def _behind(network: Network, fit: BundleFit) -> list[str]:
+    rows = np.flatnonzero(fit.usable.observations)
+    i, j = network.image_of[rows], network.point_of[rows]
+    depth = np.einsum("nk,nk->n", fit.values.rotation[i, 2], fit.values.xyz[j] - fit.values.x0[i])
+    wrong = rows[depth <= 0]
+    if not len(wrong):
+        return []
+    names = [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in wrong
+    ]
+    return [f"{_plural('point', wrong)} behind the camera: {listed(names)}"]
+
+
+def _corners(network: Network, fit: BundleFit) -> list[str]:
+    """Corners of the image in which a camera to be calibrated has no points."""
+    found, used = [], fit.usable.observations
+    for c, camera in enumerate(network.cameras):
+        rows = used & (network.camera_of[network.image_of] == c)
+        if not camera.free or not rows.any():
+            continue
+        x, y = (network.xy[rows] / [camera.width, camera.height]).T
+        corners = {
+            "upper left": (x < _CORNER) & (y < _CORNER),
+            "upper right": (x > 1 - _CORNER) & (y < _CORNER),
+            "lower left": (x < _CORNER) & (y > 1 - _CORNER),
+            "lower right": (x > 1 - _CORNER) & (y > 1 - _CORNER),
+        }
+        empty = [name for name, inside in corners.items() if not inside.any()]
+        if empty:
+            found.append(f"camera {camera.id}: no points in the {', '.join(empty)} of its images")
+    return found[:LISTED]

@@ -1,0 +1,70 @@
+"""Bundle Adjustment in the Large: one file of cameras, points and observations.
+
+A camera there looks along −z, y up; its image coordinates are in pixels about the centre of the image, y up,
+f·(1 + k1 r² + k2 r⁴)·p with p = −(X, Y)/Z (Agarwal, Snavely, Seitz & Szeliski 2010, *Bundle adjustment in the
+large*). It is Brown's camera on the object side with a pitch of one and K1 = k1/f², K2 = k2/f⁴.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..bundle import Camera, Network
+from ..errors import FormatError
+from ..formats import read_text
+from ..optics.poses import matrix_to_vector, rotation_matrix
+from .lines import network_of
+
+__all__ = ["read_bal"]
+
+_VIEW = np.diag([1.0, -1.0, -1.0])
+
+
+def read_bal(path: Path | str) -> Network:
+    """A network from a BAL file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    FormatError
+        When it holds other than the numbers its first line promises.
+    """
+    path = Path(path)
+    words = read_text(path).split()
+    try:
+        cameras, points, observations = (int(word) for word in words[:3])
+        values = np.array(words[3:], dtype=np.float64)
+    except ValueError:
+        raise FormatError("holds words that are no numbers", where=path) from None
+    expected = 4 * observations + 9 * cameras + 3 * points
+    if min(cameras, points, observations) < 1 or len(values) != expected:
+        raise FormatError(f"holds {len(values)} numbers after the first line, not {expected}", where=path)
+    if not np.isfinite(values).all():
+        raise FormatError("holds numbers that are not finite", where=path)
+    table = values[: 4 * observations].reshape(-1, 4)
+    poses = values[4 * observations : 4 * observations + 9 * cameras].reshape(-1, 9)
+    image, point = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
+    if not (0 <= image.min() <= image.max() < cameras and 0 <= point.min() <= point.max() < points):
+        raise FormatError("has an observation of a camera or point that is not there", where=path)
+    half = int(np.ceil(np.abs(table[:, 2:]).max()))
+    matrices = rotation_matrix(poses[:, :3])
+    entries = tuple(_camera(str(i), 2 * half + 1, *row) for i, row in enumerate(poses[:, 6:]))
+    xy = np.column_stack([table[:, 2] + half, half - table[:, 3]])
+    return network_of(
+        entries,
+        tuple(str(i) for i in range(cameras)),
+        np.arange(cameras),
+        matrix_to_vector(_VIEW @ matrices),
+        -np.einsum("mji,mj->mi", matrices, poses[:, 3:6]),
+        tuple(str(j) for j in range(points)),
+        values[4 * observations + 9 * cameras :].reshape(-1, 3),
+        (image, point, xy, np.ones(xy.shape)),
+    )
+
+
+def _camera(name: str, size: int, f: float, k1: float, k2: float) -> Camera:
+    values = np.array([f, 0.0, 0.0, k1 / f**2, k2 / f**4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return Camera(name, size, size, (1.0, 1.0), "brown", values, ("c", "K1", "K2"), "object")

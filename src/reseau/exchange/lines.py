@@ -1,0 +1,82 @@
+"""Lines of numbers, and what is said when one is not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..bundle import Camera, Network
+from ..data import Array, Rows
+from ..errors import FormatError
+
+__all__ = ["network_of", "numbers"]
+
+
+def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
+    """`count` finite numbers.
+
+    Raises
+    ------
+    FormatError
+        When there are others; names the line, counted from one.
+    """
+    try:
+        values = [float(word) for word in words]
+        if len(values) != count or not np.isfinite(values).all():
+            raise ValueError
+    except ValueError:
+        shown = " ".join(words)[:60]
+        raise FormatError(f"line {line}: `{shown}` is not {count} numbers", where=path) from None
+    return values
+
+
+def network_of(
+    cameras: tuple[Camera, ...],
+    images: tuple[str, ...],
+    camera_of: Rows,
+    rotation: Array,
+    x0: Array,
+    points: tuple[str, ...],
+    xyz: Array,
+    observations: tuple[Rows, Rows, Array, Array],
+    *,
+    files: tuple[str | None, ...] | None = None,
+    unit: str = "",
+) -> Network:
+    """A free network: every coordinate and pose approximate, as other programs leave them.
+
+    Parameters
+    ----------
+    rotation : ndarray (m, 3)
+        Rotation vectors.
+    observations : tuple
+        Rows of images and of points (n,), coordinates (n, 2) and standard deviations (n, 2), px.
+    """
+    image_of, point_of, xy, sigma = observations
+    cov = np.zeros((len(xy), 2, 2))
+    cov[:, [0, 1], [0, 1]] = sigma**2
+    m, p = len(images), len(points)
+    return Network(
+        cameras=cameras,
+        images=images,
+        camera_of=camera_of,
+        x0=x0,
+        rotation=rotation,
+        points=points,
+        xyz=xyz,
+        sigma=np.full((p, 3), np.nan),
+        role=("tie",) * p,
+        image_of=image_of,
+        point_of=point_of,
+        xy=xy,
+        cov=cov,
+        distance_of=np.zeros((0, 2), dtype=np.intp),
+        distance=np.zeros((0, 2)),
+        datum="free",
+        datum_points=np.ones(p, dtype=bool),
+        groups=(None,) * m,
+        files=files or (None,) * m,
+        unit=unit,
+    )

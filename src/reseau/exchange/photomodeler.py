@@ -1,0 +1,138 @@
+"""PhotoModeler's text export, as DBAT reads it.
+
+Title; tolerance, iterations, image width and height; default sigmas; the camera (c, principal point from
+the upper left corner, format, K1, K2, K3, P1, P2; mm) and its sigmas. Then for each image three lines (number
+and file; X, Y, Z, kappa, phi, omega in degrees; their sigmas) and two with its camera. Then points (id, X, Y,
+Z, sigmas) and observations (image, id, x, y, sigmas), blank lines between. Pixels have their origin at the
+corner of the top-left pixel, ours at its centre. Which points are control stands in another file: the network
+is read as a free one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..bundle import Camera, Network
+from ..errors import FormatError
+from ..formats import read_text
+from ..optics.poses import angles_to_matrix, matrix_to_vector
+from .lines import network_of, numbers
+
+__all__ = ["read_photomodeler"]
+
+_FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+
+
+def read_photomodeler(path: Path | str) -> Network:
+    """A network from PhotoModeler's text export.
+
+    Images whose cameras agree to the printed digits share one.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    FormatError
+        When a line is not what it should be; the message names it.
+    """
+    path = Path(path)
+    lines = _Lines(path)
+    lines.next()
+    _, _, width, height = numbers(lines.next(), 4, path, lines.number)
+    lines.next()
+    default = numbers(lines.next(), 10, path, lines.number)
+    lines.next()
+    size = int(width), int(height)
+    cameras, poses, files, camera_of, ids = [_camera("1", default, *size)], [], [], [], list[str]()
+    kept = [_printed(default)]
+    while (words := lines.peek()) and len(words) >= 2 and not _is_number(words[1]):
+        ids.append(lines.next()[0])
+        files.append(" ".join(words[1:]))
+        poses.append(numbers(lines.next()[1:], 6, path, lines.number))
+        lines.next()
+        own = numbers(lines.next()[1:], 10, path, lines.number)
+        lines.next()
+        if _printed(own) not in kept:
+            kept.append(_printed(own))
+            cameras.append(_camera(str(len(kept)), own, *size))
+        camera_of.append(kept.index(_printed(own)))
+    points, xyz = list[str](), []
+    while (words := lines.peek()) and len(words) == 7:
+        points.append(lines.next()[0])
+        xyz.append(numbers(words[1:4], 3, path, lines.number))
+    table: list[list[float]] = []
+    rows, images = {name: j for j, name in enumerate(points)}, {name: i for i, name in enumerate(ids)}
+    while words := lines.peek():
+        if table and len(words) == 3:
+            break  # tables of features follow, which say nothing new
+        lines.next()
+        if len(words) != 6 or words[0] not in images or words[1] not in rows:
+            raise FormatError(
+                f"line {lines.number}: `{' '.join(words)[:60]}` is no observation of an image and a point",
+                where=path,
+            )
+        table.append([images[words[0]], rows[words[1]], *numbers(words[2:], 4, path, lines.number)])
+    if not table:
+        raise FormatError("holds no observations", where=path)
+    values, table_of = np.array(poses), np.array(table)
+    omega, phi, kappa = np.radians(values[:, [5, 4, 3]]).T
+    # PhotoModeler counts images from zero, its users from one.
+    return network_of(
+        tuple(cameras),
+        tuple(str(int(name) + 1) if name.isdigit() else name for name in ids),
+        np.array(camera_of, dtype=np.intp),
+        matrix_to_vector(angles_to_matrix(omega, phi, kappa)),
+        values[:, :3],
+        tuple(points),
+        np.array(xyz),
+        (
+            table_of[:, 0].astype(np.intp),
+            table_of[:, 1].astype(np.intp),
+            table_of[:, 2:4] - 0.5,
+            table_of[:, 4:6],
+        ),
+        files=tuple(files),
+    )
+
+
+class _Lines:
+    """Lines one after the other, blank ones passed over."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.lines, self.number = path, read_text(path).splitlines(), 0
+
+    def peek(self) -> list[str]:
+        """Words of the next line; empty at the end."""
+        while self.number < len(self.lines) and not self.lines[self.number].split():
+            self.number += 1
+        return self.lines[self.number].split() if self.number < len(self.lines) else []
+
+    def next(self) -> list[str]:
+        """Words of the next line, which must be there."""
+        words = self.peek()
+        if not words:
+            raise FormatError("ends too soon", where=self.path)
+        self.number += 1
+        return words
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _printed(values: list[float]) -> tuple[float, ...]:
+    """A camera as the lines of the images print it: three digits of c and the principal point."""
+    return tuple(round(v, 3) if k < 3 else v for k, v in enumerate(values))
+
+
+def _camera(name: str, values: list[float], width: int, height: int) -> Camera:
+    c, px, py, format_x, format_y, *distortion = values
+    pitch = format_x / width, format_y / height
+    brown = [c, px - format_x / 2, format_y / 2 - py, *distortion, 0.0, 0.0]
+    return Camera(name, width, height, pitch, "brown", np.array(brown), _FREE, "image")

@@ -1,0 +1,216 @@
+"""`reseau bundle`: the result, and what is said about networks that cannot be adjusted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.formats.network import Network1
+from reseau.optics import Brown, PixelGrid
+from reseau.optics.poses import Pose, matrix_to_vector, project
+
+Run = Callable[..., tuple[int, str, str]]
+Change = Callable[[dict[str, Any]], None]
+
+
+def looking_at(x0: np.ndarray, roll: float) -> np.ndarray:
+    """Rotation vector of a camera at x0 that looks at the middle of the points."""
+    z = np.array([0.0, 0.0, 0.4]) - x0
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(z, x), z])
+    c, s = np.cos(roll), np.sin(roll)
+    return matrix_to_vector(np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ upright)
+
+
+def content(noise: float = 0.05) -> dict[str, Any]:
+    """Four images of a grid of fifteen points on two levels, four of them control."""
+    rng = np.random.default_rng(7)
+    grid = PixelGrid(640, 480, (0.01, 0.01))
+    camera = Brown(grid=grid).with_values({"c": 8.0, "x0": 0.02, "K1": 1e-3})
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-0.7, 0.7, 3)))
+    xyz = np.column_stack([x, y, 0.3 * ((np.arange(15) * 7) % 4)])
+    centres = [(-2.2, -1.8, 4.0), (2.3, -1.6, 4.3), (2.0, 2.1, 3.8), (-1.9, 2.0, 4.4)]
+    poses = [(looking_at(np.array(x0), 1.5 * i), x0) for i, x0 in enumerate(centres)]
+    table: dict[str, list[Any]] = {key: [] for key in ("image", "point", "x", "y", "sx", "sy")}
+    for i, (rotation, x0) in enumerate(poses):
+        for j, xy in enumerate(project(camera, Pose(np.array(rotation), np.array(x0)), xyz).xy):
+            if (np.abs(xy - [319.5, 239.5]) < [319, 239]).all():
+                u, v = (xy + noise * rng.normal(size=2)).tolist()
+                row = (f"i{i}", f"p{j}", u, v, 0.05, 0.05)
+                for key, value in zip(table, row, strict=True):
+                    table[key].append(value)
+    control = (0, 4, 10, 14, 7)
+    return {
+        "schema": "reseau-network/1",
+        "unit": "m",
+        "cameras": [
+            {"id": "cam", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01], "model": "brown",
+             "side": "object", "parameters": {"c": 7.7}, "free": ["c", "x0", "y0", "K1"]},
+        ],
+        "images": {
+            "id": [f"i{i}" for i in range(4)], "camera": ["cam"] * 4,
+            "X0": [None] * 4, "rotation": [None] * 4,
+        },
+        "points": {
+            "id": [f"p{j}" for j in range(15)],
+            "xyz": [xyz[j].tolist() if j in control else None for j in range(15)],
+            "sigma": [[0, 0, 0] if j in control else None for j in range(15)],
+            "role": ["control" if j in control else "tie" for j in range(15)],
+        },
+        "observations": table,
+        "datum": "control",
+    }  # fmt: skip
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Callable[..., Path]:
+    """A network as a file, changed or not."""
+
+    def write(change: Change | None = None) -> Path:
+        document = content()
+        if change is not None:
+            change(document)
+        path = tmp_path / "network.json"
+        path.write_text(json.dumps(document))
+        return path
+
+    return write
+
+
+def test_the_result_has_the_columns_of_its_schema(reseau: Run, network: Callable[..., Path]) -> None:
+    status, out, err = reseau("bundle", network(), "--json", "--cov")
+    assert (status, err) == (0, "")
+    found = json.loads(out)
+    assert next(iter(found)) == "schema"
+    assert found["schema"] == "reseau-bundle/1"
+    n = found["observations"]
+    assert found["redundancy"] == n - found["unknowns"] + found["constraints"]
+    assert found["unknowns"] == 4 + 24 + 30
+    table = found["image_points"]
+    assert sum(table["rx"]) + sum(table["ry"]) == pytest.approx(found["redundancy"], abs=1e-6)
+    w = abs(table["vx"][0]) / (found["sigma0"] * 0.05 * table["rx"][0] ** 0.5)
+    assert table["wx"][0] == pytest.approx(w, rel=1e-9)
+    assert 0.6 < found["sigma0"] < 1.4
+    c = found["cameras"][0]["parameters"]["c"]
+    assert abs(c["value"] - 8.0) < 4 * c["sigma"]
+    assert np.array(found["points"]["cov"]).shape == (15, 3, 3)
+    assert found["points"]["sigma"][0] == [0, 0, 0]
+
+
+def test_the_summary_says_what_was_estimated(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    status, out, _ = reseau("bundle", network(), "-o", tmp_path / "result.json")
+    assert status == 0
+    assert "redundancy" in out
+    assert "camera cam" in out
+    assert json.loads((tmp_path / "result.json").read_text())["schema"] == "reseau-bundle/1"
+
+
+def test_the_same_network_gives_the_same_bytes(reseau: Run, network: Callable[..., Path]) -> None:
+    path = network()
+    assert reseau("bundle", path, "--json") == reseau("bundle", path, "--json")
+
+
+def test_blunders_are_named_and_left_out(reseau: Run, network: Callable[..., Path]) -> None:
+    def blunder(document: dict[str, Any]) -> None:
+        document["observations"]["x"][17] += 40.0
+
+    path = network(blunder)
+    table = json.loads(path.read_text())["observations"]
+    where = (table["image"][17], table["point"][17])
+    status, out, _ = reseau("bundle", path, "--json")
+    assert status == 0
+    assert any(f"{where[1]} in image {where[0]}" in warning for warning in json.loads(out)["warnings"])
+    status, out, _ = reseau("bundle", path, "--reject", "--json")
+    assert status == 0
+    found = json.loads(out)
+    assert [k for k, r in enumerate(found["image_points"]["rejected"]) if r] == [17]
+    assert found["sigma0"] < 1.4
+
+
+def swap(column: str, a: int, b: int) -> Change:
+    def change(document: dict[str, Any]) -> None:
+        values = document["points"][column]
+        values[a], values[b] = values[b], values[a]
+
+    return change
+
+
+def without_control(document: dict[str, Any]) -> None:
+    document["points"]["xyz"] = document["points"]["sigma"] = [None] * 15
+
+
+def two_points(document: dict[str, Any]) -> None:
+    table = document["observations"]
+    keep = [k for k, image in enumerate(table["image"]) if image != "i3" or table["point"][k] in ("p1", "p2")]
+    for key in table:
+        table[key] = [table[key][k] for k in keep]
+
+
+def idle_camera(document: dict[str, Any]) -> None:
+    document["cameras"].append(document["cameras"][0] | {"id": "spare"})
+
+
+SAID = {
+    "no datum": (without_control, 1, "rank defect 7"),
+    "an unknown key": (lambda d: d.update(colour="red"), 2, "unknown key `colour`"),
+    "a missing key": (lambda d: d.pop("datum"), 2, "missing key `datum`"),
+    "a point that is not there": (lambda d: d["observations"]["point"].__setitem__(0, "x9"), 2, "'x9'"),
+    "a camera that is not there": (lambda d: d["images"]["camera"].__setitem__(0, "none"), 2, "'none'"),
+    "a negative sigma": (lambda d: d["observations"]["sx"].__setitem__(0, -1.0), 2, "above zero"),
+    "columns of different length": (lambda d: d["observations"]["x"].pop(), 2, "entries"),
+    "a parameter of another model": (lambda d: d["cameras"][0]["free"].append("k1"), 2, "'k1'"),
+    "a coordinate that is no number": (lambda d: d["observations"]["x"].__setitem__(0, float("nan")), 2, ""),
+    "points of one image twice": (lambda d: d["observations"]["point"].__setitem__(1, "p0"), 2, "twice"),
+}
+
+
+@pytest.mark.parametrize("case", SAID)
+def test_what_cannot_be_adjusted_is_refused_in_one_line(
+    case: str, reseau: Run, network: Callable[..., Path]
+) -> None:
+    change, expected, words = SAID[case]
+    status, out, err = reseau("bundle", network(change), "--json")
+    assert (status, out) == (expected, "")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+WARNED = {
+    "an image with two points": (two_points, "image i3 has 2 points"),
+    "a camera without image": (idle_camera, "camera spare has no image"),
+}
+
+
+@pytest.mark.parametrize("case", WARNED)
+def test_what_takes_no_part_is_named(case: str, reseau: Run, network: Callable[..., Path]) -> None:
+    change, words = WARNED[case]
+    status, out, _ = reseau("bundle", network(change), "--json")
+    assert status == 0
+    assert any(words in warning for warning in json.loads(out)["warnings"])
+
+
+def test_the_document_comes_back_as_it_was_written() -> None:
+    document = Network1.parse(json.dumps(content()), where="network")
+    again = Network1.parse(document.to_json(), where="network")
+    assert again == document
+    assert next(iter(document.to_dict())) == "schema"
+
+
+@pytest.mark.parametrize("pair", [(0, 4), (0, 14), (4, 10)])
+def test_swapped_control_points_are_no_silent_nonsense(
+    pair: tuple[int, int], reseau: Run, network: Callable[..., Path]
+) -> None:
+    status, out, err = reseau("bundle", network(swap("xyz", *pair)), "--json")
+    said = " ".join(json.loads(out)["warnings"]) if status == 0 else err
+    # The control is a symmetric plane figure: the other pair would do as well.
+    assert f"p{pair[0]} and p{pair[1]}" in said
+    assert "exchanged" in said
