@@ -102,6 +102,26 @@ def test_a_stored_calibration_gives_the_same_true_coordinates(bench, tmp_path, c
     assert document["notes"] == []
 
 
+def test_stored_coefficients_are_held_against_a_new_photo_ii(bench, tmp_path, capsys):
+    assert _run(bench, "--out", tmp_path / "k.json") == 0
+    reseau, rods, aside = standard_reseau(), np.array(list(_RODS.values())), np.array([0.05, 0.0])
+    anew = _csv(tmp_path / "the same.csv", (reseau.ids, _pixels(reseau.xy)), (list(_RODS), _shown(rods)))
+    shifted = _csv(
+        tmp_path / "shifted.csv", (reseau.ids, _pixels(reseau.xy)), (list(_RODS), _shown(rods + aside))
+    )
+    capsys.readouterr()
+    assert _run({"--calibration": tmp_path / "k.json", "--photo-ii": anew}) == 0
+    assert "the same.csv: the coefficients still hold" in capsys.readouterr().out
+    assert _run({"--calibration": tmp_path / "k.json", "--photo-ii": shifted}, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert not document["holds"]
+    assert document["same_object"]
+    assert document["shift"][0] == pytest.approx(0.05, abs=5 * document["shift_sigma"][0])
+    assert len(document["notes"]) == 1
+    assert "the display has shifted against the reseau by 0.0" in document["notes"][0]
+    assert len(document["rods"]["id"]) == len(_RODS)
+
+
 def test_a_camera_that_moved_before_photo_iii_is_noticed_and_corrected(bench, tmp_path, capsys):
     reseau = standard_reseau()
     moved = np.array([0.8, -0.5])

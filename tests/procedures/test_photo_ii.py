@@ -7,9 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
+from reseau.data import ImagePoints
 from reseau.designs import standard_reseau
+from reseau.procedures.oscilloscope import PhotoI, PhotoII, photo_i, photo_ii, photo_iii, still_standard_in
 from reseau.refine import measure_reseau
-from reseau_sims import World
+from reseau_sims import Faults, World, swapped
 
 
 @pytest.fixture(scope="module")
@@ -33,3 +35,104 @@ def test_the_shadow_of_a_reseau_lies_on_its_wires_and_nowhere_else(world):
         assert (hidden[row, column] == value).all()
     assert 0.03 < hidden.mean() < 0.2
     assert world.design == standard_reseau()
+
+
+@pytest.fixture(scope="module")
+def bench(world) -> tuple[PhotoI, PhotoII]:
+    first = photo_i(world.photo_i(), world.design).required()
+    return first, photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
+
+
+def at_fault(**faults: float | str) -> World:
+    """The same world with something amiss."""
+    return World.standard(1, faults=Faults(**faults))
+
+
+def errors(found: ImagePoints, world: World) -> np.ndarray:
+    """True coordinates less the world's (n, 2), for points that the world has."""
+    truth = world.truth_iii()
+    row = np.hypot(*np.moveaxis(found.xy[:, None] - truth.object_xy[None], -1, 0)).argmin(axis=1)
+    return found.xy - truth.object_xy[row]
+
+
+def test_nothing_is_said_of_a_bench_that_is_in_order(bench):
+    _, second = bench
+    assert second.notes == ()
+    assert len(second.pins) >= 30
+
+
+def test_true_coordinates_of_a_body_lie_within_their_sigmas(world, bench):
+    _, second = bench
+    third = photo_iii(world.photo_iii(), second.instrument, world.design).required()
+    off = errors(third.true, world)
+    assert len(off) >= 20
+    assert np.abs(off).max() < 0.5
+    assert (np.abs(off) < 4 * third.true.sigma).all()
+
+
+def test_a_missing_row_of_rods_is_named(bench):
+    found = photo_of(at_fault(missing_row="C"), bench)
+    assert found.notes == ("the whole row of rods at y = -60 mm is missing",)
+
+
+def test_a_test_object_that_stands_turned_is_named(bench):
+    found = photo_of(at_fault(object_turned_deg=3.0), bench)
+    assert len(found.notes) == 1
+    assert "turned by" in found.notes[0]
+    # The beam and the display turn the section as well, by a few tenths.
+    assert np.rad2deg(found.instrument.plane.rotation) == pytest.approx(3.0, abs=0.5)
+
+
+def photo_of(world: World, bench: tuple[PhotoI, PhotoII]) -> PhotoII:
+    """PHOTO II of a world with the camera of another."""
+    first, _ = bench
+    return photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
+
+
+@pytest.mark.parametrize("pushed", [0.4, 20.0])
+def test_a_camera_that_was_pushed_is_noticed_and_followed(pushed: float, bench):
+    _, before = bench
+    found = photo_of(at_fault(camera_moved_mm=pushed), bench)
+    assert any("the camera has moved since PHOTO I" in note for note in found.notes)
+    common = [name for name in found.pins.names if name in before.pins.names]
+    off = found.pins.select(common).xy - before.pins.select(common).xy
+    assert np.abs(off.mean(axis=0)).max() < 0.02
+    assert np.abs(off).max() < 0.6
+
+
+def test_confused_marks_of_the_common_system_are_named(world, bench):
+    confused = swapped(world.design)
+    first = photo_i(world.photo_i(), confused).required()
+    found = photo_ii(world.photo_ii(), confused, world.test_object, first.camera).required()
+    assert any("are O and S swapped?" in note for note in found.notes)
+
+
+def test_a_gap_between_reseau_and_screen_does_no_harm_from_one_place():
+    world = at_fault(parallax_mm=2.0)
+    first = photo_i(world.photo_i(), world.design).required()
+    second = photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
+    third = photo_iii(world.photo_iii(), second.instrument, world.design).required()
+    assert second.notes == ()
+    assert (np.abs(errors(third.true, world)) < 4 * third.true.sigma).all()
+
+
+def test_a_gap_between_reseau_and_screen_is_named_once_it_is_seen_from_two_places():
+    still = at_fault(parallax_mm=2.0)
+    first = photo_i(still.photo_i(), still.design).required()
+    second = photo_ii(still.photo_ii(), still.design, still.test_object, first.camera).required()
+    pushed = at_fault(parallax_mm=2.0, camera_moved_mm=5.0)
+    found = still_standard_in(
+        pushed.photo_ii(), second.instrument, still.design, still.test_object
+    ).required()
+    assert not found.test.holds
+    # Two millimetres behind a plane 264 mm away, seen from 5 mm beside.
+    assert np.hypot(*found.test.shift) == pytest.approx(2.0 * 5.0 / 264, abs=0.004)
+    assert any("a gap between reseau and screen (parallax)" in note for note in found.notes)
+
+
+def test_stored_coefficients_still_hold_in_a_new_photograph_of_the_same_bench(world, bench):
+    _, second = bench
+    again = world.photograph("PHOTO II anew", world.show(world.rods, "PHOTO II anew"))
+    found = still_standard_in(again, second.instrument, world.design, world.test_object).required()
+    assert found.test.p > 0.001
+    assert found.test.largest[1] < 0.05

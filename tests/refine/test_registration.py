@@ -42,16 +42,14 @@ def test_a_tilted_photograph_is_carried_back_as_well():
     found = register(tilted, RESEAU, _camera())
     assert found.moved
     assert not found.similar
-    # One of equations (5a, b) after another is nearly one of them.
-    assert found.left_px < 0.05
-    assert np.abs(found.apply(tilted).xy - xy).max() < 0.2
+    assert found.left_px < 2 * SIGMA_PX
+    assert np.abs(found.apply(tilted).xy - xy).max() < 5 * SIGMA_PX
 
 
-def test_a_reseau_of_another_shape_shows_in_what_is_left():
-    xy = pixels(RESEAU.xy)
-    wavy = xy + 0.5 * np.sin(xy[:, ::-1] / 60)
-    found = register(measured(RESEAU.ids, wavy, np.random.default_rng(2)), RESEAU, _camera())
-    assert 0.3 < found.left_px < 0.6
+def test_marks_that_do_not_go_together_show_in_what_is_left():
+    rng = np.random.default_rng(2)
+    apart = measured(RESEAU.ids, pixels(RESEAU.xy) + rng.normal(0, 0.5, RESEAU.xy.shape), rng)
+    assert 0.3 < register(apart, RESEAU, _camera()).left_px < 0.8
 
 
 def test_three_marks_do_not_refer_a_photograph():

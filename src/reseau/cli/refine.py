@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..calibration import Calibration
     from ..data import Frame, ImagePoints
     from ..formats import ReseauDesign
-    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
     from ..provenance import Provenance
     from ..refine.instrument import InstrumentCorrection
 
@@ -69,14 +69,17 @@ class _Files:
 def refine(
     photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
     photo_ii: Annotated[
-        Path | None, typer.Option(help="PHOTO II: the test object behind the reseau.")
+        Path | None,
+        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration: tests it."),
     ] = None,
     photo_iii: Annotated[list[Path] | None, typer.Option(help="PHOTO III: the body to be measured.")] = None,
     reseau: Annotated[Path | None, typer.Option(help="Design of the reseau.")] = None,
     test_object: Annotated[
         Path | None, typer.Option("--object", help="Design of the test object: its rods.")
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="A stored calibration, for PHOTO III.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="A stored calibration, for PHOTO III or to be tested.")
+    ] = None,
     points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
     out: Out = None,
     true: Annotated[Path | None, typer.Option(help="True coordinates to write (CSV, JSON).")] = None,
@@ -117,10 +120,12 @@ def _checked(files: _Files) -> None:
     if not 0 < files.alpha < 1:
         raise UsageError(f"{files.alpha:g} is not between 0 and 1", where="--alpha")
     if files.calibration is not None:
-        if files.photo_i or files.photo_ii:
-            raise UsageError("is already made of PHOTO I and II", where="--calibration", do="give PHOTO III")
-        if not files.photo_iii:
-            raise UsageError("corrects a photograph", where="--calibration", do="give it as --photo-iii")
+        if files.photo_i or files.reseau:
+            raise UsageError("holds PHOTO I and its reseau", where="--calibration", do="leave these out")
+        if not files.photo_iii and not files.photo_ii:
+            raise UsageError(
+                "wants a photograph", where="--calibration", do="give --photo-iii, or --photo-ii to test it"
+            )
         return
     if files.photo_i is None or files.reseau is None:
         raise UsageError("needs --photo-i and --reseau, or --calibration", where="refine")
@@ -229,19 +234,76 @@ def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json
     from ..refine.instrument import InstrumentCorrection
 
     stored: Calibration = Calibration.read(calibration)
-    instrument, design, _ = InstrumentCorrection.from_calibration(stored)
-    with progress("refining", len(files.photo_iii)) as step:
+    instrument, design, rods = InstrumentCorrection.from_calibration(stored)
+    with progress("refining", len(files.photo_iii) + (files.photo_ii is not None)) as step:
+        again = None
+        if files.photo_ii is not None:
+            again = _again(files, files.photo_ii, instrument, design, rods)
+            step(files.photo_ii.name)
         third = _third(files, instrument, design, step)
     _write_true(third, true, instrument.unit)
     if as_json:
-        documents = [
+        documents = [] if again is None or files.photo_ii is None else [_standard(files.photo_ii, again)]
+        documents += [
             points_document(found.true, instrument.unit, "object")
             | {"image": path.name, "notes": list(found.notes)}
             for path, found in third
         ]
         say(canonical_json(documents[0] if len(documents) == 1 else documents))
     else:
+        if again is not None and files.photo_ii is not None:
+            _say_again(files.photo_ii, again, instrument.unit)
         _say_third(files, third, instrument.unit, true)
+
+
+def _again(
+    files: _Files, path: Path, instrument: InstrumentCorrection, design: ReseauDesign, rods: ReseauDesign
+) -> StillStandard:
+    """The stored coefficients held against a new PHOTO II; --object names another test object."""
+    from ..data import ImagePoints
+    from ..formats import ReseauDesign
+    from ..procedures.oscilloscope import still_standard_in
+
+    same = files.test_object is None
+    if files.test_object is not None:
+        rods = ReseauDesign.read(files.test_object)
+    photo, marks = read_photo(path), None
+    if isinstance(photo, ImagePoints):
+        marks, photo = _split(photo, design)
+    found = still_standard_in(
+        photo, instrument, design, rods, marks=marks, same_object=same, alpha=files.alpha
+    )
+    return required(found, path)
+
+
+def _standard(path: Path, again: StillStandard) -> dict[str, Any]:
+    """The test as JSON."""
+    test = again.test
+    return {
+        "image": path.name,
+        "holds": test.holds,
+        "same_object": test.same_object,
+        "chi2": test.statistic,
+        "degrees": test.degrees,
+        "critical": test.critical,
+        "p": test.p,
+        "shift": test.shift.tolist(),
+        "shift_sigma": test.shift_sigma.tolist(),
+        "p_shift": test.p_shift,
+        "p_rest": test.p_rest,
+        "rods": {"id": list(test.names), "change": test.change.tolist(), "sigma": test.sigma.tolist()},
+        "notes": list(again.notes),
+    }
+
+
+def _say_again(path: Path, again: StillStandard, unit: str) -> None:
+    test = again.test
+    verdict = "still hold" if test.holds else "hold no longer"
+    rod, length = test.largest
+    say(f"{path.name}: the coefficients {verdict} (χ² = {test.statistic:.1f}, {test.degrees} degrees of ")
+    say(f"freedom, p = {test.p:.3f}); largest change {length:.3g} {unit} at rod {rod}\n")
+    for note in again.notes:
+        say(f"  note: {note}\n")
 
 
 def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str | None) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -30,22 +30,37 @@ from ..refine import (
     measure_pins,
     measure_reseau,
 )
-from ..refine.causes import COEFFICIENTS, Causes, physical_causes
+from ..refine.causes import Causes, causes_of
 from ..refine.instrument import InstrumentCorrection, correct_instrument
 from ..refine.registration import Registration, register
+from ..refine.remarks import of_the_camera, of_the_change, of_the_object
+from ..refine.standard import StandardTest, still_standard
 
-__all__ = ["PhotoI", "PhotoII", "PhotoIII", "photo_i", "photo_ii", "photo_iii"]
+__all__ = [
+    "PhotoI",
+    "PhotoII",
+    "PhotoIII",
+    "StillStandard",
+    "photo_i",
+    "photo_ii",
+    "photo_iii",
+    "still_standard_in",
+]
 
-_UPRIGHT = np.deg2rad(20.0)
-"""Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
 _STOOD_STILL_PX = 6.0
 """How far the reseau is looked for from where PHOTO I had it, before it is looked for everywhere."""
-_ANOTHER_SHAPE_PX = 0.3
-"""What may remain at the marks of a photograph referred to PHOTO I."""
+
+
+class _Refined:
+    """What a step gives where it does not fail."""
+
+    def required(self) -> Self:
+        """The result itself; see :meth:`reseau.adjust.Failure.required`."""
+        return self
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoI:
+class PhotoI(_Refined):
     """PHOTO I refined.
 
     Parameters
@@ -108,7 +123,7 @@ def photo_i(
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoII:
+class PhotoII(_Refined):
     """PHOTO II refined.
 
     Parameters
@@ -137,7 +152,7 @@ class PhotoII:
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoIII:
+class PhotoIII(_Refined):
     """PHOTO III refined.
 
     Parameters
@@ -198,34 +213,20 @@ def photo_ii(
     PhotoII or Failure
         A failure when reseau or test object are not found, or too few of their points.
     """
-    # (iv) photo-coordinates of the test object
-    measured = None
-    if isinstance(photo, Frame):
-        seen = _reseau_in(photo, reseau, camera, options)
-        if isinstance(seen, Failure):
-            return seen
-        hidden = seen.shadow(reseau, photo.pixels.shape)
-        found = measure_pins(photo, test_object, pins, hidden=hidden)
-        if isinstance(found, Failure):
-            return found
-        marks, measured, images = seen.points, found, found.points
-    else:
-        images = photo
-    # (v) into the common system, by way of PHOTO I
-    registration = None
-    if marks is not None:
-        registered = register(marks, reseau, camera)
-        if isinstance(registered, Failure):
-            return registered
-        registration, images = registered, registered.apply(images)
+    # (iv) photo-coordinates of the test object, (v) into the common system by way of PHOTO I
+    seen = _pins_in(photo, reseau, test_object, camera, marks, options, pins)
+    if isinstance(seen, Failure):
+        return seen
+    images, registration, measured = seen
     # (iv) to (vii)
     instrument = correct_instrument(
         images, test_object, camera, model=model, alpha=alpha, criterion=criterion, check=check
     )
     if isinstance(instrument, Failure):
         return instrument
-    notes = _of_the_camera(camera, registration) + _of_the_object(instrument, images, test_object)
-    return PhotoII(images, instrument, registration, _causes(instrument), notes, measured)
+    notes = of_the_camera(camera, registration) + of_the_object(instrument, images, test_object)
+    causes = None if instrument.fit is None else causes_of(instrument.fit.adjustment)
+    return PhotoII(images, instrument, registration, causes, notes, measured)
 
 
 def photo_iii(
@@ -282,8 +283,108 @@ def photo_iii(
         if isinstance(registered, Failure):
             return registered
         registration, body = registered, registered.apply(body)
-    notes = _of_the_camera(instrument.camera, registration)
+    notes = of_the_camera(instrument.camera, registration)
     return PhotoIII(body, instrument.apply(body), registration, notes, measured)
+
+
+@dataclass(frozen=True, eq=False)
+class StillStandard(_Refined):
+    """Stored coefficients held against a new PHOTO II.
+
+    Parameters
+    ----------
+    test : StandardTest
+        Whether they still hold.
+    registration : Registration or None
+        How the photograph was referred to PHOTO I; None where its reseau was not given.
+    notes : tuple of str
+        What has changed, and what it points to.
+    measured : PinResult, optional
+        How the pins were measured; None where they came from elsewhere.
+    """
+
+    test: StandardTest
+    registration: Registration | None
+    notes: tuple[str, ...]
+    measured: PinResult | None
+
+
+def still_standard_in(
+    photo: Frame | ImagePoints,
+    instrument: InstrumentCorrection,
+    reseau: ReseauDesign,
+    test_object: ReseauDesign,
+    *,
+    marks: ImagePoints | None = None,
+    options: ReseauOptions | None = None,
+    pins: PinOptions | None = None,
+    same_object: bool = True,
+    alpha: float = 0.05,
+) -> StillStandard | Failure:
+    """Test whether stored coefficients are still the instrument's, by a new PHOTO II.
+
+    Taken from another place than PHOTO I, the photograph shows as well whether the phosphor lies behind the
+    reseau: from one place a gap g looks like a larger scale, (1 + g/D) about the foot of the camera at the
+    distance D, and group B takes it up; a camera pushed by t sees the display shift by g·t/D.
+
+    Parameters
+    ----------
+    photo, marks, options, pins
+        As for :func:`photo_ii`.
+    instrument : InstrumentCorrection
+        The stored groups A and B.
+    reseau, test_object : ReseauDesign
+        The reseau and the rods.
+    same_object : bool
+        Whether the rods are those that the calibration was made with.
+    alpha : float
+        Level of the test.
+
+    Returns
+    -------
+    StillStandard or Failure
+        A failure when reseau or test object are not found, or too few of their points.
+    """
+    seen = _pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
+    if isinstance(seen, Failure):
+        return seen
+    images, registration, measured = seen
+    test = still_standard(instrument, images, test_object, same_object=same_object, alpha=alpha)
+    if isinstance(test, Failure):
+        return test
+    notes = of_the_camera(instrument.camera, registration)
+    notes += of_the_change(test, registration, instrument.unit)
+    return StillStandard(test, registration, notes, measured)
+
+
+def _pins_in(
+    photo: Frame | ImagePoints,
+    reseau: ReseauDesign,
+    test_object: ReseauDesign,
+    camera: CameraCorrection,
+    marks: ImagePoints | None,
+    options: ReseauOptions | None,
+    pins: PinOptions | None,
+) -> tuple[ImagePoints, Registration | None, PinResult | None] | Failure:
+    """Images of the rods in pixels of PHOTO I, how they came there, and how they were measured."""
+    measured = None
+    if isinstance(photo, Frame):
+        seen = _reseau_in(photo, reseau, camera, options)
+        if isinstance(seen, Failure):
+            return seen
+        hidden = seen.shadow(reseau, photo.pixels.shape)
+        found = measure_pins(photo, test_object, pins, hidden=hidden)
+        if isinstance(found, Failure):
+            return found
+        marks, measured, images = seen.points, found, found.points
+    else:
+        images = photo
+    if marks is None:
+        return images, None, measured
+    registration = register(marks, reseau, camera)
+    if isinstance(registration, Failure):
+        return registration
+    return registration.apply(images), registration, measured
 
 
 def _reseau_in(
@@ -302,60 +403,3 @@ def _reseau_in(
         return known
     anew = measure_reseau(photo, reseau, o)
     return anew if isinstance(anew, ReseauResult) and anew.found > found else known
-
-
-def _causes(instrument: InstrumentCorrection) -> Causes | None:
-    """The causes, from the adjustment with all coefficients: one dropped would be held at nought."""
-    if instrument.fit is None:
-        return None
-    full = instrument.fit.elimination.full
-    if any(name not in full.names for name in COEFFICIENTS):
-        return None
-    causes = physical_causes(full.names, full.values, full.cofactor)
-    return None if isinstance(causes, Failure) else causes
-
-
-def _of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[str, ...]:
-    """What is odd about the camera's side."""
-    notes = []
-    angle = camera.photo_system.angle
-    if abs(angle) > np.pi - _UPRIGHT:
-        notes.append("the x-axis of the common system runs to the left in the image: are O and S swapped?")
-    elif abs(angle) > _UPRIGHT:
-        notes.append(
-            f"the common system is turned by {np.rad2deg(angle):.0f}° in the image: are O and S right?"
-        )
-    if registration is not None and registration.moved:
-        notes.append(
-            f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
-            "the photograph was carried back"
-        )
-    if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
-        notes.append(
-            f"the reseau has another shape than in PHOTO I (by {registration.left_px:.2f} px, rms): "
-            "take PHOTO I anew"
-        )
-    return tuple(notes)
-
-
-def _of_the_object(
-    instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
-) -> tuple[str, ...]:
-    """What is odd about the test object's side."""
-    notes, plane = [], instrument.plane
-    if abs(plane.rotation) > np.pi - _UPRIGHT:
-        notes.append("the test object stands on its head or M and N are swapped")
-    elif abs(plane.rotation) > np.deg2rad(2.0):
-        notes.append(f"the test object is turned by {np.rad2deg(plane.rotation):.1f}° against the reseau")
-    missing = [i for i, name in enumerate(design.ids) if name not in pins.names]
-    for axis, word in ((1, "row"), (0, "column")):
-        for value in np.unique(np.round(design.xy[:, axis], 6)):
-            line = np.flatnonzero(np.abs(design.xy[:, axis] - value) < 1e-6)
-            if len(line) >= 3 and set(line) <= set(missing):
-                notes.append(f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing")
-    ratio = plane.scale[0] / plane.scale[1]
-    if abs(ratio - 1) > 0.1:
-        notes.append(
-            f"the scales along and across differ by {abs(ratio - 1):.0%}: check the display's aspect"
-        )
-    return tuple(notes)

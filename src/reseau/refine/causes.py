@@ -18,7 +18,7 @@ from ..adjust import Adjustment, Failure, GaussMarkov, Parameters, adjust
 from ..data import Array
 from ..errors import UsageError
 
-__all__ = ["CAUSES", "COEFFICIENTS", "CONDITIONS", "Causes", "ConditionTest", "physical_causes"]
+__all__ = ["CAUSES", "COEFFICIENTS", "CONDITIONS", "Causes", "ConditionTest", "causes_of", "physical_causes"]
 
 CAUSES = ("P0", "P1", "P2", "P3", "P4", "k0", "k1", "h'1", "h'2", "h'3", "h'4", "m1", "m2")
 """Orientation, symmetric and asymmetric distortion of the display, the ultrasonic beam."""
@@ -141,6 +141,14 @@ def physical_causes(
     if isinstance(fit, Failure):
         return fit
     return Causes(fit, tuple(_test(name, observed, cov, alpha) for name in CONDITIONS))
+
+
+def causes_of(fit: Adjustment, alpha: float = 0.05) -> Causes | None:
+    """The causes behind an adjustment of group B; None where it lacks one of the 16 coefficients."""
+    if any(name not in fit.names for name in COEFFICIENTS):
+        return None
+    causes = physical_causes(fit.names, fit.values, fit.cofactor, alpha)
+    return None if isinstance(causes, Failure) else causes
 
 
 def _test(condition: str, values: Array, covariance: Array, alpha: float) -> ConditionTest:

@@ -24,6 +24,8 @@ from .field import SmoothField, trend_degree
 __all__ = ["Assignment", "GridOptions", "assign", "lay_out"]
 
 _NEIGHBOURS = 6
+_NEARLY = 0.75
+"""Share of the marks from which a layout is the right one but for a step of the grid."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,10 @@ def _robust_field(
         return None
     image, kept = candidates.xy[rows[has]], np.ones(len(has), dtype=bool)
     for _ in range(6):
-        field = SmoothField.fit(source[has[kept]], image[kept], degree=degree, local=False)
+        try:
+            field = SmoothField.fit(source[has[kept]], image[kept], degree=degree, local=False)
+        except np.linalg.LinAlgError:  # marks of one row alone
+            return None
         distance = np.hypot(*(field(source[has]) - image).T)
         scatter = max(float(np.median(distance[kept])) / 1.18, 0.15)
         closer = distance < 3 * scatter
@@ -276,12 +281,32 @@ def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOpt
             found = assign(source, start, strong, valid, shifts=1)
             if found is None:
                 continue
+            if found.score > _NEARLY * len(source):
+                found = _climbed(found, source, strong, valid)
             if best is None or found.score > best.score + 0.75:
                 best = found
-            # All marks but one: a regular design laid one pitch off misses more.
-            if found.score >= len(source) - 1:
+            # What no step of the grid betters, and nearly all marks bear out, is not bettered elsewhere.
+            if found.score > _NEARLY * len(source):
                 break
     return best
+
+
+def _climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
+    """The design moved by steps of its grid as long as that gathers more marks.
+
+    A regular design laid one pitch off finds a candidate for all marks but those of a row.
+    """
+    offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
+    grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
+    steps, count = np.unique(np.round(offset.reshape(-1, 2) / grain), axis=0, return_counts=True)
+    steps = steps[count > 0.2 * len(source)] * grain
+    for _ in range(len(source)):
+        moved = (assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps)
+        better = max((m for m in moved if m is not None), key=lambda m: m.score, default=found)
+        if better.score <= found.score:
+            break
+        found = better
+    return found
 
 
 def _strongest(candidates: Candidates, count: int) -> Candidates:
@@ -340,11 +365,11 @@ def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[
     limits = [
         (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
     ]
-    votes, (x, y) = _vote(values, np.ones(len(values)), limits, pitch / 5, 1.0)
+    votes, (x, y) = _vote(values, np.ones(len(values)), limits, pitch / 10, 2.0)
     starts = []
     for _ in range(5):
         i, j = np.unravel_index(votes.argmax(), votes.shape)
         moved = turned + complex(x[i], y[j])
         starts.append(np.stack([moved.real, moved.imag], axis=1))
-        votes[max(0, i - 3) : i + 4, max(0, j - 3) : j + 4] = 0
+        votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
     return starts

@@ -17,7 +17,7 @@ from ..adjust import Adjustment, Elimination, Failure, Options
 from ..calibration import Calibration, Covariance, Quantity
 from ..data import Array, ImagePoints
 from ..errors import FormatError, UsageError
-from ..formats import ReseauDesign
+from ..formats import ReseauDesign, ReseauMeasurement
 from ..optics import RationalPolynomial, Similarity, wong_display
 from ..provenance import canonical_json
 from .correction import (
@@ -138,6 +138,9 @@ class InstrumentCorrection:
         is wrong in the one is in part taken up by the other, and their covariance says how much.
     unit : str
         Of object coordinates.
+    pins : ImagePoints
+        Images of the rods that group B was made from, in pixels of PHOTO I: what a later photograph of the
+        same rods is held against.
     fit : InstrumentFit, optional
         How the model came about; None for one read from a calibration.
     """
@@ -147,6 +150,7 @@ class InstrumentCorrection:
     plane: ObjectPlane
     covariance: Array
     unit: str
+    pins: ImagePoints
     fit: InstrumentFit | None = None
 
     def __bool__(self) -> bool:
@@ -156,22 +160,31 @@ class InstrumentCorrection:
         """The correction itself; see :meth:`reseau.adjust.Failure.required`."""
         return self
 
-    def in_common_system(self, points: ImagePoints) -> ImagePoints:
-        """True coordinates of points in pixels, in the common system, with propagated covariances."""
-        system, camera = self.camera.photo_system, self.camera.model
-        photo, by_pixel, _ = system.derivatives(points.xy)
-        refined, by_photo, by_a = camera.derivatives(photo)
-        value, by_refined, by_b = self.model.derivatives(refined)
-        slope = by_refined @ by_photo @ by_pixel
+    def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
+        """Object coordinates of points in pixels (n, 2), and their derivatives.
+
+        Returns
+        -------
+        value : ndarray (n, 2)
+        slope : ndarray (n, 2, 2)
+            By the points.
+        by_coefficients : ndarray (n, 2, a + b)
+            By the coefficients of both groups, those of the camera first.
+        """
+        photo, by_pixel, _ = self.camera.photo_system.derivatives(xy)
+        refined, by_photo, by_a = self.camera.model.derivatives(photo)
+        common, by_refined, by_b = self.model.derivatives(refined)
         by_both = np.concatenate([by_refined @ by_a, by_b], axis=2)
-        cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
-        cov = cov + by_both @ self.covariance @ np.swapaxes(by_both, 1, 2)
-        return ImagePoints(points.names, value, cov)
+        plane = self.plane.slope
+        slope = plane @ by_refined @ by_photo @ by_pixel
+        return self.plane.from_common(common), slope, plane @ by_both
 
     def apply(self, points: ImagePoints) -> ImagePoints:
         """True object coordinates of points in pixels (Wishahy, step viii), with propagated covariances."""
-        common, slope = self.in_common_system(points), self.plane.slope
-        return ImagePoints(points.names, self.plane.from_common(common.xy), slope @ common.cov @ slope.T)
+        value, slope, by_coefficients = self.derivatives(points.xy)
+        cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
+        cov = cov + by_coefficients @ self.covariance @ np.swapaxes(by_coefficients, 1, 2)
+        return ImagePoints(points.names, value, cov)
 
     def calibration(
         self,
@@ -203,6 +216,7 @@ class InstrumentCorrection:
             "scale": [float(s) for s in self.plane.scale],
             "system": system_to_dict(self.plane.system),
             "rods": rods.to_dict(),
+            "pins": ReseauMeasurement.from_image_points(self.pins, image="PHOTO II", sha256="").to_dict(),
         }
         both = camera.model | {
             "name": f"{camera.model['name']} and group B",
@@ -246,6 +260,7 @@ class InstrumentCorrection:
             row_of = {key: i for i, key in enumerate(calibration.parameters)}
             order = [row_of[key] for key in camera.model.names + model.names]
             unit = str(part["unit"])
+            pins = ReseauMeasurement.parse(canonical_json(part["pins"]), where=where).image_points()
             designs = [
                 ReseauDesign.parse(canonical_json(holder[key]), where=where)
                 for holder, key in ((content, "reseau"), (part, "rods"))
@@ -253,7 +268,7 @@ class InstrumentCorrection:
         except (KeyError, TypeError, ValueError, UsageError) as error:
             raise FormatError(f"lacks or misstates {error}", where=f"model of {where}") from None
         covariance = calibration.matrix()[np.ix_(order, order)]
-        return cls(camera, model, plane, covariance, unit), designs[0], designs[1]
+        return cls(camera, model, plane, covariance, unit, pins), designs[0], designs[1]
 
 
 def correct_instrument(
@@ -326,7 +341,7 @@ def correct_instrument(
     fit, sigma = elimination.full, table[used, 2:] * plane.scale
     full, fitted = model.with_values(fit.values), refined.select(used)
     covariance = _joint_covariance(camera, rods.select(used), full, fit)
-    correction = InstrumentCorrection(camera, full, plane, covariance, design.unit)
+    correction = InstrumentCorrection(camera, full, plane, covariance, design.unit, rods.select(used))
     displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
     record = InstrumentFit(
         elimination,

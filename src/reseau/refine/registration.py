@@ -2,9 +2,9 @@
 
 The camera's correction says where in the image every mark of the reseau should appear. A similarity from
 where the marks are to where they should be carries any other measurement in the photograph to PHOTO I;
-whether it differs from doing nothing tells if the camera has moved in between. A camera that was pushed far, or
-turned, sees the reseau in another perspective and through other parts of its lens: where the similarity leaves
-more than the marks' errors, equations (5a, b) take its place, from photograph to photograph.
+whether it differs from doing nothing tells if the camera has moved in between. A camera that was pushed far,
+or turned, sees the reseau in another perspective and through other parts of its lens: where the similarity
+leaves more than the marks' errors, a smooth field through the marks takes its place.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import scipy.stats
 from ..adjust import Failure
 from ..data import Array, ImagePoints
 from ..formats import ReseauDesign
-from ..optics import Chain, Inverted, PlaneMapping, RationalPolynomial, Similarity
+from ..optics import RationalPolynomial, Similarity
 from .correction import CameraCorrection
+from .field import SmoothField
 from .fitting import carried, fit_mapping
 
 __all__ = ["Registration", "register"]
@@ -27,7 +28,8 @@ _LEAST_PX = 0.05
 """A displacement smaller than this is nobody's concern, however significant."""
 _UNLIKE = 2.0
 """Standard deviation of unit weight from which a similarity does not do."""
-_BENT = RationalPolynomial.camera()
+_FIELD_FROM = 20
+"""Marks that a smooth field needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +38,15 @@ class Registration:
 
     Parameters
     ----------
-    system : PlaneMapping
+    system : Similarity or SmoothField
         Pixels of this photograph to pixels of PHOTO I.
     marks : int
         Marks it was made from.
     sigma0 : float
-        Standard deviation of unit weight; far above one where the photographs differ by more than that.
-    similar : bool
-        Whether a similarity does; else the camera was turned or pushed so far that it does not.
+        Standard deviation of unit weight of a similarity; far above one where the photographs differ by more.
     left_px : float
-        What remains at the marks, root mean square of their distances from where they should be.
+        How far marks lie from where the others carry them, root mean square per axis; of a similarity, from
+        where they should be.
     displacement_px : float
         Largest displacement of a mark.
     p : float
@@ -54,18 +55,26 @@ class Registration:
         Whether the camera has moved: significantly at 0.001, and by more than 0.05 px.
     """
 
-    system: PlaneMapping
+    system: Similarity | SmoothField
     marks: int
     sigma0: float
-    similar: bool
     left_px: float
     displacement_px: float
     p: float
     moved: bool
 
+    @property
+    def similar(self) -> bool:
+        """Whether a similarity does; else the camera was turned or pushed so far that it does not."""
+        return isinstance(self.system, Similarity)
+
     def apply(self, points: ImagePoints) -> ImagePoints:
         """Points of this photograph as they would be in PHOTO I; the errors of its many marks left out."""
-        return carried(self.system, points)
+        if isinstance(self.system, Similarity):
+            return carried(self.system, points)
+        slope = self.system.jacobian(points.xy)
+        cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
+        return ImagePoints(points.names, self.system(points.xy), cov)
 
 
 def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection) -> Registration | Failure:
@@ -103,17 +112,15 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     cofactor = fit.cofactor + _of_the_camera(camera, marks, expected, length, fit.cofactor)
     statistic = float(off @ np.linalg.solve(cofactor, off)) / 4 / max(1.0, fit.sigma0**2)
     p = float(scipy.stats.f.sf(statistic, 4, fit.redundancy))
-    system: PlaneMapping = _about(fit.values, centre, length)
-    bent = None if fit.sigma0 < _UNLIKE else fit_mapping(_BENT, local, (expected - centre) / length)
-    if bent:
-        fit, reduced = bent, Similarity(np.array([*(-centre / length), 1 / length, 0.0]))
-        whole = Chain(reduced, _BENT.with_values(bent.values), ("reduced.", ""))
-        system = Chain(whole, Inverted(reduced), ("", "back."))
-    seen = system(marks.xy)
-    displacement = float(np.hypot(*(seen - marks.xy).T).max())
-    left = float(np.sqrt(((seen - expected) ** 2).sum(axis=1).mean()))
-    moved = (bool(bent) or p < 0.001) and displacement > _LEAST_PX
-    return Registration(system, len(marks), float(fit.sigma0), not bent, left, displacement, p, moved)
+    system: Similarity | SmoothField = _about(fit.values, centre, length)
+    left = system(marks.xy) - expected
+    if fit.sigma0 > _UNLIKE and len(marks) >= _FIELD_FROM:
+        system = SmoothField.fit(marks.xy, expected)
+        left, _ = system.leave_one_out()
+    displacement = float(np.hypot(*(system(marks.xy) - marks.xy).T).max())
+    moved = (fit.sigma0 > _UNLIKE or p < 0.001) and displacement > _LEAST_PX
+    left_px = float(np.sqrt((left**2).mean()))
+    return Registration(system, len(marks), float(fit.sigma0), left_px, displacement, p, moved)
 
 
 def _of_the_camera(
