@@ -149,3 +149,29 @@ def mapping_of(cam: Camera) -> Brown | OpenCV:
 def with_ebner(per: Any, base_mm: float = 1.2) -> Camera:
     """A camera with Ebner's parameters beside c, x0, y0."""
     return camera(free=(), additional=Additional(base_mm, True, per))
+
+
+def normalised_errors(world: World, fit: Any) -> dict[str, float]:
+    """Mean squares of errors over their covariances, of camera, poses and points; one if these cover.
+
+    Errors of a free network are in the datum of its covariances, that of its inner constraints.
+    """
+    network, unknowns = world.network, fit.unknowns
+    found: dict[str, float] = {}
+    cam = network.cameras[0]
+    at = unknowns.camera[0] + np.arange(len(cam.free))
+    rows = [cam.names.index(name) for name in cam.free]
+    off = fit.values.cameras[0, rows] - cam.values[rows]
+    found["camera"] = float(off @ np.linalg.solve(fit.cofactors.reduced[np.ix_(at, at)], off)) / len(at)
+    images = []
+    for i, start in enumerate(unknowns.pose):
+        turned = matrix_to_vector(fit.values.rotation[i] @ world.rotation[i].T)
+        e = np.concatenate([turned, fit.values.x0[i] - world.x0[i]])
+        q = fit.cofactors.reduced[start : start + 6, start : start + 6]
+        images.append(float(e @ np.linalg.solve(q, e)) / 6)
+    found["poses"] = float(np.mean(images))
+    free = np.flatnonzero(~network.held.any(axis=1) & fit.usable.points)
+    e = (fit.values.xyz - world.xyz)[free]
+    squares = np.einsum("pi,pij,pj->p", e, np.linalg.inv(fit.cofactors.points[free]), e)
+    found["points"] = float(squares.mean()) / 3
+    return found

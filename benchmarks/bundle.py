@@ -1,0 +1,225 @@
+"""The bundle adjustment beside Ceres, its statistics, how its time grows, and whether its covariances cover.
+
+Run from the checkout: ``python benchmarks/bundle.py [--part peers|statistics|growth|cover]``. Networks are
+looked for in $RESEAU_DATA/networks. The Ceres runs need g++ and libceres-dev (Debian); without them our times
+stand alone. Both have two threads; import, compilation and reading of files are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from shared import of_the_tests
+
+from reseau.bundle import BundleFit, BundleProblem, Network, problem_of
+from reseau.bundle.posterior import cofactors_of
+from reseau.exchange import read_bal
+from reseau.formats.network import Network1
+from reseau.optics.poses import rotation_matrix
+
+DATA = (
+    Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "networks"
+)
+SOURCE = Path(__file__).parent / "ceres" / "bundle.cc"
+# ½Σr² to be reached: that of Ceres for ladybug, the published 185.94²/2 for roma.
+LADYBUG, ROMA = 1.334433e4, 0.5 * 185.940**2
+REPEATS = 5
+
+
+def compiled_peer(folder: Path) -> Path | None:
+    if shutil.which("g++") is None or not Path("/usr/include/ceres/ceres.h").exists():
+        print("no g++ or no libceres-dev: no peer")
+        return None
+    program = folder / "bundle"
+    command = [
+        "g++",
+        "-O3",
+        "-march=native",
+        "-DNDEBUG",
+        "-I/usr/include/eigen3",
+        str(SOURCE),
+        "-o",
+        str(program),
+    ]
+    subprocess.run([*command, "-lceres", "-lglog", "-lpthread"], check=True)
+    return program
+
+
+def peer(program: Path, kind: str, network: Path, target: float) -> tuple[float, float, float, int]:
+    words = subprocess.run(
+        [program, kind, network, repr(target)], check=True, capture_output=True, text=True
+    ).stdout.split()
+    return float(words[0]), float(words[1]), float(words[2]), int(words[3])
+
+
+def ours(problem: BundleProblem, target: float) -> tuple[float, float, float, int]:
+    """Seconds to the target, seconds of the adjustment in all without its statistics, ½Σr², iterations."""
+    seen: list[tuple[float, float]] = []
+    begun = time.perf_counter()
+    watched = replace(problem, watch=lambda _, cost: seen.append((time.perf_counter() - begun, 0.5 * cost)))
+    watched.adjusted()
+    reached = next((t for t, cost in seen if cost <= target), -1.0)
+    return reached, seen[-1][0] if seen else 0.0, seen[-1][1], len(seen)
+
+
+def roma_problem() -> BundleProblem:
+    network = Network.from_document(Network1.read(DATA / "roma.network.json"))
+    return problem_of(network)[0]
+
+
+def write_shared(problem: BundleProblem, path: Path) -> None:
+    """A network of one Brown camera for the Ceres program."""
+    network, camera = problem.network, problem.network.cameras[0]
+    pitch = camera.pitch_mm[0]
+    photo = (network.xy - [(camera.width - 1) / 2, (camera.height - 1) / 2]) * [pitch, -pitch]
+    with path.open("w") as file:
+        file.write(f"{len(network.images)} {len(network.points)} {len(network.xy)}\n{pitch!r}\n")
+        file.write(" ".join(repr(float(v)) for v in camera.values[:5]) + "\n")
+        for i, j, (x, y) in zip(network.image_of, network.point_of, photo.tolist(), strict=True):
+            file.write(f"{i} {j} {x!r} {y!r}\n")
+        for row in np.hstack([network.rotation, network.x0]).tolist() + problem.start.xyz.tolist():
+            file.write(" ".join(map(repr, row)) + "\n")
+
+
+def peers() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        program = compiled_peer(folder)
+        ladybug, roma = problem_of(read_bal(DATA / "bal-ladybug-49.txt"))[0], roma_problem()
+        write_shared(roma, folder / "roma.txt")
+        cases = (
+            ("ladybug-49", "bal", DATA / "bal-ladybug-49.txt", replace(ladybug, max_iterations=60), LADYBUG),
+            ("roma", "shared", folder / "roma.txt", roma, ROMA),
+        )
+        for title, kind, file, problem, target in cases:
+            ours(replace(problem, max_iterations=2), target)
+            mine, theirs = [], []
+            for _ in range(REPEATS):
+                mine.append(ours(problem, target))
+                if program is not None:
+                    theirs.append(peer(program, kind, file, target))
+            print(f"{title}: to ½Σr² ≤ {target:.8g}")
+            said("reseau", mine)
+            if theirs:
+                said("Ceres", theirs)
+                ratio = np.median([a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
+                print(f"  ratio  {ratio:.2f}")
+
+
+def said(who: str, runs: list[tuple[float, float, float, int]]) -> None:
+    reached, whole, cost, steps = np.median(np.array(runs), axis=0)
+    print(f"  {who:6s} {reached:7.3f} s to it, {whole:.3f} s in all, ½Σr² {cost:.6f}, {steps:.0f} steps")
+
+
+def statistics() -> None:
+    fit = roma_problem().adjusted()
+    assert isinstance(fit, BundleFit)
+    chosen = fit.problem.network.datum_points
+    spent, numbers = [], []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        found = cofactors_of(fit.linear, fit.freedom, chosen, fit.usable.points)
+        spent.append(time.perf_counter() - begun)
+        begun = time.perf_counter()
+        r = fit.solution.standardise().redundancy_numbers
+        numbers.append(time.perf_counter() - begun)
+    print(f"roma: covariances of all {len(found.points)} points and image points {np.median(spent):.3f} s")
+    print(f"      redundancy numbers and tests of {len(r)} coordinates from them {np.median(numbers):.3f} s")
+    print(f"      their sum less the redundancy {r.sum() - fit.redundancy:.1e}")
+
+
+def strip(images: int, seed: int = 0) -> Network:
+    """A strip block: images in strips of twenty, points seen by three to nine of them."""
+    networks = of_the_tests("bundle/networks.py")
+    rng = np.random.default_rng(seed)
+    strips = max(2, round((images / 20) ** 0.5 * 1.5))
+    along = images // strips
+    camera = networks.camera(free=("c", "x0", "y0", "K1"))
+    row, column = np.divmod(np.arange(strips * along), along)
+    x0 = np.column_stack([1.0 * column, 1.6 * row, np.full(len(row), 4.0)])
+    x0 += rng.normal(0, 0.05, x0.shape)
+    rotation = rotation_matrix(rng.normal(0, 0.02, x0.shape)) @ np.diag([1.0, -1.0, -1.0])
+    points = 60 * len(x0)
+    xyz = rng.uniform([-1, -1, -0.3], [along, 1.6 * strips, 0.3], (points, 3))
+    image_of, point_of, seen = [], [], []
+    for i, where in enumerate(x0):
+        near = np.flatnonzero((np.abs(xyz[:, :2] - where[:2]) < 2.2).all(axis=1))
+        xy = networks.image_points(camera, rotation[i], where, xyz[near])
+        inside = (xy > 0).all(axis=1) & (xy < [639, 479]).all(axis=1)
+        image_of.append(np.full(int(inside.sum()), i))
+        point_of.append(near[inside])
+        seen.append(xy[inside])
+    sees, saw = np.concatenate(image_of), np.concatenate(point_of)
+    xy = np.concatenate(seen) + rng.normal(0, 0.1, (len(sees), 2))
+    small = networks.world(cameras=(camera,)).network
+    return replace(
+        small, images=tuple(f"i{k}" for k in range(len(x0))),
+        camera_of=np.zeros(len(x0), dtype=np.intp), x0=x0,
+        rotation=networks.matrix_to_vector(rotation), points=tuple(f"p{k}" for k in range(points)),
+        xyz=np.full((points, 3), np.nan), sigma=np.full((points, 3), np.nan), role=("tie",) * points,
+        image_of=sees, point_of=saw, xy=xy, cov=np.tile(np.eye(2) * 0.01, (len(xy), 1, 1)), datum="free",
+        datum_points=np.ones(points, dtype=bool), groups=(None,) * len(x0), files=(None,) * len(x0),
+    )  # fmt: skip
+
+
+def growth() -> None:
+    first = None
+    for images in (60, 600, 2000):
+        network = strip(images)
+        problem, _ = problem_of(network)
+        begun, seen = time.perf_counter(), []
+        watched = replace(problem, watch=lambda *_, seen=seen: seen.append(time.perf_counter()))
+        fit = watched.adjusted()
+        total, n = time.perf_counter() - begun, 2 * len(network.xy)
+        assert isinstance(fit, BundleFit), fit
+        adjusting = seen[-1] - begun
+        per = 1e6 * adjusting / n
+        first = first or per
+        rays = network.rays[network.rays > 1]
+        status = Path("/proc/self/status").read_text().splitlines()
+        memory = max(int(line.split()[1]) for line in status if "VmHWM" in line) / 2**20
+        off = fit.redundancy_numbers.sum() - fit.redundancy
+        print(
+            f"{len(network.images):5d} images, {n} coordinates, {rays.mean():.1f} rays: adjusted "
+            f"{adjusting:.2f} s, {per:.1f} µs each ({per / first:.2f}), with all statistics {total:.1f} s, "
+            f"{memory:.2f} GiB, Σr − r = {off:.1e}"
+        )
+
+
+def cover() -> None:
+    """Normalised errors of 400 simulated networks: variances should be one."""
+    networks = of_the_tests("bundle/networks.py")
+    for datum in ("control", "free"):
+        world = networks.world(datum=datum, control=5 if datum == "control" else 0)
+        table = []
+        for seed in range(400):
+            fit = world.problem(world.noisy(seed)).adjusted()
+            assert isinstance(fit, BundleFit)
+            table.append(networks.normalised_errors(world, fit))
+        for name in table[0]:
+            squares = np.array([row[name] for row in table])
+            mean, sigma = squares.mean(), squares.std() / 20
+            print(f"{datum:8s} {name:8s} mean square of normalised errors {mean:.3f} ± {sigma:.3f}")
+
+
+def main() -> int:
+    parts = {"peers": peers, "statistics": statistics, "growth": growth, "cover": cover}
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", choices=parts)
+    chosen = parser.parse_args().part
+    for name, part in parts.items():
+        if chosen in (None, name):
+            part()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

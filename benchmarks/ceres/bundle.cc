@@ -1,0 +1,126 @@
+// The two networks of the benchmark adjusted by Ceres: time to the cost asked for, and to its own convergence.
+//
+//   bundle bal NETWORK COST      BAL file; each image has f, k1, k2 of its own
+//   bundle shared NETWORK COST   one camera c, x0, y0, K1, K2 (image side) for all, as benchmarks/bundle.py writes it
+//
+// Prints: seconds until half the sum of squares is at most COST, seconds in all, final cost, iterations.
+#include <ceres/ceres.h>
+#include <ceres/rotation.h>
+
+#include <chrono>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <string>
+#include <vector>
+
+namespace {
+
+struct BalResidual {
+  BalResidual(double x, double y) : x(x), y(y) {}
+  template <typename T>
+  bool operator()(const T* camera, const T* point, T* residual) const {
+    T p[3];
+    ceres::AngleAxisRotatePoint(camera, point, p);
+    for (int i = 0; i < 3; ++i) p[i] += camera[3 + i];
+    const T u = -p[0] / p[2], v = -p[1] / p[2], s = u * u + v * v;
+    const T scale = camera[6] * (1.0 + s * (camera[7] + s * camera[8]));
+    residual[0] = scale * u - x;
+    residual[1] = scale * v - y;
+    return true;
+  }
+  double x, y;
+};
+
+struct SharedResidual {
+  SharedResidual(double x, double y, double pitch) : x(x), y(y), pitch(pitch) {}
+  template <typename T>
+  bool operator()(const T* interior, const T* pose, const T* point, T* residual) const {
+    T d[3], p[3];
+    for (int i = 0; i < 3; ++i) d[i] = point[i] - pose[3 + i];
+    ceres::AngleAxisRotatePoint(pose, d, p);
+    const T xm = T(x) - interior[1], ym = T(y) - interior[2], s = xm * xm + ym * ym;
+    const T bent = 1.0 + s * (interior[3] + s * interior[4]);
+    residual[0] = (interior[0] * p[0] / p[2] - xm * bent) / pitch;
+    residual[1] = (-interior[0] * p[1] / p[2] - ym * bent) / pitch;
+    return true;
+  }
+  double x, y, pitch;
+};
+
+class Watch : public ceres::IterationCallback {
+ public:
+  explicit Watch(double target) : target(target), begun(std::chrono::steady_clock::now()) {}
+  ceres::CallbackReturnType operator()(const ceres::IterationSummary& summary) override {
+    if (reached < 0 && summary.cost <= target) reached = seconds();
+    return ceres::SOLVER_CONTINUE;
+  }
+  double seconds() const {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
+  }
+  double target, reached = -1;
+
+ private:
+  std::chrono::steady_clock::time_point begun;
+};
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc != 4) return 2;
+  const std::string kind = argv[1];
+  std::ifstream file(argv[2]);
+  int images, points, observations;
+  double pitch = 1;
+  file >> images >> points >> observations;
+  std::vector<double> interior(5);
+  if (kind == "shared") {
+    file >> pitch;
+    for (double& value : interior) file >> value;
+  }
+  std::vector<int> image(observations), point(observations);
+  std::vector<double> x(observations), y(observations);
+  for (int k = 0; k < observations; ++k) file >> image[k] >> point[k] >> x[k] >> y[k];
+  const int width = kind == "shared" ? 6 : 9;
+  std::vector<double> cameras(width * images), xyz(3 * points);
+  for (double& value : cameras) file >> value;
+  for (double& value : xyz) file >> value;
+  if (!file) return 3;
+
+  const auto begun = std::chrono::steady_clock::now();
+  ceres::Problem problem;
+  auto ordering = std::make_shared<ceres::ParameterBlockOrdering>();
+  for (int k = 0; k < observations; ++k) {
+    double* camera = &cameras[width * image[k]];
+    double* where = &xyz[3 * point[k]];
+    if (kind == "shared") {
+      problem.AddResidualBlock(
+          new ceres::AutoDiffCostFunction<SharedResidual, 2, 5, 6, 3>(new SharedResidual(x[k], y[k], pitch)),
+          nullptr, interior.data(), camera, where);
+    } else {
+      problem.AddResidualBlock(
+          new ceres::AutoDiffCostFunction<BalResidual, 2, 9, 3>(new BalResidual(x[k], y[k])), nullptr, camera,
+          where);
+    }
+  }
+  for (int j = 0; j < points; ++j)
+    if (problem.HasParameterBlock(&xyz[3 * j])) ordering->AddElementToGroup(&xyz[3 * j], 0);
+  for (int i = 0; i < images; ++i)
+    if (problem.HasParameterBlock(&cameras[width * i])) ordering->AddElementToGroup(&cameras[width * i], 1);
+  if (kind == "shared") ordering->AddElementToGroup(interior.data(), 1);
+  const double built = std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
+
+  ceres::Solver::Options options;
+  options.linear_solver_type = ceres::DENSE_SCHUR;
+  options.linear_solver_ordering = ordering;
+  options.num_threads = 2;
+  options.max_num_iterations = 200;
+  options.function_tolerance = 1e-6;
+  Watch watch(std::atof(argv[3]));
+  options.callbacks.push_back(&watch);
+  ceres::Solver::Summary summary;
+  ceres::Solve(options, &problem, &summary);
+  std::printf("%.6f %.6f %.10g %zu %.6f\n", watch.reached, watch.seconds(), summary.final_cost,
+              summary.iterations.size() - 1, built);
+  return 0;
+}
