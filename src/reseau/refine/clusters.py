@@ -31,8 +31,9 @@ _ALIKE = 0.06
 """Relative difference of local frames below which one set of formed images serves for both."""
 _SHIFT_PX = 0.4
 """Standard deviation of what a target is off the place where the lines have it."""
-_UNLIKE = 4.0
-"""Times the ordinary noise from which on a target is none of the design's."""
+_UNLIKE, _UNEXPLAINED = 4.0, 0.3
+"""A target is none of the design's where more is left than so many times the ordinary noise, and than this
+part of what is seen."""
 _WIDTH_PX = 0.2
 """How well the width of the point-spread function must be known for targets to be told apart."""
 _FAINT = 0.3
@@ -147,7 +148,7 @@ def read_clusters(
         if abs(better - psf_px) < _WIDTH_PX:
             break
         psf_px = better
-    alone, joint = work.classified(found.cost)
+    alone, joint = work.classified(found)
     code = TopologicalCode.of(design)
     decoded = tuple(code.decode(symbols) for symbols in joint)
     level, contrast = (np.where(joint == HIDDEN, np.nan, values) for values in (found.level, found.contrast))
@@ -156,9 +157,11 @@ def read_clusters(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Minus log-likelihoods (s, 16, 8) of the symbols; level and contrast (s, 16); change of width wanted."""
+    """Minus log-likelihoods (s, 16, 8) of the symbols, and of none of them (s, 16); level and contrast
+    (s, 16); change of width wanted."""
 
     cost: Array
+    none: Array
     level: Array
     contrast: Array
     widening: float
@@ -219,18 +222,21 @@ class _Clusters:
         cost[amplitude < _FAINT * ordinary] = np.inf
         by_symbol = [cost[..., self.kinds.symbol == symbol].min(axis=2) for symbol in range(8)]
         widening = float(np.median((wider / np.where(contrast == 0, np.inf, contrast))[self.visible]))
-        return _Comparison(np.stack(by_symbol, axis=2), level, np.abs(contrast), widening)
+        left = np.maximum(_UNLIKE, _UNEXPLAINED * self.seen.var(axis=2) / noise)
+        none = 0.5 * pixels[self.group][:, None] * left
+        return _Comparison(np.stack(by_symbol, axis=2), none, level, np.abs(contrast), widening)
 
-    def classified(self, cost: Array) -> tuple[Rows, Rows]:
+    def classified(self, found: _Comparison) -> tuple[Rows, Rows]:
         """Symbols (s, 16) of the targets, each by itself, and all of a cluster together."""
-        limit = 0.5 * self.own.sum(axis=1)[self.group] * _UNLIKE
-        cost = np.where(self.visible[..., None], cost, np.inf)
-        cost = np.minimum(cost, 1e6 * limit[:, None, None])
-        alone = np.where(cost.min(axis=2) < limit[:, None], cost.argmin(axis=2), HIDDEN)
+        cost = np.where(self.visible[..., None], found.cost, np.inf)
+        cost = np.minimum(cost, 1e6 * found.none.max())
+        alone = np.where(cost.min(axis=2) < found.none, cost.argmin(axis=2), HIDDEN)
         joint = np.full(alone.shape, HIDDEN)
         for square, each in enumerate(cost):
             # Every symbol twice, or none of them.
-            choices = np.concatenate([np.repeat(each, 2, axis=1), np.full((16, 16), limit[square])], axis=1)
+            choices = np.concatenate(
+                [np.repeat(each, 2, axis=1), np.repeat(found.none[square, :, None], 16, axis=1)], axis=1
+            )
             row, column = linear_sum_assignment(choices)
             joint[square, row] = np.where(column < 16, column // 2, HIDDEN)
         return alone, joint

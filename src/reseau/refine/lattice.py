@@ -9,11 +9,12 @@ n the distance :math:`n^T(F(s) - p)` is observed, s being the point of its line 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..adjust import BatchOptions, adjust_batch, weight_function
 from ..data import Array, Rows
@@ -21,6 +22,7 @@ from ..optics import Chain, PlaneMapping, RationalPolynomial
 from ..optics.newton import solve_2x2
 from .field import trend_degree
 from .lines import Lattice, Ridges
+from .profiles import crossings, located
 
 __all__ = ["LatticeFit", "fit_lattice", "lattices", "refit", "second_order"]
 
@@ -55,7 +57,7 @@ class LatticeFit:
     across, along : ndarray of int (a,), (b,)
         Numbers of the lines there are.
     rms_px : float
-        Of the distances of ridge points from their lines.
+        Of the distances of points, measured in single rows and columns, from their lines.
     points : int
         Their number.
     """
@@ -90,11 +92,26 @@ def second_order(mapping: PlaneMapping, at: Array) -> tuple[Array, Array, Array]
     return middle, slope, bend / step**2
 
 
-def lattices(ridges: Ridges, found: Lattice) -> Iterator[LatticeFit]:
-    """Lattices adjusted to the ridge points, the likeliest first.
+def lattices(
+    grey: NDArray[np.float32], ridges: Ridges, found: Lattice, width: float, blur: float
+) -> Iterator[LatticeFit]:
+    """Lattices adjusted to the lines of a frame, the likeliest first.
 
     Every second or third line only may have been found, the others being hidden or faint: then there are
     lines between them, or the numbering does not fit what the squares are read as.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w)
+        Grey values, the lines dark.
+    ridges : Ridges
+        Its ridge points.
+    found : Lattice
+        The lines found.
+    width : float
+        Of the lines, in steps of the lattice.
+    blur : float
+        Width (one sigma) of a blurred edge in pixels, about.
     """
     parts = (1, 2, 3)
     likely = [max(parts, key=lambda n: n * _between(ridges, found, axis, n)) for axis in (0, 1)]
@@ -104,7 +121,7 @@ def lattices(ridges: Ridges, found: Lattice) -> Iterator[LatticeFit]:
         lattice = Lattice(found.homography * scale, found.across * pair[0], found.along * pair[1])
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
-            yield fit
+            yield _sharpened(fit, grey, width, blur)
 
 
 def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
@@ -149,8 +166,37 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         numbers[k] = _lines(mapping, ridges, at[axis == k][:, k], k, numbers[1 - k])
         if len(numbers[k]) < 2:
             return None
-    rms = float(np.sqrt((residuals**2).mean()))
-    return LatticeFit(mapping, numbers[0], numbers[1], rms, len(residuals))
+    return LatticeFit(mapping, numbers[0], numbers[1], _rms(residuals), len(residuals))
+
+
+def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
+    """The lattice adjusted to the profiles of its lines, which are an order better than ridge points."""
+    xy, normal, at = [], [], []
+    for axis, (numbers, others) in enumerate(((fit.across, fit.along), (fit.along, fit.across))):
+        along = np.linspace(others.min(), others.max(), 2 * max(grey.shape))
+        for number in numbers:
+            on = np.full((len(along), 2), float(number))
+            on[:, 1 - axis] = along
+            line = crossings(fit.mapping(on), along, grey.shape)
+            if line is None:
+                continue
+            on = np.full((len(line.along), 2), float(number))
+            on[:, 1 - axis] = line.along
+            across = _slope(fit.mapping, on)[:, :, axis]
+            shift, told = located(grey, line, 0.5 * width * np.abs((across * line.normal).sum(axis=1)), blur)
+            xy.append(line.xy(shift)[told])
+            normal.append(line.normal[told])
+            at.append(on[told])
+    points = [np.concatenate(column) for column in (xy, normal, at)]
+    if len(points[0]) < _LEAST_POINTS:
+        return fit
+    degree = min(max(min(len(fit.across), len(fit.along)) - 1, 1), _DEGREE)
+    mapping, residuals = _adjusted(fit.mapping, degree, *points)
+    return replace(fit, mapping=mapping, rms_px=_rms(residuals), points=len(residuals))
+
+
+def _rms(residuals: Array) -> float:
+    return float(np.sqrt((residuals**2).mean()))
 
 
 def _start(lattice: Lattice, shape: tuple[int, ...]) -> Chain:

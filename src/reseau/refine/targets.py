@@ -21,6 +21,7 @@ from ..optics.formation import Outline, PixelResponse
 from ..optics.targets import target_outline
 from .lattice import second_order
 from .matching import SIZE, Matches, MatchOptions, match
+from .profiles import blur_of, crossings, strip
 from .shapes import GrownOutline, Window
 
 __all__ = ["Light", "Scene", "TargetImages", "match_targets", "merged"]
@@ -303,63 +304,38 @@ class _Canvas:
 
 
 def _line_light(scene: Scene) -> Array:
-    """Grey values that the lines take or add, (h, w).
-
-    Across a line the image is that of a strip; along it nothing changes but slowly.
-    """
+    """Grey values that the lines take or add, (h, w)."""
     h, w = scene.grey.shape
-    lines = scene.design.lines
+    lines, free = scene.design.lines, np.ones((h, w))
     x0, y0, x1, y1 = lines.extent
-    free = np.ones((h, w))
-    count = 2 * max(h, w)
+    blur, count = blur_of(scene.psf_px, scene.response), 2 * max(h, w)
+    reach = int(4 * blur + 3)
     for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
-        ends = (y0, y1) if axis == 0 else (x0, x1)
-        for place in places:
-            on = np.full((count, 2), place)
-            on[:, 1 - axis] = np.linspace(*ends, count)
-            xy = scene.mapping(scene.lattice(on))
-            if not ((xy > -5) & (xy < [w + 5, h + 5])).all(axis=1).any():
+        along = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
+        on = np.empty((len(places), 2, count, 2))
+        on[..., 1 - axis] = along
+        on[..., axis] = np.array(places)[:, None, None] + np.array([0.0, lines.width])[:, None]
+        images = scene.mapping(scene.lattice(on.reshape(-1, 2))).reshape(on.shape)
+        for middle, beside in images:
+            line = crossings(middle, np.arange(count, dtype=float), (h, w), 4 * blur)
+            if (
+                line is None
+                or not ((line.place > -reach) & (line.place < (w, h)[1 - line.axis] + reach)).any()
+            ):
                 continue
-            across = np.zeros(2)
-            across[axis] = lines.width
-            end = scene.mapping(scene.lattice(on + across))
-            free *= 1 - _strip(xy, end - xy, scene, (h, w))
+            width = (beside - middle)[line.along.astype(np.intp)]
+            half = 0.5 * np.abs((width * line.normal).sum(axis=1))
+            row, column, distance = line.around(reach)
+            share = strip(distance, half[:, None], blur)
+            # Its ends are blurred likewise.
+            ends = np.sort(middle[[0, -1], line.axis])
+            share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
+            keep = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+            free[row[keep], column[keep]] *= 1 - share[keep]
     rows, columns = np.indices((h, w))
     amplitude = scene.light.at(np.stack([columns.ravel(), rows.ravel()], axis=1))[1].reshape(h, w)
     taken: Array = amplitude * (1 - free)
     return taken
-
-
-def _strip(xy: Array, across: Array, scene: Scene, shape: tuple[int, int]) -> Array:
-    """Share of the pixels (h, w) on which a narrow line falls."""
-    share = np.zeros(shape)
-    way = np.diff(xy, axis=0, append=2 * xy[-1:] - xy[-2:-1])
-    # Seen from its steeper side: the line as a function of the rows or of the columns.
-    steep = np.abs(way[:, 1]).sum() > np.abs(way[:, 0]).sum()
-    main, other = (1, 0) if steep else (0, 1)
-    order = np.argsort(xy[:, main], kind="stable")
-    # A pixel's square has its variance in whatever direction.
-    sigma = np.hypot(scene.psf_px, scene.response.fill / np.sqrt(12))
-    first, last = xy[order[0], main], xy[order[-1], main]
-    steps = np.arange(max(0, np.ceil(first - 4 * sigma)), min(shape[1 - main], last + 4 * sigma))
-    if not len(steps):
-        return share
-    middle = np.interp(steps, xy[order, main], xy[order, other])
-    normal = np.stack([-way[:, 1], way[:, 0]], axis=1)
-    normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
-    cosine = np.interp(steps, xy[order, main], np.abs(normal[order, other]))
-    width = np.interp(steps, xy[order, main], np.abs((across * normal).sum(axis=1))[order])
-    reach = np.arange(-int(4 * scene.psf_px + 3), int(4 * scene.psf_px + 3) + 1)
-    beside = np.rint(middle)[:, None] + reach
-    distance = (beside - middle[:, None]) * cosine[:, None]
-    half = width[:, None] / 2
-    seen = ndtr((distance + half) / sigma) - ndtr((distance - half) / sigma)
-    seen *= (ndtr((steps - first) / sigma) * ndtr((last - steps) / sigma))[:, None]
-    keep = (beside >= 0) & (beside < shape[main])
-    along = np.broadcast_to(steps[:, None], beside.shape)[keep].astype(np.intp)
-    at = beside[keep].astype(np.intp)
-    share[(along, at) if steep else (at, along)] = seen[keep]
-    return share
 
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:

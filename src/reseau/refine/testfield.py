@@ -20,6 +20,7 @@ from .clusters import Placement, Reading, locate, read_clusters
 from .lattice import LatticeFit, lattices, refit, second_order
 from .lines import find_lattice, ridge_points
 from .matching import Matches
+from .profiles import blur_of
 from .screening import quiet_noise, screen
 from .targets import Light, Scene, match_targets, merged
 
@@ -176,7 +177,8 @@ def measure_testfield(
         return Failure(f"{frame.name}: {found.reason}")
     response = PixelResponse(options.fill)
     why = ""
-    for lattice in lattices(ridges, found):
+    width, blur = design.lines.width / design.pitch, blur_of(options.psf_px, response)
+    for lattice in lattices(grey, ridges, found, width, blur):
         reading = read_clusters(screened.grey, lattice, design, options.psf_px, response)
         placed = reading if isinstance(reading, Failure) else locate(reading, design)
         if isinstance(placed, Placement) and isinstance(reading, Reading):

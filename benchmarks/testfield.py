@@ -1,0 +1,258 @@
+"""The coded testfield: lines, recognition and precision in the paper's recordings, against known truth.
+
+Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--workers N]``. The 36 recordings of
+Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured. The bound
+is that of Cramér and Rao with position, sharpness, contrast, ground (level and slopes) and size unknown,
+under all noise that was simulated, row jitter included. The figures are of the 256 targets of the central
+4 × 4 squares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from shared import of_the_tests
+
+from reseau.data import Array, Frame
+from reseau.designs import HIDDEN, coded_testfield
+from reseau.formats import SHAPES
+from reseau.refine import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau_sims import FieldBench, Station, paper_stations
+from reseau_sims.testfield import JITTER_PX
+
+DESIGN = coded_testfield()
+OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
+CENTRAL = np.abs(DESIGN.xy).max(axis=1) < 250
+PAPER = {
+    ("square", False): 0.040,
+    ("triangle", False): 0.056,
+    ("cross", False): 0.044,
+    ("circle", False): 0.041,
+    ("square", True): 0.034,
+    ("triangle", True): 0.050,
+    ("cross", True): 0.030,
+    ("circle", True): 0.033,
+}
+
+
+@dataclass
+class Recording:
+    """A recording as it was measured, with its truth."""
+
+    station: Station
+    frame: Frame
+    result: TestfieldResult
+    error: Array
+    bound: Array
+    truth: Any
+
+
+def measure(frame: Frame) -> Any:
+    return measure_testfield(frame, DESIGN, OPTIONS)
+
+
+def recordings(fields: ModuleType, seed: int, tilts: tuple[float, ...]) -> Iterator[Recording]:
+    """Simulated, measured one after the other."""
+    bench = FieldBench(seed=seed)
+    for station in paper_stations(tilts):
+        frame, truth = bench.record(station), bench.truth(station)
+        result = measure(frame)
+        assert result, result.reason
+        bound = fields.bounds(bench, station, result.ok & CENTRAL)
+        yield Recording(station, frame, result, result.xy - truth.xy, bound, truth)
+
+
+def lines(recording: Recording) -> Array:
+    """How far lines are off the truth, across, at points 15 mm apart between the outermost ones found."""
+    lattice = recording.result.lattice
+    found = []
+    for axis, (numbers, others) in enumerate(
+        ((lattice.across, lattice.along), (lattice.along, lattice.across))
+    ):
+        for number in numbers:
+            at = np.full((8 * int(np.ptp(others)) + 1, 2), float(number))
+            at[:, 1 - axis] = np.linspace(others.min(), others.max(), len(at))
+            xy = lattice.mapping(at)
+            inside = ((xy > 0) & (xy < 239)).all(axis=1)
+            found.append(true_distance(recording, xy[inside]))
+    return np.concatenate(found)
+
+
+def true_distance(recording: Recording, xy: Array) -> Array:
+    """Distance (n,) in the image of points from the nearest true line."""
+    # Points of the board under the image points, by Newton's method from the nearest targets.
+    near = np.argmin(np.hypot(*(xy[:, None] - recording.truth.xy).transpose(2, 0, 1)), axis=1)
+    board = DESIGN.xy[near].copy()
+    for _ in range(8):
+        seen, slope = recording.truth.view(board)
+        board += np.linalg.solve(slope, (xy - seen)[..., None])[..., 0]
+    off = board - np.rint(board / DESIGN.pitch) * DESIGN.pitch
+    axis = np.abs(off).argmin(axis=1)
+    rows = np.arange(len(xy))
+    gradient = np.linalg.inv(slope)[rows, axis]
+    return np.asarray(off[rows, axis] / np.hypot(*gradient.T))
+
+
+def misread(recording: Recording, contours: bool = False) -> Array:
+    """Targets of the central squares taken for something else: alone, in their cluster, by contours (3,)."""
+    reading = recording.result.reading
+    places = reading.xy.reshape(-1, 2)
+    distance = np.hypot(*(places[:, None] - recording.truth.xy[CENTRAL]).transpose(2, 0, 1))
+    near = distance.argmin(axis=1)
+    true = np.where(distance.min(axis=1) < 3, DESIGN.symbols[CENTRAL][near], HIDDEN).reshape(-1, 16)
+    counts = [((taken != true) & (true != HIDDEN)).sum() for taken in (reading.alone, reading.joint)]
+    if not contours:
+        return np.array([*counts, 0])
+    by_contour = np.array([by_contours(recording.frame, each) for each in reading.xy])
+    return np.array([*counts, ((by_contour != true) & (true != HIDDEN)).sum()])
+
+
+def by_contours(frame: Frame, xy: Array) -> Array:
+    """Symbols (16,) of a cluster by the contours of its targets, four times enlarged: what is compared with.
+
+    Large and small by the area, and two of each shape among those of a size, by the area of the contour over
+    those of its hull, of its least rectangle and of its least triangle.
+    """
+    features, areas = np.zeros((16, 3)), np.zeros(16)
+    for k, at in enumerate(xy):
+        patch = cv2.getRectSubPix(frame.pixels, (15, 15), (float(at[0]), float(at[1])))
+        patch = cv2.resize(patch, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        middle = (float(patch[24:36, 24:36].min()) + float(np.percentile(patch, 90))) / 2
+        parts, labels, stats, _ = cv2.connectedComponentsWithStats((patch < middle).astype(np.uint8))
+        part = labels[30, 30] or (1 + stats[1:, cv2.CC_STAT_AREA].argmax() if parts > 1 else 0)
+        found, _ = cv2.findContours(
+            (labels == part).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        contour = max(found, key=cv2.contourArea)
+        areas[k] = cv2.contourArea(contour)
+        hull = cv2.convexHull(contour)
+        (_, (a, b), _), (triangle, _) = cv2.minAreaRect(contour), cv2.minEnclosingTriangle(contour)
+        features[k] = areas[k] / np.maximum([cv2.contourArea(hull), a * b, triangle], 1.0)
+    symbols = np.zeros(16, dtype=int)
+    order = np.argsort(areas)
+    # Squares, triangles, crosses, circles, blurred.
+    ideal = np.array([[1.0, 0.95, 0.55], [0.97, 0.58, 0.88], [0.82, 0.68, 0.5], [1.0, 0.8, 0.62]])
+    for large, rows in ((0, order[:8]), (1, order[8:])):
+        cost = ((features[rows][:, None] - np.repeat(ideal, 2, axis=0)) ** 2).sum(axis=2)
+        row, column = linear_sum_assignment(cost)
+        symbols[rows[row]] = 2 * (column // 2) + large
+    return symbols
+
+
+def binary_centroids(recording: Recording) -> Array:
+    """Errors (n, 2) of the centroids of the targets in the binary image, enlarged by two as in the paper."""
+    frame, result = recording.frame, recording.result
+    error = np.full(result.xy.shape, np.nan)
+    twice = cv2.resize(frame.pixels, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    _, labels, stats, centres = cv2.connectedComponentsWithStats((twice < 115).astype(np.uint8))
+    for k in np.flatnonzero(result.ok & CENTRAL):
+        # A pixel's centre x lies at 2x + 0.5 of the enlarged image.
+        x, y = np.rint(2 * result.xy[k] + 0.5).astype(int)
+        part = labels[y, x]
+        if part and stats[part, cv2.CC_STAT_AREA] < 1000:
+            error[k] = (centres[part] - 0.5) / 2 - recording.truth.xy[k]
+    return error
+
+
+def table(done: list[Recording]) -> bool:
+    """Print rms against the bound for each kind of target; whether all keep to what is required."""
+    error = np.stack([r.error[CENTRAL] for r in done])
+    bound = np.stack([np.diagonal(r.bound[CENTRAL], axis1=1, axis2=2) for r in done])
+    cov = np.stack([np.diagonal(r.result.cov[CENTRAL], axis1=1, axis2=2) for r in done])
+    shape, large = np.array(DESIGN.targets.shape)[CENTRAL], DESIGN.large[CENTRAL]
+    binary = np.stack([binary_centroids(r)[CENTRAL] for r in done])
+    print(
+        f"\n{'targets':<16} {'number':>6} {'paper px':>9} {'rms x/y px':>15} {'rms/bound x/y':>14} "
+        f"{'all':>6} {'predicted/empirical':>20} {'bias x/y 1e-3 px':>17} {'binary/matching':>16}"
+    )
+    kept = True
+    for big in (True, False):
+        for name in SHAPES:
+            of = (shape == name) & (large == big)
+            e, b, c, n = error[:, of], bound[:, of], cov[:, of], binary[:, of]
+            measured = np.isfinite(e[..., 0])
+            e, b, c = e[measured], b[measured], c[measured]
+            rms, least = np.sqrt((e**2).mean(axis=0)), np.sqrt(b.mean(axis=0))
+            ratio = float(np.sqrt((e**2).mean() / b.mean()))
+            predicted = float(np.sqrt(c.mean() / (e**2).mean()))
+            coarse = np.sqrt(np.nanmean(n**2) / (e**2).mean())
+            good = ratio <= (1.15 if big else 1.2) and 0.9 <= predicted <= 1.1
+            kept &= good
+            bias = 1e3 * e.mean(axis=0)
+            print(
+                f"{('large ' if big else 'small ') + name:<16} {len(e):>6} {PAPER[name, big]:>9.3f} "
+                f"{rms[0]:>7.4f}/{rms[1]:.4f} {rms[0] / least[0]:>8.3f}/{rms[1] / least[1]:.3f} "
+                f"{ratio:>6.3f} {predicted:>20.3f} {bias[0]:>10.2f}/{bias[1]:.2f} {coarse:>16.1f}  "
+                f"{'ok' if good else 'MISSED'}"
+            )
+    return kept
+
+
+def counts(label: str, done: list[Recording]) -> bool:
+    """Print what was found and what was taken for something else."""
+    wrong = sum(misread(r, contours=True) for r in done)
+    expected = [r.truth for r in done]
+    inside = sum(int((CENTRAL & ((t.xy > 8) & (t.xy < 231)).all(axis=1)).sum()) for t in expected)
+    measured = sum(int((r.result.ok & CENTRAL).sum()) for r in done)
+    every = sum(r.result.found for r in done)
+    misnumbered = sum(int((np.hypot(*r.error.T) > 1.0).sum()) for r in done)
+    off = np.concatenate([lines(r) for r in done])
+    worst = max(float(np.sqrt((lines(r) ** 2).mean())) for r in done)
+    print(f"\n{label}: {len(done)} recordings")
+    print(f"  lines: rms {np.sqrt((off**2).mean()):.4f} px off the truth, worst recording {worst:.4f} px")
+    print(f"  central targets in the frames {inside}, measured {measured}; targets measured in all {every}")
+    print(
+        f"  misclassified: alone {wrong[0]}, in their cluster {wrong[1]} (by contours {wrong[2]}); "
+        f"misnumbered {misnumbered}"
+    )
+    return worst <= 0.03 and wrong[1] == 0 and misnumbered == 0
+
+
+def speed(done: list[Recording], workers: int) -> None:
+    """Print the time for an image and for all."""
+    frames = [r.frame for r in done]
+    processor, wall = [], []
+    for frame in frames:
+        cpu, clock = time.process_time(), time.perf_counter()
+        measure(frame)
+        processor.append(time.process_time() - cpu)
+        wall.append(time.perf_counter() - clock)
+    print(
+        f"\ntime for one image: processor median {np.median(processor) * 1e3:.0f} ms, least "
+        f"{min(processor) * 1e3:.0f} ms; wall median {np.median(wall) * 1e3:.0f} ms"
+    )
+    with ProcessPoolExecutor(workers) as pool:
+        list(pool.map(measure, frames[: 2 * workers]))  # the workers have started
+        clock = time.perf_counter()
+        list(pool.map(measure, frames))
+        print(f"all {len(frames)} images with {workers} processes: {time.perf_counter() - clock:.2f} s wall")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=1, help="sets of recordings")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    fields = of_the_tests("refine/fields.py")
+    paper = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (0.0, 30.0, 45.0))]
+    steep = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (60.0,))]
+    kept = [counts("φ = 0, 30, 45°", paper), counts("φ = 60°", steep)]
+    kept.append(table(paper))
+    print("\nφ = 60°:", end="")
+    kept.append(table(steep))
+    speed(paper[:36], arguments.workers)
+    return 0 if all(kept) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
