@@ -110,3 +110,13 @@ def test_models_of_a_file_that_are_none_are_refused() -> None:
     for content in ({}, {"terms": {"k": "x"}}, {"terms": {"k": {"Q": "x"}}}, {"terms": {}, "more": 1}):
         with pytest.raises(FormatError):
             RationalPolynomial.from_dict(content)
+
+
+def test_a_model_split_into_its_monomials_is_the_same_mapping_with_more_parameters():
+    rng = np.random.default_rng(4)
+    whole = RationalPolynomial.ultrasonic()
+    whole = whole.with_values(whole.values + rng.normal(0, 1e-4, len(whole.names)))
+    split, points = whole.split(), rng.uniform(-5, 5, (50, 2))
+    assert np.abs(split(points) - whole(points)).max() < 1e-12
+    assert len(split.names) == 22
+    assert {"A0", "A6.x3", "A6.xy2", "A7.x4", "A7.2x2y2", "A7.y4", "B6.yx2"} <= set(split.names)

@@ -75,6 +75,9 @@ def test_coefficients_that_are_not_there_are_dropped_from_the_reduced_model_and_
     dropped = set(found.fit.elimination.dropped)
     assert dropped
     assert dropped.isdisjoint({"A0", "A1", "A2", "B0", "B1", "B2"})
+    # The paper's reduced model tells monomials apart, as A6·x³ and A6·xy².
+    assert found.fit.monomials.full.names == INSTRUMENT.split().names
+    assert len(found.fit.monomials.dropped) > len(dropped)
     # What is applied has them all, with their covariance.
     assert found.model.names == INSTRUMENT.names
     assert found.covariance.shape == (len(camera.model.names) + len(INSTRUMENT.names),) * 2

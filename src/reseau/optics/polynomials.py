@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping as Named
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
@@ -273,6 +273,21 @@ class RationalPolynomial(PlaneMapping):
     ) -> RationalPolynomial:
         """Any model from its table of terms; values by name, the others zero. Options as of the class."""
         return RationalPolynomial(terms, **options).with_values(values or {})
+
+    def split(self) -> RationalPolynomial:
+        """The model with a parameter for every monomial, as ``A6.x3`` and ``A6.xy2`` for ``A6``."""
+        terms: dict[str, dict[str, str]] = {}
+        values = []
+        for (name, sums), value in zip(self.terms.items(), self.values, strict=True):
+            parts = [
+                (part, text.strip())
+                for part, whole in sums.items()
+                for text in whole.replace("-", "+-").split("+")
+            ]
+            for part, text in parts:
+                terms[name if len(parts) == 1 else f"{name}.{text}"] = {part: text}
+                values.append(value)
+        return replace(self, terms=terms, values=np.array(values))
 
     @classmethod
     def projective(cls) -> RationalPolynomial:

@@ -18,63 +18,24 @@ from ..calibration import Calibration, Covariance, Quantity
 from ..data import Array, ImagePoints
 from ..errors import FormatError, UsageError
 from ..formats import ReseauDesign, ReseauMeasurement
-from ..optics import RationalPolynomial, Similarity, wong_display
+from ..optics import RationalPolynomial, wong_display
 from ..provenance import canonical_json
 from .correction import (
     CameraCorrection,
-    defining_marks,
     system_from_dict,
     system_to_dict,
     unit_of,
     with_stored_values,
 )
 from .field import SmoothField
-from .fitting import carried, is_mirrored, reduce_mapping, residual_field, tests_of
+from .fitting import carried, reduce_mapping, residual_field, tests_of
+from .plane import ObjectPlane, object_plane
 from .rivals import Rivalry, rivals
 
-__all__ = ["InstrumentCorrection", "InstrumentFit", "ObjectPlane", "correct_instrument"]
+__all__ = ["InstrumentCorrection", "InstrumentFit", "correct_instrument"]
 
 _DATUM = ("A0", "A1", "A2", "B0", "B1", "B2")
 """Coefficients that take up the errors of M, N and the scales by which the systems are joined: they stay."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectPlane:
-    """Coordinates of the test object and the common system.
-
-    Parameters
-    ----------
-    axes : Similarity
-        Object coordinates into the system of the rods M (origin) and N (on the axis), unscaled.
-    scale : ndarray (2,)
-        λ1 and λ2: of the photograph along that axis and across it.
-    system : Similarity
-        The scaled system into the common one: M onto its image M', N onto N'.
-    """
-
-    axes: Similarity
-    scale: Array
-    system: Similarity
-
-    def to_common(self, xy: Array) -> Array:
-        """Object coordinates (n, 2) in the common system."""
-        return self.system(self.axes(xy) * self.scale)
-
-    def from_common(self, xy: Array) -> Array:
-        """Coordinates of the common system (n, 2) as object coordinates."""
-        return self.axes.inverse(self.system.inverse(xy) / self.scale)
-
-    @property
-    def slope(self) -> Array:
-        """Derivatives of `from_common`, (2, 2); the same everywhere."""
-        ends = self.from_common(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-        return np.stack([ends[1] - ends[0], ends[2] - ends[0]], axis=1)
-
-    @property
-    def rotation(self) -> float:
-        """Angle (rad) from the x-axis of the common system to that of the object."""
-        along = self.to_common(np.array([[0.0, 0.0], [1.0, 0.0]]))
-        return float(np.arctan2(*(along[1] - along[0])[::-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +55,9 @@ class InstrumentFit:
         Rods held out, in object coordinates.
     check_target : ndarray (c, 2)
         Their designed object coordinates.
+    monomials : Elimination or None
+        The same with a coefficient for every monomial (``A6.x3``, ``A6.xy2``): what remains is the reduced
+        model of the paper's end. None where there are too few rods.
     local : SmoothField or None
         What the model leaves; see :func:`reseau.refine.fitting.residual_field`.
     displays : Rivalry or None
@@ -106,6 +70,7 @@ class InstrumentFit:
     target: Array
     check: ImagePoints
     check_target: Array
+    monomials: Elimination | None
     local: SmoothField | None
     displays: Rivalry | None
 
@@ -320,26 +285,32 @@ def correct_instrument(
     table = np.array([coordinates[name] for name in known], dtype=np.float64)
     # (vi) refined of group A; (iv, v) object coordinates scaled, and into the common system
     refined = carried(camera.model, carried(camera.photo_system, rods))
-    plane = _object_plane(refined, table[:, :2], design)
+    plane = object_plane(refined, table[:, :2], design)
     if isinstance(plane, Failure):
         return plane
     target = plane.to_common(table[:, :2])
     used = ~np.isin(known, list(check))
     # (vii) equations (7a, b)
-    elimination = reduce_mapping(
-        model,
-        refined.select(used),
-        target[used],
-        table[used, 2:] * plane.scale,
-        alpha=alpha,
-        criterion=criterion,
-        keep=[name for name in _DATUM if name in model.names],
-        options=Options(scale="a-priori"),
-    )
+    fitted, sigma = refined.select(used), table[used, 2:] * plane.scale
+
+    def reduced(model: RationalPolynomial) -> Elimination | Failure:
+        return reduce_mapping(
+            model,
+            fitted,
+            target[used],
+            sigma,
+            alpha=alpha,
+            criterion=criterion,
+            keep=[name for name in _DATUM if name in model.names],
+            options=Options(scale="a-priori"),
+        )
+
+    elimination = reduced(model)
     if isinstance(elimination, Failure):
         return elimination
-    fit, sigma = elimination.full, table[used, 2:] * plane.scale
-    full, fitted = model.with_values(fit.values), refined.select(used)
+    monomials = reduced(model.split())
+    fit = elimination.full
+    full = model.with_values(fit.values)
     covariance = _joint_covariance(camera, rods.select(used), full, fit)
     correction = InstrumentCorrection(camera, full, plane, covariance, design.unit, rods.select(used))
     displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
@@ -349,29 +320,11 @@ def correct_instrument(
         target[used],
         correction.apply(rods.select(~used)),
         table[~used, :2],
+        None if isinstance(monomials, Failure) else monomials,
         residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials),
         None if isinstance(displays, Failure) else displays,
     )
     return replace(correction, fit=record)
-
-
-def _object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> ObjectPlane | Failure:
-    """Scales λ1, λ2 and the system that M and N define."""
-    ends = defining_marks(refined, plane, design)
-    if isinstance(ends, Failure):
-        return ends
-    (m_image, m), (n_image, n) = ends
-    mirrored = is_mirrored(plane, refined.xy)
-    axes = Similarity.common_system(m, n, mirrored=mirrored)
-    inverse = Similarity.common_system(m_image, n_image)
-    local, seen = axes(plane), inverse(refined.xy)
-    across = float(local[:, 1] @ local[:, 1])
-    if not across > 0:
-        return Failure(f"the rods of design {design.name!r} lie on one line with M and N; λ2 is undetermined")
-    scale = np.array([np.hypot(*(n_image - m_image)) / np.hypot(*(n - m)), local[:, 1] @ seen[:, 1] / across])
-    a, b = inverse.values[2:]
-    system = Similarity(np.array([*m_image, a, -b]))
-    return ObjectPlane(axes, scale, system)
 
 
 def _joint_covariance(

@@ -46,7 +46,7 @@ def _written(
         term = _term(sums[part])
         gap = Markup("&nbsp;") if term else Markup("")
         sign = Markup(" + ") if symbols else Markup("")
-        symbols += sign + Markup("<i>{}</i>").format(symbol(name)) + gap + term
+        symbols += sign + Markup("<i>{}</i>").format(symbol(name.partition(".")[0])) + gap + term
         shown = power(value[name], sigma[name])
         minus = shown.value.startswith("−")
         lead = (" − " if numbers else "−") if minus else (" + " if numbers else "")

@@ -203,17 +203,18 @@ def _estimates(instrument: InstrumentCorrection) -> Estimates:
 
 
 def _reduced(model: RationalPolynomial, fit: InstrumentFit) -> Row:
-    """The model that the tests leave, as two equations."""
-    reduced = fit.elimination.adjustment
-    kept = [name for name in reduced.names if name not in fit.elimination.dropped]
+    """What the tests of every monomial leave, as two equations; of every coefficient, where rods are few."""
+    record = fit.elimination if fit.monomials is None else fit.monomials
+    reduced = record.adjustment
+    kept = [name for name in reduced.names if name not in record.dropped]
     value = {name: reduced[name] for name in kept}
     sigma = {name: reduced.sigma_of(name) for name in kept}
     return {
-        "equations": equations(model, value, sigma),
+        "equations": equations(model if fit.monomials is None else model.split(), value, sigma),
         "kept": len(kept),
-        "dropped": len(fit.elimination.dropped),
+        "dropped": len(record.dropped),
         "sigma0": f"{reduced.sigma0:.3f}",
-        "full_sigma0": f"{fit.elimination.full.sigma0:.3f}",
+        "full_sigma0": f"{record.full.sigma0:.3f}",
     }
 
 
