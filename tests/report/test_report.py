@@ -225,7 +225,7 @@ def test_dropped_terms_are_absent_from_the_reduced_equations(bench: Bench) -> No
     kept = {n.partition(".")[0] for n in set(fit.monomials.full.names) - set(fit.monomials.dropped)}
     assert found == [{n for n in kept if n[0] == "A"}, {n for n in kept if n[0] == "B"}]
     constant = float(page.equations["numbers"][0].split()[1].replace("\u2212", "-"))
-    assert constant == pytest.approx(fit.elimination.adjustment["A0"], abs=6e-3)
+    assert constant == pytest.approx(fit.monomials.adjustment["A0"], abs=6e-3)
 
 
 def test_the_papers_last_equations_are_written_as_it_prints_them() -> None:
