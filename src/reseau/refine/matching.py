@@ -17,7 +17,7 @@ from ..adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ..data import Array, Mask, Rows
 from ..optics.formation import Outline
 from .patches import CONTRAST, LEVEL, WIDTH, MatchOptions, Patches, X, Y
-from .shapes import GrownOutline, Shape
+from .shapes import GrownOutline, Shape, Some
 
 __all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "match"]
 
@@ -25,6 +25,9 @@ Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
 _SETTLED = 0.01
 """Corrections, as a share of their standard deviation, that end the iterations."""
+
+_NEAR = 0.05
+"""The same where no blunders are looked for."""
 
 _FIRST, _MOST = 10, 100
 """Iterations before blunders have been looked for, and at most."""
@@ -114,6 +117,7 @@ def match(
     form_sigma: Array | None = None,
     claims: tuple[NDArray[Any], Rows] | None = None,
     others: Array | None = None,
+    light: tuple[Array, Array] | None = None,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
 
@@ -141,6 +145,9 @@ def match(
         claims its own. What belongs to another is not looked at.
     others : ndarray (k, rows, columns), optional
         Light of others in each window, which is taken off first.
+    light : tuple, optional
+        Contrast (k,) and coefficients of the background (k, b) where these, the positions and the width are
+        known to begin with: then nothing is searched for, but in patches where something is amiss.
 
     Returns
     -------
@@ -155,6 +162,22 @@ def match(
     free[CONTRAST] = options.contrast_sigma
     if form_sigma is not None:
         free[patch.form_at :] = form_sigma
+    if light is not None:
+        quick, amiss = _continued(patch, patch.begin(*light), free, noise)
+        if not len(amiss):
+            return quick
+        few = match(
+            pixels,
+            valid,
+            Some(outline, amiss),
+            xy[amiss],
+            replace(options, psf_px=patch.psf[amiss]),
+            noise=noise,
+            form_sigma=form_sigma,
+            claims=None if claims is None else (claims[0], claims[1][amiss]),
+            others=None if others is None else others[amiss],
+        )
+        return quick.replaced(amiss, few)
     start = patch.start(noise)
 
     def adjust(rows: Rows, start_at: Array, most: int = _MOST) -> BatchAdjustment:
@@ -192,6 +215,27 @@ def match(
     return _columns(patch, found, used > 0, scale[:, 0])
 
 
+def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple[Matches, Rows]:
+    """Matches from values that are nearly right, and the rows in which something is amiss."""
+    if patch.options.row_jitter_px > 0:
+        patch.whiten(start, np.full((len(start), 1), noise), patch.options.row_jitter_px)
+    found = adjust_batch(
+        patch.form_image,
+        start,
+        patch.grey,
+        weights=patch.weights * patch.course / noise**2,
+        prior=(start, free),
+        options=BatchOptions(share=_NEAR, max_iterations=_FIRST),
+    )
+    used = patch.weights > 0
+    worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)
+    rms = found.sigma0 * noise
+    amiss = (
+        ~found.converged | ~(worst < patch.options.rejection * np.maximum(rms, noise)) | ~(rms < 1.5 * noise)
+    )
+    return _columns(patch, found, used, np.full(len(start), noise), patch.shares), np.flatnonzero(amiss)
+
+
 def _robust_sigma(residuals: Array, used: Array) -> Array:
     """1.4826 × the median of the absolute residuals in use, (k, 1); not below half their rms."""
     size = np.where(used > 0, np.abs(residuals), np.nan)
@@ -208,10 +252,12 @@ def _rms(residuals: Array, used: Array, parameters: int) -> Array:
     return rms
 
 
-def _columns(patch: Patches, found: BatchAdjustment, used: Mask, scale: Array) -> Matches:
-    """Columns of results from the adjusted batch."""
+def _columns(
+    patch: Patches, found: BatchAdjustment, used: Mask, scale: Array, share: Array | None = None
+) -> Matches:
+    """Columns of results from the adjusted batch, and from the share of the pixels if it is known."""
     x, k = found.estimates, len(patch.xy)
-    flat = patch.share(x).reshape(k, -1)
+    flat = (patch.share(x) if share is None else share).reshape(k, -1)
     sight = np.maximum(flat.sum(axis=1), 1e-12)
     plane = patch.background(x).reshape(k, -1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -123,6 +123,16 @@ class Patches:
         self.weights = usable.reshape(k, -1).astype(np.float64)
         self.course = np.ones(self.grey.shape)
         self.whitener: tuple[Array, Array] | None = None
+        self._formed: tuple[Array, Rows, Array, Array] | None = None
+        self.shares = np.zeros(self.shape)
+
+    def begin(self, contrast: Array, ground: Array) -> Array:
+        """Approximate values (k, u) of marks whose light is known: contrast (k,), background (k, b)."""
+        x = np.zeros((len(self.xy), self.form_at + self.forms))
+        # As wide as expected; see `width`.
+        x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - _SHARPEST**2))
+        x[:, CONTRAST], x[:, LEVEL : self.form_at] = contrast, ground
+        return x
 
     def start(self, noise: float) -> Array:
         """Approximate values, and the pixels of the background that belong to something else left out.
@@ -168,6 +178,15 @@ class Patches:
 
     def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""
+        grey, jacobian = self._form(x, at)
+        return (grey, jacobian) if self.whitener is None else self._whitened(grey, jacobian, at)
+
+    def _form(self, x: Array, at: Rows) -> tuple[Array, Array]:
+        """The same, not whitened; what was asked for last is remembered."""
+        if self._formed is not None:
+            before, rows, grey, jacobian = self._formed
+            if np.array_equal(rows, at) and np.array_equal(before, x):
+                return grey, jacobian
         width = self.width(x, at)
         share, d_share = self.form.derivatives(
             self.xy[at] + x[:, :2], width, x[:, self.form_at :], at, self.window.select(at)
@@ -186,8 +205,7 @@ class Patches:
         jacobian[..., CONTRAST] = by_contrast
         grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
         jacobian[..., LEVEL : self.form_at] = rest.reshape(len(x), -1, 1) * self.monomials
-        if self.whitener is not None:
-            grey, jacobian = self._whitened(grey, jacobian, at)
+        self.shares[at], self._formed = share, (x.copy(), at.copy(), grey, jacobian)
         return grey, jacobian
 
     def background(self, x: Array) -> Array:
@@ -229,8 +247,7 @@ class Patches:
         the weights W of the pixels. I − g gᵀW (1 − (1 + q² gᵀWg)^(−1/2))/gᵀWg makes the residuals of a row
         independent, of the weights W.
         """
-        self.whitener = None
-        _, jacobian = self.form_image(x, np.arange(len(self.xy)))
+        _, jacobian = self._form(x, np.arange(len(self.xy)))
         slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
         length2 = (self.course.reshape(self.shape) * slope**2).sum(axis=2, keepdims=True)
         q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2

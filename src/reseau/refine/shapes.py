@@ -13,7 +13,7 @@ import numpy as np
 from ..data import Array, Rows
 from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["GrownOutline", "Shape", "Window"]
+__all__ = ["GrownOutline", "Shape", "Some", "Window"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +94,34 @@ class GrownOutline:
             grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
             nodes, tangents = nodes @ grown, tangents @ grown
         return Outline(nodes + xy[:, None, :], tangents)
+
+
+@dataclass(frozen=True, eq=False)
+class Some:
+    """Some marks of a shape, as a shape.
+
+    Parameters
+    ----------
+    whole : Shape
+        All of them.
+    rows : ndarray of int (k,)
+        Which ones.
+    """
+
+    whole: Shape
+    rows: Rows
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form."""
+        return self.whole.parameters
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`Shape`."""
+        return self.whole.image(xy, width, form, self.rows[at], window)
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`Shape`."""
+        return self.whole.derivatives(xy, width, form, self.rows[at], window)

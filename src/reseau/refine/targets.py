@@ -17,12 +17,12 @@ from scipy.special import ndtr
 from ..data import Array, Mask, Rows
 from ..formats import TestfieldDesign
 from ..optics import Chain
-from ..optics.formation import Outline, PixelResponse
+from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 from ..optics.targets import target_outline
 from .lattice import second_order
-from .matching import SIZE, Matches, MatchOptions, match
+from .matching import Matches, MatchOptions, match
 from .profiles import blur_of, crossings, strip
-from .shapes import GrownOutline, Window
+from .shapes import Some, Window
 
 __all__ = ["Light", "Scene", "TargetImages", "match_targets", "merged"]
 
@@ -77,26 +77,27 @@ class TargetImages:
 
     Parameters
     ----------
-    kinds : tuple of GrownOutline
-        Outlines of the targets of each kind.
+    kinds : tuple of Outline
+        Outlines (m, j, 2) of the targets of each kind, in single precision.
     kind, row : ndarray of int (k,)
         Of which kind each target is, and which of that kind.
     """
 
-    kinds: tuple[GrownOutline, ...]
+    kinds: tuple[Outline, ...]
     kind: Rows
     row: Rows
 
     @property
     def parameters(self) -> int:
-        """One: all grow."""
-        return len(SIZE)
+        """One: all grow by a share."""
+        return 1
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.refine.shapes.Shape`."""
         share = np.empty((len(at), window.rows.shape[1], window.columns.shape[1]))
         for k, of in self.sorted(at):
-            share[of] = self.kinds[k].image(xy[of], width[of], form[of], self.row[at[of]], window.select(of))
+            outline, _, columns, rows = self._placed(k, xy[of], form[of], self.row[at[of]], window.select(of))
+            share[of] = coverage(outline, columns, rows, width[of], window.response)
         return share
 
     def derivatives(
@@ -106,10 +107,24 @@ class TargetImages:
         share = np.empty((len(at), window.rows.shape[1], window.columns.shape[1]))
         slopes = np.empty((len(at), 3 + self.parameters, *share.shape[1:]))
         for k, of in self.sorted(at):
-            share[of], slopes[of] = self.kinds[k].derivatives(
-                xy[of], width[of], form[of], self.row[at[of]], window.select(of)
+            outline, nodes, columns, rows = self._placed(
+                k, xy[of], form[of], self.row[at[of]], window.select(of)
+            )
+            share[of], slopes[of] = coverage_derivatives(
+                outline, columns, rows, width[of], window.response, nodes[:, None]
             )
         return share, slopes
+
+    def _placed(
+        self, kind: int, xy: Array, form: Array, row: Rows, window: Window
+    ) -> tuple[Outline, Array, Array, Array]:
+        """Outlines in place and not, and the pixels, reckoned from the corner of each window."""
+        corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
+        nodes, tangents = self.kinds[kind].xy[row], self.kinds[kind].dxy[row]
+        grown = (1 + form[:, :1, None]).astype(nodes.dtype)
+        outline = Outline(nodes * grown + (xy - corner)[:, None].astype(nodes.dtype), tangents * grown)
+        columns, rows = window.columns - corner[:, :1], window.rows - corner[:, 1:]
+        return outline, nodes, columns.astype(nodes.dtype), rows.astype(nodes.dtype)
 
     def sorted(self, at: Rows) -> list[tuple[int, Rows]]:
         """The kinds of the targets `at`, and which of these are of each."""
@@ -157,7 +172,8 @@ def form_targets(
         curved = np.einsum("kabc,jc->kjab", bend[of], step)
         nodes = step @ np.swapaxes(slope[of], 1, 2) + 0.5 * np.einsum("kjab,jb->kja", curved, step)
         tangents = tangent @ np.swapaxes(slope[of], 1, 2) + np.einsum("kjab,jb->kja", curved, tangent)
-        kinds.append(GrownOutline(Outline(nodes, tangents).oriented(), SIZE))
+        image = Outline(nodes, tangents).oriented()
+        kinds.append(Outline(image.xy.astype(np.float32), image.dxy.astype(np.float32)))
         reach[of] = np.abs(nodes).max(axis=1)
     return TargetImages(tuple(kinds), kind, row), value, reach
 
@@ -228,49 +244,53 @@ def match_targets(scene: Scene, rows: Rows, inside: Mask, background: int = 1) -
     """
     at = scene.lattice(scene.design.xy[rows])
     images, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
-    canvas = _Canvas(scene, images, xy, reach)
-    wanted = np.flatnonzero(inside)
-    large = scene.design.large[rows[wanted]]
-    found: list[tuple[Rows, Matches]] = []
-    for size in (False, True):
-        part = wanted[large == size]
-        if len(part):
-            found.append((part, canvas.match(part, background)))
-    return merged([part for part, _ in found], [matches for _, matches in found])
+    canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows])
+    return merged(*canvas.match(inside, background))
 
 
 class _Canvas:
     """Light that the marks of a testfield take or add, and the matching of each without the others."""
 
-    def __init__(self, scene: Scene, images: TargetImages, xy: Array, reach: Array) -> None:
+    def __init__(self, scene: Scene, images: TargetImages, xy: Array, reach: Array, large: Mask) -> None:
         self.scene, self.images, self.xy = scene, images, xy
-        self.reach = np.ceil(reach + 2.5 * scene.psf_px + 1.0).astype(np.intp)
-        self.amplitude = scene.light.at(xy)[1]
         self.total = _line_light(scene)
-        every = np.arange(len(xy))
         h, w = self.total.shape
-        for _, of in images.sorted(every):
-            half = self.reach[of].max(axis=0)
-            window = self._window(of, half)
-            own = self.amplitude[of, None, None] * self._own(of, window)
+        self.parts: list[tuple[Rows, Rows, Array]] = []
+        amplitude = scene.light.at(xy)[1][:, None, None]
+        for size in (False, True):
+            part = np.flatnonzero(large == size)
+            if not len(part):
+                continue
+            half = np.ceil(reach[part].max(axis=0) + 2.5 * scene.psf_px + 1.0).astype(np.intp)
+            centre = np.rint(xy[part])
+            right, down = (np.arange(-n, n + 1.0) for n in half)
+            window = Window(centre[:, :1] + right, centre[:, 1:] + down, scene.response)
+            width, form = np.full(len(part), scene.psf_px), np.zeros((len(part), 1))
+            own = amplitude[part] * images.image(xy[part], width, form, part, window)
             column, row = window.columns.astype(np.intp), window.rows.astype(np.intp)
             seen = ((row >= 0) & (row < h))[:, :, None] & ((column >= 0) & (column < w))[:, None, :]
             flat = (row[:, :, None] * w + column[:, None, :])[seen]
             self.total += np.bincount(flat, own[seen], minlength=h * w).reshape(h, w)
+            self.parts.append((part, half, own))
 
-    def match(self, part: Rows, background: int) -> Matches:
-        """Match some targets in windows of one size, the light of all else taken off."""
-        scene = self.scene
-        half = self.reach[part].max(axis=0)
-        window = self._window(part, half)
-        h, w = self.total.shape
-        row, column = (
-            window.rows.astype(np.intp).clip(0, h - 1),
-            window.columns.astype(np.intp).clip(0, w - 1),
+    def match(self, inside: Mask, background: int) -> tuple[list[Rows], list[Matches]]:
+        """Match small and large targets in windows of one size each: their rows, and what was found."""
+        rows, found = [], []
+        for part, half, own in self.parts:
+            keep = inside[part]
+            if keep.any():
+                rows.append(part[keep])
+                found.append(self._match(part[keep], half, own[keep], background))
+        return rows, found
+
+    def _match(self, part: Rows, half: Rows, own: Array, background: int) -> Matches:
+        scene, (h, w) = self.scene, self.total.shape
+        centre = np.rint(self.xy[part]).astype(np.intp)
+        column, row = (
+            (centre[:, k, None] + np.arange(-half[k], half[k] + 1)).clip(0, size - 1)
+            for k, size in ((0, w), (1, h))
         )
-        own = self.amplitude[part, None, None] * self._own(part, window)
         others = self.total[row[:, :, None], column[:, None, :]] - own
-        sign = -1.0 if scene.design.polarity == "dark" else 1.0
         options = MatchOptions(
             half_px=(int(half[0]), int(half[1])),
             psf_px=scene.psf_px,
@@ -281,26 +301,25 @@ class _Canvas:
             start_px=0.3,
             background=background,
         )
-        some = TargetImages(self.images.kinds, self.images.kind[part], self.images.row[part])
+        level, amplitude = scene.light.at(centre.astype(np.float64))
+        # Slopes across half a window, in the order of the matcher's monomials: 1, v, u.
+        right, down = (
+            scene.light.at(centre + step)[0] - level
+            for step in (np.array([half[0], 0.0]), np.array([0.0, half[1]]))
+        )
+        dark = scene.design.polarity == "dark"
+        contrast = amplitude / level if dark else amplitude
         return match(
             scene.grey,
             scene.valid,
-            some,
+            Some(self.images, part),
             self.xy[part],
             options,
             noise=scene.noise,
             form_sigma=np.array([0.05]),
-            others=sign * others,
+            others=-others if dark else others,
+            light=(contrast, np.stack([level, down, right], axis=1)) if background == 1 else None,
         )
-
-    def _window(self, of: Rows, half: Rows) -> Window:
-        centre = np.rint(self.xy[of])
-        right, down = (np.arange(-n, n + 1.0) for n in half)
-        return Window(centre[:, :1] + right, centre[:, 1:] + down, self.scene.response)
-
-    def _own(self, of: Rows, window: Window) -> Array:
-        width, form = np.full(len(of), self.scene.psf_px), np.zeros((len(of), self.images.parameters))
-        return self.images.image(self.xy[of], width, form, of, window)
 
 
 def _line_light(scene: Scene) -> Array:

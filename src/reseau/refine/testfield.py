@@ -312,8 +312,8 @@ class _Measurement:
         mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)
         light = Light.through(first.xy[sure], first.level[sure], amplitude[sure], scene.light.size)
-        psf_px = float(np.median(first.psf_px[sure]))
-        self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px)
+        psf_px, noise = (float(np.median(values[sure])) for values in (first.psf_px, first.noise))
+        self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
     def _matched(self) -> Matches:
