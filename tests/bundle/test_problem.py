@@ -119,6 +119,8 @@ def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> N
     np.testing.assert_allclose(fit.w[:n], twin.w, rtol=0, atol=1e-5)
     mine, theirs = fit.minimal_detectable_errors()[:n], twin.minimal_detectable_errors()
     np.testing.assert_allclose(mine, theirs, rtol=1e-5)
+    lengths = twin.external_reliability().lengths
+    np.testing.assert_allclose(fit.external_lengths()[:n], lengths, rtol=1e-4)
     # Observed coordinates first, then the observed camera parameter, as the twin's prior has them.
     np.testing.assert_allclose(fit.redundancy_numbers[n:], twin.prior_redundancy_numbers, rtol=0, atol=1e-7)
     np.testing.assert_allclose(fit.w[n:], twin.prior_w, rtol=0, atol=1e-5)

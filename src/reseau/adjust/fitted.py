@@ -79,6 +79,7 @@ class Fitted:
     cost: float
     residuals: Array
     iterations: int
+    scale: str
     solution: Any
 
     def __bool__(self) -> bool:
@@ -97,6 +98,11 @@ class Fitted:
     def _observed(self) -> Adjustable[Self]:
         problem: Adjustable[Self] = self.problem
         return problem
+
+    @property
+    def observed(self) -> int:
+        """Number of observations, those left out too."""
+        return int(self._observed.observations.size)
 
     @property
     def _whitened(self) -> Whitened:
@@ -174,6 +180,26 @@ class Fitted:
             variance factor of one.
         """
         return self._of_observations(noncentrality(alpha, power) * self.standardised.unit_error)
+
+    def external_lengths(self, alpha: float = 0.001, power: float = 0.8) -> Array:
+        """What an undetected error does to the parameters, at most, in their standard deviations.
+
+        Baarda's λ̄, its root: no function of the parameters changes by more than this many of its standard
+        deviations by an error of the minimal detectable size; see :class:`ExternalReliability`.
+
+        Parameters
+        ----------
+        alpha, power : float
+            As of :meth:`minimal_detectable_errors`.
+
+        Returns
+        -------
+        ndarray
+            Of the observations' shape; NaN where nothing controls one.
+        """
+        with np.errstate(invalid="ignore"):
+            lengths = np.sqrt(np.maximum(self._whitened.diagonal_hats(), 0.0)) * self.standardised.unit_error
+        return self._of_observations(noncentrality(alpha, power) * lengths)
 
     def global_test(self, alpha: float = 0.05) -> GlobalTest:
         """Two-sided χ² test of the variance factor against one (Koch 1999, ch. 4)."""

@@ -107,6 +107,10 @@ class Whitened(ABC):
             errors.append(np.where(known, 1.0 / size, np.inf))
         return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
 
+    def diagonal_hats(self) -> Array:
+        """Diagonal (N,) of P Q_l̂l̂ P."""
+        return np.concatenate([np.diagonal(hat, axis1=1, axis2=2).ravel() for hat in self.hats()])
+
     def weighted_residuals(self) -> Array:
         """P v of the observations and observed parameters (N,)."""
         return np.concatenate([turn.times(self.whitened) for turn in self.influence])

@@ -11,9 +11,18 @@ import scipy.special
 from reseau.errors import UsageError
 
 if TYPE_CHECKING:
+    from .fitted import Fitted
     from .result import Adjustment
 
-__all__ = ["CoefficientTest", "GlobalTest", "NestedTest", "coefficient_test", "compare", "global_test", "ratio_test"]
+__all__ = [
+    "CoefficientTest",
+    "GlobalTest",
+    "NestedTest",
+    "coefficient_test",
+    "compare",
+    "global_test",
+    "ratio_test",
+]
 
 
 @dataclass(frozen=True)
@@ -168,14 +177,12 @@ def ratio_test(
     return CoefficientTest(name, "t", statistic, critical, p, bool(statistic > critical))
 
 
-def compare(
-    nested: Adjustment, full: Adjustment, alpha: float = 0.05, scale: str | None = None
-) -> NestedTest:
+def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
     """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
 
     Parameters
     ----------
-    nested, full : Adjustment
+    nested, full : Adjustment, or any other fit
         Of the same observations with the same covariance, `nested` a special case of `full`.
     alpha : float
         Level.
@@ -199,7 +206,7 @@ def compare(
     """
     _level(alpha)
     restrictions = nested.redundancy - full.redundancy
-    if restrictions < 1 or nested.problem.size != full.problem.size:
+    if restrictions < 1 or nested.observed != full.observed:
         raise UsageError(
             f"redundancies {nested.redundancy} and {full.redundancy} are not of a model within another",
             where="compare",

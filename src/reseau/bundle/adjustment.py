@@ -26,6 +26,10 @@ __all__ = ["Options", "adjust_network", "problem_of"]
 _BLUNDER, _SETTLED = 0.2, 0.05
 # Sigma0 above which the control is asked whether it agrees with itself.
 _DOUBT = 3.0
+# With more observations than this the search for what may be wrong takes too long to do unasked.
+_MANY = 50_000
+# Image points further off than this many times the median wait, and how often they are looked at again.
+_FAR_OFF, _TRIMS = 5.0, 5
 
 
 @dataclass(frozen=True)
@@ -111,14 +115,40 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
-    doubt = doubtful_control(network) if fit.sigma0 > _DOUBT and network.datum == "control" else ""
-    return Result(network, fit, rejected, steps, (*notes, *([doubt] if doubt else []), *remarks(bare)))
+    doubts = _doubts(problem) if fit.sigma0 > _DOUBT else []
+    return Result(network, fit, rejected, steps, (*notes, *doubts, *remarks(bare)))
+
+
+def _doubts(problem: BundleProblem) -> list[str]:
+    """What may be wrong with the observations where they fit badly."""
+    doubts = [doubtful_control(problem.network)] if problem.network.datum == "control" else []
+    if len(problem.observations) <= _MANY:
+        names = _suspects(problem)
+        if names:
+            doubts.append(f"gross errors are likely in {listed(names)}")
+    return [doubt for doubt in doubts if doubt]
+
+
+def _suspects(problem: BundleProblem) -> list[str]:
+    """Image points to which a robust adjustment gives next to no weight, the worst first."""
+    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
+    if isinstance(off, Failure):
+        return []
+    network = problem.network
+    n = len(network.xy)
+    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
+    rows = np.argsort(weight, kind="stable")
+    rows = rows[weight[rows] < _BLUNDER]
+    return [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
+    ]
 
 
 def _without_blunders(
     problem: BundleProblem, options: Options
 ) -> tuple[BundleFit, tuple[SnoopingStep, ...]] | Failure:
     """Robust start, then data snooping with what leaves and comes back."""
+    problem = _trimmed(problem)
     begun = robust(problem, "huber", max_iterations=50, tolerance=_SETTLED)
     if not isinstance(begun, Failure):
         start = problem.continued(begun.adjustment)
@@ -131,6 +161,30 @@ def _without_blunders(
     return found.adjustment, found.steps
 
 
+def _trimmed(problem: BundleProblem) -> BundleProblem:
+    """The problem begun at the estimates of those image points that most others agree with.
+
+    Least squares of all observations may not converge at all where a fifth of them is wrong. The approximate
+    values come from the largest sets that agree: those far off them wait until the estimates are better.
+    """
+    n = len(problem.network.xy)
+    out = np.ones(n, dtype=bool)
+    for _ in range(_TRIMS):
+        v = problem.misfits_at_start()
+        size = np.sqrt((v**2).sum(axis=1))
+        limit = _FAR_OFF * float(np.nanmedian(size))
+        further = ~(size <= limit)
+        if (further == out).all():
+            break
+        out, weights = further, np.ones(len(problem.observations))
+        weights[: 2 * n] = np.repeat(~out, 2)
+        fit = problem.with_weights(weights).adjusted()
+        if isinstance(fit, Failure):
+            break
+        problem = problem.continued(fit)
+    return problem
+
+
 def _explained(failure: Failure, problem: BundleProblem) -> Failure:
     """A failure to converge, with the observations that look like blunders."""
     if "converged" not in failure.reason and "rays" not in failure.reason:
@@ -138,16 +192,6 @@ def _explained(failure: Failure, problem: BundleProblem) -> Failure:
     doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""
     if doubt:
         return Failure(f"{failure.reason}; {doubt}", failure.values, failure.iterations, failure.costs)
-    off = robust(problem, "huber", max_iterations=20, tolerance=0.5)
-    if isinstance(off, Failure):
-        return failure
-    network = problem.network
-    n = len(network.xy)
-    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
-    rows = np.argsort(weight, kind="stable")
-    rows = rows[weight[rows] < _BLUNDER]
-    names = [
-        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
-    ]
+    names = _suspects(problem)
     hint = f"; gross errors are likely in {listed(names)}" if names else ""
     return Failure(failure.reason + hint, failure.values, failure.iterations, failure.costs)

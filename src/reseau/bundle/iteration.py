@@ -23,7 +23,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
 # A step that gains so much of what it promised lets the next one be so much bolder.
 _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 # Damping at which the step is as good as undamped, and below which a decrease is rounding.
-_SMALL, _FLAT = 1e-6, 1e-9
+_SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,13 @@ def iterate(
                 return Failure("the normal equations are singular", iterations=tried, costs=tuple(costs))
             continue
         offset = np.sqrt(max(step.predicted, 0.0) / rank) / np.sqrt(max(cost, 1e-300) / max(1, redundancy))
-        if offset <= tolerance and (damping <= _SMALL or step.predicted <= 1e-14 * cost):
+        settled = damping <= _SMALL or step.predicted <= 1e-14 * cost
+        # At the end of its patience it takes what is within a thousandth of the standard deviations.
+        if (
+            (offset <= tolerance and settled)
+            or cost <= system.floor
+            or (tried == max_iterations and offset < _NEAR)
+        ):
             return Iterated(linear, tuple(costs), tried)
         trial = linear.values.moved(system.unknowns, step)
         out, further = system.misfits(trial)

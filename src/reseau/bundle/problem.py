@@ -117,6 +117,16 @@ class BundleProblem:
         )
         return replace(self, start=start)
 
+    def misfits_at_start(self) -> Array:
+        """Weighted misfits (n, 2) of the image coordinates at the approximate values, NaN without any."""
+        network, start = self.network, self.start
+        known = finite(start.x0)[network.image_of] & finite(start.xyz)[network.point_of]
+        rows, v = np.flatnonzero(known), np.full((len(known), 2), np.nan)
+        unknowns = Unknowns.of(network, finite(start.x0))
+        root = Weighting([network.cov]).roots[0].matrices
+        v[rows] = (root[rows] @ residuals(network, unknowns, rows, start)[:, :, None])[:, :, 0]
+        return v
+
     def adjusted(self, options: AdjustOptions | None = None) -> BundleFit | Failure:
         """Adjust it, with everything that belongs to the result."""
         with one_thread():
@@ -146,7 +156,7 @@ class BundleFit(Fitted):
         Of unknowns and adjusted observations; rotations about the axes of their cameras.
     linear : Linear
         The linear problem at the estimates.
-    sigma0, redundancy, cost, residuals, iterations, costs, solution
+    sigma0, redundancy, cost, residuals, iterations, costs, solution, scale
         As in :class:`~reseau.adjust.Adjustment`.
     counts : tuple of int
         Observations, unknowns before datum constraints, datum constraints.
@@ -166,6 +176,7 @@ class BundleFit(Fitted):
     iterations: int
     costs: tuple[float, ...]
     solution: BlockSolution
+    scale: str
     counts: tuple[int, int, int]
 
     @property
@@ -319,6 +330,7 @@ class _Run:
             iterations=iterations,
             costs=tuple(costs),
             solution=solution,
+            scale="a-posteriori" if redundancy > 0 else "a-priori",
             counts=counts,
         )
 

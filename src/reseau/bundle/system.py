@@ -21,6 +21,8 @@ __all__ = ["Linear", "Normal", "System", "residuals"]
 
 # The sums of one part need as much memory as the matrix: a large one is formed in one part.
 _LARGE = 2000
+# Of an image coordinate computed from its unknowns, relative.
+_ROUNDING = 1e-14
 
 
 class System:
@@ -57,6 +59,12 @@ class System:
         self.pattern = unknowns.pattern
         self.chunks = chunks_of(unknowns.first)
         self.interior = _interior(network, unknowns)
+
+    @cached_property
+    def floor(self) -> float:
+        """A sum of squares that is no more than the rounding of the image coordinates."""
+        seen = np.einsum("nij,nj->ni", self.seen.root, self.seen.xy)
+        return float(_ROUNDING**2 * (seen**2).sum())
 
     def cameras(self, values: Values) -> Interior:
         """What the compiled loops take."""

@@ -1,0 +1,146 @@
+"""What is found in a network: blunders, needless parameters, variance components, what nothing determines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.adjust import variance_components
+from reseau.bundle import BundleFit, Network, Options, Result, adjust_network
+from reseau.bundle.selection import Selection, cross_validation, eliminate_parameters
+
+from . import networks
+
+SIMPLE = networks.camera(free=("c", "x0", "y0", "K1", "K2"))
+
+
+def required(result: object) -> Result:
+    assert isinstance(result, Result), result
+    return result
+
+
+def disturbed(network: Network, part: float, seed: int) -> tuple[Network, set[int]]:
+    """A part of the image points moved by 5 to 60 pixels in both coordinates."""
+    rng = np.random.default_rng(seed)
+    n = len(network.xy)
+    bad = rng.choice(n, int(part * n), replace=False)
+    xy = network.xy.copy()
+    xy[bad] += rng.uniform(5, 60, (len(bad), 2)) * rng.choice([-1, 1], (len(bad), 2))
+    return replace(network, xy=xy), set(bad.tolist())
+
+
+@pytest.mark.parametrize("part", [0.01, 0.1, 0.2])
+def test_gross_errors_are_found_and_hardly_anything_else(part: float) -> None:
+    world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
+    network, bad = disturbed(world.noisy(1), part, 1)
+    result = required(adjust_network(network, Options(outliers="reject", max_fraction=0.4)))
+    found = set(np.flatnonzero(result.rejected).tolist())
+    # What is left of a point by other blunders may control nothing: then its own are left out with the point.
+    controlled = np.nan_to_num(result.redundancy_numbers).sum(axis=1) > 0.1
+    assert all(not controlled[k] for k in bad - found)
+    # At a level of 0.001, and with few rays left to many points, some good ones are lost.
+    assert len(found - bad) <= 0.02 * len(network.xy)
+    assert 0.85 < result.sigma0 < 1.1
+
+
+def test_gross_errors_that_are_kept_are_named() -> None:
+    world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
+    network, bad = disturbed(world.noisy(1), 0.01, 1)
+    result = required(adjust_network(network))
+    said = next(w for w in result.warnings if w.startswith("gross errors are likely in"))
+    for k in bad:
+        where = f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}"
+        assert where in said
+
+
+def test_too_many_blunders_are_refused() -> None:
+    world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
+    network, _ = disturbed(world.noisy(1), 0.2, 1)
+    result = adjust_network(network, Options(outliers="reject", max_fraction=0.1))
+    assert not result
+    assert "look at the model" in result.reason  # type: ignore[union-attr]
+
+
+def test_rows_are_told_apart_from_columns_by_variance_components() -> None:
+    world = networks.world(images=8, points=60, seed=2)
+    noise = np.random.default_rng(3).normal(size=world.network.xy.shape) * [0.05, 0.08]
+    cov = np.tile(np.diag([0.05, 0.05]) ** 2, (len(noise), 1, 1))
+    problem = world.problem(replace(world.network, xy=world.network.xy + noise, cov=cov))
+    rows = np.tile([False, True], len(noise))
+    found = variance_components(problem, {"columns": ~rows, "rows": rows}).required()
+    assert abs(found["columns"] - 1.0) < 3 * found.sigma[0]
+    assert abs(found["rows"] - 1.6) < 3 * found.sigma[1]
+
+
+def test_needless_parameters_are_dropped_and_needed_ones_stay() -> None:
+    cam = networks.camera(free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"))
+    values = cam.values.copy()
+    values[4:] = 0.0
+    world = networks.world(images=8, points=60, seed=2, cameras=(replace(cam, values=values),))
+    network = world.noisy(5)
+    found = eliminate_parameters(network, alpha=0.001)
+    assert isinstance(found, Selection)
+    assert found.network.cameras[0].free == ("c", "x0", "y0", "K1")
+    full, reduced = cross_validation(network), cross_validation(found.network)
+    assert isinstance(full, float)
+    assert isinstance(reduced, float)
+    assert reduced < full
+
+
+def test_a_camera_nothing_determines_is_named() -> None:
+    """Affinity B1 and the principal distance with the scale of y are one and the same in one view only."""
+    cam = networks.camera(free=("c", "K1"))
+    world = networks.world(images=4, points=20, cameras=(cam,), control=20)
+    # All points seen at one radius alone: c and K1 cannot be told apart.
+    flat = replace(world.network, sigma=np.zeros((20, 3)), xyz=world.xyz)
+    angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(20)])
+    rotation = np.tile(np.diag([1.0, -1.0, -1.0]), (4, 1, 1))
+    x0 = np.tile([0.0, 0.0, 4.0], (4, 1))
+    xy = np.concatenate([networks.image_points(replace(cam, values=_centred(cam.values)), r, x, ring)
+                         for r, x in zip(rotation, x0, strict=True)])  # fmt: skip
+    centred = replace(cam, values=_centred(cam.values))
+    network = replace(
+        flat, cameras=(centred,), xyz=ring, xy=xy, image_of=np.repeat(np.arange(4), 20),
+        point_of=np.tile(np.arange(20), 4), cov=np.tile(np.eye(2), (80, 1, 1)),
+    )  # fmt: skip
+    fit = networks.World(network, rotation, x0, ring).problem().adjusted()
+    assert not isinstance(fit, BundleFit)
+    assert "rank defect" in fit.reason
+    assert "K1 of camera cam" in fit.reason
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    centred = np.zeros(10)
+    centred[0], centred[3] = values[0], values[3]
+    return centred
+
+
+@pytest.mark.parametrize("datum", ["control", "free"])
+def test_predicted_covariances_cover(datum: str) -> None:
+    """Mean squares of normalised errors of 60 networks; the benchmark has 400 of them."""
+    world = networks.world(datum=datum, control=5 if datum == "control" else 0)
+    table = []
+    for seed in range(60):
+        fit = world.problem(world.noisy(seed)).adjusted()
+        assert isinstance(fit, BundleFit)
+        table.append(networks.normalised_errors(world, fit))
+    for name in table[0]:
+        squares = np.array([row[name] for row in table])
+        assert abs(squares.mean() - 1.0) < 4 * squares.std() / np.sqrt(60), name
+
+
+def test_check_points_are_compared_and_change_nothing() -> None:
+    world = networks.world(images=6, points=25)
+    network = world.noisy(4)
+    role = tuple("check" if k in (20, 21) else r for k, r in enumerate(network.role))
+    xyz = network.xyz.copy()
+    xyz[[20, 21]] = world.xyz[[20, 21]]
+    plain = required(adjust_network(network))
+    checked = required(adjust_network(replace(network, role=role, xyz=xyz)))
+    rows, off = checked.check_points
+    assert rows.tolist() == [20, 21]
+    assert np.abs(off / checked.point_sigma[rows]).max() < 4
+    np.testing.assert_allclose(plain.fit.values.xyz, checked.fit.values.xyz, atol=1e-8)

@@ -1,0 +1,115 @@
+"""The network of Vosselman & Förstner (1988): Ebner's parameters per group, seven observed coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.adjust import compare
+from reseau.bundle import Additional, Camera, Network, Result, adjust_network
+from reseau.data import Array
+from reseau.optics.poses import matrix_to_vector
+
+from . import networks
+
+# A board of 1 m with 32 targets before a camera of 512×512 pixels of 27 µm with a lens of 16 mm.
+PITCH, C, BASE = 0.027, 16.0, 3.0
+
+
+def board() -> Array:
+    """Thirty-two points of an 8×8 pattern, every other square."""
+    x, y = np.meshgrid(np.arange(8), np.arange(8))
+    chosen = (x + y) % 2 == 0
+    return np.column_stack([125.0 * (x[chosen] - 3.5), 125.0 * (y[chosen] - 3.5), np.zeros(32)])
+
+
+def about(axis: int, angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.eye(3)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+    return turn
+
+
+def paper(all_images: bool = False, noise: float = 0.04, bend_mm: float = 0.0, seed: int = 0) -> Network:
+    """32 or 36 images: the board tilted by 30° and 45° (and 0°), turned in its plane, the camera rolled."""
+    rng, xyz = np.random.default_rng(seed), board()
+    extra = Additional(BASE, True, "group")
+    values = np.array([C] + 9 * [0.0])
+    camera = Camera("ccd", 512, 512, (PITCH, PITCH), "brown", values, (), "object", additional=extra)
+    settings = [(phi, t, c) for phi in (30, 45) for t in range(4) for c in range(4)]
+    settings += [(0, 0, c) for c in range(4)] if all_images else []
+    x0, rotation, seen = [], [], []
+    for phi, t, c in settings:
+        board_to_mount = about(1, np.radians(phi)) @ about(2, np.pi / 2 * t)
+        # The camera looks along −z of the mount from 1.9 m.
+        view = about(2, np.pi / 2 * c) @ np.diag([1.0, -1.0, -1.0])
+        turn = view @ board_to_mount
+        where = board_to_mount.T @ np.array([0.0, 0.0, 1900.0])
+        # A bend that turns with the mount, whatever way the board is turned in it.
+        turned, tilt = xyz @ about(2, np.pi / 2 * t).T, about(1, np.radians(phi))
+        turned[:, 2] += bend_mm * ((turned[:, 0] / 437.5) ** 2 - 0.5)
+        bent = turned @ tilt.T
+        seen.append(networks.image_points(camera, view, np.array([0.0, 0.0, 1900.0]), bent))
+        x0.append(where)
+        rotation.append(matrix_to_vector(turn))
+    m, xy = len(settings), np.concatenate(seen)
+    sigma = np.full((32, 3), np.nan)
+    control = [0, 3, 28, 31]
+    sigma[control[0]], sigma[control[3]] = [0.1, 0.1, 0.1], [0.1, 0.1, 0.1]
+    sigma[control[1], 2] = 0.1
+    return Network(
+        cameras=(camera,),
+        images=tuple(f"{phi}-{t}-{c}" for phi, t, c in settings),
+        camera_of=np.zeros(m, dtype=np.intp),
+        x0=np.array(x0),
+        rotation=np.array(rotation),
+        points=tuple(f"t{k}" for k in range(32)),
+        xyz=xyz,
+        sigma=sigma,
+        role=tuple("control" if k in control else "tie" for k in range(32)),
+        image_of=np.repeat(np.arange(m), 32),
+        point_of=np.tile(np.arange(32), m),
+        xy=xy + noise * rng.normal(size=xy.shape),
+        cov=np.tile(np.eye(2) * noise**2, (len(xy), 1, 1)),
+        distance_of=np.zeros((0, 2), dtype=np.intp),
+        distance=np.zeros((0, 2)),
+        datum="control",
+        datum_points=np.ones(32, dtype=bool),
+        groups=tuple(f"{phi}-{c}" for phi, t, c in settings),
+        files=(None,) * m,
+        unit="mm",
+    )
+
+
+def adjusted(network: Network) -> Result:
+    result = adjust_network(network)
+    assert isinstance(result, Result), result
+    return result
+
+
+def test_observations_and_redundancy_are_those_of_the_paper() -> None:
+    result = adjusted(paper())
+    assert result.fit.counts == (2055, 384, 0)
+    assert result.redundancy == 1671
+    assert result.fit.redundancy_numbers.sum() == pytest.approx(1671, abs=1e-6)
+    assert 0.94 < result.sigma0 < 1.06
+
+
+def test_all_36_images_converge_too() -> None:
+    result = adjusted(paper(all_images=True))
+    assert result.fit.usable.images.all()
+    assert 0.94 < result.sigma0 < 1.06
+
+
+def test_a_bend_that_turns_with_the_mount_is_removed_by_groups() -> None:
+    """0.8 mm: significant with one set of parameters for all, gone with a set per group."""
+    network = paper(bend_mm=0.8)
+    camera = network.cameras[0]
+    common = replace(network, cameras=(replace(camera, additional=Additional(BASE, True, "camera")),))
+    one, groups = adjusted(common), adjusted(network)
+    assert 0.94 < groups.sigma0 < 1.06 < one.sigma0
+    assert compare(one.fit, groups.fit).p < 1e-12
+    assert any(test.significant for test in groups.camera_tests(0, alpha=0.001))
