@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array, Frame, ImagePoints, Mask, Rows
+from ..data import Array, Frame, Mask, Rows
 from ..errors import UsageError
-from ..formats import ReseauDesign, ReseauMeasurement
+from ..formats import ReseauDesign
 from .field import SmoothField
 from .grid import GridOptions, spacing
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .matching import Matches
+from .measured import Measured
 from .placing import PlacingOptions, place
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
@@ -30,66 +31,22 @@ _DISTORTED = 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class ReseauResult:
-    """The marks of a reseau in one frame, in columns over the n marks of the design.
+class ReseauResult(Measured):
+    """The marks of a reseau in one frame; `deviation` is from what all *other* marks predict (leave-one-out).
 
     Parameters
     ----------
-    image, sha256 : str
-        The frame.
-    ids : tuple of str (n,)
-        The marks.
-    xy : ndarray (n, 2)
-        Image coordinates in pixels, NaN where not measured.
-    cov : ndarray (n, 2, 2)
-        Covariances in px², NaN where not measured.
-    ok : ndarray of bool (n,)
-        Which were measured.
-    why : tuple of str (n,)
-        Why not, empty where measured.
-    predicted : ndarray (n, 2)
-        Where the field has each mark.
-    psf_px, contrast, t, noise : ndarray (n,)
-        Of each match, see :class:`reseau.refine.matching.Matches`; NaN where there was none.
-    deviation : ndarray (n, 2)
-        Measured minus predicted from all *other* marks (leave-one-out), NaN where not measured.
+    psf_px : ndarray (n,)
+        Width of the point-spread function of each match, NaN where there was none.
     field : SmoothField
         From the design to the image: a polynomial and a local model on top.
     notes : tuple of str
         What the user should know.
     """
 
-    image: str
-    sha256: str
-    ids: tuple[str, ...]
-    xy: Array
-    cov: Array
-    ok: Mask
-    why: tuple[str, ...]
-    predicted: Array
     psf_px: Array
-    contrast: Array
-    t: Array
-    noise: Array
-    deviation: Array
     field: SmoothField
     notes: tuple[str, ...] = ()
-
-    @property
-    def found(self) -> int:
-        """Number of marks measured."""
-        return int(self.ok.sum())
-
-    @property
-    def points(self) -> ImagePoints:
-        """The marks that were measured."""
-        names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
-        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
-
-    def rms(self) -> Array:
-        """Leave-one-out deviation, root mean square per axis (2,); NaN with too few marks to predict any."""
-        known = self.deviation[np.isfinite(self.deviation).all(axis=1)]
-        return np.sqrt((known**2).mean(axis=0)) if len(known) else np.full(2, np.nan)
 
     def need(self, trials: int = 499, seed: int = 0) -> Array:
         """Probability, per axis (2,), that white noise alone would ask as much for the local model."""
@@ -132,12 +89,6 @@ class ReseauResult:
                 bent = np.rint(self.field(line) * 16).astype(np.int32)
                 cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
         return hidden > 0
-
-    def measurement(self) -> ReseauMeasurement:
-        """The result as the document that others read."""
-        return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
-        )
 
 
 def measure_reseau(

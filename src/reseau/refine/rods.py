@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array, Frame, ImagePoints, Mask, Rows
+from ..data import Array, Frame, Mask, Rows
 from ..errors import UsageError
-from ..formats import ReseauDesign, ReseauMeasurement
+from ..formats import ReseauDesign
 from .field import SmoothField, trend_degree
+from .measured import Measured
 from .pins import PinDetections, PinOptions, find_pins
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
@@ -36,29 +37,14 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class PinResult:
-    """The rods of a design in one frame, in columns over the n rods.
+class PinResult(Measured):
+    """The rods of a design in one frame: y on the line, x in its middle.
+
+    `deviation` is from what all *other* rods predict (leave-one-out).
 
     Parameters
     ----------
-    image, sha256 : str
-        The frame.
-    ids : tuple of str (n,)
-        The rods.
-    xy : ndarray (n, 2)
-        Image coordinates in pixels, y on the line, x in its middle; NaN where not measured.
-    cov : ndarray (n, 2, 2)
-        Covariances in px², NaN where not measured.
-    ok : ndarray of bool (n,)
-        Which were measured.
-    why : tuple of str (n,)
-        Why not, empty where measured.
-    predicted : ndarray (n, 2)
-        Where the other rods have each.
-    deviation : ndarray (n, 2)
-        Measured minus predicted from all *other* rods (leave-one-out); NaN where not measured, and where
-        fewer than five are.
-    contrast, t, noise, correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
+    correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
         As in :class:`reseau.refine.PinDetections`; NaN where not measured.
     detections : PinDetections
         All spots of the frame.
@@ -66,18 +52,6 @@ class PinResult:
         What the user should know.
     """
 
-    image: str
-    sha256: str
-    ids: tuple[str, ...]
-    xy: Array
-    cov: Array
-    ok: Mask
-    why: tuple[str, ...]
-    predicted: Array
-    deviation: Array
-    contrast: Array
-    t: Array
-    noise: Array
     correlation: Array
     strength: Array
     length: Array
@@ -86,31 +60,6 @@ class PinResult:
     tilt: Array
     detections: PinDetections
     notes: tuple[str, ...] = ()
-
-    @property
-    def found(self) -> int:
-        """Number of rods measured."""
-        return int(self.ok.sum())
-
-    @property
-    def points(self) -> ImagePoints:
-        """The rods that were measured."""
-        names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
-        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
-
-    def rms(self) -> Array:
-        """Leave-one-out deviation, root mean square per axis (2,); NaN where there is none."""
-        known = np.isfinite(self.deviation).all(axis=1)
-        if not known.any():
-            return np.full(2, np.nan)
-        rms: Array = np.sqrt((self.deviation[known] ** 2).mean(axis=0))
-        return rms
-
-    def measurement(self) -> ReseauMeasurement:
-        """The result as the document that others read."""
-        return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
-        )
 
 
 def measure_pins(
