@@ -17,8 +17,7 @@ average (Plotkin 1960).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Self
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,8 +130,8 @@ class TopologicalCode:
         if self.clusters.ndim != 2 or self.clusters.shape[1] != _PLACES or not len(self.clusters):
             raise UsageError(f"have the shape {self.clusters.shape}, not (k, 16)", where="clusters of a code")
 
-    @classmethod
-    def of(cls, design: TestfieldDesign) -> Self:
+    @staticmethod
+    def of(design: TestfieldDesign) -> TopologicalCode:
         """The code of a design: its squares' targets sorted into rows.
 
         Raises
@@ -140,7 +139,7 @@ class TopologicalCode:
         UsageError
             When its squares have not sixteen targets each, in a grid of four by four.
         """
-        return cls(design.symbols[places(design)])
+        return _code_of(design)
 
     @cached_property
     def appearances(self) -> Symbols:
@@ -195,6 +194,12 @@ class TopologicalCode:
                 why = f"{hidden} of its targets are hidden"
             return Decoded(corrections=corrections, hidden=hidden, why=why)
         return Decoded(square + 1, way % 4, way >= 4, corrections, hidden)
+
+
+@lru_cache(maxsize=16)
+def _code_of(design: TestfieldDesign) -> TopologicalCode:
+    """One code for all frames of a testfield: its distance takes longer to find than a cluster to read."""
+    return TopologicalCode(design.symbols[places(design)])
 
 
 def places(design: TestfieldDesign) -> Symbols:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -62,6 +63,7 @@ class Kinds:
     symbol: Rows
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, design: TestfieldDesign) -> Kinds:
         """The kinds of a design, turned by all quarters."""
         found: dict[tuple[int, float, float], str] = {}

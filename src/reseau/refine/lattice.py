@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ _MOST_PX = 20.0
 _POINT_PX = 0.1
 """What a ridge point is off its line on the average."""
 _NEAR = (0.2, 25.0)
-_GATES = ((0.08, 15.0), (0.05, 12.0), (0.03, 10.0))
+_GATES = ((0.08, 15.0), (0.04, 12.0))
 """How far, in steps of the lattice and in degrees, a ridge point may be off its line, round by round."""
 _SUPPORT = 0.25
 """Ridge points per sample along it that a line must have."""
@@ -41,7 +42,10 @@ _LEAST_DARK = 0.7
 """Share of its length on which a line must be dark, some of it hidden."""
 _BETWEEN = 0.85
 """Share of their length on which lines between those found must be dark."""
+_TIMES = 4
 _LEAST_POINTS = 40
+_MIDDLE = 0.5
+"""Part of the half frame around its middle that tells the projectivity."""
 _SHORTEST = 20
 """Samples that a line must have within the frame."""
 
@@ -121,7 +125,12 @@ def lattices(
         lattice = Lattice(found.homography * scale, found.across * pair[0], found.along * pair[1])
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
-            yield _sharpened(fit, grey, width, blur)
+            # Where the lens distorts much, a line is found on more of its length every time.
+            for _ in range(_TIMES):
+                points, fit = fit.points, _sharpened(fit, grey, width, blur)
+                if fit.points < 1.02 * points:
+                    break
+            yield fit
 
 
 def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
@@ -161,19 +170,22 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         lines = min(len(np.unique(at[axis == k, k])) for k in (0, 1))
         degree = min(max(lines - 1, 1), _DEGREE)
         mapping, residuals = _adjusted(mapping, degree, xy[row], normal[row], at)
+        other = _adjusted(_middled(mapping, at), degree, xy[row], normal[row], at)
+        if _rms(other[1]) < _rms(residuals):
+            mapping, residuals = other
     numbers = [lattice.across, lattice.along]
     for k in (0, 1):
         numbers[k] = _lines(mapping, ridges, at[axis == k][:, k], k, numbers[1 - k])
         if len(numbers[k]) < 2:
             return None
-    return LatticeFit(mapping, numbers[0], numbers[1], _rms(residuals), len(residuals))
+    return LatticeFit(mapping, numbers[0], numbers[1], _rms(residuals), 0)
 
 
 def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
     """The lattice adjusted to the profiles of its lines, which are an order better than ridge points."""
     xy, normal, at = [], [], []
     for axis, (numbers, others) in enumerate(((fit.across, fit.along), (fit.along, fit.across))):
-        along = np.linspace(others.min(), others.max(), 2 * max(grey.shape))
+        along = np.linspace(others.min(), others.max(), max(grey.shape) // 4)
         for number in numbers:
             on = np.full((len(along), 2), float(number))
             on[:, 1 - axis] = along
@@ -208,15 +220,43 @@ def _start(lattice: Lattice, shape: tuple[int, ...]) -> Chain:
     return Chain(straight.with_values(dict(zip(straight.names, matrix.ravel(), strict=False))), curved)
 
 
+def _middled(mapping: Chain, at: Array) -> Chain:
+    """The mapping with the projectivity that it is near the middle of the frame, where lenses distort least.
+
+    Of straight lines laid through bent ones comes a projectivity that a polynomial after it cannot make good.
+    """
+    assert isinstance(mapping.second, RationalPolynomial)
+    xy = mapping(at)
+    near = np.hypot(*(xy - mapping.second.offset).T) < _MIDDLE * mapping.second.scale
+    if near.sum() < _LEAST_POINTS or min(np.ptp(at[near], axis=0)) < 1:
+        return mapping
+    found: Any = cv2.findHomography(at[near], xy[near])[0]
+    if found is None:
+        return mapping
+    straight = mapping.first.with_values((found / found[2, 2]).ravel()[:8])
+    return Chain(straight, mapping.second)
+
+
 def _coordinates(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points; a few steps of Newton, which is near enough here."""
     h = np.append(mapping.first.values, 1.0).reshape(3, 3)
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
     at: Array = back[:, :2] / back[:, 2:]
-    slope = _slope(mapping, at)
+    if np.array_equal(mapping(at[:1]), mapping.first(at[:1])):
+        return at  # there is no polynomial yet
+    slope = _straight_slope(mapping, at)
     for _ in range(3):
         at = at + solve_2x2(slope, xy - mapping(at))
     return at
+
+
+def _straight_slope(mapping: Chain, at: Array) -> Array:
+    """Derivatives (n, 2, 2) of the projectivity alone: near enough for directions."""
+    h = np.append(mapping.first.values, 1.0).reshape(3, 3)
+    image = np.column_stack([at, np.ones(len(at))]) @ h.T
+    xy, depth = image[:, :2] / image[:, 2:], image[:, 2, None, None]
+    slope: Array = (h[:2, :2] - xy[:, :, None] * h[2, :2]) / depth
+    return slope
 
 
 def _slope(mapping: PlaneMapping, at: Array) -> Array:
@@ -231,7 +271,7 @@ def _assigned(mapping: Chain, normal: Array, at: Array, gate: float, degrees: fl
     for axis in (0, 1):
         near = np.flatnonzero(np.abs(at[:, axis] - np.rint(at[:, axis])) < gate)
         # Along the line the other coordinate changes.
-        along = _slope(mapping, at[near])[:, :, 1 - axis]
+        along = _straight_slope(mapping, at[near])[:, :, 1 - axis]
         sine = (along * normal[near]).sum(axis=1) / np.maximum(np.hypot(*along.T), 1e-12)
         found = near[np.abs(sine) < np.sin(np.deg2rad(degrees))]
         rows.append(found)
@@ -289,7 +329,7 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
         np.zeros((1, design.shape[1])),
         observed[None],
         prior=(np.zeros((1, design.shape[1])), np.full(design.shape[1], _MOST_PX / sigma_px)),
-        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=12, tolerance=0.01 * sigma_px),
+        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=8, tolerance=0.03 * sigma_px),
     )
     names = mapping.second.names
     curved = mapping.second.with_values(

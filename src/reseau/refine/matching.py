@@ -225,7 +225,7 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         patch.grey,
         weights=patch.weights * patch.course / noise**2,
         prior=(start, free),
-        options=BatchOptions(share=_NEAR, max_iterations=_FIRST),
+        options=BatchOptions(share=_NEAR, max_iterations=_FIRST, damping=1e-8),
     )
     used = patch.weights > 0
     worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)

@@ -65,6 +65,15 @@ class Light:
         design = _quadratic(xy, self.size)
         return design @ self.level, design @ self.contrast
 
+    def contrast_over(self, shape: tuple[int, int]) -> Array:
+        """Contrast of every pixel of a frame (h, w)."""
+        u, v = (2 * np.arange(n) / size - 1 for n, size in zip(shape[::-1], self.size, strict=True))
+        one, by_u, by_v, by_uu, by_uv, by_vv = self.contrast
+        over: Array = (
+            (one + by_u * u + by_uu * u * u) + np.outer(v, by_v + by_uv * u) + (by_vv * v * v)[:, None]
+        )
+        return over
+
 
 def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
     u, v = (2 * xy / np.array(size) - 1).T
@@ -242,10 +251,25 @@ def match_targets(scene: Scene, rows: Rows, inside: Mask, background: int = 1) -
     Matches
         Of the n that are wanted, in their order; residuals are in windows of the largest size.
     """
+    if not inside.all():
+        rows, inside = _around(scene, rows, inside)
     at = scene.lattice(scene.design.xy[rows])
     images, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
     canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows])
     return merged(*canvas.match(inside, background))
+
+
+def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
+    """Of the targets those that are wanted, and those whose light falls into the windows of these."""
+    # Two windows overlap no farther than targets stand apart in their squares, and half as far again.
+    xy = scene.lattice(scene.design.xy[rows])
+    step = np.abs(scene.frame).max() * np.sqrt(scene.design.pitch**2 / 16)
+    size = max(scene.design.targets.size) * np.abs(scene.frame).max()
+    blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(second_order(scene.mapping, xy)[1])))
+    far = np.maximum(1.5 * step, 1.2 * size + blur)
+    gap = np.abs(xy[:, None] - xy[inside]).max(axis=2).min(axis=1)
+    keep = inside | (gap < far)
+    return rows[keep], inside[keep]
 
 
 class _Canvas:
@@ -327,7 +351,7 @@ def _line_light(scene: Scene) -> Array:
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones((h, w))
     x0, y0, x1, y1 = lines.extent
-    blur, count = blur_of(scene.psf_px, scene.response), 2 * max(h, w)
+    blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
     reach = int(4 * blur + 3)
     for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
         along = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
@@ -342,7 +366,7 @@ def _line_light(scene: Scene) -> Array:
                 or not ((line.place > -reach) & (line.place < (w, h)[1 - line.axis] + reach)).any()
             ):
                 continue
-            width = (beside - middle)[line.along.astype(np.intp)]
+            width = (beside - middle)[np.rint(line.along).astype(np.intp)]
             half = 0.5 * np.abs((width * line.normal).sum(axis=1))
             row, column, distance = line.around(reach)
             share = strip(distance, half[:, None], blur)
@@ -351,9 +375,7 @@ def _line_light(scene: Scene) -> Array:
             share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
             keep = (row >= 0) & (row < h) & (column >= 0) & (column < w)
             free[row[keep], column[keep]] *= 1 - share[keep]
-    rows, columns = np.indices((h, w))
-    amplitude = scene.light.at(np.stack([columns.ravel(), rows.ravel()], axis=1))[1].reshape(h, w)
-    taken: Array = amplitude * (1 - free)
+    taken: Array = scene.light.contrast_over((h, w)) * (1 - free)
     return taken
 
 

@@ -26,10 +26,12 @@ from .targets import Light, Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
-_LEAST_FIRST, _MOST_FIRST = 12, 48
+_LEAST_FIRST, _MOST_FIRST = 8, 48
 """How many large targets are matched first, to know the mapping and the sharpness better."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
+_SETTLED_PX = 0.05
+"""Changes of what the mapping predicts below which it need not be looked at farther out."""
 _UNMODELLED_PX = 0.03
 """What positions scatter about a mapping of third degree beyond their own sigmas."""
 _SEEN = 0.95
@@ -298,7 +300,11 @@ class _Measurement:
                 continue
             some = np.zeros(len(self.rows), dtype=bool)
             some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
+            predicted = self.predicted
             self._learn(some)
+            moved = (self.predicted - predicted)[self.rows[self.inside]]
+            if len(moved) and np.abs(moved).max() < _SETTLED_PX:
+                break
 
     def _learn(self, some: Mask) -> None:
         first = match_targets(self.scene, self.rows, some)
