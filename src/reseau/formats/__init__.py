@@ -6,16 +6,32 @@ file appears whole or not at all.
 
 from .design import DesignPoint, Mark, ReseauDesign
 from .document import Document, Strict, read_text, write_whole
+from .frame import (
+    CORNERS,
+    EDGES,
+    FrameCorners,
+    FrameOrientation,
+    FrameTransform,
+    MeasuredCorner,
+    MeasuredEdge,
+)
 from .measurement import MeasuredPoint, ReseauMeasurement
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign
 
 __all__ = [
+    "CORNERS",
+    "EDGES",
     "SHAPES",
     "DesignPoint",
     "Document",
     "FieldLines",
     "FieldTargets",
+    "FrameCorners",
+    "FrameOrientation",
+    "FrameTransform",
     "Mark",
+    "MeasuredCorner",
+    "MeasuredEdge",
     "MeasuredPoint",
     "ReseauDesign",
     "ReseauMeasurement",
