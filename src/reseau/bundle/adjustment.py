@@ -187,7 +187,7 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
 
 def _explained(failure: Failure, problem: BundleProblem) -> Failure:
     """A failure to converge, with the observations that look like blunders."""
-    if "converged" not in failure.reason and "rays" not in failure.reason:
+    if "nothing determines" in failure.reason:
         return failure
     doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""
     if doubt:

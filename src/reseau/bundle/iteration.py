@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..adjust import Failure
+from ..data import Rows
 from .arrow import Singular
 from .system import Linear, System
 from .values import Values
@@ -24,6 +25,10 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
 _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 # Damping at which the step is as good as undamped, and below which a decrease is rounding.
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
+# Points further off than so many times the extent of the network are at infinity.
+_HORIZON, _NEARLY = 1e8, 0.99
+# A sum of squares that falls by no more than this part in so many corrections creeps.
+_PATIENCE, _CREEP = 25, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +43,17 @@ class Iterated:
         vᵀPv at the approximate values and after each correction taken.
     iterations : int
         Corrections tried.
+    offset : float
+        Relative offset: corrections still to come, in standard deviations.
+    away : ndarray of int
+        Points that ran off to infinity.
     """
 
     linear: Linear
     costs: tuple[float, ...]
     iterations: int
+    offset: float
+    away: Rows
 
     @property
     def values(self) -> Values:
@@ -88,6 +99,7 @@ def iterate(
     cost, growth, tried = linear.cost, 2.0, 0
     if not np.isfinite(cost):
         return Failure("the image coordinates have no finite misfits at the approximate values")
+    radius = _HORIZON * _extent(system, start)
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.further) - redundancy)
     while tried < max_iterations:
         tried += 1
@@ -100,14 +112,16 @@ def iterate(
             continue
         offset = np.sqrt(max(step.predicted, 0.0) / rank) / np.sqrt(max(cost, 1e-300) / max(1, redundancy))
         settled = damping <= _SMALL or step.predicted <= 1e-14 * cost
-        # At the end of its patience it takes what is within a thousandth of the standard deviations.
-        if (
-            (offset <= tolerance and settled)
-            or cost <= system.floor
-            or (tried == max_iterations and offset < _NEAR)
-        ):
-            return Iterated(linear, tuple(costs), tried)
+        # At the end of its patience it takes what is near, and what creeps it leaves where it is.
+        creeps = len(costs) > _PATIENCE and costs[-_PATIENCE] - cost <= _CREEP * cost
+        near = tried == max_iterations and offset < _NEAR
+        if (offset <= tolerance and settled) or cost <= system.floor or near or creeps:
+            away = linear.values.beyond(_NEARLY * radius)
+            return Iterated(linear, tuple(costs), tried, float(offset), away)
         trial = linear.values.moved(system.unknowns, step)
+        away = trial.beyond(radius)
+        if len(away):
+            trial = trial.confined(away, radius)
         out, further = system.misfits(trial)
         there = float((out**2).sum() + further @ further)
         flat = step.predicted <= _FLAT * cost and there <= cost * (1.0 + 1e-10)
@@ -125,3 +139,10 @@ def iterate(
             break
     reason = f"has not converged in {tried} iterations"
     return Failure(reason, iterations=tried, costs=tuple(costs))
+
+
+def _extent(system: System, values: Values) -> float:
+    """Distance from the centre within which most projection centres or points lie."""
+    images = system.unknowns.pose >= 0
+    sizes = [np.linalg.norm(part, axis=1) for part in (values.x0[images], values.xyz)]
+    return max(float(np.median(size)) if len(size) else 0.0 for size in sizes) or 1.0

@@ -18,6 +18,7 @@ from .arrow import Singular
 from .compiled import in_parallel
 from .datum import Freedom, held_for
 from .normal import posterior
+from .rank import PARALLEL
 from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
@@ -116,7 +117,7 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         held[held_for(freedom, system.unknowns, diagonal)] = True
         normal.hold(held)
     arrow = normal.factorise()
-    if arrow.weakest < _RANK or normal.least < _RANK:
+    if arrow.weakest < _RANK or normal.least < PARALLEL:
         raise Singular
     z = arrow.inverse()
     z[held] = 0.0

@@ -15,20 +15,23 @@ from ..adjust import Options as AdjustOptions
 from ..adjust.fitted import Fitted
 from ..adjust.stochastic import Weighting
 from ..adjust.threads import one_thread
-from ..data import Array, Mask
+from ..data import Array, Mask, Rows
 from .arrow import Singular
 from .datum import Freedom, freedom_of, held_minimally, similarity_onto
 from .further import Further
-from .iteration import iterate
+from .iteration import Iterated, iterate
 from .network import Network, finite
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import undetermined
+from .rank import undetermined, weak_points
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .usable import Usable, usable
 from .values import Values
 
 __all__ = ["BundleFit", "BundleProblem"]
+
+# Points that run off to infinity are left out so many times.
+_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,8 @@ class BundleProblem:
         See :func:`~reseau.bundle.iteration.iterate`.
     watch : callable, optional
         Told the number of corrections and vᵀPv after each.
+    rounds : int
+        How often points have been left out that ran off to infinity.
     """
 
     network: Network
@@ -64,6 +69,7 @@ class BundleProblem:
     max_iterations: int = 200
     tolerance: float = 1e-6
     watch: Callable[[int, float], None] | None = None
+    rounds: int = 0
 
     @cached_property
     def centre(self) -> Array:
@@ -158,6 +164,8 @@ class BundleFit(Fitted):
         The linear problem at the estimates.
     sigma0, redundancy, cost, residuals, iterations, costs, solution, scale
         As in :class:`~reseau.adjust.Adjustment`.
+    offset : float
+        Corrections still to come, in standard deviations.
     counts : tuple of int
         Observations, unknowns before datum constraints, datum constraints.
     """
@@ -177,6 +185,7 @@ class BundleFit(Fitted):
     costs: tuple[float, ...]
     solution: BlockSolution
     scale: str
+    offset: float
     counts: tuple[int, int, int]
 
     @property
@@ -249,6 +258,9 @@ class _Run:
         )  # fmt: skip
         if isinstance(found, Failure):
             return found
+        away = found.away
+        if len(away) and problem.rounds < _ROUNDS:
+            return self._without(away, found.values).adjusted()
         values, inner = found.values, network.datum == "free" and freedom.defect > 0
         chosen = network.datum_points & self.usable.points
         if inner:
@@ -260,8 +272,21 @@ class _Run:
         try:
             cofactors = cofactors_of(linear, freedom, chosen if inner else None, self.usable.points)
         except Singular:
+            weak = weak_points(linear)
+            if len(weak) and problem.rounds < _ROUNDS:
+                return self._without(weak, values).adjusted()
             return undetermined(linear, freedom, tuple(found.costs))
-        return self._fit(linear, freedom, cofactors, counts, found.iterations, found.costs)
+        return self._fit(linear, freedom, cofactors, counts, found)
+
+    def _without(self, points: Rows, values: Values) -> BundleProblem:
+        """The problem begun at the estimates, without points whose rays turn out to be parallel."""
+        start, images = self.problem.start, self.usable.images
+        xyz = np.where(self.usable.points[:, None], values.xyz + self.problem.centre, start.xyz)
+        xyz[points] = np.nan
+        rotation = np.where(images[:, None, None], values.rotation, start.rotation)
+        x0 = np.where(images[:, None], values.x0 + self.problem.centre, start.x0)
+        start = Values(rotation, x0, xyz, values.cameras, values.extra)
+        return replace(self.problem, start=start, rounds=self.problem.rounds + 1)
 
     def _start(self) -> Values:
         """Approximate values from the centre, of all that takes part; the rest is out of the way."""
@@ -293,9 +318,13 @@ class _Run:
         return similarity_onto(values, np.nan_to_num(reference), chosen, scaled=scaled)(values)
 
     def _fit(
-        self, linear: Linear, freedom: Freedom, cofactors: Cofactors, counts: tuple[int, int, int],
-        iterations: int, costs: tuple[float, ...],
-    ) -> BundleFit:  # fmt: skip
+        self,
+        linear: Linear,
+        freedom: Freedom,
+        cofactors: Cofactors,
+        counts: tuple[int, int, int],
+        found: Iterated,
+    ) -> BundleFit:
         redundancy, cost = counts[0] - counts[1] + counts[2], linear.cost
         whole, n = self.problem.network, len(self.problem.network.xy)
         rows = np.flatnonzero(self.usable.observations)[self.unknowns.order]
@@ -327,10 +356,11 @@ class _Run:
             redundancy=redundancy,
             cost=cost,
             residuals=residuals,
-            iterations=iterations,
-            costs=tuple(costs),
+            iterations=found.iterations,
+            costs=found.costs,
             solution=solution,
             scale="a-posteriori" if redundancy > 0 else "a-priori",
+            offset=found.offset,
             counts=counts,
         )
 

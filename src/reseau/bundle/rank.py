@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array
+from ..data import Array, Rows
 from .datum import Freedom, held_for
 from .system import Linear
 
-__all__ = ["undetermined"]
+__all__ = ["PARALLEL", "undetermined", "weak_points"]
 
 # Eigenvalues of the scaled normal equations that count as zero.
 _ZERO = 1e-11
+# Of the scaled normal equations of a point whose rays are parallel: they cut at less than 3e-5 rad.
+PARALLEL = 1e-9
 _LISTED = 8
 
 
@@ -28,7 +30,7 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
     costs : tuple of float
         vᵀPv on the way.
     """
-    weak = _weak_points(linear)
+    weak = [linear.system.unknowns.network.points[j] for j in weak_points(linear)]
     if weak:
         listed = ", ".join(weak[:_LISTED]) + (" …" if len(weak) > _LISTED else "")
         return Failure(f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}", costs=costs)
@@ -40,11 +42,10 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
     return Failure(reason, costs=costs, null_space=tuple(vectors))
 
 
-def _weak_points(linear: Linear) -> list[str]:
+def weak_points(linear: Linear) -> Rows:
     """Points whose own normal equations are singular: rays along one line."""
     system = linear.system
     network, pattern, last = system.unknowns.network, system.pattern, linear.rows.shape[2] - 3
-    names = []
     b = linear.rows[:, :, last:].reshape(-1, 2, 3)
     v = np.zeros((len(network.points), 3, 3))
     np.add.at(v, system.seen.point, np.swapaxes(b, 1, 2) @ b)
@@ -53,9 +54,7 @@ def _weak_points(linear: Linear) -> list[str]:
     known = (size > 0).all(axis=1) & (pattern.eliminated == 1)
     scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
     least = np.linalg.eigvalsh(scaled[known])[:, 0]
-    for j in np.flatnonzero(known)[least < _ZERO]:
-        names.append(network.points[j])
-    return names
+    return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
 
 
 def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:

@@ -16,6 +16,8 @@ __all__ = ["LISTED", "gaps", "listed", "remarks"]
 
 LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
+# Corrections still to come that are none, in standard deviations.
+_NEAR = 1e-3
 # A corner is this part of width and height.
 _CORNER = 0.2
 
@@ -44,7 +46,12 @@ def gaps(network: Network, fit: BundleFit) -> list[str]:
             f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
             f"{listed(where)}; left out"
         )
-    few = np.flatnonzero(lost & (rays > 1))
+    lit = np.bincount(network.point_of[fit.usable.images[network.image_of]], minlength=len(part))
+    parallel = np.flatnonzero(lost & (rays > 1) & (lit > 1))
+    if len(parallel):
+        names = listed(network.points[j] for j in parallel)
+        found.append(f"{_plural('point', parallel)} {names} left out: rays are parallel, or blunders")
+    few = np.flatnonzero(lost & (rays > 1) & (lit <= 1))
     if len(few):
         found.append(f"{_points(network, few)} not seen by two images that are oriented; left out")
     images = np.flatnonzero(~fit.usable.images)
@@ -66,6 +73,7 @@ def remarks(result: Result) -> list[str]:
     network, fit = result.network, result.fit
     return [
         *gaps(network, fit),
+        *_creeping(result),
         *_global(result),
         *_large(result),
         *_correlations(result),
@@ -95,6 +103,12 @@ def _global(result: Result) -> list[str]:
         f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
         "the sigmas of the observations are not true, or the model is not"
     ]
+
+
+def _creeping(result: Result) -> list[str]:
+    if result.fit.offset < _NEAR:
+        return []
+    return [f"the adjustment creeps: corrections of {result.fit.offset:.2g} standard deviations were to come"]
 
 
 def _large(result: Result) -> list[str]:

@@ -150,7 +150,7 @@ class Linear:
         network, further = self.system.unknowns.network, self.system.further
         prior = np.zeros((len(network.points), 3, 2))
         untouched = (network.rays == 0)[:, None] & ~network.observed
-        prior[..., 0] = np.where(network.held | untouched, 1.0, 0.0)
+        prior[..., 0] = np.where((self.system.movable == 0) | untouched, 1.0, 0.0)
         at = further.slices[1]
         j, axis = further.coordinate.T
         root = self.system.sigma_root[at]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Array
+from ..data import Array, Rows
 from ..optics.poses import rotation_matrix
 from .imaging import CAMERA_WIDTH, EBNER, Orientation
 from .unknowns import Unknowns
@@ -70,6 +70,16 @@ class Values:
     def orientation(self) -> Orientation:
         """What the compiled loops take."""
         return Orientation(self.rotation, self.x0, self.xyz)
+
+    def beyond(self, radius: float) -> Rows:
+        """Points further than this from the origin."""
+        return np.flatnonzero(~(np.linalg.norm(self.xyz, axis=1) <= radius)).astype(np.intp)
+
+    def confined(self, points: Rows, radius: float) -> Values:
+        """The same with these points brought back to a distance from the origin."""
+        xyz = self.xyz.copy()
+        xyz[points] *= radius / np.linalg.norm(xyz[points], axis=1, keepdims=True)
+        return Values(self.rotation, self.x0, xyz, self.cameras, self.extra)
 
     def moved(self, unknowns: Unknowns, step: Correction) -> Values:
         """The values after a correction; rotations turn about the axes of their camera."""
