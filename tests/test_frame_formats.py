@@ -52,7 +52,7 @@ def test_corners_read_back_the_same_with_sigmas_or_without() -> None:
 
 def test_corners_with_y_down_are_refused() -> None:
     turned = {"ul": [-18, -12], "ur": [18, -12], "lr": [18, 12], "ll": [-18, 12]}
-    with pytest.raises(FormatError, match=r"c\.json: .*do not go around a frame, y up"):
+    with pytest.raises(FormatError, match=r"c\.json: .*do not go around a frame with y up"):
         FrameCorners.parse(corners(corners=turned), where="c.json")
 
 
