@@ -184,7 +184,7 @@ def table(done: list[Recording]) -> bool:
             rms, least = np.sqrt((e**2).mean(axis=0)), np.sqrt(b.mean(axis=0))
             ratio = float(np.sqrt((e**2).mean() / b.mean()))
             predicted = float(np.sqrt(c.mean() / (e**2).mean()))
-            coarse = np.sqrt(np.nanmean(n**2) / (e**2).mean())
+            coarse = np.nanmedian(np.abs(n)) / np.median(np.abs(e))
             good = ratio <= (1.15 if big else 1.2) and 0.9 <= predicted <= 1.1
             kept &= good
             bias = 1e3 * e.mean(axis=0)

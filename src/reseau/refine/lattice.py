@@ -139,11 +139,10 @@ def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
         return True
     numbers = (found.across, found.along)
     mapping = _start(found, ridges.darkness.shape)
-    dark = [_darkness_along(mapping, ridges, axis, line, numbers[1 - axis]) for line in numbers[axis]]
+    dark = _darkness_along(mapping, ridges, axis, numbers[axis].astype(float), numbers[1 - axis])
     level = 0.5 * np.median([np.median(each) for each in dark if each.size])
     steps = np.arange(numbers[axis].min() * parts, numbers[axis].max() * parts + 1)
-    steps = steps[steps % parts != 0] / parts
-    dark = [_darkness_along(mapping, ridges, axis, line, numbers[1 - axis]) for line in steps]
+    dark = _darkness_along(mapping, ridges, axis, steps[steps % parts != 0] / parts, numbers[1 - axis])
     return bool(np.median([(each > level).mean() if each.size else 0.0 for each in dark]) > _BETWEEN)
 
 
@@ -186,19 +185,21 @@ def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: f
     xy, normal, at = [], [], []
     for axis, (numbers, others) in enumerate(((fit.across, fit.along), (fit.along, fit.across))):
         along = np.linspace(others.min(), others.max(), max(grey.shape) // 4)
-        for number in numbers:
-            on = np.full((len(along), 2), float(number))
-            on[:, 1 - axis] = along
-            line = crossings(fit.mapping(on), along, grey.shape)
+        on = np.empty((len(numbers), 2, len(along), 2))
+        on[..., 1 - axis] = along
+        on[..., axis] = numbers[:, None, None] + np.array([0.0, width])[:, None]
+        images = fit.mapping(on.reshape(-1, 2)).reshape(on.shape)
+        for number, (middle, beside) in zip(numbers, images, strict=True):
+            line = crossings(middle, np.arange(float(len(along))), grey.shape)
             if line is None:
                 continue
-            on = np.full((len(line.along), 2), float(number))
-            on[:, 1 - axis] = line.along
-            across = _slope(fit.mapping, on)[:, :, axis]
-            shift, told = located(grey, line, 0.5 * width * np.abs((across * line.normal).sum(axis=1)), blur)
+            side = (beside - middle)[np.rint(line.along).astype(np.intp)]
+            shift, told = located(grey, line, 0.5 * np.abs((side * line.normal).sum(axis=1)), blur)
+            place = np.full((len(told), 2), float(number))
+            place[:, 1 - axis] = np.interp(line.along, np.arange(len(along)), along)
             xy.append(line.xy(shift)[told])
             normal.append(line.normal[told])
-            at.append(on[told])
+            at.append(place[told])
     points = [np.concatenate(column) for column in (xy, normal, at)]
     if len(points[0]) < _LEAST_POINTS:
         return fit
@@ -338,25 +339,25 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
     return Chain(mapping.first, curved), fit.residuals[0]
 
 
-def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, line: float, others: Rows) -> Array:
-    """Darkness along a lattice line between the outermost of those that cross it, a sample for each pixel."""
+def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows) -> list[Array]:
+    """Darkness along lattice lines between the outermost of those that cross them, sample by sample."""
     h, w = ridges.darkness.shape
-    at = np.full((max(h, w), 2), float(line))
-    at[:, 1 - axis] = np.linspace(others.min(), others.max(), len(at))
-    xy = mapping(at)
-    xy = xy[((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=1)]
-    if len(xy) < 2:
-        return np.zeros(0)
-    x, y = xy.T.astype(np.float32)[:, None]
-    return np.asarray(cv2.remap(ridges.darkness, x, y, cv2.INTER_LINEAR)[0], dtype=np.float64)
+    along = np.linspace(others.min(), others.max(), max(h, w))
+    at = np.empty((len(lines), len(along), 2))
+    at[..., 1 - axis], at[..., axis] = along, lines[:, None]
+    xy = mapping(at.reshape(-1, 2)).reshape(at.shape)
+    inside = np.asarray(((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=2))
+    x, y = np.moveaxis(xy.astype(np.float32), 2, 0)
+    seen = cv2.remap(ridges.darkness, x, y, cv2.INTER_LINEAR) if x.size else x
+    return [np.asarray(dark[keep], dtype=np.float64) for dark, keep in zip(seen, inside, strict=True)]
 
 
 def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, others: Rows) -> Rows:
     """Numbers of the lines that are really there: dark, and with ridge points."""
     found = []
-    for line in range(int(number.min()), int(number.max()) + 1):
-        dark = _darkness_along(mapping, ridges, axis, line, others)
+    lines = np.arange(number.min(), number.max() + 1)
+    for line, dark in zip(lines, _darkness_along(mapping, ridges, axis, lines, others), strict=True):
         enough = (number == line).sum() > _SUPPORT * len(dark)
         if len(dark) > _SHORTEST and enough and (dark > 0.5 * np.median(dark)).mean() > _LEAST_DARK:
-            found.append(line)
+            found.append(int(line))
     return np.array(found, dtype=np.intp)

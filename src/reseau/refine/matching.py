@@ -26,8 +26,8 @@ Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 _SETTLED = 0.01
 """Corrections, as a share of their standard deviation, that end the iterations."""
 
-_NEAR = 0.05
-"""The same where no blunders are looked for."""
+_NEAR, _PLAIN = 0.05, 1.25
+"""The same where no blunders are looked for; times the limit for these from which they are."""
 
 _FIRST, _MOST = 10, 100
 """Iterations before blunders have been looked for, and at most."""
@@ -231,7 +231,9 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
     worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)
     rms = found.sigma0 * noise
     amiss = (
-        ~found.converged | ~(worst < patch.options.rejection * np.maximum(rms, noise)) | ~(rms < 1.5 * noise)
+        ~found.converged
+        | ~(worst < _PLAIN * patch.options.rejection * np.maximum(rms, noise))
+        | ~(rms < 2 * noise)
     )
     return _columns(patch, found, used, np.full(len(start), noise), patch.shares), np.flatnonzero(amiss)
 

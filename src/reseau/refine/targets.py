@@ -26,7 +26,7 @@ from .shapes import Some, Window
 
 __all__ = ["Light", "Scene", "TargetImages", "match_targets", "merged"]
 
-_SPACING = 0.9
+_SPACING = 1.1
 """Distance of nodes on an outline in widths of the point-spread function: good to 1e-4 of the light."""
 
 
@@ -178,9 +178,11 @@ def form_targets(
         flat = target_outline(*key, _SPACING * psf_px / scale)
         step, tangent = flat.xy @ frame.T, flat.dxy @ frame.T
         # F(s + d) − F(s) = J d + ½ d H d, and its derivative J + H d.
-        curved = np.einsum("kabc,jc->kjab", bend[of], step)
-        nodes = step @ np.swapaxes(slope[of], 1, 2) + 0.5 * np.einsum("kjab,jb->kja", curved, step)
-        tangents = tangent @ np.swapaxes(slope[of], 1, 2) + np.einsum("kjab,jb->kja", curved, tangent)
+        ways = np.swapaxes(slope[of], 1, 2)
+        # (k, a, c, j): what H does with the first of its two arguments.
+        curved = bend[of] @ step.T
+        nodes = step @ ways + 0.5 * np.swapaxes((curved * step.T).sum(axis=2), 1, 2)
+        tangents = tangent @ ways + np.swapaxes((curved * tangent.T).sum(axis=2), 1, 2)
         image = Outline(nodes, tangents).oriented()
         kinds.append(Outline(image.xy.astype(np.float32), image.dxy.astype(np.float32)))
         reach[of] = np.abs(nodes).max(axis=1)
@@ -265,8 +267,9 @@ def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
     xy = scene.lattice(scene.design.xy[rows])
     step = np.abs(scene.frame).max() * np.sqrt(scene.design.pitch**2 / 16)
     size = max(scene.design.targets.size) * np.abs(scene.frame).max()
-    blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(second_order(scene.mapping, xy)[1])))
-    far = np.maximum(1.5 * step, 1.2 * size + blur)
+    slope = second_order(scene.mapping, xy[inside])[1]
+    blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(slope)).min())
+    far = max(1.5 * step, 1.2 * size + blur)
     gap = np.abs(xy[:, None] - xy[inside]).max(axis=2).min(axis=1)
     keep = inside | (gap < far)
     return rows[keep], inside[keep]

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array, Frame, ImagePoints, Mask, Rows
-from ..formats import ReseauMeasurement, TestfieldDesign
+from ..data import Array, Frame, Mask, Rows
+from ..formats import TestfieldDesign
 from ..optics.formation import PixelResponse
 from .clusters import Placement, Reading, locate, read_clusters
 from .lattice import LatticeFit, lattices, refit, second_order
 from .lines import find_lattice, ridge_points
 from .matching import Matches
+from .measured import Measured
 from .profiles import blur_of
 from .screening import quiet_noise, screen
 from .targets import Light, Scene, match_targets, merged
@@ -30,7 +31,7 @@ _LEAST_FIRST, _MOST_FIRST = 8, 48
 """How many large targets are matched first, to know the mapping and the sharpness better."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
-_SETTLED_PX = 0.05
+_SETTLED_PX = 0.02
 """Changes of what the mapping predicts below which it need not be looked at farther out."""
 _UNMODELLED_PX = 0.03
 """What positions scatter about a mapping of third degree beyond their own sigmas."""
@@ -74,27 +75,13 @@ class TestfieldOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class TestfieldResult:
-    """The targets of a testfield in one frame, in columns over the n targets of the design.
+class TestfieldResult(Measured):
+    """The targets of a testfield in one frame: `xy` are images of centroids, `deviation` from a mapping.
 
     Parameters
     ----------
-    image, sha256 : str
-        The frame.
-    ids : tuple of str (n,)
-        The targets.
-    xy : ndarray (n, 2)
-        Images of their centroids in pixels, NaN where not measured.
-    cov : ndarray (n, 2, 2)
-        Covariances in px², NaN where not measured.
-    ok : ndarray of bool (n,)
-        Which were measured.
-    why : tuple of str (n,)
-        Why not, empty where measured.
-    predicted : ndarray (n, 2)
-        Where the mapping through all has each target.
-    psf_px, contrast, t, noise : ndarray (n,)
-        Of each match, see :class:`reseau.refine.matching.Matches`; NaN where there was none.
+    psf_px : ndarray (n,)
+        Width of the point-spread function of each match, NaN where there was none.
     lattice : LatticeFit
         The straight lines as they were adjusted.
     reading : Reading
@@ -104,43 +91,10 @@ class TestfieldResult:
     """
 
     __test__ = False  # not one for pytest, which collects what is named so
-    image: str
-    sha256: str
-    ids: tuple[str, ...]
-    xy: Array
-    cov: Array
-    ok: Mask
-    why: tuple[str, ...]
-    predicted: Array
     psf_px: Array
-    contrast: Array
-    t: Array
-    noise: Array
     lattice: LatticeFit
     reading: Reading
     squares: int
-
-    @property
-    def found(self) -> int:
-        """Number of targets measured."""
-        return int(self.ok.sum())
-
-    @property
-    def points(self) -> ImagePoints:
-        """The targets that were measured."""
-        names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
-        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
-
-    def rms(self) -> Array:
-        """Deviation from the mapping through all, root mean square per axis (2,)."""
-        off = (self.xy - self.predicted)[self.ok]
-        return np.asarray(np.sqrt((off**2).mean(axis=0)) if len(off) else np.full(2, np.nan))
-
-    def measurement(self) -> ReseauMeasurement:
-        """The result as the document that others read."""
-        return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
-        )
 
 
 def measure_testfield(
@@ -283,6 +237,7 @@ class _Measurement:
             "ok": ok,
             "why": tuple(reasons),
             "predicted": predicted,
+            "deviation": spread(found.xy - predicted[wanted], good),
         } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
 
     def _learn_outwards(self) -> None:
@@ -290,7 +245,8 @@ class _Measurement:
 
         It begins between the lines, where the mapping is known, and goes on outwards from there.
         """
-        for before, beyond in ((-np.inf, 0.0), (0.0, 1.0), (1.0, np.inf)):
+        # The second time light and neighbours are known better; a third is for what lies far out.
+        for before, beyond in ((-np.inf, 0.0), (-np.inf, 1.0), (1.0, np.inf)):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
             out = np.abs(self.at[self.rows[candidates]] - self.middle) - self.half
             candidates = candidates[(out <= beyond).all(axis=1)]
@@ -303,7 +259,7 @@ class _Measurement:
             predicted = self.predicted
             self._learn(some)
             moved = (self.predicted - predicted)[self.rows[self.inside]]
-            if len(moved) and np.abs(moved).max() < _SETTLED_PX:
+            if beyond and len(moved) and np.abs(moved).max() < _SETTLED_PX:
                 break
 
     def _learn(self, some: Mask) -> None:
@@ -318,7 +274,9 @@ class _Measurement:
         mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)
         light = Light.through(first.xy[sure], first.level[sure], amplitude[sure], scene.light.size)
-        psf_px, noise = (float(np.median(values[sure])) for values in (first.psf_px, first.noise))
+        psf_px = float(np.median(first.psf_px[sure]))
+        # What neighbours take of the light was not known well yet: the quieter ones tell the noise.
+        noise = float(np.quantile(first.noise[sure], 0.2))
         self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
