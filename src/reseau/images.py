@@ -13,7 +13,7 @@ from .errors import ImageError, InputError
 from .formats import write_whole
 from .provenance import sha256_of
 
-__all__ = ["MAX_PIXELS", "read_frame", "write_image"]
+__all__ = ["MAX_PIXELS", "decoded", "read_frame", "write_image"]
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; the header is asked before a pixel is decoded."""
@@ -115,6 +115,19 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
 
 
 def _read_coded(path: Path, magic: bytes) -> tuple[NDArray[Any], float]:
+    pixels = decoded(path, magic)
+    full_scale = _full_scale(pixels.dtype, path)
+    return (_luma(pixels) if pixels.ndim == 3 else pixels), full_scale
+
+
+def decoded(path: Path, magic: bytes) -> NDArray[Any]:
+    """Pixels of a PNG, JPEG or BMP with the given first bytes: (h, w), or (h, w, c) in the order BGR.
+
+    Raises
+    ------
+    ImageError
+        When it is none of these, damaged, truncated or too large.
+    """
     import cv2
 
     _too_large(path, *_header_size(magic, path))
@@ -129,10 +142,7 @@ def _read_coded(path: Path, magic: bytes) -> tuple[NDArray[Any], float]:
         pixels = None
     if pixels is None:
         raise ImageError("is a damaged image", where=path)
-    full_scale = _full_scale(pixels.dtype, path)
-    if pixels.ndim == 3:
-        pixels = _luma(pixels)
-    return pixels, full_scale
+    return np.asarray(pixels)
 
 
 def write_image(path: Path | str, pixels: NDArray[Any]) -> None:
