@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.adjust import GaussMarkov, Options, Parameters, Prior, adjust
-from reseau.bundle import BundleFit, BundleProblem, Network
+from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
+from reseau.adjust import Options as AdjustOptions
+from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
 from reseau.data import Array
+from reseau.errors import UsageError
 from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
 
 from . import networks
@@ -65,7 +67,7 @@ def dense_twin(world: networks.World, network: Network) -> Any:
         GaussMarkov(
             computed, observed, [network.cov, network.distance[:, 1]], Parameters(names, start, prior=prior)
         ),
-        Options(tolerance=1e-7),
+        AdjustOptions(tolerance=1e-7),
     ).required()
 
 
@@ -124,6 +126,43 @@ def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> N
     # Observed coordinates first, then the observed camera parameter, as the twin's prior has them.
     np.testing.assert_allclose(fit.redundancy_numbers[n:], twin.prior_redundancy_numbers, rtol=0, atol=1e-7)
     np.testing.assert_allclose(fit.w[n:], twin.prior_w, rtol=0, atol=1e-5)
+
+
+def test_the_joint_covariance_of_anything_is_that_of_the_dense_engine() -> None:
+    world = mixed()
+    network = world.noisy(3)
+    result = adjust_network(network, Options(tolerance=1e-10))
+    assert isinstance(result, Result)
+    twin = dense_twin(world, network)
+    # Point p8 takes part in a distance and is not eliminated, p5 and p6 are; p3 is held in X.
+    names = [
+        "c of camera cam",
+        "X of point p5",
+        "Z of point p6",
+        "Y of point p8",
+        "Y0 of image i2",
+        "X of point p3",
+    ]
+    theirs = twin.covariance_of("c", "p5.0", "p6.2", "p8.1", "i2.4")
+    mine = result.covariance_of(*names)
+    size = np.sqrt(np.diag(theirs))
+    np.testing.assert_allclose(mine[:5, :5] / np.outer(size, size), theirs / np.outer(size, size), atol=1e-6)
+    assert not mine[5].any()
+    with pytest.raises(UsageError, match="c of camera none"):
+        result.covariance_of("c of camera none")
+
+
+def test_the_joint_covariance_of_a_free_network_agrees_with_that_of_its_points() -> None:
+    world = networks.world(datum="free", control=0)
+    result = adjust_network(world.noisy(2))
+    assert isinstance(result, Result)
+    names = [f"{axis} of point p{j}" for j in (3, 9) for axis in "XYZ"]
+    joint = result.covariance_of(*names)
+    np.testing.assert_allclose(joint[:3, :3], result.point_covariance[3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(joint[3:, 3:], result.point_covariance[9], rtol=0, atol=1e-12)
+    # Inner constraints over all points: the mean of the corrections is nothing, so its variance is nothing.
+    every = [f"X of point p{j}" for j in range(25)]
+    assert abs(result.covariance_of(*every).sum()) < 1e-12
 
 
 @pytest.mark.parametrize("datum", ["control", "minimal", "free"])

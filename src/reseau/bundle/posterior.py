@@ -13,7 +13,7 @@ import numpy as np
 
 from ..adjust.reliability import Whitened
 from ..adjust.stochastic import Blocks, Weighting
-from ..data import Array, Mask
+from ..data import Array, Mask, Rows
 from .arrow import Singular
 from .compiled import in_parallel
 from .datum import Freedom, held_for
@@ -66,6 +66,22 @@ class BlockSolution(Whitened):
 
 
 @dataclass(frozen=True, eq=False)
+class Referral:
+    """What refers cofactors to inner constraints: Q = Q⁻ − G N Hᵀ − H N Gᵀ + G M Gᵀ.
+
+    N = (GᵀEG)⁻¹ (d, d) is `weight`; H = Q⁻EG of reduced unknowns (u, d) and points (p, 3, d); M = N GᵀE H N
+    is `m`; `before` is Q⁻ of the reduced unknowns.
+    """
+
+    freedom: Freedom
+    before: Array
+    weight: Array
+    h: Array
+    h_points: Array
+    m: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Cofactors:
     """Cofactors after the adjustment.
 
@@ -81,6 +97,8 @@ class Cofactors:
         Of the further adjusted observations, over their variances.
     normal : Normal
         Undamped normal equations, which joint cofactors are made of.
+    referral : Referral, optional
+        How cofactors come into the datum of inner constraints.
     """
 
     reduced: Array
@@ -88,6 +106,43 @@ class Cofactors:
     seen: Array
     further: Array
     normal: Normal
+    referral: Referral | None = None
+
+    def joint(self, columns: Rows, points: Rows) -> Array:
+        """Joint cofactor matrix of some reduced unknowns and of all coordinates of some points.
+
+        Parameters
+        ----------
+        columns : ndarray of int (k,)
+            Reduced unknowns.
+        points : ndarray of int (q,)
+            Eliminated points.
+
+        Returns
+        -------
+        ndarray (k + 3q, k + 3q)
+            In this order; zero for coordinates that are held.
+        """
+        linear, inverse = self.normal.linear, self.normal.inverse
+        system, k, size = linear.system, len(columns), len(columns) + 3 * len(points)
+        through = np.zeros((size, system.unknowns.size))
+        through[np.arange(k), columns] = 1.0
+        for q, j in enumerate(points):
+            through[k + 3 * q : k + 3 * q + 3] = -(_cross(linear, int(j)) @ inverse[j]).T
+        z = self.reduced if self.referral is None else self.referral.before
+        joint = through @ z @ through.T
+        for q, j in enumerate(points):
+            own = slice(k + 3 * q, k + 3 * q + 3)
+            joint[own, own] += inverse[j]
+        if self.referral is not None:
+            r = self.referral
+            g = np.concatenate([r.freedom.reduced[columns], *r.freedom.points[points]])
+            h = np.concatenate([r.h[columns], *r.h_points[points]])
+            one = g @ r.weight @ h.T
+            joint = joint - one - one.T + g @ r.m @ g.T
+        free = np.concatenate([np.ones(k), system.movable[points].ravel()])
+        covariance: Array = joint * np.outer(free, free)
+        return covariance
 
 
 def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_part: Mask) -> Cofactors:
@@ -134,10 +189,12 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     points[kept] = z[columns[:, :, None], columns[:, None, :]]
     further = _further(linear, z, points)
+    referral = None
     if datum is not None and freedom.defect:
-        z, points = _in_datum(normal, freedom, datum & taking_part, z, points)
+        referral = _referral(normal, freedom, datum & taking_part, z)
+        z, points = _in_datum(referral, points)
         points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    return Cofactors(z, points, seen, further, normal)
+    return Cofactors(z, points, seen, further, normal, referral)
 
 
 def _further(linear: Linear, z: Array, points: Array) -> Array:
@@ -155,8 +212,8 @@ def _further(linear: Linear, z: Array, points: Array) -> Array:
     return hats
 
 
-def _in_datum(normal: Normal, freedom: Freedom, chosen: Mask, z: Array, points: Array) -> tuple[Array, Array]:
-    """Cofactors referred to inner constraints over the chosen points."""
+def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Referral:
+    """What refers cofactors to inner constraints over the chosen points."""
     system = normal.linear.system
     unknowns, d = system.unknowns, freedom.defect
     g = np.where(chosen[:, None, None], freedom.points, 0.0)
@@ -167,11 +224,28 @@ def _in_datum(normal: Normal, freedom: Freedom, chosen: Mask, z: Array, points: 
     h = z @ (g_reduced + normal.reduced_sides(g))
     h_points = normal.points(g, h) * system.movable[:, :, None]
     inner = g.reshape(-1, d).T @ g.reshape(-1, d) + g_reduced.T @ g_reduced
-    weight = np.linalg.inv(inner)
+    weight = np.asarray(np.linalg.inv(inner), dtype=np.float64)
     m = weight @ (np.einsum("pad,pae->de", g, h_points) + g_reduced.T @ h) @ weight
-    one = freedom.reduced @ weight
-    z = z - one @ h.T - h @ one.T + freedom.reduced @ m @ freedom.reduced.T
-    cross = np.einsum("pad,de,pbe->pab", freedom.points, weight, h_points, optimize=True)
+    return Referral(freedom, z, weight, h, h_points, m)
+
+
+def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:
+    """Cofactors of the reduced unknowns and of the points, referred."""
+    freedom, weight, m = referral.freedom, referral.weight, referral.m
+    one = freedom.reduced @ weight @ referral.h.T
+    z = referral.before - one - one.T + freedom.reduced @ m @ freedom.reduced.T
+    cross = np.einsum("pad,de,pbe->pab", freedom.points, weight, referral.h_points, optimize=True)
     points = points - cross - np.swapaxes(cross, 1, 2)
     points += np.einsum("pad,de,pbe->pab", freedom.points, m, freedom.points, optimize=True)
     return z, points
+
+
+def _cross(linear: Linear, point: int) -> Array:
+    """W of one point (u, 3): derivatives by the reduced unknowns against those by the point."""
+    pattern, last = linear.system.pattern, linear.rows.shape[2] - 3
+    w = np.zeros((linear.system.unknowns.size, 3))
+    for k in range(pattern.first[point], pattern.first[point + 1]):
+        b = linear.rows[k, :, last:]
+        for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
+            w[start : start + width] += linear.rows[k, :, column : column + width].T @ b
+    return w

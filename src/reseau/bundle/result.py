@@ -11,6 +11,7 @@ import numpy as np
 from ..adjust.rejection import SnoopingStep
 from ..adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ..data import Array, Mask, Rows
+from ..errors import UsageError
 from ..optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from .imaging import EBNER
 from .network import Network
@@ -173,6 +174,47 @@ class Result:
         rows = np.flatnonzero([role == "check" for role in self.network.role])
         rows = rows[self.fit.usable.points[rows]]
         return rows, self.fit.values.xyz[rows] - self.network.xyz[rows]
+
+    # -- anything with anything
+
+    def covariance_of(self, *names: str) -> Array:
+        """Joint covariance of any unknowns.
+
+        Parameters
+        ----------
+        *names : str
+            ``c of camera C``, ``X0 of image I`` (or Y0, Z0), ``dx of image I`` (or dy, dz: rotations about
+            the axes of its camera, rad), ``X of point P`` (or Y, Z), ``b1 of group G``.
+
+        Returns
+        -------
+        ndarray (k, k)
+            In the order of the names; zero for held coordinates.
+
+        Raises
+        ------
+        UsageError
+            For a name of nothing that was estimated.
+        """
+        unknowns, network = self.fit.unknowns, self.network
+        column_of = {name: k for k, name in enumerate(unknowns.names)}
+        point_row = {name: j for j, name in enumerate(network.points)}
+        columns, points, places = list[int](), list[int](), list[tuple[bool, int, int]]()
+        for name in names:
+            axis, _, label = name.partition(" of point ")
+            if name in column_of:
+                places.append((False, len(columns), 0))
+                columns.append(column_of[name])
+            elif label in point_row and axis in "XYZ" and self.fit.usable.points[point_row[label]]:
+                j = point_row[label]
+                points += [j] if j not in points else []
+                places.append((True, points.index(j), "XYZ".index(axis)))
+            else:
+                raise UsageError("is none of the unknowns that were estimated", where=name)
+        joint = self.fit.cofactors.joint(np.array(columns, dtype=np.intp), np.array(points, dtype=np.intp))
+        at = [len(columns) + 3 * k + axis if of_point else k for of_point, k, axis in places]
+        covariance: Array = joint[np.ix_(at, at)] * self.fit.variance
+        return covariance
 
     # -- observations
 

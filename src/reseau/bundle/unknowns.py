@@ -19,7 +19,7 @@ __all__ = ["Unknowns"]
 # Fewer unknowns than this are factorised as a full matrix, whatever their pattern.
 _DENSE = 1500
 _POINT = ("X", "Y", "Z")
-_POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0")
+_POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
 
 
 @dataclass(frozen=True, eq=False)
