@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from reseau.errors import UsageError
 
 from .engine import Options, adjust
@@ -14,6 +16,9 @@ from .result import Adjustment, Failure
 from .significance import CoefficientTest, coefficient_test, compare
 
 __all__ = ["Elimination", "EliminationStep", "eliminate"]
+
+_LOOKED_AT = 2
+"""Parameters that are tested in a step."""
 
 Criterion = Literal["t", "chi2", "F"]
 
@@ -131,21 +136,44 @@ def eliminate(
         raise UsageError("has no redundancy to test with", where="eliminate", do="use criterion='chi2'")
     steps: list[EliminationStep] = []
     while isinstance(fit, Adjustment):
-        tests = []
-        for name in fit.free:
-            if name not in kept:
-                test = _test(fit, name, value, alpha, criterion)
-                if isinstance(test, Failure):
-                    return test
-                tests.append(test)
+        candidates = [name for name in fit.free if name not in kept]
+        tests = _tests(fit, _weakest(fit, candidates, value), value, alpha, criterion)
+        if isinstance(tests, Failure):
+            return tests
         weakest = min(tests, key=lambda test: (-test.p, test.statistic), default=None)
         if weakest is None or weakest.significant:
+            tests = _tests(fit, candidates, value, alpha, criterion)
+            if isinstance(tests, Failure):
+                return tests
             return Elimination(tuple(steps), tuple(tests), full, fit, criterion, alpha)
         before = fit
         fit = _without(before, weakest.name, value)
         if isinstance(fit, Adjustment):
             steps.append(EliminationStep(weakest, len(before.free), before.sigma0, fit.sigma0))
     return fit
+
+
+def _weakest(fit: Adjustment, names: list[str], value: float) -> list[str]:
+    """Those of the names whose estimates lie nearest to the value, in their standard deviations.
+
+    In a linear model the first of them is the least significant by any criterion; a few are looked at for the
+    sake of those that are not.
+    """
+    at = [fit.index(name) for name in names]
+    ratio = np.abs(fit.values[at] - value) / np.sqrt(np.maximum(np.diagonal(fit.cofactor)[at], 1e-300))
+    return [names[k] for k in np.argsort(ratio, kind="stable")[:_LOOKED_AT]]
+
+
+def _tests(
+    fit: Adjustment, names: Iterable[str], value: float, alpha: float, criterion: Criterion
+) -> list[CoefficientTest] | Failure:
+    tests = []
+    for name in names:
+        test = _test(fit, name, value, alpha, criterion)
+        if isinstance(test, Failure):
+            return test
+        tests.append(test)
+    return tests
 
 
 def _without(fit: Adjustment, name: str, value: float) -> Adjustment | Failure:

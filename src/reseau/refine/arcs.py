@@ -19,6 +19,8 @@ _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
 """Halves of windows' sides, pixels; arcs of like size are matched in one batch."""
 _SURE = 8.0
 """Contrast over its standard deviation of an arc whose light is taken off another."""
+_TOUCHING = 0.1
+"""Level at which two spots meet, as a share of the height, from which the one may pull at the other."""
 _MARGIN_PX = 4.0
 """What a window shows of the ground around an arc."""
 _FORM_SIGMA = np.array([0.5, 0.05, 0.3])
@@ -126,7 +128,7 @@ def match_arcs(
     """
     work = _Matching(grey, valid, echoes, at, options, noise)
     found = _together(work.all(), len(at))
-    touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
+    touching = np.flatnonzero((echoes.joined[at] > _TOUCHING) & found.converged)
     if len(touching):
         # How light adds up where two echoes meet is the instrument's secret: the stronger is seen, behind a
         # logarithmic amplifier, or both. The first match took the one for true; how far the other would
