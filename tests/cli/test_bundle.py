@@ -114,6 +114,22 @@ def test_the_summary_says_what_was_estimated(
     assert json.loads((tmp_path / "result.json").read_text())["schema"] == "reseau-bundle/1"
 
 
+def test_the_report_stands_alone_and_names_what_deserves_attention(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    status, _, err = reseau("bundle", network(idle_camera), "--report", tmp_path / "report.html")
+    assert (status, err) == (0, "")
+    page = (tmp_path / "report.html").read_text()
+    assert "camera spare has no image" in page
+    assert page.count("<svg") == 3
+    assert "http://" not in page.replace("http://www.w3.org", "").replace(
+        "http://creativecommons", ""
+    ).replace("http://purl", "")
+    again = tmp_path / "again.html"
+    reseau("bundle", network(idle_camera), "--report", again)
+    assert again.read_text() == page
+
+
 def test_the_same_network_gives_the_same_bytes(reseau: Run, network: Callable[..., Path]) -> None:
     path = network()
     assert reseau("bundle", path, "--json") == reseau("bundle", path, "--json")

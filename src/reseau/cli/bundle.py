@@ -23,18 +23,20 @@ def bundle(
     reject: Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")] = False,
     alpha: Annotated[float, typer.Option(help="Level of the single test of data snooping.")] = 0.001,
     cov: Annotated[bool, typer.Option("--cov", help="Full covariances of the points in the result.")] = False,
+    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust a bundle: orientation, calibration and points from image coordinates, with all their quality."""
     from ..bundle import Options, adjust_network, to_document
     from ..errors import UsageError
     from ..formats import write_whole
-    from ..provenance import canonical_json
+    from ..provenance import Provenance, canonical_json, sha256_of
 
     if not 0 < alpha < 1:
         raise UsageError(f"{alpha:g} is not between 0 and 1", where="--alpha")
-    if out is not None:
-        suffix_of(writable(out), (".json",))
+    for path, suffixes in ((out, (".json",)), (report, (".html",))):
+        if path is not None:
+            suffix_of(writable(path), suffixes)
     content = read_network(network)
     with progress("adjusting", 30) as step:
         options = Options(
@@ -42,6 +44,12 @@ def bundle(
         )
         result = required(adjust_network(content, options), network)
     document = to_document(result, covariances=cov)
+    if report is not None:
+        from ..report.bundle import bundle_report
+
+        inputs = {network.name: sha256_of(network)} if network.is_file() else {}
+        provenance = Provenance(inputs, {"reject": reject, "alpha": alpha})
+        write_whole(report, bundle_report(result, title=network.name, provenance=provenance))
     if out is not None:
         write_whole(out, canonical_json(document))
     if as_json:
