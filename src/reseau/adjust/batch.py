@@ -323,7 +323,9 @@ class _Work:
         residuals = values - self.observed[rows]
         if missing.any():
             residuals = np.where(missing, 0.0, residuals)
-            jacobian = np.where(missing[:, :, None], 0.0, jacobian)
+            # Weight zero takes care of the rest, and the function's array keeps its layout.
+            if not np.isfinite(jacobian).all():
+                jacobian = np.where(missing[:, :, None], 0.0, jacobian)
         return residuals, jacobian
 
     def _cost(self, residuals: Array, x: Array, rows: Rows) -> Array:

@@ -59,6 +59,9 @@ class MatchOptions:
         Degree of the polynomial that the background is: 1, or 2 amid a scene.
     start_px : float
         How far the approximate positions may be off.
+    settled : float
+        Corrections, as a share of their standard deviation, that end the iterations. Images formed in single
+        precision are not smooth enough for less than 0.05.
     variance : (float, float), optional
         Variance of a grey value g as a + b·g, of which only the course counts; see
         :func:`reseau.refine.noise.grey_variance`. By default all are alike.
@@ -75,6 +78,7 @@ class MatchOptions:
     row_jitter_px: float = 0.0
     background: int = 1
     start_px: float = 1.0
+    settled: float = 0.01
     variance: tuple[float, float] | None = None
 
     @property
@@ -198,13 +202,18 @@ class Patches:
         else:
             rest = np.ones_like(share)
             grey, by_share, by_contrast = plane + contrast * share, contrast, share
-        jacobian = np.empty((*share.shape, x.shape[1]))
-        shape_columns = [X, Y, WIDTH, *range(self.form_at, x.shape[1])]
-        jacobian[..., shape_columns] = np.moveaxis(by_share[:, None] * d_share, 1, -1)
-        jacobian[..., WIDTH] *= (np.exp(2 * x[:, WIDTH]) / width)[:, None, None]
-        jacobian[..., CONTRAST] = by_contrast
-        grey, jacobian = grey.reshape(len(x), -1), jacobian.reshape(len(x), share[0].size, -1)
-        jacobian[..., LEVEL : self.form_at] = rest.reshape(len(x), -1, 1) * self.monomials
+        # A row for each parameter, one pixel beside the other; handed on with the parameters last.
+        rows = np.empty((len(x), x.shape[1], *share.shape[1:]))
+        np.multiply(by_share, d_share[:, 0], out=rows[:, X])
+        np.multiply(by_share, d_share[:, 1], out=rows[:, Y])
+        by_width = by_share * (np.exp(2 * x[:, WIDTH]) / width)[:, None, None]
+        np.multiply(by_width, d_share[:, 2], out=rows[:, WIDTH])
+        rows[:, CONTRAST] = by_contrast
+        for k in range(self.forms):
+            np.multiply(by_share, d_share[:, 3 + k], out=rows[:, self.form_at + k])
+        flat = rows.reshape(len(x), x.shape[1], -1)
+        np.multiply(rest.reshape(len(x), 1, -1), self.monomials.T, out=flat[:, LEVEL : self.form_at])
+        grey, jacobian = grey.reshape(len(x), -1), np.swapaxes(flat, 1, 2)
         self.shares[at], self._formed = share, (x.copy(), at.copy(), grey, jacobian)
         return grey, jacobian
 
