@@ -245,7 +245,7 @@ class _Clusters:
 
     def _design(self, psf_px: float) -> Array:
         """Design matrices (g, k, n, 5): level, contrast, shifts, width."""
-        scale = float(np.sqrt(np.abs(np.linalg.det(self.frames))).min())
+        scale = float(np.linalg.norm(self.frames, ord=2, axis=(1, 2)).max())
         outline = self.kinds.outline(psf_px / scale)
         turned = np.swapaxes(self.frames, 1, 2)[:, None]
         image = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()

@@ -42,6 +42,8 @@ _LEAST_DARK = 0.7
 """Share of its length on which a line must be dark, some of it hidden."""
 _BETWEEN = 0.85
 """Share of their length on which lines between those found must be dark."""
+_BENT_PX = 0.13
+"""Distances of ridge points, root mean square, from which on the lens distorts much."""
 _TIMES = 4
 _LEAST_POINTS = 40
 _MIDDLE = 0.5
@@ -126,7 +128,7 @@ def lattices(
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
             # Where the lens distorts much, a line is found on more of its length every time.
-            for _ in range(_TIMES):
+            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 1):
                 points, fit = fit.points, _sharpened(fit, grey, width, blur)
                 if fit.points < 1.02 * points:
                     break
@@ -169,9 +171,10 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         lines = min(len(np.unique(at[axis == k, k])) for k in (0, 1))
         degree = min(max(lines - 1, 1), _DEGREE)
         mapping, residuals = _adjusted(mapping, degree, xy[row], normal[row], at)
-        other = _adjusted(_middled(mapping, at), degree, xy[row], normal[row], at)
-        if _rms(other[1]) < _rms(residuals):
-            mapping, residuals = other
+        if _rms(residuals) > _BENT_PX:
+            other = _adjusted(_middled(mapping, at), degree, xy[row], normal[row], at)
+            if _rms(other[1]) < _rms(residuals):
+                mapping, residuals = other
     numbers = [lattice.across, lattice.along]
     for k in (0, 1):
         numbers[k] = _lines(mapping, ridges, at[axis == k][:, k], k, numbers[1 - k])

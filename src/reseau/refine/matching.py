@@ -23,11 +23,8 @@ __all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "match"]
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
-_SETTLED = 0.01
-"""Corrections, as a share of their standard deviation, that end the iterations."""
-
-_NEAR, _PLAIN = 0.05, 1.25
-"""The same where no blunders are looked for; times the limit for these from which they are."""
+_PLAIN = 1.25
+"""Times the limit for blunders from which they are looked for in patches that are nearly right."""
 
 _FIRST, _MOST = 10, 100
 """Iterations before blunders have been looked for, and at most."""
@@ -187,7 +184,7 @@ def match(
             patch.grey[rows],
             weights=used[rows] * patch.course[rows] / scale[rows] ** 2,
             prior=(start[rows], free),
-            options=BatchOptions(share=_SETTLED, max_iterations=most),
+            options=BatchOptions(share=options.settled, max_iterations=most),
         )
 
     every = np.arange(len(xy))
@@ -225,7 +222,7 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         patch.grey,
         weights=patch.weights * patch.course / noise**2,
         prior=(start, free),
-        options=BatchOptions(share=_NEAR, max_iterations=_FIRST, damping=1e-8),
+        options=BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5),
     )
     used = patch.weights > 0
     worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)

@@ -8,6 +8,7 @@ What its neighbours and the lines take of the light in its window is formed too,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,12 @@ class TargetImages:
         return [(int(k), np.flatnonzero(kind == k)) for k in np.unique(kind)]
 
 
+@lru_cache(maxsize=256)
+def _outline(shape: str, size: float, angle: float, spacing: float) -> Outline:
+    """Outlines are the same for all frames, as near as the number of nodes goes."""
+    return target_outline(shape, size, angle, spacing)
+
+
 def form_targets(
     design: TestfieldDesign, rows: Rows, mapping: Chain, frame: Array, at: Array, psf_px: float
 ) -> tuple[TargetImages, Array, Array]:
@@ -166,7 +173,8 @@ def form_targets(
         Half the width and half the height of each image.
     """
     value, slope, bend = second_order(mapping, at)
-    scale = float(np.sqrt(np.abs(np.linalg.det(slope @ frame))).min())
+    # Nodes are as near to each other as they must be where a millimetre is longest in the image.
+    scale = float(np.linalg.norm(slope @ frame, ord=2, axis=(1, 2)).max())
     targets = design.targets
     keys = [(targets.shape[k], targets.size[k], targets.angle[k]) for k in rows]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
@@ -175,7 +183,7 @@ def form_targets(
     for key, i in number.items():
         of = np.flatnonzero(kind == i)
         row[of] = np.arange(len(of))
-        flat = target_outline(*key, _SPACING * psf_px / scale)
+        flat = _outline(*key, float(f"{_SPACING * psf_px / scale:.2g}"))
         step, tangent = flat.xy @ frame.T, flat.dxy @ frame.T
         # F(s + d) − F(s) = J d + ½ d H d, and its derivative J + H d.
         ways = np.swapaxes(slope[of], 1, 2)
@@ -326,6 +334,7 @@ class _Canvas:
             polarity=scene.design.polarity,
             row_jitter_px=scene.row_jitter_px,
             start_px=0.3,
+            settled=0.05,
             background=background,
         )
         level, amplitude = scene.light.at(centre.astype(np.float64))

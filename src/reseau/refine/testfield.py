@@ -31,6 +31,8 @@ _LEAST_FIRST, _MOST_FIRST = 8, 48
 """How many large targets are matched first, to know the mapping and the sharpness better."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
+_WIDE = 0.1
+"""Part of the frame around it in which targets are looked for that reach into it."""
 _SETTLED_PX = 0.02
 """Changes of what the mapping predicts below which it need not be looked at farther out."""
 _UNMODELLED_PX = 0.03
@@ -185,23 +187,26 @@ class _Measurement:
         self.predicted = scene.mapping(self.at)
         h, w = scene.grey.shape
         size = np.array([w, h])
-        slope = second_order(scene.mapping, self.at)[1] @ scene.frame
-        reach = np.abs(slope).sum(axis=2) * (np.array(scene.design.targets.size) * 0.6)[:, None]
         margin = 3 * scene.psf_px
-        near = (self.predicted > -reach - margin) & (self.predicted < size - 1 + reach + margin)
-        self.rows = np.flatnonzero(near.all(axis=1) & self._unfolded())
-        inside = (self.predicted > reach - 0.5) & (self.predicted < size - 0.5 - reach)
-        self.inside = inside.all(axis=1)[self.rows]
+        wide = _WIDE * size.max()
+        self.rows = np.flatnonzero(((self.predicted > -wide) & (self.predicted < size + wide)).all(axis=1))
+        self.rows = self.rows[self._unfolded(self.at[self.rows])]
+        slope = second_order(scene.mapping, self.at[self.rows])[1] @ scene.frame
+        reach = np.abs(slope).sum(axis=2) * (np.array(scene.design.targets.size) * 0.6)[self.rows, None]
+        xy = self.predicted[self.rows]
+        near = ((xy > -reach - margin) & (xy < size - 1 + reach + margin)).all(axis=1)
+        self.rows, reach, xy = self.rows[near], reach[near], xy[near]
+        self.inside = ((xy > reach - 0.5) & (xy < size - 0.5 - reach)).all(axis=1)
 
-    def _unfolded(self) -> Mask:
-        """Targets up to which, from the middle of the lattice, the mapping keeps its orientation.
+    def _unfolded(self, at: Array) -> Mask:
+        """Whether, from the middle of the lattice to these places, the mapping keeps its orientation.
 
         A polynomial folds back beyond the points that it was adjusted to.
         """
-        unfolded = np.ones(len(self.at), dtype=bool)
-        for part in (0.25, 0.5, 0.75, 1.0):
-            slope = second_order(self.scene.mapping, self.middle + part * (self.at - self.middle))[1]
-            unfolded &= np.linalg.det(slope) < 0
+        way = at - self.middle
+        parts = np.array([0.4, 0.7, 1.0])[:, None, None]
+        slope = second_order(self.scene.mapping, (self.middle + parts * way).reshape(-1, 2))[1]
+        unfolded: Mask = np.asarray((np.linalg.det(slope).reshape(3, -1) < 0).all(axis=0))
         return unfolded
 
     def columns(self) -> dict[str, Any]:
