@@ -248,3 +248,15 @@ def test_t_and_chi2_tests_of_a_coefficient_keep_their_level():
         chi2 += adjust(parabola(y, 0.5), Options(scale="a-priori")).required().test_of("c").significant
     assert within(t, trials, alpha)
     assert within(chi2, trials, alpha)
+
+
+def test_the_lengths_of_undetected_errors_need_no_effects():
+    """The same λ̄ from the cofactors of the adjusted observations alone."""
+    t = np.linspace(0, 1, 12)
+    line = GaussMarkov(
+        lambda x: x[0] + x[1] * t, 2 * t + 0.01 * np.sin(9 * t), 0.01, Parameters("ab", [0, 0])
+    )
+    fit = adjust(line).required()
+    np.testing.assert_allclose(
+        fit.external_lengths(0.01, 0.7), fit.external_reliability(0.01, 0.7).lengths, rtol=1e-9
+    )

@@ -63,6 +63,16 @@ def test_snooping_finds_the_blunders_and_nothing_else():
     assert all(step.statistic > step.critical for step in found.steps)
 
 
+def test_snooping_in_groups_finds_the_same_in_fewer_rounds():
+    """One of each group leaves in a round; good ones that left with them come back."""
+    alone = data_snooping(line(spoilt()), alpha=0.0001).required()
+    groups = np.arange(len(T)) // 10
+    together = data_snooping(line(spoilt()), alpha=0.0001, groups=groups).required()
+    np.testing.assert_array_equal(together.rejected, alone.rejected)
+    assert together.rounds < alone.rounds
+    assert together.adjustment.sigma0 == pytest.approx(alone.adjustment.sigma0, rel=1e-12)
+
+
 def test_snooping_by_tau_needs_no_true_sigmas():
     found = data_snooping(line(spoilt(), sigma=None), alpha=0.001, test="tau").required()
     assert np.flatnonzero(found.rejected).tolist() == [3, 20, 44]

@@ -219,9 +219,13 @@ def _restored(
     """The adjustment with the best fitting of those left out taken back, one of each label, if they pass."""
     if not out.any():
         return None
-    size = np.where(out, 1.0 / np.maximum(runs.standardised(fit), np.finfo(float).tiny), 0.0)
+    t = runs.standardised(fit) / (fit.sigma0 if level[0] == "tau" and fit.sigma0 > 0 else 1.0)
+    size = np.where(out, 1.0 / np.maximum(t, np.finfo(float).tiny), 0.0)
     several = label.any()
     best = _foremost(size, label)
+    if several:
+        # The best alone is tried whatever its residual; more at once only when they look good.
+        best = [place for k, place in enumerate(best) if k == 0 or t[place] <= _tests(fit, *level)[1]]
     fewer = out.copy()
     for place in best:
         fewer[runs.mark(place)] = False
