@@ -13,6 +13,8 @@ from reseau.bundle.system import Linear, System, residuals
 from reseau.bundle.unknowns import Unknowns
 from reseau.bundle.values import Correction, Values
 from reseau.data import Array
+from reseau.optics import EbnerCorrection
+from reseau.optics.poses import Pose, matrix_to_vector, project
 
 from . import networks
 
@@ -145,3 +147,18 @@ def test_ebner_is_orthogonal_over_its_grid_and_as_defined() -> None:
     assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-12
     x = pixels[:, 0]
     np.testing.assert_allclose(effects.reshape(9, 2, 12)[:, 0, 2], -(2 * x**2 - 4 / 3), atol=1e-12)
+
+
+def test_ebner_of_the_bundle_is_that_of_optics() -> None:
+    values = np.random.default_rng(2).normal(0, 1e-4, 12)
+    camera = networks.with_ebner("camera", 1.2)
+    world = networks.world(images=3, points=10, cameras=(camera,))
+    system, start = system_of(world)
+    rows = np.arange(len(world.network.xy))
+    bent = residuals(world.network, system.unknowns, rows, replace(start, extra=values[None]))
+    plain = networks.mapping_of(replace(camera, values=np.array([camera.values[0]] + 9 * [0.0])))
+    poses = Pose(matrix_to_vector(world.rotation)[world.network.image_of], world.x0[world.network.image_of])
+    ideal = project(plain, poses, world.xyz[world.network.point_of]).xy
+    photo = (ideal - [319.5, 239.5]) * [0.01, -0.01]
+    off = (EbnerCorrection(values, 1.2)(photo) - photo) / [0.01, -0.01]
+    np.testing.assert_allclose(bent, off, rtol=0, atol=1e-9)

@@ -18,6 +18,7 @@ from reseau.optics import (
     BrownDistortion,
     Chain,
     DecenteredDisplay,
+    EbnerCorrection,
     Identity,
     Inverted,
     Mapping,
@@ -70,6 +71,8 @@ def _projective() -> RationalPolynomial:
 
 # A 36×24 mm camera with 24 mm lens: barrel distortion of 0.5 mm at the corner, decentering, affinity.
 BROWN = [24.36, 0.11, -0.07, 2.2e-4, -1.5e-7, 1e-10, 2e-5, -1e-5, 3e-4, -2e-4]
+# Some hundredths of a millimetre at the corner each.
+EBNER = [1e-3, -8e-4, 1e-4, -1e-4, 2e-4, 1e-4, 1e-5, -2e-5, 1e-5, 2e-5, 1e-6, -1e-6]
 GRID = PixelGrid(5616, 3744, (0.00641, 0.00642))
 OPENCV = [800.0, 805.0, 319.0, 241.0, -0.28, 0.09, 8e-4, -5e-4, -0.012]
 # A screen of 100 mm: 2 % pincushion at the corner, decentering, tilt and beam of some tenths of a millimetre.
@@ -104,6 +107,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "display": lambda: Case(wong_display().with_values(DISPLAY), 50),
     "display-decentered": lambda: Case(DecenteredDisplay(DECENTERED), 50),
     "brown-distortion": lambda: Case(BrownDistortion(BROWN[3:], 12.0), 18),
+    "ebner": lambda: Case(EbnerCorrection(EBNER, 9.0), 12),
     "brown-object": lambda: Case(Brown(BROWN, "object"), 0.6),
     "brown-image": lambda: Case(Brown(BROWN, "image"), 0.6),
     "brown-object-pixels": lambda: Case(Brown(BROWN, "object", 12.0, GRID), 0.6),

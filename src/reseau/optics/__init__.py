@@ -1,5 +1,6 @@
 """Image formation: cameras, distortions, displays, sensors and target images."""
 
+from .additional import EbnerCorrection
 from .arcs import Arcs
 from .cameras import Brown, OpenCV, PixelGrid
 from .composition import Chain, Identity, Inverted, Similarity
@@ -26,6 +27,7 @@ __all__ = [
     "Chain",
     "DecenteredDisplay",
     "Derivatives",
+    "EbnerCorrection",
     "Identity",
     "Inverted",
     "Mapping",

@@ -1,0 +1,70 @@
+"""Additional parameters of self-calibration: corrections of photo-coordinates without a physical reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..data import Array
+from ..errors import UsageError
+from .mapping import Derivatives, PlaneMapping, as_points, as_values
+
+__all__ = ["EbnerCorrection"]
+
+
+@dataclass(frozen=True, eq=False)
+class EbnerCorrection(PlaneMapping):
+    """Ebner's twelve parameters, orthogonal over a grid of nine points: (x, y) + (Δx, Δy), mm.
+
+    With the base b of the grid, k = 2b²/3 and l = 4b²/3::
+
+        Δx =  b1·x + b2·y − b3(2x²−l) + b4·xy + b5(y²−k) + b7·x(y²−k) + b9·y(x²−k) + b11(x²−k)(y²−k)
+        Δy = −b1·y + b2·x + b3·xy − b4(2y²−l) + b6(x²−k) + b8·y(x²−k) + b10·x(y²−k) + b12(x²−k)(y²−k)
+
+    Ebner (1976), Self calibrating block adjustment, Bildmessung und Luftbildwesen 44.
+
+    Parameters
+    ----------
+    values : array_like (12,)
+        b1 … b12.
+    base_mm : float
+        b, distance of neighbouring points of the grid.
+
+    Raises
+    ------
+    UsageError
+        For a base that is not above zero.
+    """
+
+    names: ClassVar[tuple[str, ...]] = tuple(f"b{k}" for k in range(1, 13))
+    values: Array = field(default_factory=lambda: np.zeros(12))
+    base_mm: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", as_values(self.names, self.values))
+        if not self.base_mm > 0:
+            raise UsageError(f"{self.base_mm:g} is not above zero", where="base of the additional parameters")
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        points = as_points(xy)
+        x, y = points.T
+        k, m = 2 * self.base_mm**2 / 3, 4 * self.base_mm**2 / 3
+        s, t = x * x - k, y * y - k
+        d = np.zeros((len(points), 2, 12))
+        d[:, 0] = np.stack(
+            [x, y, m - 2 * x * x, x * y, t, 0 * x, x * t, 0 * x, y * s, 0 * x, s * t, 0 * x], 1
+        )
+        d[:, 1] = np.stack(
+            [-y, x, x * y, m - 2 * y * y, 0 * x, s, 0 * x, y * s, 0 * x, x * t, 0 * x, s * t], 1
+        )
+        b = self.values
+        d_xy = np.empty((len(points), 2, 2))
+        d_xy[:, 0, 0] = b[0] - 4 * b[2] * x + b[3] * y + b[6] * t + 2 * b[8] * x * y + 2 * b[10] * x * t
+        d_xy[:, 0, 1] = b[1] + b[3] * x + 2 * b[4] * y + 2 * b[6] * x * y + b[8] * s + 2 * b[10] * s * y
+        d_xy[:, 1, 0] = b[1] + b[2] * y + 2 * b[5] * x + 2 * b[7] * x * y + b[9] * t + 2 * b[11] * x * t
+        d_xy[:, 1, 1] = -b[0] + b[2] * x - 4 * b[3] * y + b[7] * s + 2 * b[9] * x * y + 2 * b[11] * s * y
+        return Derivatives(points + d @ b, d_xy + np.eye(2), d)
