@@ -1,0 +1,170 @@
+"""BK Medical's OEM interface: messages between 0x01 and 0x04, with frames and their geometry.
+
+Source: *BK Ultrasound OEM Interface*, "Message Framing" and "GRAB_FRAME". The bytes 0x01, 0x04 and 0x1B
+inside a message stand as 0x1B and their complement. A frame comes as ``DATA:GRAB_FRAME #<n><length><4 bytes
+of a time stamp><pixels>;``. Its length is wrong on some instruments: the end of the message counts.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from reseau.errors import ProtocolError
+
+from .stream import Damaged, shown
+
+__all__ = ["PORT", "GrabbedFrame", "MessageDecoder", "encode", "encode_frame", "numbers", "parse_frame"]
+
+PORT = 7915
+START, END, ESCAPE = 0x01, 0x04, 0x1B
+
+_ESCAPED = re.compile(b"[\x01\x04\x1b]")
+_MARKS = re.compile(b"[\x01\x04]")
+_STAMP = 4
+_GRAB = b"DATA:GRAB_FRAME "
+
+
+def encode(content: bytes) -> bytes:
+    """A message with its frame.
+
+    Examples
+    --------
+    >>> encode(b"A" + bytes([4]) + b";").hex(" ")
+    '01 41 1b fb 3b 04'
+    """
+    body = _ESCAPED.sub(lambda found: bytes([ESCAPE, ~found[0][0] & 0xFF]), content)
+    return bytes([START]) + body + bytes([END])
+
+
+class MessageDecoder:
+    """Messages from a stream.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes of the longest message; of a longer one nothing is kept.
+    """
+
+    def __init__(self, limit: int = 8_000_000) -> None:
+        self._limit = limit
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the message that was begun."""
+        self._begun: bytearray | None = None
+
+    def feed(self, data: bytes) -> list[bytes | Damaged]:
+        """Messages that are complete with these bytes, without their frame and escapes."""
+        found: list[bytes | Damaged] = []
+        at = 0
+        for mark in _MARKS.finditer(data):
+            self._take(data[at : mark.start()], found)
+            at = mark.end()
+            body, self._begun = self._begun, bytearray() if mark[0] == b"\x01" else None
+            if body is None:
+                continue
+            if mark[0] == b"\x04":
+                found.append(_unescaped(bytes(body)))
+            else:
+                # A start inside a message, which escapes forbid: the end of the one before was lost.
+                _report(found, bytes(body), "a message without end")
+        self._take(data[at:], found)
+        return found
+
+    def _take(self, piece: bytes, found: list[bytes | Damaged]) -> None:
+        """Add a piece without marks to the message that was begun."""
+        if not piece:
+            return
+        if self._begun is None:
+            _report(found, piece, f"{len(piece)} bytes between messages")
+        elif len(self._begun) + len(piece) > self._limit:
+            _report(found, bytes(self._begun[:60]), f"longer than {self._limit} bytes")
+            self._begun = None
+        else:
+            self._begun += piece
+
+
+def _report(found: list[bytes | Damaged], data: bytes, why: str) -> None:
+    """One report for what is damaged in one go: garbage can look like thousands of messages."""
+    if not found or not isinstance(found[-1], Damaged):
+        found.append(Damaged(data[:60], why))
+
+
+def _unescaped(body: bytes) -> bytes | Damaged:
+    parts = body.split(bytes([ESCAPE]))
+    out = bytearray(parts[0])
+    for part in parts[1:]:
+        if not part or (~part[0] & 0xFF) not in (START, END, ESCAPE):
+            return Damaged(body[:60], "a wrong escape")
+        out.append(~part[0] & 0xFF)
+        out += part[1:]
+    return bytes(out)
+
+
+@dataclass(frozen=True)
+class GrabbedFrame:
+    """Pixels of a frame, row by row.
+
+    Parameters
+    ----------
+    stamp : int
+        Milliseconds of the instrument's clock.
+    pixels : bytes
+        One byte each.
+    announced : int
+        What the message said of its length; not to be trusted.
+    """
+
+    stamp: int
+    pixels: bytes
+    announced: int
+
+
+def encode_frame(frame: GrabbedFrame) -> bytes:
+    """The content of a message that brings a frame."""
+    length = str(frame.announced).encode("ascii")
+    stamp = frame.stamp.to_bytes(_STAMP, "little")
+    return _GRAB + b"#%d" % len(length) + length + stamp + frame.pixels + b";"
+
+
+def parse_frame(content: bytes) -> GrabbedFrame:
+    """The frame that a message brings.
+
+    Raises
+    ------
+    ProtocolError
+        When it brings none.
+    """
+    head = re.match(rb"DATA:GRAB_FRAME #([1-9])", content)
+    digits = int(head[1]) if head else 0
+    length = content[head.end() : head.end() + digits] if head else b""
+    if head is None or len(length) != digits or not length.isdigit():
+        raise ProtocolError(f"no frame: {shown(content)}")
+    start = head.end() + digits
+    if len(content) < start + _STAMP:
+        raise ProtocolError(f"a frame without a time stamp: {shown(content)}")
+    pixels = content[start + _STAMP :]
+    return GrabbedFrame(int.from_bytes(content[start : start + _STAMP], "little"), pixels[:-1], int(length))
+
+
+def numbers(content: bytes, name: str) -> tuple[float, ...]:
+    """The numbers of an answer ``DATA:<name> a,b,…;``.
+
+    Raises
+    ------
+    ProtocolError
+        When it is another message or holds no numbers.
+
+    Examples
+    --------
+    >>> numbers(b"DATA:US_WIN_SIZE 640,480;", "US_WIN_SIZE")
+    (640.0, 480.0)
+    """
+    prefix = f"DATA:{name} ".encode("ascii")
+    try:
+        if not content.startswith(prefix):
+            raise ValueError
+        return tuple(float(value) for value in content[len(prefix) :].rstrip(b"; ").split(b","))
+    except ValueError:
+        raise ProtocolError(f"no answer to {name}: {shown(content)}") from None

@@ -1,0 +1,81 @@
+r"""US Ultratek's CompactPulser: one letter, a number, a carriage return; ``G?`` is answered ``G=…\r``.
+
+Source: *CompactPulser Instruction Manual*, the table of its serial commands.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from reseau.errors import ProtocolError, SettingError
+
+from .stream import shown
+
+__all__ = ["LETTERS", "LIMIT", "Setting", "decode", "encode", "encode_answer"]
+
+LIMIT = 64
+"""Bytes of the longest line."""
+
+LETTERS: dict[str, str] = {
+    "P": "pulse repetition frequency, in units of 10 Hz; 0 is off",
+    "W": "width of the pulse (ns)",
+    "V": "voltage of the pulse (V)",
+    "D": "damping",
+    "M": "mode: 0 pulse-echo, 1 through transmission",
+    "T": "trigger: 0 internal, 1 external",
+    "G": "gain (dB)",
+}
+"""What each letter sets."""
+
+_COMMAND = re.compile(rb"([A-Z])(\?|-?\d{1,5}(?:\.\d)?)")
+_ANSWER = re.compile(rb"([A-Z])=(-?\d{1,5}(?:\.\d+)?)")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A letter with its value; none in a question."""
+
+    letter: str
+    value: float | None
+
+
+def encode(setting: Setting) -> bytes:
+    """Bytes of a command or question.
+
+    Raises
+    ------
+    SettingError
+        When there is no such letter or the value cannot be written.
+
+    Examples
+    --------
+    >>> encode(Setting("P", 100)), encode(Setting("G", None))
+    (b'P100\\r', b'G?\\r')
+    """
+    text = f"{setting.letter}{'?' if setting.value is None else f'{setting.value:g}'}"
+    if setting.letter not in LETTERS or _COMMAND.fullmatch(text.encode()) is None:
+        raise SettingError("is no command of a CompactPulser", where=repr(text))
+    return text.encode("ascii") + b"\r"
+
+
+def encode_answer(setting: Setting) -> bytes:
+    """Bytes of an answer."""
+    return f"{setting.letter}={setting.value:g}\r".encode("ascii")
+
+
+def decode(line: bytes) -> tuple[Setting, bool]:
+    """The setting in a line, and whether it is an answer.
+
+    Raises
+    ------
+    ProtocolError
+        When the line is neither command nor answer.
+    """
+    line = line.strip(b"\r\n")
+    for pattern, answer in ((_COMMAND, False), (_ANSWER, True)):
+        found = pattern.fullmatch(line)
+        if found and found[1].decode() in LETTERS:
+            value = None if found[2] == b"?" else float(found[2])
+            return Setting(found[1].decode(), value), answer
+    raise ProtocolError(f"no line of a CompactPulser: {shown(line)}")

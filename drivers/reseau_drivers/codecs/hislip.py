@@ -1,0 +1,135 @@
+"""HiSLIP messages: sixteen bytes of head, and a payload.
+
+Source: IVI-6.1, *High-Speed LAN Instrument Protocol* 1.1, section 2.4 (message header format), table 4
+(message types) and section 3 (transactions).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from reseau.errors import SettingError
+
+from .stream import Damaged
+
+__all__ = ["HEAD", "PORT", "Message", "MessageDecoder", "Type", "encode"]
+
+PORT = 4880
+HEAD = 16
+"""Bytes of the head."""
+
+_HEAD = struct.Struct(">2sBBIQ")
+
+
+class Type(IntEnum):
+    """Of a message."""
+
+    INITIALIZE = 0
+    INITIALIZE_RESPONSE = 1
+    FATAL_ERROR = 2
+    ERROR = 3
+    ASYNC_LOCK = 4
+    ASYNC_LOCK_RESPONSE = 5
+    DATA = 6
+    DATA_END = 7
+    DEVICE_CLEAR_COMPLETE = 8
+    DEVICE_CLEAR_ACKNOWLEDGE = 9
+    ASYNC_REMOTE_LOCAL_CONTROL = 10
+    ASYNC_REMOTE_LOCAL_RESPONSE = 11
+    TRIGGER = 12
+    INTERRUPTED = 13
+    ASYNC_INTERRUPTED = 14
+    ASYNC_MAX_MSG_SIZE = 15
+    ASYNC_MAX_MSG_SIZE_RESPONSE = 16
+    ASYNC_INITIALIZE = 17
+    ASYNC_INITIALIZE_RESPONSE = 18
+    ASYNC_DEVICE_CLEAR = 19
+    ASYNC_SERVICE_REQUEST = 20
+    ASYNC_STATUS_QUERY = 21
+    ASYNC_STATUS_RESPONSE = 22
+    ASYNC_DEVICE_CLEAR_ACKNOWLEDGE = 23
+    ASYNC_LOCK_INFO = 24
+    ASYNC_LOCK_INFO_RESPONSE = 25
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message.
+
+    Parameters
+    ----------
+    type : int
+        A :class:`Type`, or what the peer sent for one.
+    control : int
+        Control code, 8 bits.
+    parameter : int
+        Message parameter, 32 bits: the message's number in data messages.
+    payload : bytes
+        What it carries.
+    """
+
+    type: int
+    control: int = 0
+    parameter: int = 0
+    payload: bytes = b""
+
+
+def encode(message: Message) -> bytes:
+    """Bytes of a message.
+
+    Raises
+    ------
+    SettingError
+        When a number does not fit its field.
+
+    Examples
+    --------
+    >>> encode(Message(Type.DATA_END, 0, 0xFFFFFF00, b"*IDN?")).hex(" ", -4)
+    '48530700 ffffff00 00000000 00000005 2a49444e 3f'
+    """
+    try:
+        head = _HEAD.pack(b"HS", message.type, message.control, message.parameter, len(message.payload))
+    except struct.error as error:
+        raise SettingError(f"does not fit ({error})", where="a HiSLIP message") from None
+    return head + message.payload
+
+
+class MessageDecoder:
+    """Messages from a stream.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes of the largest payload. After a larger one, or a wrong head, the stream cannot be trusted any
+        more; what follows is ignored.
+    """
+
+    def __init__(self, limit: int = 1 << 23) -> None:
+        self._limit = limit
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the message that was begun."""
+        self._begun, self._lost = bytearray(), False
+
+    def feed(self, data: bytes) -> list[Message | Damaged]:
+        """Messages that are complete with these bytes."""
+        if self._lost:
+            return []
+        found: list[Message | Damaged] = []
+        self._begun += data
+        while len(self._begun) >= HEAD:
+            prologue, kind, control, parameter, length = _HEAD.unpack_from(self._begun)
+            if prologue != b"HS" or length > self._limit:
+                why = "no head of HiSLIP" if prologue != b"HS" else f"a payload of {length} bytes"
+                found.append(Damaged(bytes(self._begun[:60]), why))
+                self._begun.clear()
+                self._lost = True
+                return found
+            if len(self._begun) < HEAD + length:
+                return found
+            found.append(Message(kind, control, parameter, bytes(self._begun[HEAD : HEAD + length])))
+            del self._begun[: HEAD + length]
+        return found

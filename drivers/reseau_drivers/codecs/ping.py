@@ -1,0 +1,280 @@
+"""Blue Robotics' Ping protocol, and the messages of the scanning sonar Ping360.
+
+Source: *Ping Protocol*, "Message Format", "Common Messages" and "Ping360 Messages". A frame is ``BR``, the
+payload's length, the message's number, sender and receiver, the payload and the sum of all bytes before,
+little-endian. Angles are gradians of 400 a turn, sample periods are units of 25 ns.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Self
+
+from reseau.errors import ProtocolError, SettingError
+
+from .stream import Damaged
+
+__all__ = [
+    "ACK",
+    "ASCII_TEXT",
+    "AUTO_DEVICE_DATA",
+    "AUTO_TRANSMIT",
+    "DEVICE_DATA",
+    "DEVICE_ID",
+    "DEVICE_INFORMATION",
+    "GENERAL_REQUEST",
+    "GRADIANS",
+    "MOTOR_OFF",
+    "NACK",
+    "PERIOD_NS",
+    "PROTOCOL_VERSION",
+    "RESET",
+    "TRANSDUCER",
+    "DeviceData",
+    "Frame",
+    "FrameDecoder",
+    "Information",
+    "Transducer",
+    "encode",
+]
+
+ACK, NACK, ASCII_TEXT, DEVICE_INFORMATION, PROTOCOL_VERSION, GENERAL_REQUEST = 1, 2, 3, 4, 5, 6
+DEVICE_ID, DEVICE_DATA, AUTO_DEVICE_DATA = 2000, 2300, 2301
+RESET, TRANSDUCER, AUTO_TRANSMIT, MOTOR_OFF = 2600, 2601, 2602, 2903
+GRADIANS = 400
+"""Of a turn of the head."""
+PERIOD_NS = 25.0
+"""Unit of the sample period."""
+MAX_PAYLOAD = 2048
+"""Longer than any message of these devices; a length beyond is noise."""
+
+_HEAD = struct.Struct("<2sHHBB")
+_TRANSDUCER = struct.Struct("<BBHHHHHBB")
+_DATA = struct.Struct("<BBHHHHH")
+_VECTOR = struct.Struct("<H")
+_INFORMATION = struct.Struct("<BBBBBB")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One message.
+
+    Parameters
+    ----------
+    id : int
+        What it is.
+    payload : bytes
+        What it says.
+    source, target : int
+        Numbers of the devices.
+    """
+
+    id: int
+    payload: bytes = b""
+    source: int = 0
+    target: int = 0
+
+
+def encode(frame: Frame) -> bytes:
+    """Bytes of a frame.
+
+    Raises
+    ------
+    SettingError
+        When its payload is too long.
+
+    Examples
+    --------
+    >>> encode(Frame(GENERAL_REQUEST, b"\\x05\\x00")).hex(" ")
+    '42 52 02 00 06 00 00 00 05 00 a1 00'
+    """
+    if len(frame.payload) > MAX_PAYLOAD:
+        raise SettingError(f"is longer than {MAX_PAYLOAD} bytes", where="payload of a Ping frame")
+    body = _HEAD.pack(b"BR", len(frame.payload), frame.id, frame.source, frame.target) + frame.payload
+    return body + _VECTOR.pack(sum(body) & 0xFFFF)
+
+
+class FrameDecoder:
+    """Frames from a stream; garbage between them is skipped and reported."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frame that was begun."""
+        self._begun = bytearray()
+
+    def feed(self, data: bytes) -> list[Frame | Damaged]:
+        """Frames that are complete with these bytes."""
+        found: list[Frame | Damaged] = []
+        begun = self._begun
+        begun += data
+        while True:
+            self._skip_to_start(found)
+            if len(begun) < _HEAD.size:
+                return found
+            _, length, id_, source, target = _HEAD.unpack_from(begun)
+            if length > MAX_PAYLOAD:
+                self._give_up(found, f"a frame of {length} bytes")
+                continue
+            end = _HEAD.size + length
+            if len(begun) < end + 2:
+                return found
+            if _VECTOR.unpack_from(begun, end)[0] != sum(begun[:end]) & 0xFFFF:
+                # Its length may be what is wrong: the next frame may begin within this one.
+                self._give_up(found, "a frame with a wrong checksum")
+                continue
+            found.append(Frame(id_, bytes(begun[_HEAD.size : end]), source, target))
+            del begun[: end + 2]
+
+    def _skip_to_start(self, found: list[Frame | Damaged]) -> None:
+        start = self._begun.find(b"BR")
+        if start < 0:
+            start = len(self._begun) - (self._begun[-1:] == b"B")
+        if start > 0:
+            if not found or not isinstance(found[-1], Damaged):
+                found.append(Damaged(bytes(self._begun[:60]), f"{start} bytes between frames"))
+            del self._begun[:start]
+
+    def _give_up(self, found: list[Frame | Damaged], why: str) -> None:
+        # One report for what is damaged in one go: garbage can look like thousands of frames.
+        if not found or not isinstance(found[-1], Damaged):
+            found.append(Damaged(bytes(self._begun[:60]), why))
+        del self._begun[:2]
+
+
+def _unpacked(layout: struct.Struct, payload: bytes, what: str) -> tuple[int, ...]:
+    if len(payload) < layout.size:
+        raise ProtocolError(f"{what} of {len(payload)} bytes; {layout.size} were expected")
+    return layout.unpack_from(payload)
+
+
+@dataclass(frozen=True)
+class Transducer:
+    """What TRANSDUCER asks for, and DEVICE_DATA repeats.
+
+    Parameters
+    ----------
+    gain : int
+        0 low, 1 normal, 2 high.
+    angle : int
+        Of the head (gradians).
+    duration_us : int
+        Of the transmitted pulse.
+    period : int
+        Between samples, in units of 25 ns.
+    frequency_khz : int
+        Of the pulse.
+    samples : int
+        Number of samples.
+    transmit : bool
+        Whether a pulse is sent.
+    mode : int
+        1 for a Ping360.
+    """
+
+    gain: int
+    angle: int
+    duration_us: int
+    period: int
+    frequency_khz: int
+    samples: int
+    transmit: bool = True
+    mode: int = 1
+
+    def frame(self, target: int = 0) -> Frame:
+        """The message that asks for it.
+
+        Raises
+        ------
+        SettingError
+            When a value does not fit its field.
+        """
+        try:
+            payload = _TRANSDUCER.pack(*self._common, int(self.transmit), 0)
+        except struct.error as error:
+            raise SettingError(f"does not fit ({error})", where="TRANSDUCER") from None
+        return Frame(TRANSDUCER, payload, 0, target)
+
+    @classmethod
+    def parse(cls, payload: bytes) -> Self:
+        """What a TRANSDUCER message asks for.
+
+        Raises
+        ------
+        ProtocolError
+            When it is too short.
+        """
+        mode, *rest, transmit, _ = _unpacked(_TRANSDUCER, payload, "a TRANSDUCER message")
+        return cls(*rest, transmit=bool(transmit), mode=mode)
+
+    @property
+    def _common(self) -> tuple[int, ...]:
+        return (
+            self.mode,
+            self.gain,
+            self.angle,
+            self.duration_us,
+            self.period,
+            self.frequency_khz,
+            self.samples,
+        )
+
+
+@dataclass(frozen=True)
+class DeviceData:
+    """One line of echoes: with what it was taken, and its samples."""
+
+    settings: Transducer
+    samples: bytes
+
+    def frame(self, source: int = 1) -> Frame:
+        """The message that reports it."""
+        head = _DATA.pack(*self.settings._common)
+        return Frame(DEVICE_DATA, head + _VECTOR.pack(len(self.samples)) + self.samples, source, 0)
+
+    @classmethod
+    def parse(cls, payload: bytes) -> Self:
+        """What a DEVICE_DATA message reports.
+
+        Raises
+        ------
+        ProtocolError
+            When it is too short, or announces another number of samples than it brings.
+        """
+        mode, *rest = _unpacked(_DATA, payload, "a DEVICE_DATA message")
+        (count,) = _unpacked(_VECTOR, payload[_DATA.size :], "the vector of a DEVICE_DATA message")
+        samples = payload[_DATA.size + _VECTOR.size :]
+        if len(samples) != count:
+            raise ProtocolError(f"DEVICE_DATA announces {count} samples and brings {len(samples)}")
+        return cls(Transducer(*rest, transmit=False, mode=mode), samples)
+
+
+@dataclass(frozen=True)
+class Information:
+    """DEVICE_INFORMATION: type 2 is a Ping360."""
+
+    type: int
+    revision: int
+    firmware: tuple[int, int, int]
+
+    def frame(self, source: int = 1) -> Frame:
+        """The message that reports it."""
+        return Frame(
+            DEVICE_INFORMATION, _INFORMATION.pack(self.type, self.revision, *self.firmware, 0), source
+        )
+
+    @classmethod
+    def parse(cls, payload: bytes) -> Self:
+        """What a DEVICE_INFORMATION message reports.
+
+        Raises
+        ------
+        ProtocolError
+            When it is too short.
+        """
+        kind, revision, major, minor, patch, _ = _unpacked(
+            _INFORMATION, payload, "a DEVICE_INFORMATION message"
+        )
+        return cls(kind, revision, (major, minor, patch))

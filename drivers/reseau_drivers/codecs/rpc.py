@@ -1,0 +1,198 @@
+"""ONC remote procedure calls: XDR, records on a stream, calls, replies, and the portmapper.
+
+Source: RFC 4506 (XDR), RFC 5531 (RPC: sections 9 and 11), RFC 1833 (portmapper, section 3). Numbers are
+big-endian and fill four bytes; opaque data is padded to four. On a stream a record is cut into fragments
+whose four-byte head says their length, with the highest bit set in the last.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from reseau.errors import ProtocolError
+
+from .stream import Damaged, shown
+
+__all__ = [
+    "ACCEPTED",
+    "GARBAGE_ARGS",
+    "GETPORT",
+    "PORTMAPPER",
+    "PORTMAPPER_VERSION",
+    "PROC_UNAVAIL",
+    "PROG_UNAVAIL",
+    "SUCCESS",
+    "Call",
+    "RecordDecoder",
+    "Unpacker",
+    "decode_call",
+    "decode_reply",
+    "encode_call",
+    "encode_reply",
+    "pack",
+    "record",
+]
+
+PORTMAPPER, PORTMAPPER_VERSION, GETPORT = 100000, 2, 3
+ACCEPTED = 0
+SUCCESS, PROG_UNAVAIL, PROC_UNAVAIL, GARBAGE_ARGS = 0, 1, 3, 4
+_LAST = 0x80000000
+
+
+def pack(*values: int | bytes) -> bytes:
+    """XDR of numbers and of opaque data of variable length.
+
+    Examples
+    --------
+    >>> pack(1, b"inst0").hex(" ", 4)
+    '00000001 00000005 696e7374 30000000'
+    """
+    out = bytearray()
+    for value in values:
+        if isinstance(value, int):
+            out += struct.pack(">I", value & 0xFFFFFFFF)
+        else:
+            out += struct.pack(">I", len(value)) + value + bytes(-len(value) % 4)
+    return bytes(out)
+
+
+class Unpacker:
+    """Takes XDR apart.
+
+    Raises
+    ------
+    ProtocolError
+        From its methods, when the data ends before the value.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    def number(self) -> int:
+        """An unsigned number."""
+        return int.from_bytes(self._take(4), "big")
+
+    def opaque(self, largest: int = 1 << 26) -> bytes:
+        """Data of variable length, no longer than allowed."""
+        length = self.number()
+        if length > largest:
+            raise ProtocolError(f"XDR announces {length} bytes")
+        data = self._take(length)
+        self._take(-length % 4)
+        return data
+
+    def rest(self) -> bytes:
+        """What has not been taken."""
+        rest, self._at = self._data[self._at :], len(self._data)
+        return rest
+
+    def _take(self, count: int) -> bytes:
+        if len(self._data) - self._at < count:
+            raise ProtocolError(f"XDR ends too early: {shown(self._data)}")
+        self._at += count
+        return self._data[self._at - count : self._at]
+
+
+def record(content: bytes) -> bytes:
+    """A record of one fragment."""
+    return struct.pack(">I", _LAST | len(content)) + content
+
+
+class RecordDecoder:
+    """Records from a stream.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes of the largest record. After a larger one the stream cannot be trusted; the rest is damaged.
+    """
+
+    def __init__(self, limit: int = 1 << 23) -> None:
+        self._limit = limit
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the record that was begun."""
+        self._begun, self._record, self._lost = bytearray(), bytearray(), False
+
+    def feed(self, data: bytes) -> list[bytes | Damaged]:
+        """Records that are complete with these bytes."""
+        if self._lost:
+            return []
+        found: list[bytes | Damaged] = []
+        self._begun += data
+        while len(self._begun) >= 4:
+            head = int.from_bytes(self._begun[:4], "big")
+            length = head & ~_LAST
+            if length + len(self._record) > self._limit:
+                found.append(Damaged(bytes(self._begun[:60]), f"a record of more than {self._limit} bytes"))
+                self._begun.clear()
+                self._lost = True
+                return found
+            if len(self._begun) < 4 + length:
+                return found
+            self._record += self._begun[4 : 4 + length]
+            del self._begun[: 4 + length]
+            if head & _LAST:
+                found.append(bytes(self._record))
+                self._record.clear()
+        return found
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a remote procedure."""
+
+    xid: int
+    program: int
+    version: int
+    procedure: int
+    arguments: bytes = b""
+
+
+def encode_call(call: Call) -> bytes:
+    """The content of a record that calls, without credentials."""
+    head = (call.xid, 0, 2, call.program, call.version, call.procedure, 0, 0, 0, 0)
+    return pack(*head) + call.arguments
+
+
+def decode_call(data: bytes) -> Call:
+    """The call in a record.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none, or of another version of RPC.
+    """
+    found = Unpacker(data)
+    xid, kind, version = found.number(), found.number(), found.number()
+    if kind != 0 or version != 2:
+        raise ProtocolError(f"no RPC call: {shown(data)}")
+    program, its_version, procedure = found.number(), found.number(), found.number()
+    for _ in ("credentials", "verifier"):
+        found.number()
+        found.opaque(400)
+    return Call(xid, program, its_version, procedure, found.rest())
+
+
+def encode_reply(xid: int, results: bytes, status: int = SUCCESS) -> bytes:
+    """The content of a record that replies to an accepted call."""
+    return pack(xid, 1, ACCEPTED, 0, 0, status) + (results if status == SUCCESS else b"")
+
+
+def decode_reply(data: bytes) -> tuple[int, int, bytes]:
+    """Number of the call, status and results of a reply in a record.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none, or denies the call.
+    """
+    found = Unpacker(data)
+    xid, kind, state = found.number(), found.number(), found.number()
+    if kind != 1 or state != ACCEPTED:
+        raise ProtocolError(f"no RPC reply to an accepted call: {shown(data)}")
+    found.number()
+    found.opaque(400)
+    return xid, found.number(), found.rest()

@@ -1,0 +1,188 @@
+r"""Newport's SMC100 and CONEX controllers: ``nnAAxx\r\n``, one axis for each address.
+
+Source: *SMC100CC & SMC100PP User's Manual*, section 2.3 "Command Syntax" and the commands TS and TE. Commands
+that set or move are not acknowledged: whether one was understood is asked with TE, what the axis does with
+TS.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+
+from reseau.errors import ProtocolError, SettingError
+
+from .stream import shown
+
+__all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
+
+LIMIT = 128
+"""Bytes of the longest line that is waited for."""
+
+_LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
+
+ERRORS: dict[str, str] = {
+    "@": "no error",
+    "A": "unknown message code or floating point controller address",
+    "B": "controller address not correct",
+    "C": "parameter missing or out of range",
+    "D": "command not allowed",
+    "E": "home sequence already started",
+    "F": "ESP stage name unknown",
+    "G": "displacement out of limits",
+    "H": "command not allowed in NOT REFERENCED state",
+    "I": "command not allowed in CONFIGURATION state",
+    "J": "command not allowed in DISABLE state",
+    "K": "command not allowed in READY state",
+    "L": "command not allowed in HOMING state",
+    "M": "command not allowed in MOVING state",
+    "N": "current position out of software limit",
+    "S": "communication time-out",
+    "U": "error during EEPROM access",
+    "V": "error during command execution",
+}
+"""Answers to TE."""
+
+BITS: dict[int, str] = {
+    0x0001: "negative end of run",
+    0x0002: "positive end of run",
+    0x0004: "peak current limit",
+    0x0008: "RMS current limit",
+    0x0010: "short circuit",
+    0x0020: "following error",
+    0x0040: "homing time-out",
+    0x0080: "wrong ESP stage",
+    0x0100: "DC voltage too low",
+    0x0200: "80 W output power exceeded",
+}
+"""Bits of the first four digits of TS."""
+
+
+class Phase(Enum):
+    """What an axis is doing, of the last two digits of TS."""
+
+    NOT_REFERENCED = "not referenced"
+    CONFIGURATION = "configuration"
+    HOMING = "homing"
+    MOVING = "moving"
+    READY = "ready"
+    DISABLED = "disabled"
+    JOGGING = "jogging"
+
+
+def phase(code: int) -> Phase:
+    """The phase of a state's code.
+
+    Raises
+    ------
+    ProtocolError
+        When the controller has no such state.
+
+    Examples
+    --------
+    >>> phase(0x33)
+    <Phase.READY: 'ready'>
+    """
+    for codes, found in (
+        (range(0x0A, 0x12), Phase.NOT_REFERENCED),
+        (range(0x14, 0x15), Phase.CONFIGURATION),
+        (range(0x1E, 0x20), Phase.HOMING),
+        (range(0x28, 0x29), Phase.MOVING),
+        (range(0x32, 0x36), Phase.READY),
+        (range(0x3C, 0x3F), Phase.DISABLED),
+        (range(0x46, 0x48), Phase.JOGGING),
+    ):
+        if code in codes:
+            return found
+    raise ProtocolError(f"state {code:02X} is none of an SMC100")
+
+
+@dataclass(frozen=True)
+class Line:
+    """A command or an answer.
+
+    Parameters
+    ----------
+    address : int
+        Of the controller, 1 to 31.
+    name : str
+        Two letters.
+    value : str
+        Its argument, ``?`` in a question about a parameter.
+    """
+
+    address: int
+    name: str
+    value: str = ""
+
+
+@dataclass(frozen=True)
+class Status:
+    """An answer to TS: what is wrong, and what the axis does."""
+
+    errors: int
+    state: int
+
+    @property
+    def phase(self) -> Phase:
+        """What the axis is doing."""
+        return phase(self.state)
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What is wrong, in words."""
+        return tuple(text for bit, text in BITS.items() if self.errors & bit)
+
+
+def encode(line: Line) -> bytes:
+    """Bytes of a command or an answer.
+
+    Raises
+    ------
+    SettingError
+        When it cannot be sent.
+
+    Examples
+    --------
+    >>> encode(Line(1, "PA", "12.5"))
+    b'1PA12.5\\r\\n'
+    """
+    content = f"{line.address}{line.name}{line.value}"
+    if not 1 <= line.address <= 31 or not content.isascii() or _LINE.fullmatch(content.encode()) is None:
+        raise SettingError("is no command of an SMC100", where=repr(content))
+    return content.encode("ascii") + b"\r\n"
+
+
+def decode(line: bytes) -> Line:
+    """The command or answer that stands in a line.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none.
+    """
+    found = _LINE.fullmatch(line.strip(b"\r\n"))
+    if found is None or not 1 <= int(found[1]) <= 31:
+        raise ProtocolError(f"no line of an SMC100: {shown(line)}")
+    return Line(int(found[1]), found[2].decode(), found[3].decode())
+
+
+def decode_status(value: str) -> Status:
+    """What an answer to TS says.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none, or of a state the controller does not have.
+
+    Examples
+    --------
+    >>> decode_status("002028").complaints
+    ('following error',)
+    """
+    if re.fullmatch(r"[0-9A-Fa-f]{6}", value) is None:
+        raise ProtocolError(f"no status: {value!r}")
+    status = Status(int(value[:4], 16), int(value[4:], 16))
+    phase(status.state)
+    return status

@@ -1,0 +1,232 @@
+r"""Zaber's ASCII protocol: chained motion controllers, each with axes.
+
+Source: *Zaber ASCII Protocol Manual*, sections "Message Format" and "Checksumming". A command is
+``/device axis id words:LRC\n``; a reply ``@device axis id OK|RJ IDLE|BUSY flag data:LRC\r\n``, an info ``#``,
+an alert ``!``. The checksum of a message is the two's complement of the sum of its bytes between the first
+one and the colon.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import ClassVar
+
+from reseau.errors import ProtocolError, SettingError
+
+from .stream import Damaged, LineDecoder, shown
+
+__all__ = [
+    "FAULTS",
+    "LIMIT",
+    "Alert",
+    "Command",
+    "Info",
+    "Message",
+    "MessageDecoder",
+    "Reply",
+    "decode",
+    "decode_command",
+    "encode",
+    "lrc",
+]
+
+LIMIT = 512
+"""Bytes of the longest message that is waited for; devices send at most 80 by default."""
+
+FAULTS: dict[str, str] = {
+    "FF": "a critical error switched the driver off",
+    "FN": "the power is not connected",
+    "FO": "the driver is off",
+    "FD": "the driver is off: it was overloaded",
+    "FS": "the axis stalled",
+    "FT": "the driver is too hot",
+    "FB": "the motion stopped: something was in its way",
+    "FE": "a limit switch was met",
+}
+"""Warning flags that mean that a movement did not end where it should, and what they say."""
+
+_REPLY = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? (OK|RJ) (IDLE|BUSY) ([A-Z]{2}|--) ([ -~]+)")
+_INFO = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? ([ -~]*)")
+_ALERT = re.compile(rb"(\d{1,2}) (\d) (IDLE|BUSY) ([A-Z]{2}|--)(?: ([ -~]*))?")
+
+
+def lrc(content: bytes) -> bytes:
+    """The checksum of a message as two hexadecimal digits; `content` is what stands between lead and colon.
+
+    Examples
+    --------
+    >>> lrc(b"01 0 00 tools echo")
+    b'BF'
+    """
+    return b"%02X" % (-sum(content) & 0xFF)
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a device is told.
+
+    Parameters
+    ----------
+    device, axis : int
+        0 for all of them.
+    words : str
+        The command with its arguments; nothing asks for the status.
+    id : int or None
+        0 to 99; the reply repeats it.
+    """
+
+    device: int
+    axis: int
+    words: str
+    id: int | None = None
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a device answers to a command."""
+
+    lead: ClassVar[bytes] = b"@"
+    device: int
+    axis: int
+    id: int | None
+    ok: bool
+    busy: bool
+    flag: str
+    data: str
+
+
+@dataclass(frozen=True)
+class Info:
+    """A further line of an answer."""
+
+    lead: ClassVar[bytes] = b"#"
+    device: int
+    axis: int
+    id: int | None
+    data: str
+
+
+@dataclass(frozen=True)
+class Alert:
+    """What a device says of itself, unasked."""
+
+    lead: ClassVar[bytes] = b"!"
+    device: int
+    axis: int
+    busy: bool
+    flag: str
+    data: str = ""
+
+
+Message = Reply | Info | Alert
+
+
+def encode(message: Command | Message) -> bytes:
+    """Bytes of a message, with its checksum.
+
+    Raises
+    ------
+    SettingError
+        When the words of a command cannot be sent.
+    """
+    number = "" if getattr(message, "id", None) is None else f" {message.id:02d}"  # type: ignore[union-attr]
+    if isinstance(message, Command):
+        if not message.words.isascii() or any(c in message.words for c in "/:\n\r\\"):
+            raise SettingError("holds what the protocol does not allow", where=repr(message.words))
+        if not (0 <= message.device <= 99 and 0 <= message.axis <= 9 and (message.id or 0) in range(100)):
+            raise SettingError("device 0…99, axis 0…9, id 0…99", where=repr(message))
+        content = f"{message.device:02d} {message.axis}{number} {message.words}".rstrip().encode("ascii")
+        return b"/" + content + b":" + lrc(content) + b"\n"
+    text = f"{message.device:02d} {message.axis}{number} "
+    if isinstance(message, Reply):
+        text += f"{'OK' if message.ok else 'RJ'} "
+    if not isinstance(message, Info):
+        text += f"{'BUSY' if message.busy else 'IDLE'} {message.flag} "
+    content = f"{text}{message.data}".rstrip().encode("ascii")
+    return message.lead + content + b":" + lrc(content) + b"\r\n"
+
+
+def _content(line: bytes) -> bytes:
+    """What stands between the lead and the checksum, when that is right; a message may have none."""
+    content, colon, check = line[1:].partition(b":")
+    if colon and check.upper() != lrc(content):
+        raise ProtocolError(f"a message with a wrong checksum: {shown(line)}")
+    return content
+
+
+def _number(text: bytes | None) -> int | None:
+    return None if text is None else int(text)
+
+
+def decode(line: bytes) -> Message:
+    """The message of a device that stands in a line.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none.
+    """
+    # After noise on the wire the message begins at the last of the bytes that can begin one.
+    start = max(line.rfind(b"@"), line.rfind(b"#"), line.rfind(b"!")) if line[:1] not in b"@#!" else 0
+    line = line[max(start, 0) :]
+    content, lead = _content(line), line[:1]
+    if lead == b"@" and (found := _REPLY.fullmatch(content)):
+        device, axis, id_, ok, busy, flag, data = found.groups()
+        return Reply(
+            int(device), int(axis), _number(id_), ok == b"OK", busy == b"BUSY", flag.decode(), data.decode()
+        )
+    if lead == b"#" and (found := _INFO.fullmatch(content)):
+        device, axis, id_, data = found.groups()
+        return Info(int(device), int(axis), _number(id_), data.decode())
+    if lead == b"!" and (found := _ALERT.fullmatch(content)):
+        device, axis, busy, flag, data = found.groups()
+        return Alert(int(device), int(axis), busy == b"BUSY", flag.decode(), (data or b"").decode())
+    raise ProtocolError(f"no message of a Zaber device: {shown(line)}")
+
+
+def decode_command(line: bytes) -> Command:
+    """The command that stands in a line; numbers that are left out are 0.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none.
+    """
+    start = line.rfind(b"/")
+    if start < 0:
+        raise ProtocolError(f"no command: {shown(line)}")
+    content = _content(line[start:])
+    if not content.isascii():
+        raise ProtocolError(f"no command: {shown(line)}")
+    words, numbers = content.decode("ascii").split(), []
+    while words and len(numbers) < 3 and words[0].isdigit():
+        numbers.append(int(words.pop(0)))
+    device, axis, id_ = (*numbers, *(None, None, None)[len(numbers) :])
+    if max(device or 0, id_ or 0) > 99 or (axis or 0) > 9:
+        raise ProtocolError(f"no command: {shown(line)}")
+    return Command(device or 0, axis or 0, " ".join(words), id_)
+
+
+class MessageDecoder:
+    """Messages of devices from a stream."""
+
+    def __init__(self) -> None:
+        self._lines = LineDecoder(limit=LIMIT)
+
+    def reset(self) -> None:
+        """Forget the message that was begun."""
+        self._lines.reset()
+
+    def feed(self, data: bytes) -> list[Message | Damaged]:
+        """Messages that are complete with these bytes."""
+        found: list[Message | Damaged] = []
+        for line in self._lines.feed(data):
+            if isinstance(line, Damaged):
+                found.append(line)
+                continue
+            try:
+                found.append(decode(line))
+            except ProtocolError as error:
+                found.append(Damaged(line, error.what))
+        return found

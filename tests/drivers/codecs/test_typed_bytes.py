@@ -1,0 +1,144 @@
+"""Bytes typed from the protocols' documents, not made by the code that they check."""
+
+from __future__ import annotations
+
+import pytest
+
+from reseau.errors import ProtocolError, SettingError
+from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, vxi11, zaber
+from reseau_drivers.codecs.stream import Damaged
+
+
+def test_zaber_replies_of_the_manual_with_and_without_id_and_checksum() -> None:
+    # Message format of the manual: "@01 0 OK IDLE -- 0", and an alert "!01 1 IDLE --".
+    assert zaber.decode(b"@01 0 OK IDLE -- 0") == zaber.Reply(1, 0, None, True, False, "--", "0")
+    assert zaber.decode(b"@01 1 05 RJ BUSY WR BADDATA") == zaber.Reply(1, 1, 5, False, True, "WR", "BADDATA")
+    assert zaber.decode(b"#01 0 Available settings:"[:-1]) == zaber.Info(1, 0, None, "Available settings")
+    assert zaber.decode(b"!01 1 IDLE --") == zaber.Alert(1, 1, False, "--")
+    # 0x30+0x31+0x20+0x30 = 0xB1, its two's complement 0x4F.
+    assert zaber.encode(zaber.Command(1, 0, "")) == b"/01 0:4F\n"
+    assert zaber.decode_command(b"/01 0:4F") == zaber.Command(1, 0, "")
+    assert zaber.decode_command(b"/") == zaber.Command(0, 0, "")
+    assert zaber.decode_command(b"/1 2 home") == zaber.Command(1, 2, "home")
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"@", b"@01 0 OK IDLE -- 0:00", b"@01 OK", b"hello", b"@01 0 OK IDLE --"]
+)
+def test_zaber_refuses_what_is_no_message(line: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        zaber.decode(line)
+
+
+def test_zaber_finds_the_message_behind_noise() -> None:
+    assert zaber.decode(b"\xff\x00@01 0 OK IDLE -- 0") == zaber.Reply(1, 0, None, True, False, "--", "0")
+
+
+def test_zaber_sends_nothing_that_ends_a_message() -> None:
+    for words in ("home\n/1 estop", "get pos:00", "move abs é", "a\\"):
+        with pytest.raises(SettingError):
+            zaber.encode(zaber.Command(1, 1, words))
+
+
+def test_smc100_lines_of_the_manual() -> None:
+    assert smc100.encode(smc100.Line(1, "OR")) == b"1OR\r\n"
+    assert smc100.decode(b"1TP2.0001\r\n") == smc100.Line(1, "TP", "2.0001")
+    assert smc100.decode(b"1TS000033") == smc100.Line(1, "TS", "000033")
+    assert smc100.decode_status("000033").phase is smc100.Phase.READY
+    assert smc100.decode_status("000010").phase is smc100.Phase.NOT_REFERENCED
+    assert smc100.decode_status("00001E").phase is smc100.Phase.HOMING
+    assert smc100.decode_status("000128").complaints == ("negative end of run",)
+    for wrong in ("", "0000", "0000FF", "00003Z"):
+        with pytest.raises(ProtocolError):
+            smc100.decode_status(wrong)
+
+
+def test_smc100_status_bits_are_the_first_four_digits() -> None:
+    status = smc100.decode_status("002132")
+    assert status.complaints == ("negative end of run", "following error")
+    assert status.phase is smc100.Phase.READY
+    assert smc100.decode_status("000232").complaints == ("positive end of run",)
+
+
+def test_ping_request_of_the_documentation() -> None:
+    # "Message Format": general_request for protocol_version.
+    typed = bytes.fromhex("42 52 02 00 06 00 00 00 05 00 a1 00")
+    frame = ping.Frame(ping.GENERAL_REQUEST, b"\x05\x00")
+    assert ping.encode(frame) == typed
+    assert ping.FrameDecoder().feed(typed) == [frame]
+
+
+def test_ping_transducer_payload_has_the_documented_fields() -> None:
+    asked = ping.Transducer(1, 200, 32, 88, 740, 1200)
+    payload = bytes.fromhex("01 01 c8 00 20 00 58 00 e4 02 b0 04 01 00")
+    assert asked.frame().payload == payload
+    assert ping.Transducer.parse(payload) == asked
+
+
+def test_compactpulser_commands_of_the_manual() -> None:
+    assert compactpulser.encode(compactpulser.Setting("V", 300)) == b"V300\r"
+    assert compactpulser.decode(b"G=12.5\r") == (compactpulser.Setting("G", 12.5), True)
+    assert compactpulser.decode(b"P0") == (compactpulser.Setting("P", 0.0), False)
+    for wrong in (b"", b"X1", b"P", b"G=?", b"P1e9", b"\xff"):
+        with pytest.raises(ProtocolError):
+            compactpulser.decode(wrong)
+    with pytest.raises(SettingError):
+        compactpulser.encode(compactpulser.Setting("G", float("nan")))
+
+
+def test_bk_messages_and_a_frame_with_every_escape() -> None:
+    typed = (
+        bytes.fromhex("01") + b"DATA:GRAB_FRAME #15" + bytes.fromhex("00 1b fb 00 00 1b fe 1b e4 ff 3b 04")
+    )
+    (content,) = bk.MessageDecoder().feed(typed)
+    assert isinstance(content, bytes)
+    frame = bk.parse_frame(content)
+    # The announced length (5) is wrong, as on a BK5000: the end of the message counts.
+    assert frame == bk.GrabbedFrame(0x0400, bytes([0x01, 0x1B, 0xFF]), 5)
+    assert bk.encode(bk.encode_frame(frame)) == typed
+
+
+def test_blocks_and_pictures_end_where_they_say() -> None:
+    assert ieee488.parse_block(b"#800000005hello\n") == b"hello"
+    assert ieee488.missing_of(b"#800000005hel") == 2
+    png = bytes.fromhex(
+        "89504e470d0a1a0a 0000000d49484452 00000001000000010800000000 3a7e9b55"
+        "0000000a49444154 789c63600000000200 01 48afa471 0000000049454e44 ae426082".replace(" ", "")
+    )
+    assert ieee488.missing_of(png) == 0
+    assert ieee488.missing_of(png[:-1]) is None
+    assert ieee488.picture(png + b"\n") == png
+    assert ieee488.picture(ieee488.block(png) + b"\n") == png
+    bmp = b"BM" + (60).to_bytes(4, "little") + bytes(54)
+    assert ieee488.missing_of(bmp[:-4]) == 4
+    for wrong in (b"hello", b"#", b"#0", b"#9999999999", b"#3ab", b"BM\xff\xff\xff\xff", b"\x89GIF1234"):
+        with pytest.raises(ProtocolError):
+            ieee488.picture(wrong)
+
+
+def test_vxi11_create_link_as_on_the_wire() -> None:
+    # RFC 5531: xid, CALL, RPC 2, program 0x0607AF, version 1, procedure 10, no credentials; arguments.
+    typed = bytes.fromhex(
+        "00000007 00000000 00000002 000607af 00000001 0000000a 00000000 00000000 00000000 00000000"
+        "0000002a 00000000 00000000 00000005 696e7374 30000000".replace(" ", "")
+    )
+    call = rpc.decode_call(typed)
+    assert (call.program, call.version, call.procedure) == (vxi11.CORE, vxi11.VERSION, 10)
+    found = rpc.Unpacker(call.arguments)
+    assert [found.number() for _ in range(3)] == [42, 0, 0]
+    assert found.opaque() == b"inst0"
+    assert rpc.encode_call(call) == typed
+    assert rpc.record(b"abcd") == bytes.fromhex("80000004 61626364".replace(" ", ""))
+
+
+def test_a_record_in_fragments_is_one() -> None:
+    assert rpc.RecordDecoder().feed(bytes.fromhex("00000002 6162 80000001 63".replace(" ", ""))) == [b"abc"]
+
+
+def test_hislip_initialize_as_on_the_wire() -> None:
+    # Table 4: prologue, Initialize, control 0, version 1.0 and vendor "xx", length 7, "hislip0".
+    typed = b"HS\x00\x00\x01\x00xx" + bytes(7) + b"\x07hislip0"
+    (message,) = hislip.MessageDecoder().feed(typed)
+    assert message == hislip.Message(hislip.Type.INITIALIZE, 0, 0x01007878, b"hislip0")
+    assert not isinstance(message, Damaged)
+    assert hislip.encode(message) == typed
