@@ -128,7 +128,7 @@ def lattices(
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
             # Where the lens distorts much, a line is found on more of its length every time.
-            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 1):
+            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 2):
                 points, fit = fit.points, _sharpened(fit, grey, width, blur)
                 if fit.points < 1.02 * points:
                     break
