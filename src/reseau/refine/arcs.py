@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +20,6 @@ _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
 """Halves of windows' sides, pixels; arcs of like size are matched in one batch."""
 _SURE = 8.0
 """Contrast over its standard deviation of an arc whose light is taken off another."""
-_TOUCHING = 0.1
-"""Level at which two spots meet, as a share of the height, from which the one may pull at the other."""
 _MARGIN_PX = 4.0
 """What a window shows of the ground around an arc."""
 _FORM_SIGMA = np.array([0.5, 0.05, 0.3])
@@ -38,6 +37,10 @@ _OF_MOMENTS = 1.7
 """Width of a Gaussian over that of what stands out of it above a third of its height, about."""
 _REACH = 2.6
 """Widths to both sides that a window shows."""
+_VEILED = 0.5
+"""Share of a flank from which on an arc rests on the other."""
+_LESS_PX = 2
+"""By how much more of an arc is left out next to what is hidden, to see how it takes that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +131,20 @@ def match_arcs(
     """
     work = _Matching(grey, valid, echoes, at, options, noise)
     found = _together(work.all(), len(at))
-    touching = np.flatnonzero((echoes.joined[at] > _TOUCHING) & found.converged)
+    touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
     if len(touching):
         # How light adds up where two echoes meet is the instrument's secret: the stronger is seen, behind a
         # logarithmic amplifier, or both. The first match took the one for true; how far the other would
         # carry the arc is not known better.
         pulled = work.without_others(touching, found)
         found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
+    veiled = np.flatnonzero((work.hidden_flanks(found) > _VEILED) & found.converged)
+    if len(veiled):
+        # Where one flank of an arc is hidden, its middle follows from the law by which the other fades. What
+        # the lines of a raster or a reverberation make of that law no longer cancels out, and is no noise of
+        # single pixels: how far it may carry the arc shows when a little less of it is seen.
+        pulled = work.seeing_less(veiled, found)
+        found.cov[veiled] += pulled[:, :, None] * pulled[:, None, :]
     return found
 
 
@@ -177,21 +187,53 @@ class _Matching:
             pulled[np.searchsorted(touching, rows)] = moved
         return pulled
 
+    def hidden_flanks(self, found: ArcMatches) -> Array:
+        """Of what tells where an arc lies, the share that is hidden on its worst side, (m,)."""
+        share = np.zeros(len(self.at))
+        for rows in self._of_like_size(np.flatnonzero(found.converged)):
+            window = self._window(rows, found.xy[rows])
+            _, parts = found.form.select(rows).derivatives(found.xy[rows], *window)
+            columns, lines = (np.rint(axis).astype(np.intp) for axis in window)
+            height, width = self.valid.shape
+            shown = self.valid[
+                np.clip(lines, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]
+            ]
+            for flank in (parts[:, :2].clip(0, None), -parts[:, :2].clip(None, 0)):
+                hidden = (flank * ~shown[:, None]).sum(axis=(2, 3)) / flank.sum(axis=(2, 3))
+                share[rows] = np.maximum(share[rows], hidden.max(axis=1))
+        return share
+
+    def seeing_less(self, veiled: Rows, found: ArcMatches) -> Array:
+        """By how much (m, 2) arcs move when the pixels next to hidden ones are left out, too."""
+        side = 2 * _LESS_PX + 1
+        less = cv2.erode(self.valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        pulled = np.zeros((len(veiled), 2))
+        for rows in self._of_like_size(veiled):
+            _, again, _ = self._adjusted(rows, found.form, found.xy, _FORM_SIGMA, valid=less)
+            moved = np.where(again.converged[:, None], again.xy - found.xy[rows], np.nan)
+            pulled[np.searchsorted(veiled, rows)] = moved
+        return pulled
+
+    def _window(self, rows: Rows, xy: Array) -> tuple[Array, Array]:
+        """Columns and rows of the pixels around arcs of one size, (k, c) and (k, r)."""
+        (half_x, half_y), centre = self.half[rows[0]], np.rint(xy)
+        columns = centre[:, :1] + np.arange(-half_x, half_x + 1.0)
+        return columns, centre[:, 1:] + np.arange(-half_y, half_y + 1.0)
+
     def _of_like_size(self, rows: Rows) -> list[Rows]:
         sizes = np.unique(self.half[rows], axis=0)
         return [rows[(self.half[rows] == size).all(axis=1)] for size in sizes]
 
     def _light_of_others(self, arc: int, found: ArcMatches, modelled: Mask) -> Array:
         """What the other arcs give to the window of one, (rows, columns)."""
-        (half_x, half_y), centre = self.half[arc], np.rint(found.xy[arc])
-        columns = centre[0] + np.arange(-half_x, half_x + 1.0)
-        rows = centre[1] + np.arange(-half_y, half_y + 1.0)
+        window = self._window(np.array([arc]), found.xy[[arc]])
         reach = 5 * found.form.along + 5 * found.form.across
-        near = (np.abs(found.xy - centre) < reach[:, None] + (half_x, half_y)).all(axis=1) & modelled
+        off = np.abs(found.xy - np.rint(found.xy[arc]))
+        near = (off < reach[:, None] + self.half[arc]).all(axis=1) & modelled
         near[arc] = False
         others = np.flatnonzero(near)
         image = found.form.select(others).image(
-            found.xy[others], *(np.broadcast_to(axis, (len(others), len(axis))) for axis in (columns, rows))
+            found.xy[others], *(np.broadcast_to(axis, (len(others), axis.shape[1])) for axis in window)
         )
         return np.asarray(np.tensordot(found.contrast[others], image, axes=1))
 
@@ -203,6 +245,7 @@ class _Matching:
         form_sigma: Array,
         others: Array | None = None,
         modelled: Mask | None = None,
+        valid: Mask | None = None,
     ) -> tuple[Rows, Matches, Arcs]:
         """Match the arcs `rows`, all of one size of window."""
         shape = ArcShape(start.select(rows))
@@ -220,7 +263,7 @@ class _Matching:
         )
         found = match(
             self.grey,
-            self.valid,
+            self.valid if valid is None else valid,
             shape,
             xy[rows],
             windowed,

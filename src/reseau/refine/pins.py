@@ -15,6 +15,7 @@ import numpy as np
 from ..data import Array, Frame, ImagePoints, Mask, Rows
 from .arcs import ArcMatches, match_arcs
 from .echoes import Echoes, find_echoes, ground_of
+from .glow import falloff
 from .graphics import is_sharp, looks_sharp, same_in_all, series
 from .hidden import bridged, find_cuts
 from .matching import MatchOptions
@@ -157,6 +158,7 @@ def find_pins(
         Further frames of the sequence, in which the object has moved: what is the same in all is no echo.
     hidden : ndarray (h, w) of bool, optional
         Pixels that wires of a reseau cover, where they are known; upright cuts through echoes are found.
+        The raster against which the wires stand out then tells how the light falls off.
 
     Returns
     -------
@@ -172,6 +174,8 @@ def find_pins(
     screened = screen(frame, run=None)
     longest = o.most_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
+    if hidden is not None and (dim := falloff(ground, hidden, screened.noise)) is not None:
+        screened, ground = replace(screened, grey=screened.grey / dim), ground / dim
     light = screened.grey - ground
     least = max(2.5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
     covered = find_cuts(light, screened.noise, o.most_wire_px)
