@@ -301,7 +301,10 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     sigma_px : float
         Standard deviation of the latter.
     """
-    mapping = _of_degree(mapping, max(1, trend_degree(len(at))))
+    # Not below what the lines have told already.
+    powers = _powers(mapping)
+    before = max(i + j for i, j in powers) if len(at) > len(powers) else 1
+    mapping = _of_degree(mapping, max(before, trend_degree(len(at))))
     monomials = _monomials(mapping, at)
     none = np.zeros_like(monomials)
     design = np.block([[monomials, none], [none, monomials]])
@@ -312,8 +315,12 @@ def _monomials(mapping: Chain, at: Array) -> Array:
     """Monomials (n, m) of the polynomial at lattice coordinates (n, 2)."""
     assert isinstance(mapping.second, RationalPolynomial)
     u, v = ((mapping.first(at) - mapping.second.offset) / mapping.second.scale).T
-    powers = [(int(name[2]), int(name[3])) for name in mapping.second.names if name[0] == "X"]
-    return np.stack([u**i * v**j for i, j in powers], axis=1)
+    return np.stack([u**i * v**j for i, j in _powers(mapping)], axis=1)
+
+
+def _powers(mapping: Chain) -> list[tuple[int, int]]:
+    """Powers of the polynomial's monomials."""
+    return [(int(name[2]), int(name[3])) for name in mapping.second.names if name[0] == "X"]
 
 
 def _of_degree(mapping: Chain, degree: int) -> Chain:

@@ -334,7 +334,7 @@ class _Canvas:
             polarity=scene.design.polarity,
             row_jitter_px=scene.row_jitter_px,
             start_px=0.3,
-            settled=0.05,
+            settled=0.1,
             background=background,
         )
         level, amplitude = scene.light.at(centre.astype(np.float64))

@@ -251,7 +251,11 @@ class _Measurement:
         It begins between the lines, where the mapping is known, and goes on outwards from there.
         """
         # The second time light and neighbours are known better; a third is for what lies far out.
-        for before, beyond in ((-np.inf, 0.0), (-np.inf, 1.0), (1.0, np.inf)):
+        for most, before, beyond in (
+            (_MOST_FIRST // 2, -np.inf, 0.0),
+            (_MOST_FIRST, -np.inf, 1.0),
+            (_MOST_FIRST, 1.0, np.inf),
+        ):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
             out = np.abs(self.at[self.rows[candidates]] - self.middle) - self.half
             candidates = candidates[(out <= beyond).all(axis=1)]
@@ -260,7 +264,7 @@ class _Measurement:
             if len(candidates) < _LEAST_FIRST:
                 continue
             some = np.zeros(len(self.rows), dtype=bool)
-            some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
+            some[candidates[:: max(1, len(candidates) // most)]] = True
             predicted = self.predicted
             self._learn(some)
             moved = (self.predicted - predicted)[self.rows[self.inside]]
