@@ -31,6 +31,8 @@ _LEAST_FIRST, _MOST_FIRST = 8, 48
 """How many large targets are matched first, to know the mapping and the sharpness better."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
+_FAR = 4.5
+"""Standard deviations that a target may be off where all targets together have it."""
 _WIDE = 0.1
 """Part of the frame around it in which targets are looked for that reach into it."""
 _SETTLED_PX = 0.02
@@ -64,7 +66,7 @@ class TestfieldOptions:
     most_sigma_px : float
         Largest standard deviation of a coordinate that still counts as measured.
     neighbour_px : float
-        Least deviation from what all targets together have, from which a target is looked at askance.
+        Least deviation from the mapping through all targets for which one may be declined.
     """
 
     __test__ = False  # not one for pytest
@@ -73,7 +75,7 @@ class TestfieldOptions:
     fill: float = 1.0
     least_t: float = 8.0
     most_sigma_px: float = 0.3
-    neighbour_px: float = 0.05
+    neighbour_px: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,9 +317,10 @@ class _Measurement:
             mapping = refit(mapping, self.at[wanted[good]], found.xy[good], _UNMODELLED_PX)
         predicted = mapping(self.at)
         off = np.hypot(*(found.xy - predicted[wanted]).T)
-        ordinary = 1.4826 * float(np.median(off[good])) if good.any() else 0.0
-        sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2))
-        limit = np.maximum(self.options.neighbour_px, 4 * np.hypot(ordinary, np.nan_to_num(sigma)))
+        # Half of the distances in a plane are below 1.18 standard deviations of a coordinate.
+        ordinary = float(np.median(off[good])) / 1.18 if good.any() else 0.0
+        sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
+        limit = np.maximum(self.options.neighbour_px, _FAR * np.hypot(ordinary, np.nan_to_num(sigma)))
         for k in np.flatnonzero(good & (off > limit)):
             why[k] = f"{off[k]:.2f} px off where all targets together have it"
         return why, predicted
