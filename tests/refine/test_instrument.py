@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from reseau.adjust import Failure
 from reseau.calibration import Calibration
 from reseau.data import ImagePoints
 from reseau.errors import FormatError
+from reseau.formats import DesignPoint
 from reseau.refine import correct_camera
 from reseau.refine.instrument import InstrumentCorrection, correct_instrument
 
@@ -81,6 +84,44 @@ def test_coefficients_that_are_not_there_are_dropped_from_the_reduced_model_and_
     # What is applied has them all, with their covariance.
     assert found.model.names == INSTRUMENT.names
     assert found.covariance.shape == (len(camera.model.names) + len(INSTRUMENT.names),) * 2
+
+
+def test_a_local_model_is_taken_off_where_the_rods_need_it_and_kept_with_the_calibration():
+    rng = np.random.default_rng(8)
+    camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
+    side = np.linspace(0, 100, 9)
+    grid = np.stack(np.meshgrid(side, side * 0.8), axis=-1).reshape(-1, 2)
+    points = tuple(
+        DesignPoint(id=f"g{k}", x=float(x), y=float(y), sigma=0.01) for k, (x, y) in enumerate(grid)
+    )
+    dense = RODS.model_copy(update={"points": points, "origin": "g0", "axis": "g8"})
+
+    def bulged(xy):
+        """A bright area pushes the beam away from it, by 0.2 mm at its edge."""
+        off = xy - [60.0, 40.0]
+        return xy + 0.02 * off * np.exp(-0.5 * (off**2).sum(axis=1, keepdims=True) / 14.0**2)
+
+    held = tuple(f"g{k}" for k in range(4, 81, 7))
+    plain, bent = (
+        correct_instrument(measured(dense.ids, displayed(shape(grid)), rng), dense, camera, check=held)
+        for shape in (lambda xy: xy, bulged)
+    )
+    assert plain.local is None
+    assert bent.local is not None
+    check = bent.fit.check.xy - bent.fit.check_target
+    without = replace(bent, local=None).apply(bent_points(bent, dense, bulged, held))
+    truth = np.array([grid[int(name[1:])] for name in held])
+    assert np.sqrt((check**2).mean()) < 0.5 * np.sqrt(((without.xy - truth) ** 2).mean())
+    assert (np.abs(check) < 5 * bent.fit.check.sigma).all()
+    text = bent.calibration(RESEAU, dense, name="bench").to_json()
+    back, _, _ = InstrumentCorrection.from_calibration(Calibration.parse(text, where="test"))
+    assert np.abs(back.apply(bent.pins).xy - bent.apply(bent.pins).xy).max() < 1e-9
+
+
+def bent_points(found, design, shape, names):
+    """Exact images of rods."""
+    xy = design.xy[[design.ids.index(name) for name in names]]
+    return ImagePoints.with_sigma(names, displayed(shape(xy)), 0.01)
 
 
 def test_rods_held_out_are_predicted():

@@ -349,8 +349,8 @@ def _say_second(path: Path, second: PhotoII) -> None:
         better = {"first": "the polynomials explain", "second": "Wong's model explains"}
         verdict = better.get(fit.displays.verdict, "neither the polynomials nor Wong's model explains")
         say(f"  {verdict} the rods better (p = {fit.displays.p:.3f})\n")
-    if fit is not None and fit.local is not None and fit.local.need.min() < 0.05:
-        say(f"  what remains is no noise: a local model is significant (p = {fit.local.need.min():.3f})\n")
+    if fit is not None and fit.local is not None and instrument.local is not None:
+        say(f"  what remains is no noise: a local model is taken off too (p = {fit.local.need.min():.3f})\n")
     for note in second.notes:
         say(f"  note: {note}\n")
 

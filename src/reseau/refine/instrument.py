@@ -29,6 +29,7 @@ from .correction import (
 )
 from .field import SmoothField
 from .fitting import carried, reduce_mapping, residual_field, tests_of
+from .local import LocalModel
 from .plane import ObjectPlane, object_plane
 from .rivals import Rivalry, rivals
 
@@ -106,6 +107,8 @@ class InstrumentCorrection:
     pins : ImagePoints
         Images of the rods that group B was made from, in pixels of PHOTO I: what a later photograph of the
         same rods is held against.
+    local : LocalModel, optional
+        What the rods show beyond the model, in the common system; None where it is not significant.
     fit : InstrumentFit, optional
         How the model came about; None for one read from a calibration.
     """
@@ -116,6 +119,7 @@ class InstrumentCorrection:
     covariance: Array
     unit: str
     pins: ImagePoints
+    local: LocalModel | None = None
     fit: InstrumentFit | None = None
 
     def __bool__(self) -> bool:
@@ -126,7 +130,7 @@ class InstrumentCorrection:
         return self
 
     def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
-        """Object coordinates of points in pixels (n, 2), and their derivatives.
+        """Object coordinates of points in pixels (n, 2), and their derivatives without a local model's.
 
         Returns
         -------
@@ -140,6 +144,7 @@ class InstrumentCorrection:
         refined, by_photo, by_a = self.camera.model.derivatives(photo)
         common, by_refined, by_b = self.model.derivatives(refined)
         by_both = np.concatenate([by_refined @ by_a, by_b], axis=2)
+        common = common if self.local is None else self.local.take_off(common)
         plane = self.plane.slope
         slope = plane @ by_refined @ by_photo @ by_pixel
         return self.plane.from_common(common), slope, plane @ by_both
@@ -149,6 +154,8 @@ class InstrumentCorrection:
         value, slope, by_coefficients = self.derivatives(points.xy)
         cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
         cov = cov + by_coefficients @ self.covariance @ np.swapaxes(by_coefficients, 1, 2)
+        if self.local is not None:
+            cov = cov + self.plane.slope @ np.diag(self.local.variance) @ self.plane.slope.T
         return ImagePoints(points.names, value, cov)
 
     def calibration(
@@ -180,6 +187,7 @@ class InstrumentCorrection:
             "axes": system_to_dict(self.plane.axes),
             "scale": [float(s) for s in self.plane.scale],
             "system": system_to_dict(self.plane.system),
+            "local": None if self.local is None else self.local.to_dict(),
             "rods": rods.to_dict(),
             "pins": ReseauMeasurement.from_image_points(self.pins, image="PHOTO II", sha256="").to_dict(),
         }
@@ -225,6 +233,7 @@ class InstrumentCorrection:
             row_of = {key: i for i, key in enumerate(calibration.parameters)}
             order = [row_of[key] for key in camera.model.names + model.names]
             unit = str(part["unit"])
+            local = None if part["local"] is None else LocalModel.from_dict(part["local"])
             pins = ReseauMeasurement.parse(canonical_json(part["pins"]), where=where).image_points()
             designs = [
                 ReseauDesign.parse(canonical_json(holder[key]), where=where)
@@ -233,7 +242,7 @@ class InstrumentCorrection:
         except (KeyError, TypeError, ValueError, UsageError) as error:
             raise FormatError(f"lacks or misstates {error}", where=f"model of {where}") from None
         covariance = calibration.matrix()[np.ix_(order, order)]
-        return cls(camera, model, plane, covariance, unit, pins), designs[0], designs[1]
+        return cls(camera, model, plane, covariance, unit, pins, local), designs[0], designs[1]
 
 
 def correct_instrument(
@@ -312,7 +321,16 @@ def correct_instrument(
     fit = elimination.full
     full = model.with_values(fit.values)
     covariance = _joint_covariance(camera, rods.select(used), full, fit)
-    correction = InstrumentCorrection(camera, full, plane, covariance, design.unit, rods.select(used))
+    left = residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials)
+    correction = InstrumentCorrection(
+        camera,
+        full,
+        plane,
+        covariance,
+        design.unit,
+        rods.select(used),
+        LocalModel.where_needed(left),
+    )
     displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
     record = InstrumentFit(
         elimination,
@@ -321,7 +339,7 @@ def correct_instrument(
         correction.apply(rods.select(~used)),
         table[~used, :2],
         None if isinstance(monomials, Failure) else monomials,
-        residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials),
+        left,
         None if isinstance(displays, Failure) else displays,
     )
     return replace(correction, fit=record)
