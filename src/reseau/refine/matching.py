@@ -159,22 +159,26 @@ def match(
     free[CONTRAST] = options.contrast_sigma
     if form_sigma is not None:
         free[patch.form_at :] = form_sigma
-    if light is not None:
-        quick, amiss = _continued(patch, patch.begin(*light), free, noise)
-        if not len(amiss):
-            return quick
-        few = match(
-            pixels,
-            valid,
-            Some(outline, amiss),
-            xy[amiss],
-            replace(options, psf_px=patch.psf[amiss]),
-            noise=noise,
-            form_sigma=form_sigma,
-            claims=None if claims is None else (claims[0], claims[1][amiss]),
-            others=None if others is None else others[amiss],
-        )
-        return quick.replaced(amiss, few)
+    if light is None:
+        return _searched(patch, free, noise)
+    quick, amiss = _continued(patch, patch.begin(*light), free, noise)
+    if not len(amiss):
+        return quick
+    few = Patches(
+        pixels,
+        valid,
+        Some(outline, amiss),
+        xy[amiss],
+        replace(options, psf_px=patch.psf[amiss]),
+        None if claims is None else (claims[0], claims[1][amiss]),
+        None if others is None else others[amiss],
+    )
+    return quick.replaced(amiss, _searched(few, free, noise))
+
+
+def _searched(patch: Patches, free: Array, noise: float) -> Matches:
+    """Matches from approximate positions alone, blunders among the pixels left out."""
+    options = patch.options
     start = patch.start(noise)
 
     def adjust(rows: Rows, start_at: Array, most: int = _MOST) -> BatchAdjustment:
@@ -187,8 +191,8 @@ def match(
             options=BatchOptions(share=options.settled, max_iterations=most),
         )
 
-    every = np.arange(len(xy))
-    used, scale = patch.weights, np.full((len(xy), 1), noise)
+    every = np.arange(len(patch.xy))
+    used, scale = patch.weights, np.full((len(patch.xy), 1), noise)
     # Before the blunders are out there is nothing to settle.
     found = adjust(every, start, _FIRST)
     for most in (_FIRST, _MOST):

@@ -21,64 +21,15 @@ from ..optics import Chain
 from ..optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 from ..optics.targets import target_outline
 from .lattice import second_order
+from .light import Light
 from .matching import Matches, MatchOptions, match
 from .profiles import blur_of, crossings, strip
 from .shapes import Some, Window
 
-__all__ = ["Light", "Scene", "TargetImages", "match_targets", "merged"]
+__all__ = ["Scene", "TargetImages", "match_targets", "merged"]
 
 _SPACING = 1.1
 """Distance of nodes on an outline in widths of the point-spread function: good to 1e-4 of the light."""
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """How a testfield is lit, as polynomials of second degree over the frame.
-
-    Parameters
-    ----------
-    level, contrast : ndarray (6,)
-        Coefficients of the grey value of the ground, and of what a mark takes of it or adds.
-    size : (float, float)
-        Width and height of the frame.
-    """
-
-    level: Array
-    contrast: Array
-    size: tuple[float, float]
-
-    @classmethod
-    def through(cls, xy: Array, level: Array, contrast: Array, size: tuple[float, float]) -> Light:
-        """Fit to what was found at points (n, 2), twice: the second time without what is far off."""
-        design = _quadratic(xy, size)
-        found = []
-        for values in (level, contrast):
-            keep = np.isfinite(values)
-            for _ in range(3):
-                fitted: Array = np.linalg.lstsq(design[keep], values[keep], rcond=1e-6)[0].astype(np.float64)
-                off = np.abs(values - design @ fitted)
-                keep = np.isfinite(values) & (off <= 4 * np.nanmedian(off[keep]) + 1e-9)
-            found.append(fitted)
-        return cls(found[0], found[1], size)
-
-    def at(self, xy: Array) -> tuple[Array, Array]:
-        """Level and contrast (n,) at points (n, 2)."""
-        design = _quadratic(xy, self.size)
-        return design @ self.level, design @ self.contrast
-
-    def contrast_over(self, shape: tuple[int, int]) -> Array:
-        """Contrast of every pixel of a frame (h, w)."""
-        u, v = (2 * np.arange(n) / size - 1 for n, size in zip(shape[::-1], self.size, strict=True))
-        one, by_u, by_v, by_uu, by_uv, by_vv = self.contrast
-        over: Array = (
-            (one + by_u * u + by_uu * u * u) + np.outer(v, by_v + by_uv * u) + (by_vv * v * v)[:, None]
-        )
-        return over
-
-
-def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
-    u, v = (2 * xy / np.array(size) - 1).T
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,12 +18,13 @@ from ..formats import TestfieldDesign
 from ..optics.formation import PixelResponse
 from .clusters import Placement, Reading, locate, read_clusters
 from .lattice import LatticeFit, lattices, refit, second_order
+from .light import Light
 from .lines import find_lattice, ridge_points
 from .matching import Matches
 from .measured import Measured
 from .profiles import blur_of
 from .screening import quiet_noise, screen
-from .targets import Light, Scene, match_targets, merged
+from .targets import Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
