@@ -139,8 +139,15 @@ def image_points(cam: Camera, rotation: Array, x0: Array, xyz: Array) -> Array:
     return project(mapping_of(cam), Pose(matrix_to_vector(rotation), x0), xyz).xy
 
 
-def mapping_of(cam: Camera) -> Brown | OpenCV:
+def mapped(cam: Camera) -> Camera:
+    """The same camera by its mapping of :mod:`reseau.optics`, which is not compiled."""
+    return replace(cam, model="mapping", mapping=mapping_of(cam), values=np.array(mapping_of(cam).values))
+
+
+def mapping_of(cam: Camera) -> Any:
     """The camera as :mod:`reseau.optics` has it."""
+    if cam.mapping is not None:
+        return cam.mapping.with_values(cam.values)
     if cam.model == "opencv":
         return OpenCV(cam.values)
     return Brown(cam.values, cam.side, cam.balance_radius_mm, PixelGrid(cam.width, cam.height, cam.pitch_mm))

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
+from reseau.bundle import Camera
 from reseau.bundle.further import Further
 from reseau.bundle.system import Linear, System, residuals
 from reseau.bundle.unknowns import Unknowns
 from reseau.bundle.values import Correction, Values
 from reseau.data import Array
-from reseau.optics import EbnerCorrection
+from reseau.optics import Chain, EbnerCorrection, OpenCV, Similarity, wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
 
 from . import networks
@@ -89,11 +90,20 @@ def test_image_side_reckons_with_the_corrected_image_point() -> None:
     # A measured point moved by a pixel moves the corrected one by 1 + dΔ/dx of it.
     moved = replace(world.network, xy=np.add(world.network.xy, [1e-3, 0.0]))
     cam = world.network.cameras[0]
-    lens = networks.mapping_of(cam).distortion  # type: ignore[union-attr]
+    lens = networks.mapping_of(cam).distortion
     photo = (world.network.xy - [319.5, 239.5]) * [0.01, -0.01] - cam.values[1:3]
     slope = lens.derivatives(photo).d_xy
     off = residuals(moved, system.unknowns, rows, values)
     np.testing.assert_allclose(off[:, 0], -1e-3 * slope[:, 0, 0], rtol=0, atol=1e-8)
+
+
+def polynomial() -> Camera:
+    """A lens and a distorted display behind it: a chain of a camera and Wong's model, 23 parameters."""
+    lens = OpenCV([800.0, 800.0, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 0.0])
+    chain = Chain(lens, Chain(wong_display(), Similarity([320.0, 240.0, 1.0, 0.0])), ("lens.", "display."))
+    names = ("lens.fx", "lens.k1", chain.names[10], chain.names[-1])
+    values = np.array(chain.values)
+    return Camera("chain", 640, 480, (0.01, 0.01), "mapping", values, names, mapping=chain)
 
 
 CASES = {
@@ -104,6 +114,10 @@ CASES = {
     "ebner for all": (networks.with_ebner("camera"),),
     "ebner per group": (networks.with_ebner("group"),),
     "ebner per image, image side": (replace(networks.with_ebner("image"), side="image"),),
+    "any mapping": (networks.mapped(networks.camera("opencv")),),
+    "a mapping, image side": (networks.mapped(networks.camera("brown-image")),),
+    "a polynomial behind a lens": (polynomial(),),
+    "a mapping beside a compiled camera": (networks.mapped(networks.camera("opencv")), networks.camera()),
     "two cameras": (networks.camera("brown-image"), networks.camera("opencv", ("fx", "k1"))),
 }
 

@@ -175,6 +175,30 @@ def test_redundancy_numbers_sum_to_the_redundancy(datum: str, model: str) -> Non
     assert fit.counts[2] == (0 if datum == "control" else 7)
 
 
+@pytest.mark.parametrize("model", ["brown-object", "opencv"])
+def test_a_mapping_gives_what_the_compiled_camera_gives(model: str) -> None:
+    cam = networks.camera(model)
+    world = networks.world(cameras=(cam,))
+    network = world.noisy(1)
+    compiled = required(world.problem(network, **TOLERANCE))
+    plain = required(world.problem(replace(network, cameras=(networks.mapped(cam),)), **TOLERANCE))
+    assert plain.sigma0 == pytest.approx(compiled.sigma0, rel=1e-9)
+    np.testing.assert_allclose(plain.values.xyz, compiled.values.xyz, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(plain.redundancy_numbers, compiled.redundancy_numbers, rtol=0, atol=1e-8)
+
+
+def test_the_measured_point_of_an_image_side_camera_is_had_by_its_mapping() -> None:
+    """Residuals of the measured and of the corrected point differ by the stretch of the correction."""
+    cam = networks.camera("brown-image")
+    world = networks.world(cameras=(cam,))
+    network = world.noisy(1)
+    corrected = required(world.problem(network, **TOLERANCE))
+    measured = required(world.problem(replace(network, cameras=(networks.mapped(cam),)), **TOLERANCE))
+    assert measured.redundancy == corrected.redundancy
+    assert measured.sigma0 == pytest.approx(corrected.sigma0, rel=0.1)
+    assert abs(measured.sigma0 - corrected.sigma0) > 1e-4
+
+
 def test_inner_constraints_have_the_least_trace_over_the_chosen_points() -> None:
     """No other datum gives the chosen points a smaller sum of variances; the images are the same."""
     chosen = np.arange(25) < 10

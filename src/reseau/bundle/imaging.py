@@ -15,14 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data import Array, Rows
+from ..optics import PlaneMapping
+from ..optics.poses import Pose, matrix_to_vector, project
 from .compiled import compiled
 
 __all__ = [
-    "BROWN_IMAGE", "BROWN_OBJECT", "CAMERA_WIDTH", "EBNER", "OPENCV", "Interior", "Orientation", "Seen",
-    "derive", "misfit",
+    "BROWN_IMAGE", "BROWN_OBJECT", "CAMERA_WIDTH", "EBNER", "MAPPING", "OPENCV", "Interior", "Orientation",
+    "Seen", "derive", "mapped", "misfit",
 ]  # fmt: skip
 
-BROWN_OBJECT, BROWN_IMAGE, OPENCV = 0, 1, 2
+BROWN_OBJECT, BROWN_IMAGE, OPENCV, MAPPING = 0, 1, 2, 3
 # Greatest number of parameters of a camera, and of additional parameters.
 CAMERA_WIDTH, EBNER = 12, 12
 
@@ -52,8 +54,8 @@ class Orientation(NamedTuple):
 class Interior(NamedTuple):
     """Cameras and sets of additional parameters in columns.
 
-    `kind` (c,), `values` (c, 12), `balance` (c, 3) with R0², R0⁴, R0⁶, `grid` (c, 4) with the centre (px) and
-    the pitch (mm), `extra` (e, 12), `base` (e,) in mm.
+    `kind` (c,), `values` (c, 12 or more), `balance` (c, 3) with R0², R0⁴, R0⁶, `grid` (c, 4) with the centre
+    (px) and the pitch (mm), `extra` (e, 12), `base` (e,) in mm.
     """
 
     kind: Rows
@@ -243,6 +245,8 @@ def misfit(begin: int, end: int, seen: Seen, at: Orientation, cameras: Interior,
     by_uv, slope, d, x = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 23)), np.empty(3)
     root = seen.root
     for k in range(begin, end):
+        if cameras.kind[seen.camera[k]] == MAPPING:
+            continue
         _image(k, seen, at, cameras, x, by_uv, slope, d)
         out[k, 0] = root[k, 0, 0] * d[0, 22]
         out[k, 1] = root[k, 1, 0] * d[0, 22] + root[k, 1, 1] * d[1, 22]
@@ -262,6 +266,8 @@ def derive(
     by_uv, slope, d, x = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 23)), np.empty(3)
     g, width, root, turn = np.empty((2, 3)), a_out.shape[2], seen.root, at.rotation
     for k in range(begin, end):
+        if cameras.kind[seen.camera[k]] == MAPPING:
+            continue
         _image(k, seen, at, cameras, x, by_uv, slope, d)
         w0, w1, w2 = root[k, 0, 0], root[k, 1, 0], root[k, 1, 1]
         for q in range(2):
@@ -287,3 +293,32 @@ def derive(
             for s in range(EBNER):
                 a_out[k, 0, width - EBNER + s] = w0 * d[0, 10 + s]
                 a_out[k, 1, width - EBNER + s] = w1 * d[0, 10 + s] + w2 * d[1, 10 + s]
+
+
+def mapped(
+    camera: PlaneMapping, at: Orientation, image: Rows, point: Rows
+) -> tuple[Array, Array, Array, Array]:
+    """Image points of any camera, with derivatives in NumPy: the same door for what is not compiled.
+
+    Parameters
+    ----------
+    camera : PlaneMapping
+        From ideal directions to pixels.
+    at : Orientation
+        Poses and points.
+    image, point : ndarray of int (n,)
+        Rows of them.
+
+    Returns
+    -------
+    ndarray (n, 2), ndarray (n, 2, 6), ndarray (n, 2, u), ndarray (n, 2, 3)
+        Pixels, and derivatives by the pose (rotation about the axes of the camera, projection centre), by the
+        parameters of the camera, and by the point.
+    """
+    turn, x0, xyz = at.rotation[image], at.x0[image], at.xyz[point]
+    seen = project(camera, Pose(matrix_to_vector(turn), x0), xyz)
+    by_x = seen.d_point @ np.swapaxes(turn, 1, 2)
+    x = np.einsum("nij,nj->ni", turn, xyz - x0)
+    # g·(δ × x) = δ·(x × g)
+    by_turn = np.cross(x[:, None, :], by_x)
+    return seen.xy, np.concatenate([by_turn, -seen.d_point], axis=2), seen.d_camera, seen.d_point

@@ -12,6 +12,7 @@ import numpy as np
 from ..data import Array, Mask, Rows
 from ..errors import UsageError
 from ..formats.network import CAMERA_PARAMETERS, CameraEntry, Network1
+from ..optics import PlaneMapping
 
 __all__ = ["Additional", "Camera", "Network", "finite"]
 
@@ -49,38 +50,49 @@ class Camera:
         Pixels of the image.
     pitch_mm : (float, float)
         Size of a pixel; without meaning for `opencv`.
-    model : {"brown", "opencv"}
-        See :class:`reseau.optics.Brown` and :class:`reseau.optics.OpenCV`.
+    model : {"brown", "opencv", "mapping"}
+        See :class:`reseau.optics.Brown` and :class:`reseau.optics.OpenCV`; or any other mapping.
     side : {"image", "object"}
         Whose coordinates Brown's distortion is a function of.
     balance_radius_mm : float
         R0 of Brown's radial distortion.
     values : ndarray (10,) or (12,)
-        All parameters of the model, in its order.
+        All parameters of the model, in its order; those of the mapping where there is one.
     free : tuple of str
         Those to be estimated.
     sigma : mapping of str to float
         Standard deviations of those whose values are observations.
     additional : Additional, optional
         Further parameters.
+    mapping : PlaneMapping, optional
+        From ideal directions to pixels, for a camera that is neither of the models.
     """
 
     id: str
     width: int
     height: int
     pitch_mm: tuple[float, float]
-    model: Literal["brown", "opencv"]
+    model: Literal["brown", "opencv", "mapping"]
     values: Array
     free: tuple[str, ...] = ()
     side: Literal["image", "object"] = "object"
     balance_radius_mm: float = 0.0
     sigma: dict[str, float] = field(default_factory=dict)
     additional: Additional | None = None
+    mapping: PlaneMapping | None = None
+
+    def __post_init__(self) -> None:
+        if (self.model == "mapping") != (self.mapping is not None):
+            raise UsageError("of the model `mapping` needs one, others none", where=f"camera {self.id}")
+        if len(self.values) != len(self.names):
+            raise UsageError(
+                f"has {len(self.values)} values, not {len(self.names)}", where=f"camera {self.id}"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
-        return CAMERA_PARAMETERS[self.model]
+        return CAMERA_PARAMETERS[self.model] if self.mapping is None else tuple(self.mapping.names)
 
     @property
     def parameters(self) -> dict[str, float]:

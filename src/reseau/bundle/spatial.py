@@ -47,6 +47,8 @@ def directions(network: Network) -> Array:
 
 
 def _inverse(camera: Camera, xy: Array) -> Array:
+    if camera.mapping is not None:
+        return camera.mapping.with_values(camera.values).inverse(xy)
     mapping: Brown | OpenCV
     if camera.model == "opencv":
         mapping = OpenCV(camera.values)

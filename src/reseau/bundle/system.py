@@ -8,10 +8,11 @@ import numpy as np
 
 from ..adjust.stochastic import Weighting
 from ..data import Array, Mask, Rows
+from ..optics import PlaneMapping
 from .arrow import Arrow
 from .compiled import chunks_of, in_parallel
 from .further import Further
-from .imaging import BROWN_IMAGE, BROWN_OBJECT, OPENCV, Interior, Seen, derive, misfit
+from .imaging import BROWN_IMAGE, BROWN_OBJECT, MAPPING, OPENCV, Interior, Seen, derive, mapped, misfit
 from .network import Network
 from .normal import Sums, assemble, reduce_sides, substitute
 from .unknowns import Unknowns
@@ -77,7 +78,23 @@ class System:
         in_parallel(
             lambda _, a, b: misfit(int(first[a]), int(first[b]), self.seen, at, cameras, out), self.chunks
         )
+        for mapping, _, rows in self.mappings(values):
+            xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows])
+            out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
         return out, (self.further.computed(values) - self.further.value) * self.sigma_root
+
+    def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
+        """Cameras that are not compiled, their numbers, and the rows of their observations."""
+        found = []
+        for c, camera in enumerate(self.unknowns.network.cameras):
+            if camera.mapping is not None:
+                mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
+                found.append((mapping, c, np.flatnonzero(self.seen.camera == c).astype(np.intp)))
+        return found
+
+    def _weighted(self, rows: Rows, matrix: Array) -> Array:
+        weighted: Array = self.seen.root[rows] @ matrix
+        return weighted
 
     def linearise(self, values: Values) -> Linear:
         """Misfits and derivatives at some values."""
@@ -93,6 +110,14 @@ class System:
             )  # fmt: skip
 
         in_parallel(work, self.chunks)
+        for mapping, c, own in self.mappings(values):
+            image, point, count = self.seen.image[own], self.seen.point[own], unknowns.count[c]
+            xy, by_pose, by_camera, by_point = mapped(mapping, at, image, point)
+            free = by_camera[:, :, unknowns.free[c, :count]]
+            b = by_point * self.movable[point][:, None, :]
+            out[own] = self._weighted(own, (xy - self.seen.xy[own])[:, :, None])[:, :, 0]
+            rows[own, :, : 6 + count] = self._weighted(own, np.concatenate([by_pose, free], axis=2))
+            rows[own, :, -3:] = self._weighted(own, b)
         further = (self.further.computed(values) - self.further.value) * self.sigma_root
         return Linear(self, values, rows, out, further)
 
@@ -320,16 +345,21 @@ def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) 
     cameras = _interior(network, unknowns)._replace(values=values.cameras, extra=values.extra)
     out = np.empty((len(rows), 2))
     misfit(0, len(rows), seen, values.orientation, cameras, out)
+    for c, camera in enumerate(network.cameras):
+        if camera.mapping is not None:
+            own = np.flatnonzero(seen.camera == c)
+            mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
+            xy, *_ = mapped(mapping, values.orientation, image[own], seen.point[own])
+            out[own] = xy - seen.xy[own]
     return out
 
 
 def _interior(network: Network, unknowns: Unknowns) -> Interior:
     """Cameras in columns, their values still to come."""
     cameras = network.cameras
-    kind = [
-        OPENCV if c.model == "opencv" else BROWN_OBJECT if c.side == "object" else BROWN_IMAGE
-        for c in cameras
-    ]
+    brown = {"object": BROWN_OBJECT, "image": BROWN_IMAGE}
+    kinds = {"opencv": OPENCV, "mapping": MAPPING}
+    kind = [kinds.get(c.model, brown[c.side]) for c in cameras]
     balance = np.array([c.balance_radius_mm for c in cameras])[:, None] ** [2.0, 4.0, 6.0]
     grid = np.array([((c.width - 1) / 2, (c.height - 1) / 2, *c.pitch_mm) for c in cameras])
     base = [network.cameras[c].additional.base_mm for c, _ in unknowns.extra_names]  # type: ignore[union-attr]

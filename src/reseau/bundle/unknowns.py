@@ -114,8 +114,9 @@ class Unknowns:
 
     @cached_property
     def free(self) -> Rows:
-        """Rows of the free parameters of each camera (c, 12), padded with zeros."""
-        rows = np.zeros((len(self.network.cameras), CAMERA_WIDTH), dtype=np.intp)
+        """Rows of the free parameters of each camera (c, 12 or more), padded with zeros."""
+        widest = max(CAMERA_WIDTH, *(len(camera.names) for camera in self.network.cameras))
+        rows = np.zeros((len(self.network.cameras), widest), dtype=np.intp)
         for row, camera in zip(rows, self.network.cameras, strict=True):
             row[: len(camera.free)] = [camera.names.index(name) for name in camera.free]
         return rows

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data import Array, Rows
 from ..optics.poses import rotation_matrix
-from .imaging import CAMERA_WIDTH, EBNER, Orientation
+from .imaging import EBNER, Orientation
 from .unknowns import Unknowns
 
 __all__ = ["Correction", "Values"]
@@ -61,7 +61,7 @@ class Values:
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
         """Values with the cameras as the network gives them."""
         network = unknowns.network
-        cameras = np.zeros((len(network.cameras), CAMERA_WIDTH))
+        cameras = np.zeros(unknowns.free.shape)
         for row, camera in zip(cameras, network.cameras, strict=True):
             row[: len(camera.values)] = camera.values
         return cls(rotation, x0, xyz, cameras, np.zeros((max(1, len(unknowns.extra)), EBNER)))
