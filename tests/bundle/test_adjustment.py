@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from reseau.adjust import variance_components
-from reseau.bundle import BundleFit, Network, Options, Result, adjust_network
+from reseau.bundle import BundleFit, Network, Options, Result, adjust_network, calibration_of
 from reseau.bundle.selection import Selection, cross_validation, eliminate_parameters
+from reseau.calibration import Calibration
+from reseau.errors import UsageError
 
 from . import networks
 
@@ -144,3 +146,16 @@ def test_check_points_are_compared_and_change_nothing() -> None:
     assert rows.tolist() == [20, 21]
     assert np.abs(off / checked.point_sigma[rows]).max() < 4
     np.testing.assert_allclose(plain.fit.values.xyz, checked.fit.values.xyz, atol=1e-8)
+
+
+def test_the_calibration_of_a_camera_is_a_document_with_its_covariance() -> None:
+    world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
+    result = required(adjust_network(world.noisy(1)))
+    calibration = calibration_of(result, "cam", name="bench")
+    again = Calibration.parse(calibration.to_json(), where="calibration")
+    assert again == calibration
+    assert again.covariance.names == SIMPLE.free
+    assert again.parameters["c"].sigma == pytest.approx(np.sqrt(result.camera_covariance(0)[0, 0]))
+    assert again.parameters["K3"].sigma == 0
+    with pytest.raises(UsageError, match="other"):
+        calibration_of(result, "other", name="bench")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
+from .calibrated import calibration_of
 from .document import to_document
 from .network import Additional, Camera, Network
 from .problem import BundleFit, BundleProblem
@@ -20,6 +21,7 @@ __all__ = [
     "Result",
     "adjust_network",
     "approximate",
+    "calibration_of",
     "problem_of",
     "to_document",
 ]
