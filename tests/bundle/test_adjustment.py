@@ -159,3 +159,41 @@ def test_the_calibration_of_a_camera_is_a_document_with_its_covariance() -> None
     assert again.parameters["K3"].sigma == 0
     with pytest.raises(UsageError, match="other"):
         calibration_of(result, "other", name="bench")
+
+
+def said(result: object) -> str:
+    """What the result warns of, or why there is none."""
+    return " ".join(result.warnings) if isinstance(result, Result) else result.reason  # type: ignore[attr-defined]
+
+
+def test_a_mirrored_control_is_found() -> None:
+    world = networks.world(images=8, points=40, control=6, cameras=(SIMPLE,))
+    network = world.noisy(1)
+    mirrored = replace(network, xyz=network.xyz * [1.0, -1.0, 1.0])
+    assert "mirrored" in said(adjust_network(mirrored))
+
+
+def test_two_exchanged_control_points_are_named() -> None:
+    world = networks.world(images=8, points=40, control=6, cameras=(SIMPLE,))
+    network = world.noisy(1)
+    xyz = network.xyz.copy()
+    xyz[[1, 4]] = xyz[[4, 1]]
+    assert "control points p1 and p4 look exchanged" in said(adjust_network(replace(network, xyz=xyz)))
+
+
+def test_a_wrong_control_point_is_named() -> None:
+    world = networks.world(images=8, points=40, control=7, cameras=(SIMPLE,))
+    network = world.noisy(1)
+    xyz = network.xyz.copy()
+    xyz[3, 2] += 0.3
+    assert "control point p3 contradicts the others" in said(adjust_network(replace(network, xyz=xyz)))
+
+
+def test_swapped_names_in_an_image_are_left_out() -> None:
+    world = networks.world(images=8, points=40, control=6, cameras=(SIMPLE,))
+    network = world.noisy(1)
+    xy = network.xy.copy()
+    rows = np.flatnonzero(network.image_of == 2)[[10, 20]]
+    xy[rows] = xy[rows[::-1]]
+    result = required(adjust_network(replace(network, xy=xy), Options(outliers="reject")))
+    assert set(rows.tolist()) <= set(np.flatnonzero(result.rejected).tolist())
