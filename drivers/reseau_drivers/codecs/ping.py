@@ -207,7 +207,8 @@ class Transducer:
             When it is too short.
         """
         mode, *rest, transmit, _ = _unpacked(_TRANSDUCER, payload, "a TRANSDUCER message")
-        return cls(*rest, transmit=bool(transmit), mode=mode)
+        gain, angle, duration, period, frequency, samples = rest
+        return cls(gain, angle, duration, period, frequency, samples, bool(transmit), mode)
 
     @property
     def _common(self) -> tuple[int, ...]:
@@ -248,7 +249,9 @@ class DeviceData:
         samples = payload[_DATA.size + _VECTOR.size :]
         if len(samples) != count:
             raise ProtocolError(f"DEVICE_DATA announces {count} samples and brings {len(samples)}")
-        return cls(Transducer(*rest, transmit=False, mode=mode), samples)
+        gain, angle, duration, period, frequency, number = rest
+        asked = Transducer(gain, angle, duration, period, frequency, number, False, mode)
+        return cls(asked, samples)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Generic, Protocol, TypeVar
 
 __all__ = ["Damaged", "Decoder", "LineDecoder", "shown"]
 
-T_co = TypeVar("T_co", covariant=True)
+T = TypeVar("T")
 
 _SHOWN = 60
 """Bytes of a damaged message that are kept to be shown."""
@@ -32,10 +32,10 @@ class Damaged:
         return f"{self.why}: {shown(self.data)}"
 
 
-class Decoder(Protocol, Generic[T_co]):
+class Decoder(Protocol, Generic[T]):
     """Takes the bytes of a stream as they come and yields what they mean."""
 
-    def feed(self, data: bytes) -> list[T_co | Damaged]:
+    def feed(self, data: bytes) -> list[T | Damaged]:
         """Messages that are complete with these bytes, in their order."""
 
     def reset(self) -> None:

@@ -199,10 +199,10 @@ def decode_command(line: bytes) -> Command:
     content = _content(line[start:])
     if not content.isascii():
         raise ProtocolError(f"no command: {shown(line)}")
-    words, numbers = content.decode("ascii").split(), []
+    words, numbers = content.decode("ascii").split(), list[int]()
     while words and len(numbers) < 3 and words[0].isdigit():
         numbers.append(int(words.pop(0)))
-    device, axis, id_ = (*numbers, *(None, None, None)[len(numbers) :])
+    device, axis, id_ = (numbers[k] if k < len(numbers) else None for k in range(3))
     if max(device or 0, id_ or 0) > 99 or (axis or 0) > 9:
         raise ProtocolError(f"no command: {shown(line)}")
     return Command(device or 0, axis or 0, " ".join(words), id_)

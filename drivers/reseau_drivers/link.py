@@ -1,0 +1,285 @@
+"""Byte streams to instruments: serial ports and TCP, with a deadline for everything; and talk over them."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Generic, Protocol, TypeVar
+
+import serial
+
+from reseau.errors import ConnectionLost, DeadlineError, ProtocolError, UsageError
+from reseau.instruments import Deadline
+
+from .codecs.stream import Damaged, Decoder
+
+__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "link_to"]
+
+M = TypeVar("M")
+
+_CHUNK = 65536
+
+
+class Link(Protocol):
+    """A stream of bytes; simulators in the same process have one of their own."""
+
+    def open(self, deadline: Deadline) -> None:
+        """Open it anew; nothing of an earlier stream is left."""
+
+    def close(self) -> None:
+        """Close it, if it is open."""
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Send all of it."""
+
+    def pending(self) -> bool:
+        """Whether bytes have come that were not read yet."""
+
+    def read(self, deadline: Deadline) -> bytes:
+        """What has come; waits for something until the deadline, and is empty after it."""
+
+
+class SerialLink:
+    """A serial port.
+
+    Parameters
+    ----------
+    port : str
+        Device, as ``/dev/ttyUSB0``.
+    baud : int
+        8 bits, no parity, one stop bit.
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self._port, self._baud = port, baud
+        self._serial: serial.Serial | None = None
+
+    def open(self, deadline: Deadline) -> None:
+        """Open the port for oneself alone."""
+        self.close()
+        try:
+            self._serial = serial.Serial(
+                self._port, self._baud, timeout=0.1, write_timeout=1.0, exclusive=True
+            )
+            self._serial.reset_input_buffer()
+        except (OSError, ValueError) as error:
+            self.close()
+            raise ConnectionLost(
+                f"{self._port} cannot be opened ({error})", do="is it plugged in, and free?"
+            ) from None
+
+    def close(self) -> None:
+        """Close the port, if it is open."""
+        port, self._serial = self._serial, None
+        if port is not None:
+            with suppress(OSError):
+                port.close()
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Send all of it."""
+        port = self._opened()
+        try:
+            port.write_timeout = max(0.01, deadline.left)
+            port.write(data)
+        except serial.SerialTimeoutException:
+            raise DeadlineError("took no bytes in the time allowed") from None
+        except OSError as error:
+            raise ConnectionLost(f"{self._port} went away ({error})", do="is it plugged in?") from None
+
+    def read(self, deadline: Deadline) -> bytes:
+        """What has come, or nothing after the deadline."""
+        port = self._opened()
+        try:
+            port.timeout = deadline.left
+            first = port.read(1)
+            return bytes(first) + (bytes(port.read(min(port.in_waiting, _CHUNK))) if first else b"")
+        # pyserial lets a TypeError out where another thread closes the port while it is read.
+        except (OSError, TypeError) as error:
+            raise ConnectionLost(f"{self._port} went away ({error})", do="is it plugged in?") from None
+
+    def pending(self) -> bool:
+        """Whether bytes have come that were not read yet."""
+        port = self._opened()
+        try:
+            return bool(port.in_waiting)
+        except (OSError, TypeError) as error:
+            raise ConnectionLost(f"{self._port} went away ({error})", do="is it plugged in?") from None
+
+    def _opened(self) -> serial.Serial:
+        if self._serial is None:
+            raise ConnectionLost(f"{self._port} is not open")
+        return self._serial
+
+
+class TcpLink:
+    """A TCP connection.
+
+    Parameters
+    ----------
+    host, port : str, int
+        Of the instrument.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+
+    def open(self, deadline: Deadline) -> None:
+        """Connect anew."""
+        self.close()
+        try:
+            self._socket = socket.create_connection(self._address, timeout=max(0.01, deadline.left))
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as error:
+            raise ConnectionLost(
+                f"{self._where} cannot be reached ({error})", do="is it switched on, and the address right?"
+            ) from None
+
+    @property
+    def _where(self) -> str:
+        return f"{self._address[0]}:{self._address[1]}"
+
+    def close(self) -> None:
+        """Disconnect, if connected."""
+        connection, self._socket = self._socket, None
+        if connection is not None:
+            connection.close()
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Send all of it."""
+        connection = self._opened()
+        try:
+            connection.settimeout(max(0.01, deadline.left))
+            connection.sendall(data)
+        except TimeoutError:
+            raise DeadlineError("took no bytes in the time allowed") from None
+        except OSError as error:
+            raise ConnectionLost(f"{self._where} went away ({error})") from None
+
+    def read(self, deadline: Deadline) -> bytes:
+        """What has come, or nothing after the deadline."""
+        connection = self._opened()
+        try:
+            connection.settimeout(max(0.001, deadline.left))
+            data = connection.recv(_CHUNK)
+        except TimeoutError:
+            return b""
+        except OSError as error:
+            raise ConnectionLost(f"{self._where} went away ({error})") from None
+        if not data:
+            raise ConnectionLost(f"{self._where} closed the connection")
+        return data
+
+    def pending(self) -> bool:
+        """Whether bytes have come that were not read yet."""
+        return bool(select.select([self._opened()], [], [], 0)[0])
+
+    def _opened(self) -> socket.socket:
+        if self._socket is None:
+            raise ConnectionLost(f"{self._where} is not open")
+        return self._socket
+
+
+def link_to(address: str | Link, *, baud: int = 115200) -> Link:
+    """The link of an address.
+
+    Parameters
+    ----------
+    address : str or Link
+        ``tcp://host:port``, a serial device, or a link, which is passed through.
+    baud : int
+        Of a serial device; ``device@baud`` says another one.
+
+    Raises
+    ------
+    UsageError
+        When it is no address.
+    """
+    if not isinstance(address, str):
+        return address
+    if address.startswith("tcp://"):
+        host, _, port = address.removeprefix("tcp://").rpartition(":")
+        if not host or not port.isdigit() or int(port) > 65535:
+            raise UsageError("is no address", where=address, do="write tcp://host:port")
+        return TcpLink(host.strip("[]"), int(port))
+    device, at, speed = address.partition("@")
+    if not device or (at and not speed.isdigit()):
+        raise UsageError("is no address", where=address, do="write a serial device, or device@baud")
+    return SerialLink(device, int(speed) if at else baud)
+
+
+class Conversation(Generic[M]):
+    """Messages over a link.
+
+    Parameters
+    ----------
+    link : Link
+        Carries the bytes.
+    decoder : Decoder
+        Of what the instrument says.
+
+    Attributes
+    ----------
+    ignored : int
+        Messages that were no answer to what had been asked, and damaged ones.
+    """
+
+    def __init__(self, link: Link, decoder: Decoder[M]) -> None:
+        self._link, self._decoder = link, decoder
+        self._heard: list[M | Damaged] = []
+        self.ignored = 0
+
+    def open(self, deadline: Deadline) -> None:
+        """Open the link anew."""
+        self._link.open(deadline)
+        self._decoder.reset()
+        self._heard.clear()
+
+    def close(self) -> None:
+        """Close it."""
+        self._link.close()
+
+    def tell(self, data: bytes, deadline: Deadline) -> None:
+        """Send bytes, and wait for nothing."""
+        self._link.write(data, deadline)
+
+    def ask(self, data: bytes, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
+        """Send a question and wait for its answer; other messages are passed over.
+
+        Raises
+        ------
+        DeadlineError
+            When no answer came in time.
+        ProtocolError
+            When nothing but damaged ones came in time.
+        ConnectionLost
+            When the link broke.
+        """
+        # What is there before the question is no answer to it: one that came twice, or was given up.
+        while self._link.pending() and not deadline.over:
+            self.ignored += len(self._decoder.feed(self._link.read(deadline)))
+        self.ignored += len(self._heard)
+        self._heard.clear()
+        self.tell(data, deadline)
+        return self.hear(is_answer, deadline)
+
+    def hear(self, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
+        """Wait for a message; raises as :meth:`ask`."""
+        damaged: Damaged | None = None
+        while True:
+            while self._heard:
+                message = self._heard.pop(0)
+                if isinstance(message, Damaged):
+                    damaged = message
+                elif is_answer(message):
+                    return message
+                self.ignored += 1
+            if deadline.over:
+                if damaged is not None:
+                    raise ProtocolError(f"its answer was damaged ({damaged})", do="check cable and speed")
+                raise DeadlineError(
+                    f"did not answer within {deadline.seconds:g} s", do="is it switched on, and free?"
+                )
+            self._heard += self._decoder.feed(self._link.read(deadline))

@@ -1,0 +1,32 @@
+"""Simulators behind the protocols of the real instruments: pseudo-terminals, TCP, SCPI, VXI-11, HiSLIP.
+
+An instrument is a :class:`~reseau_sims.serving.machine.Machine`: bytes in, answers out, a list of what its
+client did wrong. A :class:`~reseau_sims.serving.machine.Wire` spoils answers by a script; a server, or a link
+within the process, carries it to a client. All of them listen on the loopback interface alone.
+"""
+
+from .machine import Machine, Session, Wire
+from .motion import Motor
+from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
+from .servers import InProcess, PtyServer, Server, TcpServer
+from .smc100 import Smc100Line
+from .zaber import ZaberChain
+
+__all__ = [
+    "DEVICE_KINDS",
+    "KINDS",
+    "LINE_KINDS",
+    "Fault",
+    "InProcess",
+    "Kind",
+    "Machine",
+    "Motor",
+    "PtyServer",
+    "Script",
+    "Server",
+    "Session",
+    "Smc100Line",
+    "TcpServer",
+    "Wire",
+    "ZaberChain",
+]

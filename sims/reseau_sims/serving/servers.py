@@ -1,0 +1,342 @@
+"""Doors to simulated instruments: TCP on loopback, pseudo-terminals, and none at all within one process.
+
+A server is one thread that waits on all its connections. It never trusts its client either: what a connection
+has to send is bounded, and a client that does not read is hung up on.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import selectors
+import shutil
+import socket
+import tempfile
+import threading
+import time
+import tty
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Self
+
+from reseau.errors import ConnectionLost
+from reseau.instruments import Deadline
+
+from .machine import Session
+from .script import Output
+
+__all__ = ["InProcess", "PtyServer", "Server", "TcpServer"]
+
+_CHUNK = 65536
+_MOST_UNSENT = 64_000_000
+
+
+class _Connection:
+    """A file descriptor, its session, and what is still to be sent."""
+
+    def __init__(self, fd: int, session: Session, close: Callable[[], None]) -> None:
+        self.fd, self.session, self.close = fd, session, close
+        self.ready = bytearray()
+        self._due: list[tuple[float, int, bytes | None]] = []
+        self._order = 0
+        self._last = 0.0
+
+    def put(self, outputs: list[Output]) -> None:
+        """Add what a session wants to send; what comes later is sent later, as on any wire."""
+        for delay, data in outputs:
+            self._last = max(self._last, time.monotonic() + delay)
+            heapq.heappush(self._due, (self._last, self._order, data))
+            self._order += 1
+
+    def mature(self) -> bool:
+        """Make what is due ready to be sent; False when the session wants to hang up then."""
+        while self._due and self._due[0][0] <= time.monotonic():
+            data = heapq.heappop(self._due)[2]
+            if data is None:
+                return False
+            self.ready += data
+        return len(self.ready) <= _MOST_UNSENT
+
+    @property
+    def next_due(self) -> float | None:
+        """When something is due next."""
+        return self._due[0][0] if self._due else None
+
+
+class Server(ABC):
+    """Serves connections in a thread of its own.
+
+    Parameters
+    ----------
+    open_session : callable
+        Makes the session of a new connection.
+    """
+
+    def __init__(self, open_session: Callable[[], Session]) -> None:
+        self._open_session = open_session
+        self._selector = selectors.DefaultSelector()
+        self._wake_out, self._wake_in = os.pipe()
+        self._selector.register(self._wake_out, selectors.EVENT_READ)
+        self._connections: dict[int, _Connection] = {}
+        self._closing, self._drop_all = False, False
+        self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
+
+    @property
+    @abstractmethod
+    def address(self) -> str:
+        """As a driver takes it."""
+
+    @abstractmethod
+    def _accept(self, fd: int) -> bool:
+        """Whether the descriptor is one that brings new connections; if so, one is taken."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Close what is not a connection."""
+
+    @abstractmethod
+    def _after_loss(self) -> None:
+        """A connection is over."""
+
+    def start(self) -> Self:
+        """Begin to serve."""
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Hang up on all and end the thread."""
+        if self._closing:
+            return
+        self._closing = True
+        os.write(self._wake_in, b"x")
+        self._thread.join(10.0)
+        os.close(self._wake_in)
+
+    def hang_up(self) -> None:
+        """Break all connections, as when a cable is pulled."""
+        self._drop_all = True
+        os.write(self._wake_in, b"x")
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _add(self, fd: int, close: Callable[[], None]) -> None:
+        os.set_blocking(fd, False)
+        self._connections[fd] = _Connection(fd, self._open_session(), close)
+        self._selector.register(fd, selectors.EVENT_READ)
+
+    def _remove(self, connection: _Connection) -> None:
+        del self._connections[connection.fd]
+        self._selector.unregister(connection.fd)
+        connection.session.hung_up()
+        with suppress(OSError):
+            connection.close()
+        if not self._closing:
+            self._after_loss()
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                for key, events in self._selector.select(self._patience()):
+                    self._serve(key.fd, events)
+                if self._drop_all:
+                    self._drop_all = False
+                    for connection in list(self._connections.values()):
+                        self._remove(connection)
+                for connection in list(self._connections.values()):
+                    self._flush(connection)
+        finally:
+            self._closing = True
+            for connection in list(self._connections.values()):
+                self._remove(connection)
+            self._selector.close()
+            os.close(self._wake_out)
+            self._release()
+
+    def _patience(self) -> float | None:
+        due = [c.next_due for c in self._connections.values() if c.next_due is not None]
+        return max(0.0, min(due) - time.monotonic()) if due else None
+
+    def _serve(self, fd: int, events: int) -> None:
+        if fd == self._wake_out:
+            os.read(fd, 64)
+            return
+        if self._accept(fd):
+            return
+        connection = self._connections.get(fd)
+        if connection is None or not events & selectors.EVENT_READ:
+            return
+        try:
+            data = os.read(fd, _CHUNK)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._remove(connection)
+            return
+        connection.put(connection.session.receive(data))
+
+    def _flush(self, connection: _Connection) -> None:
+        alive = connection.mature()
+        try:
+            while connection.ready:
+                sent = os.write(connection.fd, connection.ready[:_CHUNK])
+                del connection.ready[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            alive = False
+        if not alive:
+            self._remove(connection)
+            return
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.ready else 0)
+        self._selector.modify(connection.fd, wanted)
+
+
+class TcpServer(Server):
+    """Serves on a port of the loopback interface.
+
+    Parameters
+    ----------
+    open_session : callable
+        Makes the session of a new connection.
+    port : int
+        0 takes a free one.
+    """
+
+    HOST = "127.0.0.1"
+
+    def __init__(self, open_session: Callable[[], Session], port: int = 0) -> None:
+        super().__init__(open_session)
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._listener.bind((self.HOST, port))
+        except OSError:
+            self._listener.close()
+            self._selector.close()
+            for fd in (self._wake_out, self._wake_in):
+                os.close(fd)
+            raise
+        self._listener.listen(16)
+        self._listener.setblocking(False)
+        self.port = int(self._listener.getsockname()[1])
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    @property
+    def address(self) -> str:
+        """``tcp://127.0.0.1:port``."""
+        return f"tcp://{self.HOST}:{self.port}"
+
+    def _accept(self, fd: int) -> bool:
+        if fd != self._listener.fileno():
+            return False
+        with suppress(OSError):
+            connection, _ = self._listener.accept()
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._add(connection.fileno(), connection.close)
+        return True
+
+    def _after_loss(self) -> None:
+        """Others may connect as before."""
+
+    def _release(self) -> None:
+        self._listener.close()
+
+
+class PtyServer(Server):
+    """Serves on a pseudo-terminal, under a name that stays when it is unplugged and plugged in again."""
+
+    def __init__(self, open_session: Callable[[], Session]) -> None:
+        super().__init__(open_session)
+        self._folder = tempfile.mkdtemp(prefix="reseau-")
+        self._slave = -1
+        self._plug_in()
+
+    @property
+    def address(self) -> str:
+        """The terminal's name."""
+        return os.path.join(self._folder, "tty")
+
+    def _plug_in(self) -> None:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        # One end is kept open here: otherwise the master hangs up whenever the client closes.
+        old, self._slave = self._slave, slave
+        if old >= 0:
+            os.close(old)
+        draft = f"{self.address}.new"
+        os.symlink(os.ttyname(slave), draft)
+        os.replace(draft, self.address)
+        self._add(master, lambda: os.close(master))
+
+    def _after_loss(self) -> None:
+        self._plug_in()
+
+    def _accept(self, fd: int) -> bool:
+        return False
+
+    def _release(self) -> None:
+        os.close(self._slave)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class InProcess:
+    """A link that leads straight into a simulator: no sockets, no threads.
+
+    Parameters
+    ----------
+    open_session : callable
+        Makes the session of a new connection.
+    """
+
+    def __init__(self, open_session: Callable[[], Session]) -> None:
+        self._open_session = open_session
+        self._connection: _Connection | None = None
+
+    def open(self, deadline: Deadline) -> None:
+        """Open a new session."""
+        self.close()
+        self._connection = _Connection(-1, self._open_session(), lambda: None)
+
+    def close(self) -> None:
+        """End the session."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.session.hung_up()
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Hand it over."""
+        connection = self._opened()
+        connection.put(connection.session.receive(data))
+
+    def pending(self) -> bool:
+        """Whether bytes are due."""
+        connection = self._opened()
+        if not connection.mature():
+            self.close()
+            raise ConnectionLost("the simulator hung up")
+        return bool(connection.ready)
+
+    def read(self, deadline: Deadline) -> bytes:
+        """What is due, or comes due before the deadline."""
+        while not self.pending():
+            due = self._opened().next_due
+            if due is None or due - time.monotonic() > deadline.left:
+                time.sleep(deadline.left)
+                return b""
+            time.sleep(max(0.0, due - time.monotonic()))
+        connection = self._opened()
+        data = bytes(connection.ready[:_CHUNK])
+        del connection.ready[: len(data)]
+        return data
+
+    def _opened(self) -> _Connection:
+        if self._connection is None:
+            raise ConnectionLost("the simulator is not connected")
+        return self._connection

@@ -1,0 +1,133 @@
+"""Rigs of a driver with its simulator: every driver passes the same battery on every transport."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from reseau.instruments import Device
+from reseau_drivers.link import link_to
+from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
+from reseau_sims.serving import (
+    InProcess,
+    Machine,
+    PtyServer,
+    Script,
+    Server,
+    Smc100Line,
+    TcpServer,
+    Wire,
+    ZaberChain,
+)
+
+TRANSPORTS = ("pty", "tcp", "in process")
+
+
+@dataclass
+class Rig:
+    """A driver, what it drives, and what to do with it.
+
+    Parameters
+    ----------
+    device : Device
+        The driver.
+    machine : Machine
+        What it drives.
+    script : Script
+        What goes wrong between them.
+    work : callable
+        Takes the number of a run; does something that is different from run to run, and asserts that what
+        came out is right.
+    recover : callable
+        Brings the instrument back after any fault, as a user would.
+    """
+
+    device: Device[Any]
+    machine: Machine
+    script: Script
+    work: Callable[[int], None]
+    recover: Callable[[], None]
+    server: Server | None = None
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+def left_open() -> tuple[int, int, int]:
+    """File descriptors, sockets among them, and threads of this process."""
+    fds = os.listdir("/proc/self/fd")
+    sockets = 0
+    for fd in fds:
+        try:
+            sockets += os.readlink(f"/proc/self/fd/{fd}").startswith("socket:")
+        except OSError:
+            continue
+    return len(fds), sockets, threading.active_count()
+
+
+def _wired(stack: ExitStack, transport: str, machine: Machine, script: Script) -> tuple[Any, Server | None]:
+    """Address or link by which a driver reaches a machine."""
+
+    def session() -> Wire:
+        return Wire(machine, script)
+
+    if transport == "in process":
+        return InProcess(session), None
+    server: Server = stack.enter_context(PtyServer(session) if transport == "pty" else TcpServer(session))
+    return server.address, server
+
+
+def _table_rig(device: Table, machine: ZaberChain | Smc100Line, script: Script, server: Server | None) -> Rig:
+    def work(run: int) -> None:
+        for axis, plan in device.plans.items():
+            target = 10.0 + (7 * run + plan.axis) % 60
+            state = device.move(axis, target, 8.0)
+            key: Any = (plan.device, plan.axis) if isinstance(machine, ZaberChain) else plan.device
+            assert abs(state.position - target) < 0.01
+            assert abs(machine.motors[key].position / plan.per_unit - target) < 0.01
+
+    def recover() -> None:
+        for axis in device.plans:
+            device.home(axis, 8.0)
+
+    return Rig(device, machine, script, work, recover, server)
+
+
+def zaber_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = ZaberChain([2, 1])
+    address, server = _wired(stack, transport, machine, script)
+    plans = {
+        "tilt": AxisPlan(1, 1, per_unit=1000.0, high=100.0, backlash=0.5),
+        "roll": AxisPlan(2, 1, per_unit=500.0, high=100.0),
+    }
+    device = Table("table", Zaber(link_to(address), 0.15), plans, seconds=1.2)
+    device.configure(speed=800.0)
+    return _table_rig(device, machine, script, server)
+
+
+def smc100_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = Smc100Line(1, low=0.0, high=100.0, speed=800.0)
+    address, server = _wired(stack, transport, machine, script)
+    device = Table("roll", Smc100(link_to(address), 0.15), {"roll": AxisPlan(1, high=100.0)}, seconds=1.2)
+    device.configure(speed=800.0)
+    return _table_rig(device, machine, script, server)
+
+
+Maker = Callable[[ExitStack, str, Script], Rig]
+RIGS: dict[tuple[str, str], Maker] = {
+    **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
+    **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
+}
+
+
+@contextmanager
+def rig(driver: str, transport: str, script: Script | None = None) -> Iterator[Rig]:
+    """A rig, connected and ready; nothing of it is left afterwards."""
+    with ExitStack() as stack:
+        made = RIGS[driver, transport](stack, transport, script or Script())
+        stack.callback(made.device.close)
+        made.device.connect()
+        made.recover()
+        yield made

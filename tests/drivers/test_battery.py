@@ -1,0 +1,111 @@
+"""The table driver × transport × fault: right or a typed error, in time, and nothing left open.
+
+Every cell is one test: a fault befalls an answer, and what the driver does is either right in the end or an
+error of the tree that names the instrument; not long after its deadline; and the next call works.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from reseau.errors import InstrumentError
+from reseau_sims.serving import KINDS, Fault, Kind, Script
+
+from .rigs import RIGS, Rig, left_open, rig
+
+CELLS = [
+    (driver, transport, kind, at)
+    for driver, transport in RIGS
+    for kind in KINDS
+    for at in ((0, 1, 2, 4) if transport == "in process" else (2,))
+]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left_open() -> object:
+    before = left_open()
+    yield
+    deadline = time.monotonic() + 5.0
+    while left_open() != before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert left_open() == before
+
+
+@pytest.mark.parametrize(("driver", "transport", "kind", "at"), CELLS)
+def test_a_fault_is_survived_or_said_in_time(driver: str, transport: str, kind: Kind, at: int) -> None:
+    script = Script()
+    with rig(driver, transport, script) as found:
+        found.work(0)
+        script.fault_at(script.count + at, Fault(kind, 0.2))
+        began = time.monotonic()
+        said = None
+        try:
+            found.work(1)
+        except InstrumentError as error:
+            said = error
+        assert said is None or (said.instrument, bool(said.command)) == (found.device.name, True)
+        assert time.monotonic() - began < 10.0
+        assert [fault.kind for fault in script.happened] == [kind]
+        found.recover()
+        found.work(2)
+        # A state the instrument was put into makes it reject commands; a line fault never does.
+        if kind not in ("wrong state", "out of range", "stuck", "power-cycled"):
+            assert found.machine.violations == []
+
+
+@pytest.mark.parametrize(("driver", "transport"), [key for key in RIGS if key[1] != "in process"])
+def test_a_cable_pulled_and_plugged_in_again(driver: str, transport: str) -> None:
+    with rig(driver, transport) as found:
+        assert found.server is not None
+        found.server.hang_up()
+        time.sleep(0.05)
+        with pytest.raises(InstrumentError):
+            found.work(1)
+        found.work(2)
+        assert found.device.reconnections == 2
+        assert found.machine.violations == []
+
+
+@pytest.mark.parametrize(("driver", "transport"), list(RIGS))
+def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) -> None:
+    _endure(driver, transport, exchanges=120, rate=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("driver", "transport"), list(RIGS))
+def test_endurance(driver: str, transport: str) -> None:
+    _endure(driver, transport, exchanges=int(os.environ.get("RESEAU_EXCHANGES", "10000")), rate=0.01)
+
+
+def _endure(driver: str, transport: str, exchanges: int, rate: float) -> None:
+    script = Script()
+    with rig(driver, transport, script) as found:
+        start, run, failed = script.count, 0, 0
+        script.at_random(rate, seed=7, seconds=0.05)
+        while script.count - start < exchanges:
+            run += 1
+            began = time.monotonic()
+            try:
+                found.work(run)
+            except InstrumentError:
+                failed += 1
+                _recovered(found)
+            assert time.monotonic() - began < 30.0
+        script.at_random(0.0)
+        _recovered(found)
+        found.work(run + 1)
+        assert failed <= len(script.happened)
+
+
+def _recovered(found: Rig) -> None:
+    """Bring an instrument back that may fail again meanwhile."""
+    patience = time.monotonic() + 20.0
+    while True:
+        try:
+            found.recover()
+            return
+        except InstrumentError:
+            assert time.monotonic() < patience

@@ -1,0 +1,146 @@
+"""What is safe on a table: homed first, within limits, from below, stopped from any thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from reseau.errors import ConnectionLost, DeadlineError, SettingError, StateError, UsageError
+from reseau.instruments import Turntable
+from reseau_drivers.link import link_to
+from reseau_drivers.turntable import AxisPlan, Table, Zaber, smc100, zaber
+from reseau_sims.serving import Fault, InProcess, Script, Smc100Line, Wire, ZaberChain
+
+
+def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
+    chain, line = ZaberChain([1], high=100_000.0), Smc100Line(1, low=-10.0, high=100.0)
+    axis = {"high": 100.0, "backlash": 0.5}
+    return [
+        (
+            zaber(
+                "table", InProcess(lambda: Wire(chain, Script())), axes={"tilt": axis | {"per_unit": 1000.0}}
+            ),
+            chain,
+        ),
+        (smc100("table", InProcess(lambda: Wire(line, Script())), axes={"tilt": axis}), line),
+    ]
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_table_is_homed_before_it_moves_and_keeps_to_its_limits(which: int) -> None:
+    table, machine = tables()[which]
+    assert isinstance(table, Turntable)
+    with table:
+        with pytest.raises(StateError, match="home tilt first"):
+            table.move("tilt", 5.0)
+        table.configure(speed=500.0)
+        table.home("tilt")
+        for beyond in (-1.0, 0.2, 100.1, float("nan")):
+            with pytest.raises(SettingError):
+                table.move("tilt", beyond)
+        with pytest.raises(SettingError, match="no axis"):
+            table.move("roll", 1.0)
+        assert table.move("tilt", 30.0).position == pytest.approx(30.0, abs=2e-3)
+        assert table.check()["tilt"] == "30 deg"
+    assert machine.violations == []
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_every_position_is_reached_from_below(which: int) -> None:
+    table, machine = tables()[which]
+    motor = next(iter(machine.motors.values()))
+    targets: list[float] = []
+    go = motor.go
+
+    def recorded(target: float) -> None:
+        targets.append(target / table.plans["tilt"].per_unit)
+        go(target)
+
+    motor.go = recorded  # type: ignore[method-assign]
+    with table:
+        table.configure(speed=900.0)
+        table.home("tilt")
+        targets.clear()
+        table.move("tilt", 50.0)
+        table.move("tilt", 20.0)
+        table.move("tilt", 20.2)
+        table.move("tilt", 40.0)
+    assert targets == pytest.approx([50.0, 19.5, 20.0, 19.7, 20.2, 40.0])
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_stop_works_from_any_thread(which: int) -> None:
+    table, machine = tables()[which]
+    with table:
+        table.home("tilt")
+        status = table.axes["tilt"].set(90.0)
+        time.sleep(0.15)
+        began = time.monotonic()
+        stopper = threading.Thread(target=table.stop)
+        stopper.start()
+        stopper.join()
+        assert isinstance(status.exception(2.0), StateError)
+        assert time.monotonic() - began < 1.0
+        state = table.state("tilt")
+        assert not state.moving
+        assert state.position < 80.0
+        assert table.state("tilt").position == state.position
+    assert machine.violations == []
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_move_that_takes_too_long_is_stopped(which: int) -> None:
+    table, _ = tables()[which]
+    with table:
+        table.home("tilt")
+        table.configure(speed=1.0)
+        with pytest.raises(DeadlineError, match="move tilt to 90 deg"):
+            table.move("tilt", 90.0, 0.3)
+        assert not table.state("tilt").moving
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("stuck", "stalled"), ("out of range", "limit switch"), ("wrong state", "driver is off")],
+)
+def test_flags_of_a_movement_are_said(kind: str, said: str) -> None:
+    chain, script = ZaberChain([1]), Script()
+    link = InProcess(lambda: Wire(chain, script))
+    with Table("table", Zaber(link), {"tilt": AxisPlan(per_unit=1000.0)}) as table:
+        table.home("tilt")
+        script.fault_at(script.count + 6, Fault(kind))  # type: ignore[arg-type]
+        with pytest.raises(StateError, match=said):
+            table.move("tilt", 200.0)
+
+
+def test_a_table_that_lost_power_says_so_and_gets_its_speed_back() -> None:
+    chain, script = ZaberChain([1]), Script()
+    with Table(
+        "table", Zaber(InProcess(lambda: Wire(chain, script))), {"tilt": AxisPlan(per_unit=1000.0)}
+    ) as table:
+        table.configure(speed=100.0)
+        table.home("tilt")
+        script.fault_at(script.count + 6, Fault("power-cycled"))
+        with pytest.raises(StateError, match="home tilt again"):
+            table.move("tilt", 200.0)
+        chain.motors[1, 1].speed = 1.0
+        script.fault_at(script.count, Fault("disconnected"))
+        with pytest.raises(ConnectionLost):
+            table.state("tilt")
+        table.home("tilt")
+        assert chain.motors[1, 1].speed == pytest.approx(100_000.0, rel=1e-4)
+
+
+def test_wrong_plans_and_addresses_are_refused() -> None:
+    for axes in ({}, {"tilt": {"hight": 3}}, {"tilt": {"low": 5.0, "high": 1.0}}):
+        with pytest.raises(SettingError):
+            zaber("table", "/dev/null", axes=axes)
+    for address in ("tcp://", "tcp://host", "tcp://host:99999999", "", "/dev/ttyS0@fast"):
+        with pytest.raises(UsageError):
+            link_to(address)
+    with pytest.raises(ConnectionLost, match="cannot be opened"):
+        zaber("table", "/dev/no-such-port", axes={"tilt": {}}).connect()
+    with pytest.raises(ConnectionLost, match="cannot be reached"):
+        zaber("table", "tcp://127.0.0.1:1", axes={"tilt": {}}).connect()
