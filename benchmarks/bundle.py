@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from shared import of_the_tests
 
+from reseau.adjust.threads import one_thread
 from reseau.bundle import BundleFit, BundleProblem, Network, problem_of
 from reseau.bundle.posterior import cofactors_of
 from reseau.exchange import read_bal
@@ -128,7 +129,8 @@ def statistics() -> None:
     spent, numbers = [], []
     for _ in range(REPEATS):
         begun = time.perf_counter()
-        found = cofactors_of(fit.linear, fit.freedom, chosen, fit.usable.points)
+        with one_thread():
+            found = cofactors_of(fit.linear, fit.freedom, chosen, fit.usable.points)
         spent.append(time.perf_counter() - begun)
         begun = time.perf_counter()
         r = fit.solution.standardise().redundancy_numbers

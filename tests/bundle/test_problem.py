@@ -12,6 +12,7 @@ import pytest
 from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
 from reseau.adjust import Options as AdjustOptions
 from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
+from reseau.bundle.careful import careful_inverse
 from reseau.data import Array
 from reseau.errors import UsageError
 from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
@@ -197,6 +198,29 @@ def test_the_measured_point_of_an_image_side_camera_is_had_by_its_mapping() -> N
     assert measured.redundancy == corrected.redundancy
     assert measured.sigma0 == pytest.approx(corrected.sigma0, rel=0.1)
     assert abs(measured.sigma0 - corrected.sigma0) > 1e-4
+
+
+def test_the_careful_inverse_is_that_of_the_normal_equations() -> None:
+    """From the rows of the observations of all kinds, never multiplied out."""
+    world = mixed()
+    fit = required(world.problem(world.noisy(3), **TOLERANCE))
+    normal = fit.linear.normal(0.0)
+    held = np.diag(fit.cofactors.reduced) == 0
+    careful = careful_inverse(normal, held)
+    size = np.sqrt(np.diag(careful))
+    size[held] = 1.0
+    np.testing.assert_allclose(
+        careful / np.outer(size, size), fit.cofactors.reduced / np.outer(size, size), rtol=0, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_redundancy_numbers_sum_where_parameters_are_hardly_determined(seed: int) -> None:
+    """Three images and all parameters of the camera: correlations near one."""
+    cam = networks.camera(free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"))
+    world = networks.world(images=3, points=14, cameras=(cam,), control=4, seed=seed)
+    fit = required(world.problem(world.noisy(seed)))
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
 
 
 def test_inner_constraints_have_the_least_trace_over_the_chosen_points() -> None:

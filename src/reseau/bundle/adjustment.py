@@ -172,6 +172,8 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
     for _ in range(_TRIMS):
         v = problem.misfits_at_start()
         size = np.sqrt((v**2).sum(axis=1))
+        if not np.isfinite(size).any():
+            break
         limit = _FAR_OFF * float(np.nanmedian(size))
         further = ~(size <= limit)
         if (further == out).all():

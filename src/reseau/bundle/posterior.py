@@ -15,6 +15,7 @@ from ..adjust.reliability import Whitened
 from ..adjust.stochastic import Blocks, Weighting
 from ..data import Array, Mask, Rows
 from .arrow import Singular
+from .careful import careful_inverse, is_small
 from .compiled import in_parallel
 from .datum import Freedom, held_for
 from .normal import posterior
@@ -25,6 +26,8 @@ __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
 
 # Least pivot of the normal equations scaled to ones that is no rounding.
 _RANK = 1e-14
+# How far the cofactors of the adjusted observations may be from summing to the number of unknowns.
+_EXACT, _INEXACT = 1e-7, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,13 +171,76 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     normal = linear.normal(0.0)
     diagonal = normal.sums.diagonal.copy()
     held = system.held.copy()
+    ends = np.flatnonzero(system.unknowns.kept >= 0)
+    still = system.unknowns.kept[ends, None] + np.arange(3)
+    held[still[system.movable[ends] == 0]] = True
     if datum is not None:
         held[held_for(freedom, system.unknowns, diagonal)] = True
         normal.hold(held)
-    arrow = normal.factorise()
-    if arrow.weakest < _RANK or normal.least < PARALLEL:
+    z, points, seen, further = _marginal(linear, normal, held, taking_part)
+    kept = np.flatnonzero(system.unknowns.kept >= 0)
+    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    referral = None
+    if datum is not None and freedom.defect:
+        referral = _referral(normal, freedom, datum & taking_part, z)
+        z, points = _in_datum(referral, points)
+        points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    return Cofactors(z, points, seen, further, normal, referral)
+
+
+def _marginal(
+    linear: Linear, normal: Normal, held: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """Cofactors of reduced unknowns, points, image coordinates and further observations in some datum.
+
+    Those of the adjusted observations sum to the number of unknowns. Where they do not, the normal equations
+    have lost digits, and the inverse is had from the rows of the observations instead.
+
+    Raises
+    ------
+    Singular
+        When the observations do not determine the unknowns.
+    """
+    system = linear.system
+    free = int((~held).sum()) + _free_coordinates(linear, taking_part)
+    try:
+        arrow = normal.factorise()
+        if normal.least < PARALLEL:
+            raise Singular
+        z = arrow.inverse()
+        found = _with_inverse(linear, normal, z, held, taking_part)
+        missing = abs(_total(found) - free)
+        if arrow.weakest >= _RANK and missing < _EXACT:
+            return found
+    except Singular:
+        missing = np.inf
+    if normal.least < PARALLEL:
         raise Singular
-    z = arrow.inverse()
+    if is_small(linear):
+        found = _with_inverse(linear, normal, careful_inverse(normal, held), held, taking_part)
+        missing = abs(_total(found) - free)
+    if not missing < _INEXACT * max(1.0, system.unknowns.size / 1000.0):
+        raise Singular
+    return found
+
+
+def _total(found: tuple[Array, Array, Array, Array]) -> float:
+    """Sum of the cofactors of the adjusted observations, whitened."""
+    _, _, seen, further = found
+    return float(np.trace(seen, axis1=1, axis2=2).sum() + further.sum())
+
+
+def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
+    """Number of unknown coordinates of eliminated points."""
+    eliminated = linear.system.pattern.eliminated == 1
+    return int(linear.system.movable[eliminated & taking_part].sum())
+
+
+def _with_inverse(
+    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """Cofactors from the inverse of the reduced normal equations."""
+    system = linear.system
     z[held] = 0.0
     z[:, held] = 0.0
     points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
@@ -188,13 +254,7 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    further = _further(linear, z, points)
-    referral = None
-    if datum is not None and freedom.defect:
-        referral = _referral(normal, freedom, datum & taking_part, z)
-        z, points = _in_datum(referral, points)
-        points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    return Cofactors(z, points, seen, further, normal, referral)
+    return z, points, seen, _further(linear, z, points)
 
 
 def _further(linear: Linear, z: Array, points: Array) -> Array:
