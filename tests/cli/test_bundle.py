@@ -101,6 +101,10 @@ def test_the_result_has_the_columns_of_its_schema(reseau: Run, network: Callable
     c = found["cameras"][0]["parameters"]["c"]
     assert abs(c["value"] - 8.0) < 4 * c["sigma"]
     assert np.array(found["points"]["cov"]).shape == (15, 3, 3)
+    assert np.array(found["images"]["sigma"]).shape == (4, 6)
+    assert {len(column) for column in found["images"].values()} == {4}
+    assert {len(column) for column in found["points"].values()} == {15}
+    assert {len(column) for column in table.values()} == {n // 2}
     assert found["points"]["sigma"][0] == [0, 0, 0]
 
 

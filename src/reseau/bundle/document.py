@@ -87,12 +87,10 @@ def _images(result: Result) -> dict[str, Any]:
         "camera": [network.cameras[c].id for c in network.camera_of],
         "X0": _rows(result.fit.values.x0),
         "rotation": _rows(result.rotation),
+        # Of X0, Y0, Z0 and the rotation vector.
+        "sigma": _rows(np.hstack([sigma[:, 3:], sigma[:, :3]])),
         "angles_deg": _rows(np.degrees(result.angles)),
-        "sigma": {
-            "X0": _rows(sigma[:, 3:]),
-            "rotation": _rows(sigma[:, :3]),
-            "angles_deg": _rows(np.degrees(result.angle_sigma)),
-        },
+        "angles_sigma_deg": _rows(np.degrees(result.angle_sigma)),
     }
 
 
