@@ -11,7 +11,9 @@ from typing import Any
 
 from reseau.instruments import Device
 from reseau_drivers.link import link_to
+from reseau_drivers.scanner import Ping360, Ping360Settings
 from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
+from reseau_sims import serving
 from reseau_sims.serving import (
     InProcess,
     Machine,
@@ -115,10 +117,23 @@ def smc100_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return _table_rig(device, machine, script, server)
 
 
+def ping360_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = serving.Ping360()
+    address, server = _wired(stack, transport, machine, script)
+    device = Ping360("sonar", link_to(address), Ping360Settings(half_sector=2), seconds=1.2, answer_s=0.15)
+
+    def work(run: int) -> None:
+        for angle in ((37 * run + 11 * k) % 200 - 100 for k in range(5)):
+            assert set(device.line(angle)) == {(200 + angle) % 256}
+
+    return Rig(device, machine, script, work, device.stop, server)
+
+
 Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
+    **{("ping360", transport): ping360_rig for transport in TRANSPORTS},
 }
 
 

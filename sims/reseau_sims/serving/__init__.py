@@ -7,6 +7,7 @@ within the process, carries it to a client. All of them listen on the loopback i
 
 from .machine import Machine, Session, Wire
 from .motion import Motor
+from .ping360 import Ping360
 from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
 from .servers import InProcess, PtyServer, Server, TcpServer
 from .smc100 import Smc100Line
@@ -21,6 +22,7 @@ __all__ = [
     "Kind",
     "Machine",
     "Motor",
+    "Ping360",
     "PtyServer",
     "Script",
     "Server",

@@ -1,0 +1,122 @@
+"""A Ping360: a head that turns, sends pulses, and reports their echoes.
+
+Source: *Ping Protocol*, "Common Messages" and "Ping360 Messages", with the ranges of their fields.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reseau_drivers.codecs import ping
+from reseau_drivers.codecs.stream import Damaged
+
+from .machine import Machine
+from .script import Kind
+
+__all__ = ["Ping360"]
+
+Echo = Callable[[int, int, float, float], NDArray[np.uint8]]
+_GAINS = (0.5, 1.0, 2.0)
+
+
+def _silence(angle: int, samples: int, period_s: float, gain: float) -> NDArray[np.uint8]:
+    """Echoes that tell the angle, for want of a world."""
+    return np.full(samples, angle % 256, np.uint8)
+
+
+class Ping360(Machine):
+    """The sonar.
+
+    Parameters
+    ----------
+    echo : callable
+        Echoes of a pulse: angle (gradians), number of samples, their period (s), and the factor of the gain.
+    """
+
+    def __init__(self, echo: Echo = _silence) -> None:
+        super().__init__()
+        self._echo, self._frames = echo, ping.FrameDecoder()
+        self.motor_on, self._stuck, self._refuse, self._odd = False, False, False, False
+        self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
+
+    def receive(self, data: bytes) -> Sequence[bytes]:
+        """Messages in answer."""
+        answers: list[bytes] = []
+        for frame in self._frames.feed(data):
+            if isinstance(frame, Damaged):
+                self.violations.append(str(frame))
+            else:
+                answers.append(ping.encode(self._obey(frame)))
+        return answers
+
+    def hung_up(self) -> None:
+        """A message that was begun is forgotten."""
+        self._frames.reset()
+
+    def afflict(self, kind: Kind) -> None:
+        """Stuck: the head does not turn; wrong state: it refuses; out of range: too many samples."""
+        self._stuck = self._stuck or kind == "stuck"
+        self._refuse = self._refuse or kind == "wrong state"
+        self._odd = self._odd or kind == "out of range"
+        if kind == "power-cycled":
+            self.motor_on = self._stuck = self._refuse = self._odd = False
+            self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
+
+    def _obey(self, frame: ping.Frame) -> ping.Frame:
+        if frame.id == ping.GENERAL_REQUEST and len(frame.payload) == 2:
+            return self._tell(int.from_bytes(frame.payload, "little"))
+        if frame.id == ping.TRANSDUCER and len(frame.payload) == 14:
+            return self._ping(ping.Transducer.parse(frame.payload))
+        if frame.id == ping.MOTOR_OFF:
+            self.motor_on = self._stuck = self._refuse = self._odd = False
+            return ping.Frame(ping.ACK, struct.pack("<H", frame.id), 1)
+        return self._no(frame.id, "unknown message")
+
+    def _no(self, id_: int, why: str) -> ping.Frame:
+        self.violations.append(f"message {id_}: {why}")
+        return ping.Frame(ping.NACK, struct.pack("<H", id_) + why.encode() + b"\0", 1)
+
+    def _tell(self, id_: int) -> ping.Frame:
+        match id_:
+            case ping.PROTOCOL_VERSION:
+                return ping.Frame(id_, bytes([1, 0, 0, 0]), 1)
+            case ping.DEVICE_INFORMATION:
+                return ping.Information(2, 1, (3, 1, 1)).frame()
+            case ping.DEVICE_DATA:
+                return self.last.frame()
+            case ping.DEVICE_ID:
+                return ping.Frame(id_, bytes([1, 0]), 1)
+        return self._no(id_, "unknown request")
+
+    def _ping(self, asked: ping.Transducer) -> ping.Frame:
+        within = (
+            asked.mode == 1
+            and asked.gain in (0, 1, 2)
+            and asked.angle < ping.GRADIANS
+            and 1 <= asked.duration_us <= 1000
+            and 80 <= asked.period <= 40000
+            and 500 <= asked.frequency_khz <= 1000
+            and 200 <= asked.samples <= 1200
+        )
+        if not within:
+            return self._no(ping.TRANSDUCER, "parameter out of range")
+        if self._refuse:
+            self._refuse = False
+            return ping.Frame(ping.NACK, struct.pack("<H", ping.TRANSDUCER) + b"busy\0", 1)
+        self.motor_on = True
+        angle = self.last.settings.angle if self._stuck else asked.angle
+        settings = ping.Transducer(
+            asked.gain, angle, asked.duration_us, asked.period, asked.frequency_khz, asked.samples, False
+        )
+        if not asked.transmit:
+            return ping.DeviceData(settings, b"").frame()
+        period = asked.period * ping.PERIOD_NS * 1e-9
+        samples = self._echo(angle, asked.samples, period, _GAINS[asked.gain]).tobytes()
+        if self._odd:
+            self._odd, samples = False, samples + bytes(300)
+        self.last = ping.DeviceData(settings, samples)
+        return self.last.frame()
