@@ -9,6 +9,7 @@ import numpy as np
 
 from ..calibration import Calibration, Covariance, Quantity
 from ..errors import UsageError
+from .network import Camera
 from .result import Result
 
 __all__ = ["calibration_of"]
@@ -62,34 +63,35 @@ def calibration_of(
         key: Quantity(value=float(value), sigma=float(s), unit=_UNITS.get(key, ""))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
-    model: dict[str, Any] = {
-        "model": entry.model, "width": entry.width, "height": entry.height, "pitch_mm": list(entry.pitch_mm),
-    }  # fmt: skip
-    if entry.model == "brown":
-        model |= {"side": entry.side, "balance_radius_mm": entry.balance_radius_mm}
-    if entry.additional is not None:
-        model["additional"] = {
-            "model": "ebner12",
-            "base_mm": entry.additional.base_mm,
-            "per": entry.additional.per,
-        }
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     return Calibration(
         kind="camera",
         name=name,
-        model=model,
+        model=_model(entry),
         parameters=parameters,
         covariance=Covariance(names=names, matrix=tuple(tuple(row) for row in covariance.tolist())),
         sigma0=result.sigma0 if result.redundancy > 0 else None,
         redundancy=result.redundancy,
-        tests=tuple(
-            {"name": t.name, "distribution": t.distribution, "statistic": t.statistic, "critical": t.critical,
-             "p": t.p, "significant": t.significant}
-            for t in result.camera_tests(c)
-        ),
+        tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
                   "warnings": list(result.warnings)},
         provenance=dict(provenance or {}),
         times=dict(times or {}),
     )  # fmt: skip
+
+
+def _model(camera: Camera) -> dict[str, Any]:
+    """What the parameters are parameters of."""
+    model: dict[str, Any] = {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "pitch_mm": list(camera.pitch_mm),
+    }
+    if camera.model == "brown":
+        model |= {"side": camera.side, "balance_radius_mm": camera.balance_radius_mm}
+    extra = camera.additional
+    if extra is not None:
+        model["additional"] = {"model": "ebner12", "base_mm": extra.base_mm, "per": extra.per}
+    return model
