@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +168,7 @@ class FilmFrame:
     @property
     def _cut(self) -> float:
         """Pixels that a cropped scan lacks: the margin and a millimetre of the frame."""
-        tilted = abs(np.sin(np.deg2rad(self.tilt_deg))) * max(self.format[:2])
+        tilted = abs(float(np.sin(np.deg2rad(self.tilt_deg)))) * max(self.format.width, self.format.height)
         return (self.margin_mm + 1.0 + tilted) * self.px_per_mm
 
     @cached_property
@@ -213,7 +213,7 @@ class FilmFrame:
         """What the scanner sees without noise, grey values (h, w) of 255."""
         return filmscene.light(self)
 
-    def scan(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    def scan(self) -> NDArray[Any]:
         """The scan: (h, w), or (h, w, 3) in colour."""
         light = self.light()
         if not self.colour:
@@ -225,7 +225,7 @@ class FilmFrame:
         ]
         return np.stack(parts, axis=2)
 
-    def _exposed(self, light: Array, channel: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    def _exposed(self, light: Array, channel: str) -> NDArray[Any]:
         rng = stream(self.seed, "noise", channel)
         noisy = light + self.noise * rng.standard_normal(light.shape, dtype=np.float32)
         if self.grain > 0:

@@ -221,7 +221,7 @@ def _film(frame: FilmFrame, view: _View, grey: Plane, rng: np.random.Generator) 
                 hole = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [0.99, 1.397]
                 at = view.mm(start + 4.75 * i + hole[:, 0], middle + hole[:, 1])
                 cv2.fillPoly(mask, [np.rint(at * 16).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
-        mask = cv2.GaussianBlur(mask, (0, 0), max(0.15 * frame.px_per_mm, 0.7))
+        mask[:] = cv2.GaussianBlur(mask, (0, 0), max(0.03 * frame.px_per_mm, 0.7))
         grey = np.asarray(grey * (1 - mask) + 252.0 * mask, dtype=np.float32)
     if beside.print:
         letters = np.zeros(frame.shape, dtype=np.uint8)
@@ -253,6 +253,6 @@ def _damage(frame: FilmFrame, view: _View, grey: Plane, rng: np.random.Generator
         if rng.random() < 0.3:
             ends = rng.uniform(0, 1, (2, 2)) * (w, h)
         tone = float(rng.choice([5.0, 245.0]))
-        way = [np.rint(ends * 16).astype(np.int32)]
-        cv2.polylines(grey, way, False, tone, max(1, round(frame.px_per_mm / 24)), cv2.LINE_AA, 4)
+        scratch = [np.rint(ends * 16).astype(np.int32)]
+        cv2.polylines(grey, scratch, False, tone, max(1, round(frame.px_per_mm / 24)), cv2.LINE_AA, 4)
     return grey

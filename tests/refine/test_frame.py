@@ -1,0 +1,133 @@
+"""Frames oriented: corners where they truly are, sigmas that cover, and refusal rather than a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.data import Array
+from reseau.refine.frame import FrameOptions, FrameResult, orient_frames
+from reseau.scans import scan_of
+from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
+
+BUSY = Beside(perforations=True, print=True, neighbours=True, dust=40, scratches=3)
+
+
+def oriented(frame: FilmFrame, **options: object) -> FrameResult:
+    known = FrameOptions(formats=(frame.format[:2],), **options)  # type: ignore[arg-type]
+    results = orient_frames(scan_of(frame.scan(), dpi=frame.dpi), known)
+    assert len(results) == 1
+    return results[0]
+
+
+def errors(result: FrameResult, frame: FilmFrame) -> Array:
+    assert result.lines is not None, result.why
+    return np.asarray(result.lines.corners - frame.truth.corners)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        FilmFrame(1),
+        FilmFrame(2, tilt_deg=14.0, beside=BUSY),
+        FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
+        FilmFrame(4, negative=True, beside=BUSY),
+        FilmFrame(5, beside=Beside(lines=1)),
+        FilmFrame(6, beside=Beside(rods=1)),
+        FilmFrame(7, beside=Beside(blown=True)),
+        FilmFrame(8, bow_mm=0.1),
+        FilmFrame(9, format=RICOH._replace(radius=1.5)),
+        FilmFrame(10, bits=16),
+        FilmFrame(11, contrast=0.3),
+    ],
+    ids=lambda frame: f"seed {frame.seed}",
+)
+def test_corners_are_found_whatever_disturbs(frame: FilmFrame) -> None:
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_a_frame_that_stands_upright_is_named_as_seen() -> None:
+    frame = FilmFrame(12, tilt_deg=90.0)
+    result = oriented(frame)
+    assert result.format_mm == (24.0, 36.0)
+    assert result.lines is not None
+    seen = np.roll(frame.truth.corners, -1, axis=0)  # the frame's upper right corner is at the upper left
+    np.testing.assert_allclose(result.lines.corners, seen, rtol=0, atol=0.35)
+
+
+def test_predicted_sigmas_cover() -> None:
+    normalised = []
+    for seed in range(14):
+        frame = FilmFrame(seed + 50, dpi=400)
+        result = oriented(frame)
+        assert result.lines is not None
+        normalised.append(errors(result, frame).ravel() / np.sqrt(np.diag(result.lines.covariance)))
+    # 112 values in fives that go together: their rms is 1 ± 0.15.
+    assert 0.65 < np.sqrt(np.mean(np.square(normalised))) < 1.4
+
+
+def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
+    frame = FilmFrame(21, bow_mm=0.15)
+    result = oriented(frame)
+    assert result.lines is not None
+    np.testing.assert_allclose(result.lines.bow, frame.bows_px, rtol=0, atol=0.25)
+    reported = [edge.curvature_px for edge in result.edges.values()]
+    assert any(bow for bow in reported)
+
+
+def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_fourth_is() -> None:
+    frame = FilmFrame(31, crop="right")
+    result = oriented(frame)
+    assert result.status == "three-edges"
+    assert result.why.startswith("right edge: ")
+    assert result.lines is not None
+    error, sigma = errors(result, frame), np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
+    assert np.abs(error[[0, 3]]).max() < 0.3
+    assert (np.abs(error) < 4 * sigma).all()
+    assert sigma[1, 0] > 1.0
+    assert not result.edges["right"].found
+
+
+def test_colour_is_measured_by_channel_and_the_best_is_kept() -> None:
+    frame = FilmFrame(41, colour=True, dpi=400)
+    result = oriented(frame)
+    assert result.channel == "red"  # that of the most contrast
+    assert np.abs(errors(result, frame)).max() < 0.3
+
+
+def test_what_is_no_frame_is_declined_with_what_would_help() -> None:
+    rng = np.random.default_rng(0)
+    blank = np.full((500, 700), 12, dtype=np.uint8)
+    noise = rng.integers(0, 255, (500, 700)).astype(np.uint8)
+    inner = FilmFrame(1, margin_mm=-1.0).scan()
+    for pixels, words in ((blank, "of one tone"), (noise, "no frame"), (inner, "no frame")):
+        (result,) = orient_frames(scan_of(pixels))
+        assert not result
+        assert words in result.why
+        assert ";" in result.why
+        document = result.document()
+        assert document.status == "declined"
+        assert document.corners is None
+
+
+def test_a_wrong_format_is_declined() -> None:
+    (result,) = orient_frames(scan_of(FilmFrame(1).scan()), FrameOptions(formats=((56.0, 56.0),)))
+    assert not result
+
+
+def test_the_document_says_pp_axes_and_scale() -> None:
+    frame = FilmFrame(51, tilt_deg=3.0)
+    document = oriented(frame).document()
+    ul, ur, lr, ll = frame.truth.corners
+    point, angle = document.principal_point, document.angle_deg
+    assert point is not None
+    assert angle is not None
+    assert document.px_per_mm is not None
+    way = lr - ll
+    assert angle == pytest.approx(-np.rad2deg(np.arctan2(way[1], way[0])), abs=0.02)
+    s, t = np.linalg.solve(np.stack([lr - ul, -(ll - ur)], axis=1), ur - ul)
+    np.testing.assert_allclose([point.x, point.y], ul + s * (lr - ul), rtol=0, atol=0.15)
+    assert document.px_per_mm == pytest.approx((600 / 25.4, 600 / 25.4), rel=0.005)
+    assert 0 < t < 1
