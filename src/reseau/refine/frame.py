@@ -61,6 +61,8 @@ class FrameOptions:
         Standard deviation of its right angles.
     max_tilt_deg : float
         Largest tilt.
+    shape : FrameShape, optional
+        Format and shape of the camera's frame as others of its roll show them; instead of the formats.
     """
 
     formats: tuple[tuple[float, float], ...] = FORMATS
@@ -69,6 +71,7 @@ class FrameOptions:
     aspect_sigma: float = 0.007
     angle_sigma_deg: float = 0.25
     max_tilt_deg: float = 16.0
+    shape: FrameShape | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +202,7 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
         near = None if options.near is None else (options.near + 0.5) / r - 0.5
         found = search_frames(
             overview,
-            options.formats,
+            options.formats if options.shape is None else [(options.shape.width, options.shape.height)],
             max_tilt_deg=options.max_tilt_deg,
             px_per_mm=None if options.dpi is None else options.dpi / 25.4 / r,
             hint=None if scan.dpi is None else scan.dpi / 25.4 / r,
@@ -249,7 +252,9 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         ends = corners[k], corners[(k + 1) % 4]
         return read_band(scan, *ends, beside, beside + 8, wide=wide) if guess.supported[k] else None
 
-    shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
+    shape = options.shape
+    if shape is None or guess.format_mm != (shape.width, shape.height):
+        shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
     best: FrameResult | None = None
     for c, name in enumerate(scan.channels):
         measured = _channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)

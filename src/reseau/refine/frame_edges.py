@@ -265,7 +265,7 @@ def _border(grey: Array, band: Band, reach: float, gap: float) -> _Border | None
 
 def _row_median(values: Array) -> Array:
     """Medians of rows, NaN left out; NaN for a row that has nothing else."""
-    empty = ~np.isfinite(values).any(axis=1)
+    empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
     filled = np.where(empty[:, None], 0.0, values)
     return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
 
@@ -277,7 +277,8 @@ def _width(grey: Array, band: Band, border: _Border) -> float:
     place = np.arange(-12.0, 12.0, 0.5)
     tones = _binned(rest, at, -12.0, 0.5, len(place))
     inside = _row_median(np.where((place > 1) & (place < 6), tones, np.nan))
-    strong: Mask = inside > 0.5 * np.nanmedian(np.where(inside > 0, inside, np.nan))
+    half = 0.5 * float(np.nanmedian(np.where(inside > 0, inside, np.nan)))
+    strong = np.asarray(inside > half)
     if not strong.any():
         return 1.0
     with warnings.catch_warnings():  # where no profile has a pixel there is no mean, and none is needed

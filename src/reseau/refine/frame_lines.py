@@ -17,7 +17,16 @@ from ..adjust import Adjustment, Failure, GaussMarkov, Options, Parameters, adju
 from ..data import Array, Mask
 from .frame_outline import crossings_of
 
-__all__ = ["EdgeData", "FrameShape", "Lines", "adjust_lines", "derived", "robust_line", "shared_error"]
+__all__ = [
+    "EdgeData",
+    "FrameShape",
+    "Lines",
+    "adjust_lines",
+    "derived",
+    "robust_line",
+    "shape_of",
+    "shared_error",
+]
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 """Standard deviation of the bow of an edge before any is measured, and the least after that, pixels."""
@@ -56,12 +65,16 @@ class FrameShape:
         Relative standard deviation of its proportions: of the gate, and of the scanner's two scales.
     angle_sigma : float
         Standard deviation of its right angles, radians.
+    deviation : tuple of float (4,)
+        What is known of its angles at ur, lr, ll less right ones and of the logarithm of its proportions over
+        the format's: nought, or the gate of the camera as its other frames show it.
     """
 
     width: float
     height: float
     aspect_sigma: float = 0.007
     angle_sigma: float = 0.004
+    deviation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +214,8 @@ def _corners(values: Array, corners: Array) -> Array:
     return crossings_of(a + ends[:, :1] * normal, b + ends[:, 1:2] * normal)
 
 
-def _shape_of(corners: Array, shape: FrameShape) -> Array:
-    """Three angles less a right one, and the logarithm of the proportions over the format's."""
+def shape_of(corners: Array, shape: FrameShape) -> Array:
+    """Of corners (4, 2): three angles less right ones, the logarithm of the proportions over the format's."""
     side = np.roll(corners, -1, axis=0) - corners
     before = np.roll(side, 1, axis=0)
     turn = np.arctan2(before[:, 0] * side[:, 1] - before[:, 1] * side[:, 0], (before * side).sum(axis=1))
@@ -229,12 +242,12 @@ def _problem(
         bounds.append(bounds[-1] + (0 if edge is None else len(edge.sigma)))
     design = np.concatenate(rows)
     if shape is not None:
-        observed.append(np.zeros(4))
+        observed.append(np.array(shape.deviation))
         sigma.append(np.array([shape.angle_sigma] * 3 + [shape.aspect_sigma]))
 
     def of_shape(x: Array) -> Array:
         assert shape is not None
-        return _shape_of(_corners(x, corners), shape)
+        return shape_of(_corners(x, corners), shape)
 
     def function(x: Array) -> Array:
         return np.concatenate([design @ x, of_shape(x)]) if shape is not None else design @ x

@@ -1,0 +1,340 @@
+"""`reseau orient`: the inner orientation of scanned film frames."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import InputError, ReseauError, UsageError
+from .common import AsJson, progress, required, say
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..formats import FrameCorners, FrameOrientation
+    from ..procedures.frame import FrameOptions, FrameResult, Roll
+
+__all__ = ["orient"]
+
+
+class Transform(StrEnum):
+    """Transformations to calibrated corners."""
+
+    similarity = "similarity"
+    affine = "affine"
+    projective = "projective"
+    bilinear = "bilinear"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One image and what to do with it; goes to another process."""
+
+    image: Path
+    name: str
+    frame: str | None
+    dpi: float | None
+    near: tuple[float, ...] | None
+    corners: Path | None
+    transform: str
+    out: Path | None
+    marked: bool
+    roll: Any = None
+
+
+@dataclass(frozen=True)
+class _Done:
+    """What came of one image."""
+
+    documents: list[FrameOrientation]
+    results: list[FrameResult]
+    failed: str = ""
+
+
+def orient(
+    images: Annotated[list[Path], typer.Argument(help="Scans of film frames: TIFF, PNG, JPEG, BMP.")],
+    frame: Annotated[
+        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56; without it usual ones are tried.")
+    ] = None,
+    corners: Annotated[
+        Path | None, typer.Option("--corners", "-c", help="Calibrated corners (frame-corners/1).")
+    ] = None,
+    transform: Annotated[
+        Transform, typer.Option(help="Transformation to the calibrated corners.")
+    ] = Transform.affine,
+    dpi: Annotated[float | None, typer.Option(min=10, help="Resolution, where the file is wrong.")] = None,
+    near: Annotated[
+        str | None, typer.Option(help="Where the frame roughly is: left,top,right,bottom in pixels.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write into.")] = None,
+    marked: Annotated[bool, typer.Option(help="Write copies with the corners marked.")] = True,
+    roll: Annotated[bool, typer.Option(help="Let the frames of a roll help each other.")] = True,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores by default.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Orient scanned film frames by their four edges."""
+    from ..formats import FrameCorners
+
+    if corners is not None:
+        FrameCorners.read(corners)  # a mistake in it is told before the work begins
+    box = _numbers(near)
+    _format(frame)
+    if out is not None:
+        _prepare(out)
+    work = [
+        _Job(path, name, frame, dpi, box, corners, transform.value, out, marked and out is not None)
+        for path, name in zip(images, _names(images), strict=True)
+    ]
+    done = dict(zip((job.name for job in work), _all(work, jobs), strict=True))
+    found = _common(done) if roll else None
+    if found is not None:
+        _again(work, done, found, jobs)
+    if out is not None:
+        _sheet(out, done, work)
+        if found is not None:
+            found.corners.write(out / "corners.json")
+    _report(work, done, found, as_json)
+    return 0 if any(d.status != "declined" for item in done.values() for d in item.documents) else 1
+
+
+def _names(images: list[Path]) -> list[str]:
+    """Stems of the outputs: those of the files, numbered where two are alike."""
+    stems = [path.stem for path in images]
+    return [
+        stem if stems.count(stem) == 1 else f"{stem}-{stems[: i + 1].count(stem)}"
+        for i, stem in enumerate(stems)
+    ]
+
+
+def _numbers(text: str | None) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        left, top, right, bottom = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"is {text!r}", where="--near", do="say left,top,right,bottom") from None
+    if not (left < right and top < bottom):
+        raise UsageError("has no area", where="--near", do="say left,top,right,bottom")
+    return left, top, right, bottom
+
+
+def _format(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        width, height = (float(part) for part in text.lower().replace("×", "x").split("x"))
+        if not 1 < min(width, height) <= max(width, height) < 400:
+            raise ValueError
+    except ValueError:
+        raise UsageError(f"is {text!r}", where="--frame", do="say width x height in mm, as 36x24") from None
+    return width, height
+
+
+def _prepare(out: Path) -> None:
+    try:
+        (out / "provenance").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be written to ({error.strerror})", where=out) from None
+
+
+def _options(job: _Job) -> FrameOptions:
+    import numpy as np
+
+    from ..procedures.frame import FrameOptions
+
+    size = _format(job.frame)
+    near = None
+    if job.near is not None:
+        x0, y0, x1, y1 = job.near
+        near = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    common = FrameOptions(dpi=job.dpi, near=near)
+    return common if size is None else FrameOptions(formats=(size,), dpi=job.dpi, near=near)
+
+
+def _run(job: _Job, before: _Done | None = None) -> _Done:
+    """Orient the frames of one image and write what came of them; in a process of its own."""
+    from ..formats import FrameCorners
+    from ..procedures.frame import described, helped, orient_scan
+    from ..scans import open_scan
+
+    try:
+        scan = open_scan(job.image)
+        if job.roll is None or before is None:
+            results = orient_scan(scan, _options(job))
+        else:
+            results = helped(scan, job.roll, before.results, _options(job))
+        calibrated: FrameCorners | None = FrameCorners.read(job.corners) if job.corners else None
+        documents = [
+            required(described(result, calibrated, job.transform), job.image)  # type: ignore[arg-type]
+            for result in results
+        ]
+        if job.out is not None:
+            _write(job, scan, documents)
+    except ReseauError as error:
+        return _Done([], [], str(error))
+    return _Done(documents, results)
+
+
+def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
+    """JSON, CSV, picture and marked copy; last the provenance, by which a run goes on after a break."""
+    from ..formats import write_whole
+    from ..images import write_image
+    from ..provenance import canonical_json
+    from ..report.frames import frame_tile, write_marked
+
+    assert job.out is not None
+    for i, document in enumerate(documents):
+        stem = job.name if len(documents) == 1 else f"{job.name}-{i + 1}"
+        document.write(job.out / f"{stem}.json")
+        write_whole(job.out / f"{stem}.csv", _csv(document))
+        write_image(job.out / "provenance" / f"{stem}.png", frame_tile(scan, document))
+    if job.marked:
+        corners = [d.image_points().xy for d in documents if d.corners is not None]
+        if corners:
+            write_marked(job.out / f"{job.name}-marked.tif", scan, corners)
+    content = _provenance(job) | {"frames": len(documents)}
+    write_whole(job.out / "provenance" / f"{job.name}.json", canonical_json(content))
+
+
+def _provenance(job: _Job) -> dict[str, Any]:
+    from ..provenance import Provenance, sha256_of
+
+    inputs = {"image": sha256_of(job.image)}
+    if job.corners is not None:
+        inputs["corners"] = sha256_of(job.corners)
+    options = {"frame": job.frame, "dpi": job.dpi, "near": job.near, "transform": job.transform}
+    return Provenance(inputs, options | {"marked": job.marked}).to_dict()
+
+
+def _csv(document: FrameOrientation) -> str:
+    points = document.image_points()
+    lines = ["id,x,y,sx,sy,rho"]
+    for name, (x, y), (sx, sy), cov in zip(points.names, points.xy, points.sigma, points.cov, strict=True):
+        lines.append(f"{name},{x:.4f},{y:.4f},{sx:.4f},{sy:.4f},{cov[0, 1] / max(sx * sy, 1e-12):.4f}")
+    return "\n".join(lines) + "\n"
+
+
+def _kept(job: _Job) -> _Done | None:
+    """What an earlier run made of the same image with the same options."""
+    import json
+
+    from ..formats import FrameOrientation
+
+    if job.out is None:
+        return None
+    path = job.out / "provenance" / f"{job.name}.json"
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        count = content.pop("frames")
+        if json.loads(json.dumps(_provenance(job))) != content:
+            return None
+        stems = [job.name] if count == 1 else [f"{job.name}-{i + 1}" for i in range(count)]
+        return _Done([FrameOrientation.read(job.out / f"{stem}.json") for stem in stems], [])
+    except (OSError, ValueError, KeyError, AttributeError, ReseauError):
+        return None
+
+
+def _all(work: list[_Job], jobs: int | None) -> Iterator[_Done]:
+    """Every image in its order, several at a time."""
+    from concurrent.futures import ProcessPoolExecutor
+
+    kept = [_kept(job) for job in work]
+    rest = [job for job, done in zip(work, kept, strict=True) if done is None]
+    count = min(jobs or os.cpu_count() or 1, max(len(rest), 1))
+    with progress("orienting frames", len(work)) as step:
+        for done in kept:
+            if done is not None:
+                step()
+        if count == 1:
+            fresh: Any = map(_run, rest)
+            yield from _merged(kept, fresh, step)
+            return
+        with ProcessPoolExecutor(count) as pool:
+            yield from _merged(kept, pool.map(_run, rest), step)
+
+
+def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iterator[_Done]:
+    for done in kept:
+        if done is None:
+            done = next(fresh)
+            step()
+        yield done
+
+
+def _common(done: dict[str, _Done]) -> Roll | None:
+    """What the frames of the images have in common, if they are many enough."""
+    from ..adjust import Failure
+    from ..procedures.frame import roll_of
+
+    found = roll_of([result for item in done.values() for result in item.results])
+    return None if isinstance(found, Failure) else found
+
+
+def _again(work: list[_Job], done: dict[str, _Done], roll: Roll, jobs: int | None) -> None:
+    """Doubtful frames once more, with what the roll knows."""
+    from dataclasses import replace
+
+    for job in work:
+        item = done[job.name]
+        if item.results and any(result.status != "oriented" for result in item.results):
+            done[job.name] = _run(replace(job, roll=roll), item)
+
+
+def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
+    import cv2
+
+    from ..report.frames import contact_sheet
+
+    tiles: list[NDArray[np.uint8]] = []
+    for job in work:
+        count = len(done[job.name].documents)
+        for i in range(count):
+            stem = job.name if count == 1 else f"{job.name}-{i + 1}"
+            tile: Any = cv2.imread(str(out / "provenance" / f"{stem}.png"))
+            if tile is not None:
+                tiles.append(tile[:, :, ::-1])
+    contact_sheet(out / "overview.png", tiles)
+
+
+def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json: bool) -> None:
+    from ..provenance import canonical_json
+
+    failed = [item.failed for item in done.values() if item.failed]
+    if as_json:
+        content = [d.to_dict() for job in work for d in done[job.name].documents]
+        say(canonical_json(content[0] if len(work) == len(content) == 1 else content))
+    else:
+        for job in work:
+            for document in done[job.name].documents:
+                say(_line(document))
+        if roll is not None:
+            sx, sy = roll.corners.sigma or (0.0, 0.0)
+            say(f"roll: {roll.frames} frames, scatter of a corner {1000 * roll.scatter_mm[0]:.1f} and ")
+            say(f"{1000 * roll.scatter_mm[1]:.1f} µm, calibrated corners ± {1000 * max(sx, sy):.1f} µm\n")
+    if failed and len(failed) == len(work):
+        raise InputError(failed[0] if len(failed) == 1 else f"{failed[0]} (and {len(failed) - 1} more)")
+    for line in failed:
+        typer.echo(f"reseau: {line}", err=True)
+
+
+def _line(document: FrameOrientation) -> str:
+    """One frame in a line."""
+    if document.corners is None or document.principal_point is None:
+        return f"{document.image}: declined: {document.why}\n"
+    largest = max(max(c.sx, c.sy) for c in document.corners.values())
+    pp, angle = document.principal_point, document.angle_deg or 0.0
+    text = f"{document.image}: {document.status}, principal point {pp.x:.2f} {pp.y:.2f}, angle {angle:.3f}°"
+    text += f", corners ± {largest:.2f} px at most"
+    if document.transform is not None and document.transform.sigma_mm is not None:
+        sx, sy = document.transform.sigma_mm
+        text += f", {document.transform.kind} σX {sx:.4f} σY {sy:.4f} mm"
+    elif document.transform is not None:
+        text += f", {document.transform.kind} without residuals (8 parameters of 4 corners)"
+    return text + (f" ({document.why})" if document.why else "") + "\n"

@@ -1,0 +1,145 @@
+"""Pictures of oriented frames: copies with their corners marked, and one overview of all edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data import Array
+from ..errors import InputError
+from ..formats import FrameOrientation
+from ..images import write_image
+from ..scans import Scan
+
+__all__ = ["contact_sheet", "frame_tile", "write_marked"]
+
+_STRIPE = 512
+"""Rows copied at a time."""
+_SIDE, _ZOOM = 420, 104
+"""Sides of a frame's picture and of that of a corner, pixels."""
+_COLOURS = {"oriented": (60, 170, 60), "three-edges": (230, 150, 30), "declined": (200, 50, 50)}
+
+
+def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
+    """Write a copy of a scan, TIFF, with the pixels of the corners marked (Cruz et al., sect. 2.3).
+
+    Parameters
+    ----------
+    path : Path
+        Where to; appears whole or not at all.
+    scan : Scan
+        The scan, copied stripe by stripe.
+    corners : sequence of ndarray (4, 2)
+        Of each frame. The pixel of a corner is white, in a black cross of 15 pixels with a gap around it.
+
+    Raises
+    ------
+    InputError
+        When the place cannot be written to.
+    """
+    import tifffile
+
+    grey = len(scan.channels) == 1
+    kind = np.dtype(np.uint8 if scan.full_scale == 255 else np.uint16)
+    shape = (scan.height, scan.width) if grey else (scan.height, scan.width, 3)
+    draft = path.with_name(f".{path.name}.draft")
+    resolution = None if scan.dpi is None else (scan.dpi, scan.dpi)
+    try:
+        image = tifffile.memmap(
+            draft, shape=shape, dtype=kind, photometric="minisblack" if grey else "rgb", resolution=resolution
+        )
+        for top in range(0, scan.height, _STRIPE):
+            bottom = min(top + _STRIPE, scan.height)
+            part = scan.window(top, bottom, 0, scan.width)
+            image[top:bottom] = part[:, :, 0] if grey else part
+        for xy in np.concatenate(list(corners)) if corners else ():
+            _mark(image, xy, int(scan.full_scale))
+        image.flush()
+        del image
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise InputError(f"cannot be written ({error.strerror})", where=path) from None
+
+
+def _mark(image: NDArray[Any], xy: Array, white: int) -> None:
+    column, row = (int(v) for v in np.rint(xy))
+    h, w = image.shape[:2]
+    for away in (*range(-7, -1), *range(2, 8)):
+        for r, c in ((row + away, column), (row, column + away)):
+            if 0 <= r < h and 0 <= c < w:
+                image[r, c] = 0
+    if 0 <= row < h and 0 <= column < w:
+        image[row, column] = white
+
+
+def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
+    """A picture (h, w, 3) of one frame: its edges drawn over it, beside it its corners, enlarged."""
+    overview, r = scan.overview(_SIDE)
+    step = np.quantile(overview, [0.002, 0.998]).astype(np.float64)
+    small = _shown(overview, step)
+    tile = np.full((_SIDE + 22, _SIDE + 2 * _ZOOM + 8, 3), 255, dtype=np.uint8)
+    points = found.image_points().xy
+    colour = _COLOURS[found.status]
+    if len(points):
+        at = np.rint(((points + 0.5) / r - 0.5) * 16).astype(np.int32)
+        cv2.polylines(small, [at], True, colour, 1, cv2.LINE_AA, 4)
+        for k in range(4):
+            zoom = _corner(scan, points, k, step, colour)
+            y, x = 22 + (k // 2) * (_ZOOM + 4), _SIDE + 4 + ((k in (1, 2)) * (_ZOOM + 4))
+            tile[y : y + _ZOOM, x : x + _ZOOM] = zoom
+    tile[22 : 22 + small.shape[0], : small.shape[1]] = small
+    text = f"{found.image}  {found.status}"
+    # The built-in letters know ASCII alone.
+    text = text.encode("ascii", "replace").decode()
+    cv2.putText(tile, text, (2, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (34, 39, 43), 1, cv2.LINE_AA)
+    return tile
+
+
+def _shown(grey: NDArray[Any], step: Array) -> NDArray[np.uint8]:
+    """Grey values between two of them as RGB of 8 bits."""
+    scaled = np.clip((grey.astype(np.float32) - step[0]) / max(step[1] - step[0], 1e-9), 0, 1) * 255
+    eight = np.rint(scaled).astype(np.uint8)
+    return np.ascontiguousarray(eight if eight.shape[2] == 3 else np.repeat(eight, 3, axis=2))
+
+
+def _corner(
+    scan: Scan, points: Array, k: int, step: Array, colour: tuple[int, int, int]
+) -> NDArray[np.uint8]:
+    """The surroundings of a corner, each pixel as four by four, with the two edges that meet there."""
+    half, zoom = _ZOOM // 8, 4
+    column, row = (int(v) for v in np.rint(points[k]))
+    top, left = max(row - half, 0), max(column - half, 0)
+    bottom, right = min(row + half, scan.height), min(column + half, scan.width)
+    canvas = np.full((_ZOOM, _ZOOM, 3), 255, dtype=np.uint8)
+    if bottom <= top or right <= left:
+        return canvas
+    part = _shown(scan.window(top, bottom, left, right), step)
+    y, x = (top - row + half) * zoom, (left - column + half) * zoom
+    large = np.repeat(np.repeat(part, zoom, axis=0), zoom, axis=1)
+    canvas[y : y + large.shape[0], x : x + large.shape[1]] = large
+    for other in (points[k - 1], points[(k + 1) % 4]):
+        ends = (np.array([points[k], other]) - [column - half, row - half] + 0.5) * zoom - 0.5
+        way = ends[1] - ends[0]
+        ends[1] = ends[0] + way / np.hypot(*way) * 200
+        cv2.polylines(canvas, [np.rint(ends * 16).astype(np.int32)], False, colour, 1, cv2.LINE_AA, 4)
+    return canvas
+
+
+def contact_sheet(path: Path, tiles: Sequence[NDArray[np.uint8]]) -> None:
+    """Write pictures of frames as one, six in a row at most."""
+    if not tiles:
+        return
+    across = min(6, int(np.ceil(np.sqrt(len(tiles)))))
+    h, w = tiles[0].shape[:2]
+    down = -(-len(tiles) // across)
+    sheet = np.full((down * (h + 8), across * (w + 8), 3), 255, dtype=np.uint8)
+    for i, tile in enumerate(tiles):
+        y, x = (i // across) * (h + 8), (i % across) * (w + 8)
+        sheet[y : y + h, x : x + w] = tile
+    write_image(path, sheet)

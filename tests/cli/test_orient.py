@@ -1,0 +1,115 @@
+"""`reseau orient` on files: what it writes, goes on after a break, and says of what it cannot orient."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from reseau.formats import FrameCorners, FrameOrientation
+from reseau_sims.filmframe import FilmFrame
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def scan(path: Path, frame: FilmFrame) -> FilmFrame:
+    pixels = frame.scan()
+    tifffile.imwrite(path, pixels, photometric="minisblack", resolution=(frame.dpi, frame.dpi))
+    return frame
+
+
+@pytest.fixture(scope="module")
+def roll(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("roll")
+    for seed in range(4):
+        scan(folder / f"{seed}.tif", FilmFrame(seed, dpi=300))
+    scan(folder / "4.tif", FilmFrame(4, dpi=300, crop="left"))
+    return folder
+
+
+def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
+    roll: Path, tmp_path: Path, reseau: Run
+) -> None:
+    images = sorted(roll.glob("*.tif"))
+    status, out, err = reseau("orient", *images, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)
+    assert (status, err) == (0, "")
+    assert out.count("oriented") == 4
+    assert "4.tif: three-edges" in out
+    assert "4 frames of its roll" in out
+    frame = FilmFrame(0, dpi=300)
+    found = FrameOrientation.read(tmp_path / "0.json")
+    np.testing.assert_allclose(found.image_points().xy, frame.truth.corners, rtol=0, atol=0.3)
+    assert (tmp_path / "0.csv").read_text().startswith("id,x,y,sx,sy,rho\nul,")
+    marked, plain = tifffile.imread(tmp_path / "0-marked.tif"), tifffile.imread(roll / "0.tif")
+    x, y = np.rint(found.image_points().xy[0]).astype(int)
+    assert marked[y, x] == 255
+    assert (marked != plain).sum() < 4 * 30
+    assert (tmp_path / "overview.png").stat().st_size > 10_000
+    corners = FrameCorners.read(tmp_path / "corners.json")
+    np.testing.assert_allclose(corners.xy(), frame.gate, rtol=0, atol=0.15)
+    # The frame that lacks an edge is surer by its roll than by the format alone.
+    alone = json.loads(reseau("orient", roll / "4.tif", "--frame", "36x24", "--json")[1])
+    helped = FrameOrientation.read(tmp_path / "4.json")
+    assert helped.corners is not None
+    assert helped.corners["ul"].sx < 0.5 * alone["corners"]["ul"]["sx"]
+
+
+def test_a_second_run_goes_on_where_the_first_ended(roll: Path, tmp_path: Path, reseau: Run) -> None:
+    images = [roll / "0.tif", roll / "1.tif"]
+    arguments = ("--frame", "36x24", "--out", tmp_path, "--jobs", 1, "--no-marked")
+    reseau("orient", images[0], *arguments)
+    written = (tmp_path / "0.json").stat().st_mtime_ns
+    assert reseau("orient", *images, *arguments)[0] == 0
+    assert (tmp_path / "0.json").stat().st_mtime_ns == written
+    assert (tmp_path / "1.json").exists()
+    # Other options are another result.
+    reseau("orient", images[0], "--out", tmp_path, "--jobs", 1, "--no-marked", "--frame", "36.1x24")
+    assert (tmp_path / "0.json").stat().st_mtime_ns > written
+
+
+def test_calibrated_corners_give_a_transformation_with_residuals_or_honestly_none(
+    roll: Path, tmp_path: Path, reseau: Run
+) -> None:
+    frame = FilmFrame(0, dpi=300)
+    FrameCorners.from_xy(frame.gate).write(tmp_path / "gate.json")
+    for kind in ("similarity", "affine", "projective", "bilinear"):
+        status, out, _ = reseau(
+            "orient", roll / "0.tif", "--corners", tmp_path / "gate.json", "--transform", kind, "--json"
+        )
+        assert status == 0
+        transform = json.loads(out)["transform"]
+        assert transform["kind"] == kind
+        left = np.array(list(transform["residuals_mm"].values()))
+        if kind in ("projective", "bilinear"):
+            assert transform["sigma_mm"] is None
+            assert np.abs(left).max() < 1e-6
+        else:
+            assert 0 < max(transform["sigma_mm"]) < 0.05
+            assert np.abs(left).max() < 0.05
+
+
+def test_what_cannot_be_oriented_is_told_in_one_line(tmp_path: Path, reseau: Run, roll: Path) -> None:
+    tifffile.imwrite(tmp_path / "blank.tif", np.full((300, 400), 9, np.uint8))
+    status, out, err = reseau("orient", tmp_path / "blank.tif")
+    assert (status, err) == (1, "")
+    assert out.startswith("blank.tif: declined: shows nothing")
+    (tmp_path / "cut.tif").write_bytes((roll / "0.tif").read_bytes()[:9000])
+    tifffile.imwrite(tmp_path / "cmyk.tif", np.zeros((30, 30, 4), np.uint8), photometric="separated")
+    for name, words in (("cut.tif", "truncated"), ("cmyk.tif", "CMYK"), ("none.tif", "cannot be read")):
+        status, _, err = reseau("orient", tmp_path / name)
+        assert status == 2
+        assert words in err
+        assert err.count("\n") == 1
+    for arguments in (("--frame", "36"), ("--near", "1,2,3"), ("--frame", "ax b")):
+        status, _, err = reseau("orient", roll / "0.tif", *arguments)
+        assert status == 2
+        assert "say" in err
+    # One bad file does not keep the others of a roll from being oriented.
+    status, out, err = reseau("orient", roll / "0.tif", tmp_path / "cut.tif", "--jobs", 1)
+    assert status == 0
+    assert "0.tif: oriented" in out
+    assert "cut.tif: is a truncated TIFF" in err
