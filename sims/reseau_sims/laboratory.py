@@ -90,7 +90,7 @@ class Laboratory:
         with self.lock:
             scanner, tank = self.world.scanner, self._tank
             step = scanner.speed * 1e6 * period_s / 2
-            ranges: Array = (np.arange(samples) + 0.5) * step
+            ranges: Array = (np.arange(samples, dtype=np.float64) + 0.5) * step
             x, depth = tank.xy[:, 0], -tank.xy[:, 1]
             distance = np.hypot(x, depth)
             off = np.arctan2(x, depth) - (angle - _AHEAD) * 2 * np.pi / GRADIANS

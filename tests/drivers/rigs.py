@@ -7,10 +7,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
+
+import numpy as np
 
 from reseau.instruments import Device
 from reseau_drivers.link import link_to
+from reseau_drivers.oscilloscope import Oscilloscope
+from reseau_drivers.oscilloscope.visa import scpi_link
 from reseau_drivers.scanner import Ping360, Ping360Settings
 from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
 from reseau_sims import serving
@@ -52,7 +57,7 @@ class Rig:
     machine: Machine
     script: Script
     work: Callable[[int], None]
-    recover: Callable[[], None]
+    recover: Callable[[], object]
     server: Server | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -129,11 +134,37 @@ def ping360_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.stop, server)
 
 
+def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = serving.Oscilloscope("keysight")
+    server: Server | None = None
+    if transport in ("tcp", "in process"):
+        address, server = _wired(stack, transport, machine, script)
+    elif transport == "vxi-11":
+        session = partial(serving.Vxi11Session, machine, machine.execute, script)
+        server = tcp = stack.enter_context(TcpServer(session))
+        address = f"TCPIP::127.0.0.1,{tcp.port}::inst0::INSTR"
+    else:
+        both = serving.HislipInstrument(machine, machine.execute, script)
+        server = tcp = stack.enter_context(TcpServer(both.channel))
+        address = f"TCPIP::127.0.0.1::hislip0,{tcp.port}::INSTR"
+    device = Oscilloscope("scope", scpi_link(address), seconds=0.7)
+
+    def work(run: int) -> None:
+        shown = np.roll(machine_picture, run, axis=1)
+        machine.screen = lambda: shown
+        for _ in range(5):
+            assert (device.screen().frame().pixels == shown).all()
+
+    machine_picture = machine.screen()
+    return Rig(device, machine, script, work, device.screen, server)
+
+
 Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
     **{("ping360", transport): ping360_rig for transport in TRANSPORTS},
+    **{("oscilloscope", transport): scope_rig for transport in ("tcp", "vxi-11", "hislip", "in process")},
 }
 
 

@@ -7,7 +7,9 @@ within the process, carries it to a client. All of them listen on the loopback i
 
 from .machine import Machine, Session, Wire
 from .motion import Motor
+from .oscilloscope import FAMILIES, Family, Oscilloscope
 from .ping360 import Ping360
+from .scpi import HislipInstrument, PortmapperSession, Vxi11Session
 from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
 from .servers import InProcess, PtyServer, Server, TcpServer
 from .smc100 import Smc100Line
@@ -15,20 +17,26 @@ from .zaber import ZaberChain
 
 __all__ = [
     "DEVICE_KINDS",
+    "FAMILIES",
     "KINDS",
     "LINE_KINDS",
+    "Family",
     "Fault",
+    "HislipInstrument",
     "InProcess",
     "Kind",
     "Machine",
     "Motor",
+    "Oscilloscope",
     "Ping360",
+    "PortmapperSession",
     "PtyServer",
     "Script",
     "Server",
     "Session",
     "Smc100Line",
     "TcpServer",
+    "Vxi11Session",
     "Wire",
     "ZaberChain",
 ]

@@ -1,0 +1,257 @@
+"""How each maker's oscilloscopes hand over their screen and their waveforms: data, chosen by ``*IDN?``.
+
+Source: the makers' programming manuals. A family's model is found by the first pattern that its identity
+matches.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from reseau.data import Array
+from reseau.errors import ProtocolError
+
+__all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of"]
+
+Numbers = dict[str, float]
+Step = tuple[Literal["tell", "ask", "fetch"], str]
+"""``tell`` sends a command; ``ask`` waits for a line, and lets it be; ``fetch`` takes a picture or block."""
+
+
+@dataclass(frozen=True)
+class WaveformDialect:
+    """How a waveform is handed over; ``{n}`` stands for the channel.
+
+    Parameters
+    ----------
+    setup : tuple of str
+        Commands.
+    scale : mapping
+        Questions by the name of their number; or of several, separated by spaces, answered with commas. A
+        name ``-`` is passed over.
+    data : str
+        Question for the block.
+    dtype : str
+        Of its samples.
+    volts : callable
+        From samples and the numbers to volts.
+    start, step : callable
+        From the numbers to the seconds of the first sample, and of a step.
+    """
+
+    setup: tuple[str, ...]
+    scale: Mapping[str, str]
+    data: str
+    dtype: str
+    volts: Callable[[Array, Numbers], Array]
+    start: Callable[[Numbers], float] = lambda f: f["x0"]
+    step: Callable[[Numbers], float] = lambda f: f["dx"]
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """One way to speak.
+
+    Parameters
+    ----------
+    name : str
+        Of the family.
+    identity : str
+        Pattern of maker and model, as ``MAKER,MODEL``.
+    screen : tuple of Step
+        What is said for the picture of the screen; one step fetches it.
+    waveform : WaveformDialect, optional
+        None where waveforms are not known.
+    setup : tuple of str
+        Said after connecting.
+    halt : str
+        Stops the acquisition.
+    errors : str
+        Asks for the oldest error; nothing where there is no queue.
+    """
+
+    name: str
+    identity: str
+    screen: tuple[Step, ...]
+    waveform: WaveformDialect | None = None
+    setup: tuple[str, ...] = ()
+    halt: str = ":STOP"
+    errors: str = ":SYSTem:ERRor?"
+
+
+_TEN = "- - points - dx x0 - dy y0 yref"
+"""The ten numbers of a preamble of Keysight and Rigol: format, type, points, count, x, y."""
+
+_KEYSIGHT = WaveformDialect(
+    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", ":WAVeform:UNSigned ON"),
+    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
+    ":WAVeform:DATA?",
+    "u1",
+    lambda codes, f: (codes - f["yref"]) * f["dy"] + f["y0"],
+)
+_RIGOL = WaveformDialect(
+    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:MODE NORMal", ":WAVeform:FORMat BYTE"),
+    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
+    ":WAVeform:DATA?",
+    "u1",
+    lambda codes, f: (codes - f["y0"] - f["yref"]) * f["dy"],
+)
+_SIGLENT = WaveformDialect(
+    ("CHDR OFF", "WFSU SP,0,NP,0,FP,0"),
+    MappingProxyType({"vdiv": "C{n}:VDIV?", "ofst": "C{n}:OFST?", "rate": "SARA?", "tdiv": "TDIV?"}),
+    "C{n}:WF? DAT2",
+    "i1",
+    lambda codes, f: codes * f["vdiv"] / 25 - f["ofst"],
+    # Fourteen divisions, the trigger in the middle.
+    start=lambda f: -7 * f["tdiv"],
+    step=lambda f: 1 / f["rate"],
+)
+_TEKTRONIX = WaveformDialect(
+    ("HEADer OFF", "DATa:SOUrce CH{n}", "DATa:ENCdg RIBinary", "DATa:WIDth 1"),
+    MappingProxyType(
+        {
+            "dx": "WFMOutpre:XINcr?",
+            "x0": "WFMOutpre:XZEro?",
+            "dy": "WFMOutpre:YMUlt?",
+            "yoff": "WFMOutpre:YOFf?",
+            "y0": "WFMOutpre:YZEro?",
+        }
+    ),
+    "CURVe?",
+    "i1",
+    lambda codes, f: (codes - f["yoff"]) * f["dy"] + f["y0"],
+)
+_ROHDE = WaveformDialect(
+    ("FORMat REAL,32", "FORMat:BORDer LSBFirst"),
+    MappingProxyType({"x0 x1 points -": "CHANnel{n}:DATA:HEADer?"}),
+    "CHANnel{n}:DATA?",
+    "<f4",
+    lambda volts, f: volts,
+    step=lambda f: (f["x1"] - f["x0"]) / f["points"],
+)
+
+DIALECTS: tuple[Dialect, ...] = (
+    Dialect(
+        "Keysight InfiniiVision X",
+        r"(KEYSIGHT|AGILENT).*,(DSO|MSO|EDU|DSOX|MSOX|MXR)?.*",
+        (("tell", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
+        _KEYSIGHT,
+    ),
+    Dialect(
+        "Rigol 1000Z",
+        r"RIGOL.*,(DS|MSO)1\d{3}Z.*",
+        (("fetch", ":DISPlay:DATA? ON,0,PNG"),),
+        _RIGOL,
+    ),
+    Dialect("Rigol", r"RIGOL.*", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
+    Dialect(
+        "Siglent with PRINt",
+        r"SIGLENT.*,SDS(2\d{3}X (Plus|HD)|1\d{3}X HD|[567]\d{3}).*",
+        (("fetch", "PRINt? PNG"),),
+        _SIGLENT,
+        setup=("CHDR OFF",),
+        halt="STOP",
+        errors="",
+    ),
+    Dialect(
+        "Siglent", r"SIGLENT.*", (("fetch", "SCDP"),), _SIGLENT, setup=("CHDR OFF",), halt="STOP", errors=""
+    ),
+    Dialect(
+        "Tektronix with a file system",
+        r"TEKTRONIX,(MSO|DPO|LPD)(2[24]|4[46]|5[468]|58LP|6[468])B?\b.*",
+        (
+            ("tell", 'SAVe:IMAGe "C:/Temp/reseau.png"'),
+            ("ask", "*OPC?"),
+            ("fetch", 'FILESystem:READFile "C:/Temp/reseau.png"'),
+            ("tell", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
+        ),
+        _TEKTRONIX,
+        setup=("HEADer OFF",),
+        halt="ACQuire:STATE STOP",
+        errors="",
+    ),
+    Dialect(
+        "Tektronix",
+        r"TEKTRONIX.*",
+        (
+            ("tell", "SAVe:IMAGe:FILEFormat PNG"),
+            ("tell", "HARDCopy:INKSaver OFF"),
+            ("fetch", "HARDCopy STARt"),
+        ),
+        _TEKTRONIX,
+        setup=("HEADer OFF",),
+        halt="ACQuire:STATE STOP",
+        errors="",
+    ),
+    Dialect(
+        "Rohde & Schwarz with a file system",
+        r"ROHDE&SCHWARZ,(RTO|RTE|RTP|MXO).*",
+        (
+            ("tell", "HCOPy:DEVice1:LANGuage PNG"),
+            ("tell", "MMEMory:NAME 'C:\\reseau.png'"),
+            ("tell", "HCOPy:IMMediate1"),
+            ("ask", "*OPC?"),
+            ("fetch", "MMEMory:DATA? 'C:\\reseau.png'"),
+            ("tell", "MMEMory:DELete 'C:\\reseau.png'"),
+        ),
+        _ROHDE,
+    ),
+    Dialect(
+        "Rohde & Schwarz",
+        r"(ROHDE&SCHWARZ|HAMEG).*",
+        (("tell", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
+        _ROHDE,
+    ),
+    Dialect(
+        "LeCroy",
+        r"LECROY.*",
+        (
+            ("tell", "CHDR OFF"),
+            ("tell", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"),
+            ("fetch", "SCDP"),
+        ),
+        halt="STOP",
+        errors="",
+    ),
+)
+
+
+def dialect_of(identity: str) -> Dialect:
+    """The dialect of an instrument by its answer to ``*IDN?``.
+
+    Raises
+    ------
+    ProtocolError
+        When none is known for it.
+
+    Examples
+    --------
+    >>> dialect_of("RIGOL TECHNOLOGIES,DS1104Z,DS1ZA000000001,00.04.04").name
+    'Rigol 1000Z'
+    """
+    for dialect in DIALECTS:
+        if re.match(dialect.identity, identity.strip(), re.IGNORECASE):
+            return dialect
+    raise ProtocolError(f"how to speak to {identity!r} is not known", do="name a dialect")
+
+
+def samples_of(data: bytes, dialect: WaveformDialect, numbers: Numbers) -> Array:
+    """Volts of a block of samples.
+
+    Raises
+    ------
+    ProtocolError
+        When their number is not the one that was announced.
+    """
+    if len(data) % np.dtype(dialect.dtype).itemsize:
+        raise ProtocolError(f"{len(data)} bytes are no whole number of samples")
+    codes = np.frombuffer(data, dialect.dtype).astype(np.float64)
+    if "points" in numbers and len(codes) != int(numbers["points"]):
+        raise ProtocolError(f"{len(codes)} samples came; {numbers['points']:g} were announced")
+    return dialect.volts(codes, numbers)

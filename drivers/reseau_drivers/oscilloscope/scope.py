@@ -1,0 +1,260 @@
+"""An oscilloscope over SCPI: its screen and its waveforms, whoever made it."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from reseau.errors import DeadlineError, ProtocolError, RefusedError
+from reseau.instruments import Deadline, Device, Identity, Limits, ScreenPicture, Settings, Waveform, quantity
+from reseau.instruments.values import now
+
+from ..codecs.ieee488 import LARGEST, error_entry, missing_of, parse_block, picture
+from ..codecs.stream import shown
+from ..link import Link
+from .dialects import Dialect, dialect_of, samples_of
+
+__all__ = ["Oscilloscope", "OscilloscopeSettings"]
+
+_LONGEST_LINE = 65536
+
+
+@dataclass(frozen=True)
+class OscilloscopeSettings(Settings):
+    """What is read with every reading."""
+
+    channel: int = quantity(1, "", 1, 8)
+
+
+class Oscilloscope(Device[OscilloscopeSettings]):
+    """The instrument.
+
+    Parameters
+    ----------
+    name : str
+        On the bench.
+    link : Link
+        To it.
+    settings : OscilloscopeSettings
+        What is read.
+    dialect : Dialect, optional
+        Instead of the one of its identity.
+    seconds : float
+        Deadline of calls that name none; some take ten seconds for a picture.
+    limits : mapping, optional
+        Of settings.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        link: Link,
+        settings: OscilloscopeSettings | None = None,
+        *,
+        dialect: Dialect | None = None,
+        seconds: float = 15.0,
+        limits: Limits | None = None,
+    ) -> None:
+        super().__init__(name, settings or OscilloscopeSettings(), seconds=seconds, limits=limits)
+        self._link, self._given, self._dialect = link, dialect, dialect
+        self._idn, self._heard, self._asked = "", bytearray(), False
+
+    @property
+    def dialect(self) -> Dialect | None:
+        """How it is spoken to; None before it was asked who it is."""
+        return self._dialect
+
+    def _open(self, deadline: Deadline) -> None:
+        self._link.open(deadline)
+        self._heard.clear()
+        self._tell("*CLS", deadline)
+        self._idn = self._ask("*IDN?", deadline)
+        if self._idn.count(",") < 2:
+            raise ProtocolError(f"{self._idn!r} is no answer to *IDN?")
+        self._dialect = self._given or dialect_of(self._idn)
+
+    def _shut(self) -> None:
+        self._link.close()
+
+    def _push(self, settings: OscilloscopeSettings, deadline: Deadline) -> None:
+        for command in self._spoken.setup:
+            self._tell(command, deadline)
+
+    def _identify(self, deadline: Deadline) -> Identity:
+        maker, model, *rest = [part.strip() for part in self._idn.split(",", 3)]
+        return Identity(maker, model, *rest)
+
+    def _halt(self, deadline: Deadline) -> None:
+        self._tell(self._spoken.halt, deadline)
+
+    def _acquire(self) -> dict[str, Any]:
+        picture_ = self.screen()
+        return {f"{self.name}_screen": picture_.frame(self.name).pixels}
+
+    def _kinds(self) -> dict[str, dict[str, Any]]:
+        reading = self._reading.get(f"{self.name}_screen")
+        shape = list(np.shape(reading["value"])) if reading else [0, 0]
+        return {f"{self.name}_screen": {"dtype": "array", "shape": shape}}
+
+    def stage(self) -> list[Any]:
+        """Connect, and take a picture: its size is told before the run begins."""
+        staged = super().stage()
+        self._take()
+        return staged
+
+    def check(self, seconds: float | None = None) -> dict[str, str]:
+        """Who it is, how it is spoken to, and its oldest error."""
+        found = {"identity": str(self.connect(seconds)), "dialect": self._spoken.name}
+        if self._spoken.errors:
+            with self._exchange("check", seconds) as deadline:
+                number, text = error_entry(self._ask(self._spoken.errors, deadline))
+                found["error"] = f"{number} {text}".strip() if number else "none"
+        return found
+
+    def screen(self, seconds: float | None = None) -> ScreenPicture:
+        """The picture of its screen.
+
+        Raises
+        ------
+        InstrumentError
+            When none came that is whole.
+        """
+        with self._exchange("screen", seconds) as deadline:
+            asked, data = now(), b""
+            for how, text in self._spoken.screen:
+                if how == "tell":
+                    self._tell(text, deadline)
+                elif how == "ask":
+                    self._ask(text, deadline)
+                else:
+                    data = picture(self._fetch(text, deadline))
+            _verify_png(data)
+            return ScreenPicture(data, asked)
+
+    def waveform(self, channel: int = 1, seconds: float | None = None) -> Waveform:
+        """The samples of a channel.
+
+        Raises
+        ------
+        RefusedError
+            When waveforms of this family are not known.
+        InstrumentError
+            When none came that is whole.
+        """
+        self._settings.changed({"channel": channel}, self._limits)
+        with self._exchange(f"waveform of channel {channel}", seconds) as deadline:
+            dialect = self._spoken.waveform
+            if dialect is None:
+                raise RefusedError(f"waveforms of {self._spoken.name} are not known")
+            asked = now()
+            for command in dialect.setup:
+                self._tell(command.format(n=channel), deadline)
+            numbers: dict[str, float] = {}
+            for names, question in dialect.scale.items():
+                numbers |= _numbers(names, self._ask(question.format(n=channel), deadline))
+            block = parse_block(self._fetch(dialect.data.format(n=channel), deadline))
+            volts = samples_of(block, dialect, numbers)
+            try:
+                start, step = dialect.start(numbers), dialect.step(numbers)
+            except ZeroDivisionError:
+                raise ProtocolError("its waveform has no extent in time") from None
+            return Waveform(volts, start, step, channel, asked)
+
+    def errors(self, seconds: float | None = None) -> list[str]:
+        """What its error queue holds; taken out of it."""
+        found: list[str] = []
+        with self._exchange("errors", seconds) as deadline:
+            while self._spoken.errors and len(found) < 100:
+                number, text = error_entry(self._ask(self._spoken.errors, deadline))
+                if number == 0:
+                    break
+                found.append(f"{number} {text}")
+        return found
+
+    @property
+    def _spoken(self) -> Dialect:
+        if self._dialect is None:
+            raise ProtocolError("has not said who it is")
+        return self._dialect
+
+    def _tell(self, text: str, deadline: Deadline) -> None:
+        # What is still there of the last answer is none to what follows, and would be an interrupted one.
+        while self._asked and self._link.pending() and not deadline.over:
+            self._link.read(deadline)
+        self._asked = False
+        self._link.write(text.encode("ascii") + b"\n", deadline)
+
+    def _question(self, text: str, deadline: Deadline) -> None:
+        self._heard.clear()
+        self._tell(text, deadline)
+        self._asked = True
+
+    def _ask(self, text: str, deadline: Deadline) -> str:
+        self._question(text, deadline)
+        while True:
+            line, newline, _ = self._heard.lstrip(b"\r\n").partition(b"\n")
+            if newline:
+                return line.strip().decode("latin-1")
+            if len(self._heard) > _LONGEST_LINE:
+                raise ProtocolError(f"{text} is answered without end: {shown(bytes(self._heard))}")
+            self._more(deadline, text)
+
+    def _fetch(self, text: str, deadline: Deadline) -> bytes:
+        self._question(text, deadline)
+        lacking: int | None = None
+        while True:
+            # Asked again only when as much has come as was missing: a picture is large.
+            if self._heard and not lacking:
+                start = _start_of_binary(self._heard)
+                lacking = missing_of(bytes(self._heard[start:]))
+                if lacking == 0:
+                    return bytes(self._heard[start:])
+            before = len(self._heard)
+            self._more(deadline, text)
+            if lacking:
+                lacking = max(0, lacking - (len(self._heard) - before))
+            if len(self._heard) > LARGEST:
+                raise ProtocolError(f"{text} is answered without end")
+
+    def _more(self, deadline: Deadline, text: str) -> None:
+        if deadline.over:
+            if self._heard:
+                raise ProtocolError(f"the answer to {text} broke off after {len(self._heard)} bytes")
+            raise DeadlineError(
+                f"{text} was not answered within {deadline.seconds:g} s",
+                do="is it busy, or its screen locked?",
+            )
+        self._heard += self._link.read(deadline)
+
+
+def _start_of_binary(data: bytearray) -> int:
+    """Where the block begins: behind newlines, or a word such as ``DAT2,``."""
+    start = len(data) - len(data.lstrip(b"\r\n"))
+    sign = data.find(b"#", start, start + 40)
+    word = bytes(data[start:sign]) if sign > start else b""
+    return sign if word.endswith(b",") and word.isascii() else start
+
+
+def _numbers(names: str, answer: str) -> dict[str, float]:
+    """Numbers by name from an answer with commas."""
+    wanted, found = names.split(), answer.split(",")
+    if len(found) < len(wanted):
+        raise ProtocolError(f"{answer!r} holds fewer than {len(wanted)} numbers")
+    try:
+        return {name: float(text) for name, text in zip(wanted, found, strict=False) if name != "-"}
+    except ValueError:
+        raise ProtocolError(f"{answer!r} holds no numbers") from None
+
+
+def _verify_png(data: bytes) -> None:
+    """Raise ProtocolError when the sum of a chunk of a PNG is wrong (ISO 15948, 5.3)."""
+    at = 8
+    while data[:2] != b"BM" and at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise ProtocolError("its picture was damaged on the way")
+        at = end + 4

@@ -1,0 +1,198 @@
+"""Every family's screen and waveform on every transport; hostile peers; and a client by others."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.errors import InstrumentError, ProtocolError, RefusedError, SettingError, UsageError
+from reseau.instruments import Oscilloscope
+from reseau_drivers.oscilloscope import DIALECTS, dialect_of, oscilloscope
+from reseau_sims import World, serving
+from reseau_sims.laboratory import Laboratory
+from reseau_sims.serving import (
+    FAMILIES,
+    HislipInstrument,
+    InProcess,
+    PortmapperSession,
+    Script,
+    TcpServer,
+    Vxi11Session,
+    Wire,
+)
+
+
+def scope(family: str, **options: Any) -> tuple[Any, serving.Oscilloscope]:
+    machine = serving.Oscilloscope(family)
+    return oscilloscope("scope", InProcess(lambda: Wire(machine, Script())), **options), machine
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_screen_and_waveform_of_every_family(family: str) -> None:
+    device, machine = scope(family)
+    assert isinstance(device, Oscilloscope)
+    with device:
+        assert (device.screen().frame().pixels == machine.screen()).all()
+        if family == "lecroy":
+            with pytest.raises(RefusedError, match="LeCroy"):
+                device.waveform()
+        else:
+            wave = device.waveform(1)
+            assert wave.volts == pytest.approx(
+                (machine.samples().astype(float) - 128) * 0.04 + 0.12, abs=1e-6
+            )
+            assert wave.seconds[:2] == pytest.approx([-5e-4, -4.99e-4], rel=1e-6)
+        device.stop()
+        assert not machine.running
+        assert device.check()["dialect"] == device.dialect.name
+    assert machine.violations == []
+
+
+@pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
+@pytest.mark.parametrize("family", ["keysight", "rigol-2000", "siglent", "tektronix"])
+def test_families_over_their_real_protocols(family: str, transport: str) -> None:
+    machine, script = serving.Oscilloscope(family), Script()
+    # Large enough for several chunks of every protocol.
+    shown = np.random.default_rng(1).integers(0, 255, (480, 800), dtype=np.uint8)
+    machine.screen = lambda: shown
+    with ExitStack() as stack:
+        if transport == "tcp":
+            address = stack.enter_context(TcpServer(lambda: Wire(machine, script))).address
+        elif transport == "vxi-11":
+            server = stack.enter_context(TcpServer(partial(Vxi11Session, machine, machine.execute, script)))
+            address = f"TCPIP::127.0.0.1,{server.port}::inst0::INSTR"
+        else:
+            both = HislipInstrument(machine, machine.execute, script)
+            server = stack.enter_context(TcpServer(both.channel))
+            address = f"TCPIP::127.0.0.1::hislip0,{server.port}::INSTR"
+        device = stack.enter_context(oscilloscope("scope", address, seconds=5.0))
+        for _ in range(3):
+            assert (device.screen().frame().pixels == shown).all()
+            assert len(device.waveform(1).volts) == 1000
+    assert machine.violations == []
+
+
+def test_dialects_are_chosen_by_identity() -> None:
+    for idn, name in {
+        "Rohde&Schwarz,RTO2014,1329.7002k14/000001,4.0": "Rohde & Schwarz with a file system",
+        "TEKTRONIX,MSO58,C000001,CF:91.1CT": "Tektronix with a file system",
+        "TEKTRONIX,MSO2024B,C1,F": "Tektronix",
+        "TEKTRONIX,TDS 2024C,C1,F": "Tektronix",
+        "Siglent Technologies,SDS1204X-E,S,1": "Siglent",
+        "Siglent Technologies,SDS6104 H12A,S,1": "Siglent with PRINt",
+        "RIGOL TECHNOLOGIES,MSO5074,M,1": "Rigol",
+        "RIGOL TECHNOLOGIES,MSO1104Z,M,1": "Rigol 1000Z",
+        "AGILENT TECHNOLOGIES,DSO-X 2024A,M,1": "Keysight InfiniiVision X",
+    }.items():
+        assert dialect_of(idn).name == name
+    with pytest.raises(ProtocolError, match="name a dialect"):
+        dialect_of("ACME,X1,1,1")
+    assert len({dialect.name for dialect in DIALECTS}) == len(DIALECTS)
+    with pytest.raises(SettingError):
+        oscilloscope("scope", "tcp://127.0.0.1:1", dialect="none")
+    with pytest.raises(UsageError):
+        oscilloscope("scope", "TCPIP::127.0.0.1::x::SOCKET")
+
+
+def test_what_the_scanner_sweeps_is_on_the_oscilloscope() -> None:
+    laboratory = Laboratory(World.standard(seed=4))
+    machine = serving.Oscilloscope(
+        "rigol-1000z", lambda: laboratory.picture(400, 240), lambda: laboratory.echoes
+    )
+    with oscilloscope("scope", InProcess(lambda: Wire(machine, Script()))) as device:
+        before = device.screen().frame().pixels.astype(int)
+        for angle in range(190, 211):
+            laboratory.line(angle, 300, 2e-6)
+        after = device.screen().frame().pixels.astype(int)
+        assert (device.screen().frame().pixels == laboratory.picture(400, 240)).all()
+        assert len(device.waveform().volts) == 300
+    assert abs(after - before).max() > 50
+
+
+HOSTILE = {
+    "endless block": b"#9999999999" + b"x" * 100,
+    "huge length": b"#900000000",
+    "garbage": bytes(range(256)) * 10,
+    "nothing": b"",
+    "a block that never ends": b"#800999999" + b"x" * 5000,
+    "endless text": b"x" * 70000,
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_peer_costs_bounded_time(kind: str) -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.settimeout(3.0)
+            try:
+                while data := connection.recv(1000):
+                    if b"*IDN?" in data:
+                        connection.sendall(b"KEYSIGHT TECHNOLOGIES,DSO-X 1,1,1\n")
+                    elif b"DATA?" in data:
+                        connection.sendall(HOSTILE[kind])
+            except OSError:
+                return
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    device = oscilloscope("scope", f"tcp://127.0.0.1:{listener.getsockname()[1]}", seconds=0.5)
+    began = time.monotonic()
+    with pytest.raises(InstrumentError, match="scope"):
+        device.screen()
+    assert time.monotonic() - began < 1.5
+    device.close()
+    thread.join(5.0)
+    listener.close()
+
+
+@pytest.mark.skipif(shutil.which("lxi") is None, reason="lxi (Debian's lxi-tools) is not installed")
+@pytest.mark.skipif(os.geteuid() != 0, reason="lxi asks the portmapper on port 111, which only root may open")
+@pytest.mark.parametrize(
+    ("family", "plugin"),
+    [
+        ("keysight", "keysight-ivx"),
+        ("rigol-1000z", "rigol-1000z"),
+        ("rigol-2000", "rigol-2000"),
+        ("siglent", "siglent-sds"),
+        ("rohde", "rs-hmo-rtb"),
+        ("tektronix", "tektronix-2000"),
+    ],
+)
+def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> None:
+    laboratory = Laboratory(World.standard(seed=4))
+    machine = serving.Oscilloscope(family, lambda: laboratory.picture(400, 240))
+    with TcpServer(partial(Vxi11Session, machine, machine.execute, Script())) as core:
+        try:
+            portmapper = TcpServer(lambda: PortmapperSession(core.port), 111)
+        except OSError as error:
+            pytest.skip(f"port 111 is taken ({error})")
+        with portmapper:
+            saved = tmp_path / "screen.png"
+            done = subprocess.run(
+                ["lxi", "screenshot", "-a", "127.0.0.1", "-p", plugin, str(saved)],
+                capture_output=True,
+                timeout=60,
+                check=False,
+                cwd=tmp_path,
+            )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (found,) = tmp_path.iterdir()
+    picture = cv2.imdecode(np.frombuffer(found.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    assert (picture == laboratory.picture(400, 240)).all()
+    assert machine.violations == []
