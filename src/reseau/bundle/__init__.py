@@ -6,6 +6,8 @@ from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
 from .calibrated import calibration_of
 from .document import to_document
+from .fields import FieldDifference, ProjectionField, calibration_difference, projection_field
+from .lens import Lens
 from .network import Additional, Camera, Network
 from .problem import BundleFit, BundleProblem
 from .result import Result
@@ -16,12 +18,17 @@ __all__ = [
     "BundleFit",
     "BundleProblem",
     "Camera",
+    "FieldDifference",
+    "Lens",
     "Network",
     "Options",
+    "ProjectionField",
     "Result",
     "adjust_network",
     "approximate",
+    "calibration_difference",
     "calibration_of",
     "problem_of",
+    "projection_field",
     "to_document",
 ]

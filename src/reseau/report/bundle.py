@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from itertools import count
 from typing import Any
@@ -13,9 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
-from ..bundle import Result
+from ..bundle import FieldDifference, Lens, Result, projection_field
 from ..data import Array, Rows
 from ..provenance import Provenance
+from .fields import difference_figure, uncertainty_figure
 from .figures import nice
 from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 
@@ -26,7 +28,13 @@ _UNITS = {"c": "mm", "x0": "mm", "y0": "mm", "K1": "mm⁻²", "K2": "mm⁻⁴", 
           "P2": "mm⁻¹", "fx": "px", "fy": "px", "cx": "px", "cy": "px"}  # fmt: skip
 
 
-def bundle_report(result: Result, *, title: str, provenance: Provenance | None = None) -> str:
+def bundle_report(
+    result: Result,
+    *,
+    title: str,
+    provenance: Provenance | None = None,
+    against: Mapping[str, FieldDifference] | None = None,
+) -> str:
     """Render the report of a bundle adjustment.
 
     Parameters
@@ -37,6 +45,8 @@ def bundle_report(result: Result, *, title: str, provenance: Provenance | None =
         Heading of the page.
     provenance : Provenance, optional
         Inputs, options, version.
+    against : mapping of str to FieldDifference, optional
+        Differences from other calibrations, by what these are called.
 
     Returns
     -------
@@ -57,6 +67,7 @@ def bundle_report(result: Result, *, title: str, provenance: Provenance | None =
         more_cameras=max(0, sum(camera["shown"] for camera in cameras) - 20),
         images=_images(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
+        differences=[_difference(name, found) for name, found in (against or {}).items()],
         left_out=list(zip(*result.rejected_names(), strict=True))[:_IMAGES],
         unit=result.network.unit,
         provenance=(provenance or Provenance()).to_dict(),
@@ -108,7 +119,32 @@ def _camera(result: Result, c: int) -> dict[str, Any]:
         "shown": shown,
         "rows": rows,
         "residuals": Markup(_residual_figure(result, c, rows_of)) if shown else None,
+        "field": _field_figure(result, c, rows_of) if shown else None,
         "profile": Markup(_profile_figure(result, c)) if shown and _radial(result, c) is not None else None,
+    }
+
+
+def _field_figure(result: Result, c: int, rows: Rows) -> Markup | None:
+    """Uncertainty of the projection; None where a camera has several sets of parameters, or no mapping."""
+    extra = result.network.cameras[c].additional
+    if extra is not None and (extra.per != "camera" or result.network.cameras[c].side == "image"):
+        return None
+    field = projection_field(Lens.of_result(result, c))
+    if not np.isfinite(field.sigma).any() or not np.nanmax(field.sigma) > 0:
+        return None
+    return Markup(uncertainty_figure(field, result.network.xy[rows]))
+
+
+def _difference(name: str, found: FieldDifference) -> dict[str, Any]:
+    size = np.hypot(*np.moveaxis(found.difference, 2, 0))
+    return {
+        "name": name,
+        "figure": Markup(difference_figure(found)),
+        "rms": f"{np.sqrt(np.nanmean(size**2)):.2g}",
+        "statistic": f"{found.statistic:.1f}",
+        "degrees": found.degrees,
+        "p": f"{found.p:.2g}",
+        "tilt": " / ".join(f"{angle:.2g}" for angle in 1e3 * found.rotation),
     }
 
 

@@ -1,0 +1,144 @@
+"""Uncertainty of the projection over the image, and differences of calibrations: covered by Monte Carlo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.bundle import (
+    Lens,
+    Result,
+    adjust_network,
+    calibration_difference,
+    calibration_of,
+    projection_field,
+)
+from reseau.bundle.fields import FieldDifference
+from reseau.errors import UsageError
+
+from . import networks
+
+RUNS = 120
+# Of the mean of the squares of 120 normalised errors of two coordinates: 1/√120 = 0.091.
+SIGMA = 0.091
+
+
+def lens_of(world: networks.World, seed: int) -> Lens:
+    fit = world.problem(world.noisy(seed)).adjusted().required()
+    return Lens.of_result(Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool)), 0)
+
+
+def true_lens(world: networks.World) -> Lens:
+    mapping = networks.mapping_of(world.network.cameras[0])
+    return Lens(mapping, 640, 480, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+
+
+@pytest.fixture(scope="module")
+def against_truth() -> list[FieldDifference]:
+    world = networks.world(points=40, datum="free", control=0)
+    truth = true_lens(world)
+    return [calibration_difference(lens_of(world, seed), truth, 5) for seed in range(RUNS)]
+
+
+def squares(found: list[FieldDifference]) -> np.ndarray:
+    return np.array([-np.log(d.p_at) for d in found])
+
+
+def test_normalised_errors_of_the_projection_have_the_mean_square_one_at_every_place(
+    against_truth: list[FieldDifference],
+) -> None:
+    mean = squares(against_truth).mean(axis=0)
+    assert mean.shape == (4, 5)
+    # Twenty places, of which the worst of a true field stays within 3.5 standard deviations.
+    np.testing.assert_allclose(mean, 1.0, atol=3.5 * SIGMA)
+    assert mean.mean() == pytest.approx(1.0, abs=3 * SIGMA)
+
+
+def test_the_test_of_the_whole_field_keeps_its_level(against_truth: list[FieldDifference]) -> None:
+    assert {d.degrees for d in against_truth} == {9}
+    p = np.array([d.p for d in against_truth])
+    # 5 % of 120 with a standard deviation of 2.4.
+    assert (p < 0.05).sum() <= 6 + 3.5 * 2.4
+    assert p.mean() == pytest.approx(0.5, abs=3.5 * 0.29 / np.sqrt(RUNS))
+
+
+def test_two_independent_calibrations_differ_as_their_covariances_say() -> None:
+    world = networks.world(points=40, datum="free", control=0)
+    lenses = [lens_of(world, 1000 + seed) for seed in range(80)]
+    found = [calibration_difference(a, b, 5) for a, b in zip(lenses[::2], lenses[1::2], strict=True)]
+    assert squares(found).mean() == pytest.approx(1.0, abs=3.5 / np.sqrt(40))
+    assert np.mean([d.statistic / d.degrees for d in found]) == pytest.approx(
+        1.0, abs=3.5 * np.sqrt(2 / 9 / 40)
+    )
+
+
+def test_a_lens_that_changed_is_found_significant() -> None:
+    world = networks.world(points=40, datum="free", control=0)
+    before = lens_of(world, 5)
+    other = networks.camera()
+    values = other.values.copy()
+    values[3] += 1e-3
+    changed = networks.world(points=40, datum="free", control=0, cameras=(replace(other, values=values),))
+    found = calibration_difference(before, lens_of(changed, 6))
+    assert found.p < 1e-6
+    assert np.nanmin(found.p_at) < 1e-6
+
+
+def test_the_rotation_that_a_principal_point_hides_is_no_difference() -> None:
+    """Of a lens without distortion a small shift of the image is a tilt but for the squares of directions."""
+    plain = networks.camera()
+    values = np.array([8.0] + 9 * [0.0])
+    lens = true_lens(networks.world(cameras=(replace(plain, values=values),)))
+    shifted = replace(lens, mapping=lens.mapping.with_values({"x0": 0.008, "y0": -0.008}))
+    found = calibration_difference(lens, shifted)
+    # The shift is 1.13 px; its second-order part at u = 0.4, v = 0.3 is a quarter of it at most.
+    assert 0.01 < np.hypot(*found.difference.reshape(-1, 2).T).max() < 0.25 * 1.13
+    assert abs(found.rotation[0]) == pytest.approx(abs(found.rotation[1]), rel=0.1)
+    assert abs(found.rotation[1]) == pytest.approx(0.001, abs=2e-4)
+
+
+def test_a_field_is_worse_where_no_points_were() -> None:
+    world = networks.world(points=40)
+    network = world.network
+    left = network.select(network.xy[:, 0] < 400)
+    result = adjust_network(left)
+    assert isinstance(result, Result)
+    sigma = projection_field(Lens.of_result(result, 0), 9).sigma
+    assert sigma[:, -1].max() > 2 * sigma[:, 2].max()
+
+
+@pytest.mark.parametrize("per", ["camera", "group"])
+def test_the_field_of_additional_parameters_has_derivatives_of_its_mapping(per: str) -> None:
+    world = networks.world(points=40, cameras=(networks.with_ebner(per),), images=8)
+    result = adjust_network(world.noisy(0))
+    assert isinstance(result, Result)
+    lens = Lens.of_result(result, 0, None if per == "camera" else "group g1")
+    mapping, uv, step = lens.mapping, np.array([[0.1, -0.2], [-0.25, 0.15]]), 1e-6
+    given = mapping.derivatives(uv)
+    for k, value in enumerate(mapping.values):
+        up, down = mapping.values.copy(), mapping.values.copy()
+        up[k], down[k] = value + step, value - step
+        numeric = (mapping.with_values(up)(uv) - mapping.with_values(down)(uv)) / (2 * step)
+        np.testing.assert_allclose(given.d_parameters[:, :, k], numeric, atol=1e-4)
+    np.testing.assert_allclose(mapping.inverse(mapping(uv)), uv, atol=1e-10)
+    assert np.isfinite(projection_field(lens, 5).sigma).all()
+
+
+def test_a_set_of_several_must_be_named() -> None:
+    world = networks.world(points=40, cameras=(networks.with_ebner("group"),), images=8)
+    result = adjust_network(world.noisy(0))
+    assert isinstance(result, Result)
+    with pytest.raises(UsageError, match="no set of additional parameters"):
+        Lens.of_result(result, 0)
+
+
+def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
+    result = adjust_network(networks.world(points=40).noisy(1))
+    assert isinstance(result, Result)
+    direct = Lens.of_result(result, 0)
+    read = Lens.of_calibration(calibration_of(result, "cam", name="cam"))
+    np.testing.assert_allclose(
+        projection_field(read).sigma, projection_field(direct).sigma, atol=1e-12, rtol=1e-9
+    )
