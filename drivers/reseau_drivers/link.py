@@ -9,13 +9,14 @@ from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
 
 import serial
+from serial.tools import list_ports
 
 from reseau.errors import ConnectionLost, DeadlineError, ProtocolError, UsageError
 from reseau.instruments import Deadline
 
 from .codecs.stream import Damaged, Decoder
 
-__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "link_to"]
+__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "link_to", "serial_ports"]
 
 M = TypeVar("M")
 
@@ -180,6 +181,11 @@ class TcpLink:
         if self._socket is None:
             raise ConnectionLost(f"{self._where} is not open")
         return self._socket
+
+
+def serial_ports() -> tuple[str, ...]:
+    """Serial ports of this machine; found by its entry point."""
+    return tuple(sorted(port.device for port in list_ports.comports()))
 
 
 def link_to(address: str | Link, *, baud: int = 115200) -> Link:

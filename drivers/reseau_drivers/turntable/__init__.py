@@ -13,7 +13,14 @@ from .zaber import Zaber
 __all__ = ["Axis", "AxisPlan", "Smc100", "Table", "TableSettings", "Zaber", "smc100", "zaber"]
 
 
-def zaber(name: str, address: str | Link, *, axes: Mapping[str, Mapping[str, Any]], **options: Any) -> Table:
+def zaber(
+    name: str,
+    address: str | Link,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Table:
     """A table whose axes are moved by chained Zaber devices; found by its entry point.
 
     Parameters
@@ -24,18 +31,35 @@ def zaber(name: str, address: str | Link, *, axes: Mapping[str, Mapping[str, Any
         Serial device or ``tcp://host:port``.
     axes : mapping
         Fields of :class:`AxisPlan` by the name of the axis.
+    settings : mapping, optional
+        Of :class:`TableSettings`.
     **options
         Of :class:`Table`.
     """
-    return Table(name, Zaber(link_to(address)), AxisPlan.read(axes), **options)
+    return Table(
+        name, Zaber(link_to(address)), AxisPlan.read(axes), TableSettings().changed(settings or {}), **options
+    )
 
 
-def smc100(name: str, address: str | Link, *, axes: Mapping[str, Mapping[str, Any]], **options: Any) -> Table:
+def smc100(
+    name: str,
+    address: str | Link,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Table:
     """A table whose axes are moved by Newport SMC100 controllers; found by its entry point.
 
     Parameters
     ----------
-    name, address, axes, **options
+    name, address, axes, settings, **options
         As for :func:`zaber`.
     """
-    return Table(name, Smc100(link_to(address, baud=57600)), AxisPlan.read(axes), **options)
+    return Table(
+        name,
+        Smc100(link_to(address, baud=57600)),
+        AxisPlan.read(axes),
+        TableSettings().changed(settings or {}),
+        **options,
+    )

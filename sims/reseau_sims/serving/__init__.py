@@ -5,6 +5,7 @@ client did wrong. A :class:`~reseau_sims.serving.machine.Wire` spoils answers by
 within the process, carries it to a client. All of them listen on the loopback interface alone.
 """
 
+from .bench import SimulatedBench
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -34,6 +35,7 @@ __all__ = [
     "Script",
     "Server",
     "Session",
+    "SimulatedBench",
     "Smc100Line",
     "TcpServer",
     "Vxi11Session",

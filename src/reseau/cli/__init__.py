@@ -14,7 +14,7 @@ import typer
 
 from .. import __version__
 from ..errors import ReseauError
-from . import apply, bundle, demo, design, measure, orient, refine
+from . import apply, bench, bundle, demo, design, measure, orient, refine
 
 __all__ = ["app", "main"]
 
@@ -28,6 +28,7 @@ app = typer.Typer(
 )
 app.command()(demo.demo)
 app.add_typer(design.app, name="design")
+app.add_typer(bench.app, name="bench")
 app.add_typer(measure.app, name="measure")
 app.command()(orient.orient)
 app.command()(refine.refine)

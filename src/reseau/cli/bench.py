@@ -1,0 +1,97 @@
+"""`reseau bench`: what instruments there are, whether they work, and simulated ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .common import AsJson, Out, say, writable
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="The bench: find instruments, check them, simulate them.")
+
+BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="The bench, bench.toml.")]
+
+
+@app.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """Discover instruments (VISA, serial ports), and name the drivers that are installed."""
+    from ..capture import drivers, found_instruments
+    from ..provenance import canonical_json
+
+    found = found_instruments()
+    if as_json:
+        addresses = {k: [] if isinstance(v, Exception) else list(v) for k, v in found.items()}
+        errors = {k: str(v) for k, v in found.items() if isinstance(v, Exception)}
+        document = {"schema": "reseau-instruments/1", "found": addresses, "errors": errors}
+        say(canonical_json(document | {"drivers": list(drivers())}))
+        return
+    for way, addresses_ in found.items():
+        if isinstance(addresses_, Exception):
+            say(f"{way}: {addresses_}\n")
+        else:
+            say("".join(f"{way}: {address}\n" for address in addresses_) or f"{way}: nothing found\n")
+    say(f"drivers: {', '.join(drivers())}\n")
+
+
+@app.command()
+def check(
+    bench: BenchPath = Path("bench.toml"),
+    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline of each test.")] = 10.0,
+    as_json: AsJson = False,
+) -> None:
+    """Connect all instruments at once and have them test themselves; every failure is told."""
+    from ..capture import Bench
+    from ..provenance import canonical_json
+
+    found = Bench.read(bench)
+    try:
+        checked = found.check(seconds)
+    finally:
+        found.close()
+    failed = sum(each.error is not None for each in checked)
+    if as_json:
+        rows = [
+            {"name": c.name, "driver": c.driver, "address": c.address, "found": c.found}
+            | ({"error": str(c.error)} if c.error else {})
+            for c in checked
+        ]
+        say(canonical_json({"schema": "reseau-bench-check/1", "failed": failed, "instruments": rows}))
+    else:
+        say(f"{found.file.name}\n")
+        for last, each in zip([*[False] * (len(checked) - 1), True], checked, strict=True):
+            branch, stem = ("└", " ") if last else ("├", "│")
+            outcome = "failed" if each.error else "works"
+            say(f"{branch}── {each.name} ({each.driver}): {outcome}\n")
+            lines = [str(each.error)] if each.error else [f"{k}: {v}" for k, v in each.found.items()]
+            say("".join(f"{stem}       {line}\n" for line in lines))
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def sim(
+    out: Out = None,
+    seed: Annotated[int, typer.Option(help="Of the simulated world.")] = 0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Serve so long; 0: until interrupted.")] = 0.0,
+) -> None:
+    """Start simulated instruments on their real protocols, and print the bench.toml that leads to them."""
+    import threading
+
+    from ..capture import plugin
+    from ..formats import write_whole
+
+    if out is not None:
+        writable(out)
+    with plugin("reseau.simulators", "bench")(seed) as bench:
+        if out is not None:
+            write_whole(out, bench.toml)
+        else:
+            say(bench.toml)
+            typer.get_text_stream("stdout").flush()
+        threading.Event().wait(seconds or None)
+        complaints = [f"{name}: {text}" for name, texts in bench.violations.items() for text in texts]
+    for complaint in complaints:
+        typer.echo(complaint, err=True)
