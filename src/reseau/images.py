@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from .errors import ImageError, InputError
 from .formats import write_whole
 from .provenance import sha256_of
 
-__all__ = ["MAX_PIXELS", "decoded", "read_frame", "write_image"]
+__all__ = ["MAX_PIXELS", "Channel", "decoded", "read_frame", "write_image"]
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; the header is asked before a pixel is decoded."""
@@ -21,13 +21,20 @@ MAX_PIXELS = 500_000_000
 _GREY = np.array([0.114, 0.587, 0.299])  # Rec. 601 luma, in OpenCV's order blue, green, red
 
 
-def read_frame(path: Path | str) -> Frame:
-    """Read an image file as a grey frame; colour becomes its luma, values keep their scale.
+Channel = Literal["luma", "red", "green", "blue"]
+_BGR: tuple[Channel, ...] = ("blue", "green", "red")
+
+
+def read_frame(path: Path | str, channel: Channel = "luma") -> Frame:
+    """Read an image file as a grey frame; values keep their scale.
 
     Parameters
     ----------
     path : path
         PNG, JPEG, TIFF (any size and compression that tifffile knows) or BMP.
+    channel : {"luma", "red", "green", "blue"}
+        What is taken of a colour image. A lens images colours at slightly different scales; in one channel
+        that shifts nothing.
 
     Raises
     ------
@@ -41,9 +48,9 @@ def read_frame(path: Path | str) -> Frame:
     with path.open("rb") as stream:
         magic = stream.read(32)
     if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        pixels, full_scale = _read_tiff(path)
+        pixels, full_scale = _read_tiff(path, channel)
     else:
-        pixels, full_scale = _read_coded(path, magic)
+        pixels, full_scale = _read_coded(path, magic, channel)
     return Frame(pixels, full_scale, path.name, digest)
 
 
@@ -62,7 +69,7 @@ def _full_scale(dtype: np.dtype[Any], path: Path) -> float:
     raise ImageError(f"has grey values of type {dtype}", where=path, do="convert it to 8 or 16 bit grey")
 
 
-def _read_tiff(path: Path) -> tuple[NDArray[Any], float]:
+def _read_tiff(path: Path, channel: Channel) -> tuple[NDArray[Any], float]:
     import tifffile
 
     try:
@@ -81,14 +88,16 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], float]:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     full_scale = _full_scale(pixels.dtype, path)
     if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
-        pixels = _luma(pixels[:, :, 2::-1])
+        pixels = _grey(pixels[:, :, 2::-1], channel)
     return (np.iinfo(pixels.dtype).max - pixels if colour == "MINISWHITE" else pixels), full_scale
 
 
-def _luma(bgr: NDArray[Any]) -> NDArray[Any]:
+def _grey(bgr: NDArray[Any], channel: Channel) -> NDArray[Any]:
+    if channel != "luma":
+        return np.ascontiguousarray(bgr[:, :, _BGR.index(channel)])
     grey = np.zeros(bgr.shape[:2], dtype=np.float32)
-    for channel, weight in enumerate(_GREY):
-        grey += np.float32(weight) * bgr[:, :, channel]
+    for k, weight in enumerate(_GREY):
+        grey += np.float32(weight) * bgr[:, :, k]
     return grey if bgr.dtype.kind == "f" else np.rint(grey).astype(bgr.dtype)
 
 
@@ -114,10 +123,10 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
     raise ImageError("is no PNG, JPEG, TIFF or BMP image", where=path)
 
 
-def _read_coded(path: Path, magic: bytes) -> tuple[NDArray[Any], float]:
+def _read_coded(path: Path, magic: bytes, channel: Channel) -> tuple[NDArray[Any], float]:
     pixels = decoded(path, magic)
     full_scale = _full_scale(pixels.dtype, path)
-    return (_luma(pixels) if pixels.ndim == 3 else pixels), full_scale
+    return (_grey(pixels, channel) if pixels.ndim == 3 else pixels), full_scale
 
 
 def decoded(path: Path, magic: bytes) -> NDArray[Any]:

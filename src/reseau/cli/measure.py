@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,16 @@ if TYPE_CHECKING:
     from ..formats import ReseauMeasurement
 
 __all__ = ["app", "measurement_csv"]
+
+
+class Channel(StrEnum):
+    """What is taken of a colour image."""
+
+    LUMA = "luma"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
 
 app = typer.Typer(help="Measure image coordinates of a target.", no_args_is_help=True)
 
@@ -32,9 +43,10 @@ def reseau(
         float | None, typer.Option(help="Size of a mark (of a grid: width of its lines) in pixels.")
     ] = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the marks of a reseau."""
+    """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
     from ..formats import ReseauDesign
     from ..images import read_frame
     from ..refine import ReseauOptions, measure_reseau
@@ -45,7 +57,7 @@ def reseau(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = read_frame(image)
+        frame = read_frame(image, channel.value)
         options = ReseauOptions(mark_px=mark_px, row_jitter_px=row_jitter)
         with progress(f"measuring {image.name}", 1):
             result = required(measure_reseau(frame, target, options), image)

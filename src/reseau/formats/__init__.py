@@ -4,7 +4,7 @@ A document is a strict pydantic model: an unknown key is an error that names it,
 file appears whole or not at all.
 """
 
-from .design import DesignPoint, Mark, ReseauDesign
+from .design import DesignPoint, Mark, ReseauDesign, Rings
 from .document import Document, Strict, read_text, write_whole
 from .frame import (
     CORNERS,
@@ -35,6 +35,7 @@ __all__ = [
     "MeasuredPoint",
     "ReseauDesign",
     "ReseauMeasurement",
+    "Rings",
     "Strict",
     "TestfieldDesign",
     "read_text",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from ..data import Array
 from .document import Document, Strict
 
-__all__ = ["DesignPoint", "Mark", "ReseauDesign"]
+__all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
 
 
 class Mark(Strict):
@@ -31,8 +31,34 @@ class DesignPoint(Strict):
     nominal_px: tuple[float, float] | None = None
 
 
+class Rings(Strict):
+    """Coded rings around some of the disks of a sheet, which tell these from all others.
+
+    Parameters
+    ----------
+    inner, outer : float
+        Diameters of the rings in the unit of the design.
+    sectors : dict of str to tuple of (float, float)
+        For each coded point the parts of its ring that are of the marks' polarity: from one angle to another,
+        degrees from x towards y.
+    """
+
+    inner: float = Field(gt=0)
+    outer: float = Field(gt=0)
+    sectors: dict[str, tuple[tuple[float, float], ...]] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.inner < self.outer:
+            raise ValueError(f"rings reach from {self.inner} to {self.outer}")
+        for name, sectors in self.sectors.items():
+            if not all(start < end <= start + 360 for start, end in sectors):
+                raise ValueError(f"a sector of {name!r} does not go from an angle to a greater one")
+        return self
+
+
 class ReseauDesign(Document):
-    """``reseau-design/1``: a reseau, or the rods of a test object."""
+    """``reseau-design/1``: a reseau, a sheet of targets, or the rods of a test object."""
 
     SCHEMA: ClassVar[str] = "reseau-design/1"
     name: str
@@ -42,6 +68,7 @@ class ReseauDesign(Document):
     origin: str | None = None
     axis: str | None = None
     points: tuple[DesignPoint, ...]
+    rings: Rings | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -60,7 +87,23 @@ class ReseauDesign(Document):
                 raise ValueError(f"`{role}` names {named!r}, which is none of the points")
         if self.origin is not None and self.origin == self.axis:
             raise ValueError(f"`origin` and `axis` both name {self.origin!r}; they must differ")
+        if self.rings is not None:
+            self._check_rings(self.rings, names)
         return self
+
+    def _check_rings(self, rings: Rings, names: set[str]) -> None:
+        for name in rings.sectors:
+            if name not in names:
+                raise ValueError(f"`rings` names {name!r}, which is none of the points")
+        if self.mark.shape != "disk" or self.mark.size is None or self.mark.size >= rings.inner:
+            raise ValueError("`rings` stand around disks of a size that is less than theirs")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file; without coded rings there is no key for them."""
+        content = super().to_dict()
+        if self.rings is None:
+            del content["rings"]
+        return content
 
     @property
     def ids(self) -> tuple[str, ...]:

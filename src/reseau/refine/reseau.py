@@ -4,6 +4,7 @@ Screened frame → candidates by matched filter → the design laid over them �
 image, twice: first to learn what the marks of this frame look like (width of the point-spread function,
 contrast, size), then with that as prior knowledge → each mark judged by its own image and by its neighbours.
 A mark that is not there, or cannot be told from its surroundings, is reported as not found, with the reason.
+A sheet of disks with coded rings is laid over the frame by these; see :mod:`reseau.refine.sheet`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .matching import Matches
 from .measured import Measured
 from .placing import PlacingOptions, place
+from .sheet_marks import measure_sheet
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
@@ -99,7 +101,8 @@ def measure_reseau(
     Parameters
     ----------
     frame : Frame
-        A frame that shows the reseau, whole or in part, in front of any scene.
+        A frame that shows the reseau, whole or in part, in front of any scene. A sheet of disks with coded
+        rings may be turned and tilted as it likes.
     design : ReseauDesign
         The reseau, with or without nominal positions in the image.
     options : ReseauOptions, optional
@@ -123,8 +126,11 @@ def measure_reseau(
     if len(known) < 4:
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
     nominal = design.nominal_px[known]
-    grid = GridOptions(np.deg2rad(options.max_rotation_deg), options.mirrored)
     use_nominal = options.nominal and bool(np.isfinite(nominal).all())
+    if design.rings is not None and not use_nominal:
+        columns = measure_sheet(frame, design, options)
+        return columns if isinstance(columns, Failure) else ReseauResult(**columns)
+    grid = GridOptions(np.deg2rad(options.max_rotation_deg), options.mirrored)
     placed = place(
         frame,
         design,

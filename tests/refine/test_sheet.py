@@ -1,0 +1,106 @@
+"""Sheets of disks with coded rings, formed at any rotation and tilt, and in photographs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.data import Frame
+from reseau.errors import FormatError
+from reseau.formats import ReseauDesign
+from reseau.images import read_frame
+from reseau.refine import ReseauResult, measure_reseau
+
+from . import camcal, sheets
+
+
+def measured(formed: sheets.Formed, design: ReseauDesign | None = None) -> ReseauResult:
+    result = measure_reseau(formed.frame, design or sheets.DESIGN)
+    assert isinstance(result, ReseauResult), result.reason
+    return result
+
+
+@pytest.mark.parametrize(("roll", "tilt"), [(0.0, 0.0), (100.0, 30.0), (200.0, 45.0), (300.0, 45.0)])
+def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll: float, tilt: float) -> None:
+    formed = sheets.form(roll, tilt)
+    result = measured(formed)
+    error = result.xy - formed.truth
+    assert result.ok.all(), result.why
+    # The centre of its ellipse is up to 0.1 px off the image of a disk's centre here.
+    assert np.abs(error.mean(axis=0)).max() < 0.006
+    assert np.sqrt((error**2).mean()) < 0.02
+    # The covariances are from the residuals of 56 disks each.
+    assert 0.8 < np.sqrt((error**2).sum() / np.trace(result.cov, axis1=1, axis2=2).sum()) < 1.25
+
+
+def test_disks_beyond_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
+    formed = sheets.form(20.0, 30.0, shift=(330.0, 0.0))
+    result = measured(formed)
+    inside = ((formed.truth > 12) & (formed.truth < np.array([787, 587]))).all(axis=1)
+    assert 30 < inside.sum() < 50
+    assert result.ok[inside].all()
+    assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
+    assert all(result.why[k] for k in np.flatnonzero(~result.ok))
+
+
+def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
+    formed = sheets.form(10.0, 20.0)
+    x, y = np.rint(formed.truth[12]).astype(int)
+    formed.frame.pixels[y - 30 : y + 30, x : x + 60] = 190
+    result = measured(formed)
+    assert not result.ok[12]
+    assert result.why[12]
+    # Its neighbours are none the worse.
+    assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
+
+
+def test_a_sheet_whose_rings_are_hidden_has_no_numbers() -> None:
+    result = measure_reseau(sheets.form(10.0, 20.0, rings=False).frame, sheets.DESIGN)
+    assert not result
+    assert "no coded ring tells" in result.reason
+
+
+def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
+    formed = sheets.form(10.0, 20.0)
+    turned = Frame(np.ascontiguousarray(formed.frame.pixels[:, ::-1]), 255.0)
+    result = measure_reseau(turned, sheets.DESIGN)
+    assert not result
+    assert "mirrored" in result.reason
+
+
+def test_a_frame_without_a_sheet_is_a_failure_with_a_reason() -> None:
+    noise = np.random.default_rng(1).normal(128, 6, (600, 800)).clip(0, 255).astype(np.uint8)
+    result = measure_reseau(Frame(noise, 255.0), sheets.DESIGN)
+    assert not result
+    assert "is not to be found" in result.reason
+
+
+def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the_design() -> None:
+    design = sheets.DESIGN
+    assert ReseauDesign.parse(design.to_json(), where="file") == design
+    plain = design.model_copy(update={"rings": None})
+    assert "rings" not in plain.to_dict()
+    content = design.to_dict()
+    content["rings"]["sectors"]["no such disk"] = [[0.0, 90.0]]
+    with pytest.raises(FormatError, match="none of the points"):
+        ReseauDesign.parse(json.dumps(content), where="file")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 7, 10, 18])
+def test_in_photographs_every_disk_that_another_program_found_is_measured_and_numbered_alike(
+    reference_data: Callable[[str], Path], number: int
+) -> None:
+    folder = reference_data("testfield_camcal")
+    design, theirs = camcal.design(folder), camcal.marks(folder)[number - 1]
+    result = measure_reseau(read_frame(camcal.photographs(folder)[number - 1], "green"), design)
+    assert isinstance(result, ReseauResult)
+    rows = [design.ids.index(name) for name in theirs]
+    assert result.ok[rows].all()
+    difference = result.xy[rows] - np.array(list(theirs.values())) + 0.5
+    # A wrong number would be 60 px off at least; theirs are centres of ellipses, in all colours.
+    assert np.abs(difference).max() < 0.6
