@@ -1,0 +1,146 @@
+"""The bench: read strictly, connected at once, every failure in one tree; simulated on real protocols."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reseau.capture import Bench, BenchFile, found_instruments, plugin
+from reseau.cli import run
+from reseau.errors import BenchError, ConnectionLost, FormatError, InputError, UsageError
+from reseau.instruments import Oscilloscope, Turntable, UltrasonicScanner
+from reseau_sims.serving import Fault, SimulatedBench
+
+HEAD = 'schema = "reseau-bench/1"\n'
+TABLE = '[instruments.table]\ndriver = "zaber"\naddress = "tcp://127.0.0.1:1"\n'
+AXES = "[instruments.table.options.axes.tilt]\nper_unit = 1000.0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "schema"),
+        ("x = ", "no TOML"),
+        (HEAD, "instruments"),
+        (HEAD + TABLE + "colour = 3\n", "unknown key"),
+        (HEAD + "[instruments.table]\ndriver = 'zaber'\n", "address"),
+    ],
+)
+def test_a_file_that_is_no_bench_is_refused_by_key(text: str, said: str) -> None:
+    with pytest.raises(FormatError, match=said):
+        BenchFile.parse_toml(text, where="bench.toml")
+
+
+def test_what_cannot_be_built_is_named_all_at_once() -> None:
+    text = (
+        HEAD
+        + TABLE
+        + '[instruments.a]\ndriver = "nothing"\naddress = "x"\n'
+        + '[instruments.b]\ndriver = "ping360"\naddress = "tcp://127.0.0.1:1"\nsettings = {gain = 9}\n'
+        + '[instruments.c]\ndriver = "ping360"\naddress = "tcp://127.0.0.1:1"\noptions = {colour = 9}\n'
+        + '[instruments.d]\ndriver = "ping360"\naddress = "tcp://x"\nlimits = {gain = [0, 1]}\n'
+    )
+    with pytest.raises(BenchError) as caught:
+        Bench(BenchFile.parse_toml(text, where="bench.toml"))
+    assert len(caught.value.failures) == 5
+    for said in ("nothing", "gain", "colour", "tcp://x", "table"):
+        assert said in str(caught.value)
+
+
+def test_a_bench_that_does_not_answer_fails_as_one_in_time() -> None:
+    text = HEAD + TABLE + AXES + '[instruments.sonar]\ndriver = "ping360"\naddress = "tcp://127.0.0.1:1"\n'
+    bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
+    began = time.monotonic()
+    with pytest.raises(BenchError) as caught:
+        bench.connect(2.0)
+    assert time.monotonic() - began < 3.0
+    assert [type(each) for each in caught.value.failures] == [ConnectionLost, ConnectionLost]
+    with pytest.raises(UsageError, match="not on this bench"):
+        bench["camera"]
+
+
+def test_limits_of_the_bench_are_kept() -> None:
+    text = HEAD + TABLE + "limits = {speed = [1.0, 20.0]}\n" + AXES
+    bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
+    with pytest.raises(UsageError, match="1…20"):
+        bench["table"].configure(speed=50.0)
+    bench.close()
+
+
+def test_the_simulated_bench_works_over_its_real_protocols() -> None:
+    with SimulatedBench(seed=2) as simulated:
+        with Bench(BenchFile.parse_toml(simulated.toml, where="simulated")) as bench:
+            table, scanner, scope = bench["table"], bench["scanner"], bench["oscilloscope"]
+            assert isinstance(table, Turntable)
+            assert isinstance(scanner, UltrasonicScanner)
+            assert isinstance(scope, Oscilloscope)
+            table.configure(speed=300.0)
+            table.home("tilt", 20.0)
+            table.move("tilt", 30.0, 20.0)
+            assert simulated.laboratory.axes["tilt"] == pytest.approx(30.0, abs=1e-3)
+            scanner.configure(half_sector=5)
+            scanner.scan(20.0)
+            assert simulated.laboratory.swept.sum() == 11
+            shown = scope.screen(20.0).frame().pixels
+            assert (shown == simulated.laboratory.picture(800, 480)).all()
+            bench.stop()
+        assert simulated.violations == {"table": [], "scanner": [], "oscilloscope": []}
+
+
+def test_check_tells_every_failure_and_its_exit_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bench.toml"
+    with SimulatedBench() as simulated:
+        path.write_text(simulated.toml)
+        assert run(["bench", "check", "--bench", str(path), "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert document["failed"] == 0
+        assert [each["name"] for each in document["instruments"]] == ["table", "scanner", "oscilloscope"]
+        for script in simulated.scripts.values():
+            for number in range(40):
+                script.fault_at(script.count + number, Fault("dropped"))
+        assert run(["bench", "check", "--bench", str(path), "--seconds", "0.5"]) == 1
+        said = capsys.readouterr().out
+    assert said.count("failed") == 3
+    assert "did not answer" in said
+    assert "└── oscilloscope" in said
+    assert run(["bench", "check", "--bench", str(tmp_path / "none.toml")]) == 2
+    with pytest.raises(InputError):
+        Bench.read(tmp_path / "none.toml")
+
+
+def test_sim_writes_a_bench_that_check_accepts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bench.toml"
+    assert run(["bench", "sim", "--out", str(path), "--seconds", "0.01"]) == 0
+    assert set(BenchFile.read(path).instruments) == {"table", "scanner", "oscilloscope"}
+    assert run(["bench", "sim", "--seconds", "0.01"]) == 0
+    assert "reseau-bench/1" in capsys.readouterr().out
+
+
+def test_list_tells_what_was_found_and_why_a_search_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # No real search: it would broadcast.
+    def searched(group: str, name: str) -> Any:
+        if name == "visa":
+            raise ConnectionLost("VISA cannot search")
+        return lambda: ("/dev/ttyUSB0",)
+
+    monkeypatch.setattr("reseau.capture.bench.plugin", searched)
+    assert found_instruments()["serial"] == ("/dev/ttyUSB0",)
+    assert run(["bench", "list"]) == 0
+    assert "visa: VISA cannot search" in capsys.readouterr().out
+    assert run(["bench", "list", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["found"] == {"serial": ["/dev/ttyUSB0"], "visa": []}
+    assert "zaber" in document["drivers"]
+
+
+def test_plugins_that_are_not_there_are_said() -> None:
+    with pytest.raises(UsageError, match="there are"):
+        plugin("reseau.instruments", "none")
