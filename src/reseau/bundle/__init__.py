@@ -9,6 +9,7 @@ from .document import to_document
 from .fields import FieldDifference, ProjectionField, calibration_difference, projection_field
 from .lens import Lens
 from .network import Additional, Camera, Network
+from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .problem import BundleFit, BundleProblem
 from .result import Result
 
@@ -18,6 +19,7 @@ __all__ = [
     "BundleFit",
     "BundleProblem",
     "Camera",
+    "CommonPattern",
     "FieldDifference",
     "Lens",
     "Network",
@@ -26,8 +28,11 @@ __all__ = [
     "Result",
     "adjust_network",
     "approximate",
+    "by_place",
+    "by_point",
     "calibration_difference",
     "calibration_of",
+    "common_pattern",
     "problem_of",
     "projection_field",
     "to_document",

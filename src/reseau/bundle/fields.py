@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.special
 
-from ..data import Array, Mask
+from ..data import Array
 from ..errors import UsageError
 from ..optics.poses import rotation_matrix
 from .lens import Lens
+from .network import finite
 
 __all__ = ["FieldDifference", "ProjectionField", "calibration_difference", "projection_field"]
 
@@ -148,7 +149,7 @@ def calibration_difference(
         )
     xy, shape = _places(first, across, down)
     uv = first.mapping.inverse(xy)
-    known: Mask = np.isfinite(uv).all(axis=1) & np.isfinite(second.mapping(uv)).all(axis=1)
+    known = finite(uv) & finite(second.mapping(uv))
     if known.sum() < 2:
         raise UsageError("image no ray in common", where="calibrations")
     uv, turn = uv[known], np.eye(3)

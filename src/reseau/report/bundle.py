@@ -19,6 +19,7 @@ from ..data import Array, Rows
 from ..provenance import Provenance
 from .fields import difference_figure, uncertainty_figure
 from .figures import nice
+from .patterns import patterns_of
 from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 
 __all__ = ["bundle_report"]
@@ -67,6 +68,7 @@ def bundle_report(
         more_cameras=max(0, sum(camera["shown"] for camera in cameras) - 20),
         images=_images(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
+        patterns=patterns_of(result),
         differences=[_difference(name, found) for name, found in (against or {}).items()],
         left_out=list(zip(*result.rejected_names(), strict=True))[:_IMAGES],
         unit=result.network.unit,

@@ -1,0 +1,93 @@
+"""Residual patterns that images have in common: found where there are any, and only there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.bundle import Network, Result, by_place, by_point, common_pattern
+from reseau.errors import UsageError
+
+from . import networks
+from .test_testfield import adjusted, paper
+
+
+def kinds(network: Network) -> list[str | None]:
+    """Images of the same turn of the board and of the camera: pairs, of two tilts."""
+    return [name.partition("-")[2] for name in network.images]
+
+
+def with_pattern(network: Network, size_px: float) -> Network:
+    """The network with errors that the images of a kind have in common, point by point."""
+    rng = np.random.default_rng(77)
+    names = sorted(set(kinds(network)), key=str)
+    pattern = rng.normal(0, size_px, (len(names), len(network.points), 2))
+    of = np.array([names.index(kind) for kind in kinds(network)])[network.image_of]
+    return replace(network, xy=network.xy + pattern[of, network.point_of])
+
+
+def test_noise_has_nothing_in_common() -> None:
+    """The test keeps its level: of thirty small networks with a level of 5 % not more than six fail it."""
+    world = networks.world(points=30, images=8)
+    p = []
+    for seed in range(30):
+        fit = world.problem(world.noisy(seed)).adjusted().required()
+        result = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool))
+        p.append(common_pattern(result, by_point(result, ["a", "b"] * 4)).p)
+    assert (np.array(p) < 0.05).sum() <= 6
+    assert 0.3 < np.mean(p) < 0.7
+
+
+def test_a_pattern_of_pairs_of_images_is_found_and_measured() -> None:
+    """0.02 px in common beside 0.04 px of noise: what is found of it is 0.02 px, and sigma0 is one again."""
+    network = with_pattern(paper(seed=4), 0.02)
+    result = adjusted(network)
+    found = common_pattern(result, by_point(result, kinds(network)))
+    assert result.sigma0 > 1.06
+    assert found.p < 1e-4
+    assert found.count.tolist() == [2] * (16 * 32)
+    assert found.rms == pytest.approx(0.02, abs=0.003)
+    assert found.sigma0 == pytest.approx(1.0, abs=0.06)
+
+
+def test_the_statistic_is_that_of_an_adjustment_with_the_shifts_as_parameters() -> None:
+    """Shifts of one class, estimated by correcting its observations for them, lower vᵀPv by T."""
+    world = networks.world(points=30, images=8, control=8)
+    network = world.noisy(3)
+    fit = world.problem(network).adjusted().required()
+    result = Result(network, fit, np.zeros(len(network.xy), dtype=bool))
+    key = np.where((network.point_of == 12) & (network.image_of < 4), 0, -1)
+    found = common_pattern(result, key)
+    assert found.degrees[0] == 2
+    explained = fit.cost - found.sigma0**2 * found.degrees[1]
+
+    def cost(shift: np.ndarray) -> float:
+        moved = replace(network, xy=network.xy - np.where(key[:, None] == 0, shift, 0.0))
+        return world.problem(moved).adjusted().required().cost
+
+    # A quadratic function of the two shifts, from six values of it.
+    h = 0.02
+    points = [(0, 0), (h, 0), (0, h), (-h, 0), (0, -h), (h, h)]
+    design = np.array([[1, x, y, x * x, x * y, y * y] for x, y in points])
+    c0, cx, cy, cxx, cxy, cyy = np.linalg.solve(design, [cost(np.array(at)) for at in points])
+    hessian = np.array([[2 * cxx, cxy], [cxy, 2 * cyy]])
+    least = c0 - 0.5 * np.array([cx, cy]) @ np.linalg.solve(hessian, [cx, cy])
+    assert c0 - least == pytest.approx(explained, rel=0.01)
+
+
+def test_a_pattern_of_the_frame_is_found_by_place() -> None:
+    network = paper()
+    offset = 0.03 * np.sign(np.sin(network.xy / 20.0))
+    result = adjusted(replace(network, xy=network.xy + offset))
+    found = common_pattern(result, by_place(result, 0, 16))
+    assert found.p < 1e-4
+    clean = adjusted(network)
+    assert common_pattern(clean, by_place(clean, 0, 16)).p > 0.001
+
+
+def test_classes_of_single_points_are_no_classes() -> None:
+    result = adjusted(paper())
+    with pytest.raises(UsageError, match="no two image points"):
+        common_pattern(result, np.arange(len(result.network.xy)))
