@@ -11,12 +11,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pytest
 
 from reseau.instruments import Device
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
-from reseau_drivers.scanner import Ping360, Ping360Settings
+from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Settings
 from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
 from reseau_sims import serving
 from reseau_sims.serving import (
@@ -159,11 +160,46 @@ def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.screen, server)
 
 
+def bk_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = serving.BkScanner(announces_wrongly=transport == "in process")
+    address, server = _wired(stack, transport, machine, script)
+    device = BkScanner("bk", link_to(address), seconds=0.5)
+    picture = machine.section()
+
+    def work(run: int) -> None:
+        shown = np.roll(picture, run, axis=0)
+        machine.section = lambda: shown
+        scan = device.scan()
+        assert (scan.pixels == shown).all()
+        assert scan.mm_per_px == pytest.approx((0.2, 0.25))
+        assert scan.origin_px == (39.5, 0.0)
+
+    return Rig(device, machine, script, work, device.scan, server)
+
+
+def pulser_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    machine = serving.CompactPulser()
+    address, server = _wired(stack, transport, machine, script)
+    device = CompactPulser("pulser", link_to(address), seconds=1.2, answer_s=0.15)
+
+    def work(run: int) -> None:
+        width = 20.0 + run % 900
+        device.configure(width_ns=width, repetition_hz=100.0)
+        if (machine.values["W"], machine.values["P"]) != (width, 10):
+            # Its power went off behind the last answer: that is found by asking, and said.
+            device.verify()
+            raise AssertionError(machine.values)
+
+    return Rig(device, machine, script, work, device.stop, server)
+
+
 Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
     **{("ping360", transport): ping360_rig for transport in TRANSPORTS},
+    **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
+    **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},
     **{("oscilloscope", transport): scope_rig for transport in ("tcp", "vxi-11", "hislip", "in process")},
 }
 

@@ -134,7 +134,7 @@ class FrameDecoder:
             start = len(self._begun) - (self._begun[-1:] == b"B")
         if start > 0:
             if not found or not isinstance(found[-1], Damaged):
-                found.append(Damaged(bytes(self._begun[:60]), f"{start} bytes between frames"))
+                found.append(Damaged(bytes(self._begun[: min(start, 60)]), f"{start} bytes between frames"))
             del self._begun[:start]
 
     def _give_up(self, found: list[Frame | Damaged], why: str) -> None:

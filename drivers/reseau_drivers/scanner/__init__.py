@@ -5,9 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 from ..link import Link, link_to
+from .bk import BkScanner, BkSettings
+from .compactpulser import CompactPulser, CompactPulserSettings
 from .ping360 import Ping360, Ping360Settings
 
-__all__ = ["Ping360", "Ping360Settings", "ping360"]
+__all__ = [
+    "BkScanner",
+    "BkSettings",
+    "CompactPulser",
+    "CompactPulserSettings",
+    "Ping360",
+    "Ping360Settings",
+    "bk_oem",
+    "compact_pulser",
+    "ping360",
+]
 
 
 def ping360(
@@ -27,3 +39,42 @@ def ping360(
         Of :class:`Ping360`.
     """
     return Ping360(name, link_to(address), Ping360Settings().changed(settings or {}), **options)
+
+
+def bk_oem(
+    name: str, address: str | Link, *, settings: dict[str, Any] | None = None, **options: Any
+) -> BkScanner:
+    """A BK scanner; found by its entry point ``bk``.
+
+    Parameters
+    ----------
+    name : str
+        On the bench.
+    address : str or Link
+        ``tcp://host:7915``.
+    settings : dict, optional
+        Of :class:`BkSettings`.
+    **options
+        Of :class:`BkScanner`.
+    """
+    return BkScanner(name, link_to(address), BkSettings().changed(settings or {}), **options)
+
+
+def compact_pulser(
+    name: str, address: str | Link, *, settings: dict[str, Any] | None = None, **options: Any
+) -> CompactPulser:
+    """A CompactPulser; found by its entry point ``compactpulser``.
+
+    Parameters
+    ----------
+    name : str
+        On the bench.
+    address : str or Link
+        Serial device, 9600 baud.
+    settings : dict, optional
+        Of :class:`CompactPulserSettings`.
+    **options
+        Of :class:`CompactPulser`.
+    """
+    checked = CompactPulserSettings().changed(settings or {})
+    return CompactPulser(name, link_to(address, baud=9600), checked, **options)

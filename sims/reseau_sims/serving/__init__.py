@@ -6,6 +6,8 @@ within the process, carries it to a client. All of them listen on the loopback i
 """
 
 from .bench import SimulatedBench
+from .bk import BkScanner
+from .compactpulser import CompactPulser
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -21,6 +23,8 @@ __all__ = [
     "FAMILIES",
     "KINDS",
     "LINE_KINDS",
+    "BkScanner",
+    "CompactPulser",
     "Family",
     "Fault",
     "HislipInstrument",

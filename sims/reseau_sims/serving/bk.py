@@ -1,0 +1,105 @@
+"""A BK scanner's OEM interface: its windows in pixels and metres, and grabbed frames.
+
+Source: *BK Ultrasound OEM Interface*, "QUERY" and "GRAB_FRAME".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reseau_drivers.codecs import bk
+from reseau_drivers.codecs.stream import Damaged
+
+from .machine import Machine
+from .script import Kind
+
+__all__ = ["BkScanner"]
+
+
+def _grey() -> NDArray[np.uint8]:
+    """A picture with every byte that has to be escaped, for want of a world."""
+    return np.add.outer(np.arange(60), np.arange(80)).astype(np.uint8)
+
+
+class BkScanner(Machine):
+    """The scanner.
+
+    Parameters
+    ----------
+    section : callable
+        The grey picture that it shows.
+    mm_per_px : (float, float)
+        Of it, along x and down.
+    announces_wrongly : bool
+        Whether the length before a frame is wrong, as on a BK5000.
+    """
+
+    def __init__(
+        self,
+        section: Callable[[], NDArray[np.uint8]] = _grey,
+        mm_per_px: tuple[float, float] = (0.2, 0.25),
+        *,
+        announces_wrongly: bool = False,
+    ) -> None:
+        super().__init__()
+        self.section, self._mm, self._wrong = section, mm_per_px, announces_wrongly
+        self._messages = bk.MessageDecoder(4096)
+        self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
+
+    def receive(self, data: bytes) -> Sequence[bytes]:
+        """Messages in answer."""
+        answers: list[bytes] = []
+        for message in self._messages.feed(data):
+            if isinstance(message, Damaged):
+                self.violations.append(str(message))
+                continue
+            content = self._answer(message)
+            if self._mute:
+                self._mute -= 1
+            else:
+                answers.append(bk.encode(content))
+        return answers
+
+    def hung_up(self) -> None:
+        """A message that was begun is forgotten."""
+        self._messages.reset()
+
+    def afflict(self, kind: Kind) -> None:
+        """Stuck: one answer stays out; wrong state: an error; out of range: too few rows."""
+        if kind == "stuck":
+            self._mute = 1
+        self._refuse = self._refuse or kind == "wrong state"
+        self._odd = self._odd or kind == "out of range"
+        if kind == "power-cycled":
+            self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
+
+    def _answer(self, message: bytes) -> bytes:
+        if self._refuse:
+            self._refuse = False
+            return b'ERROR "not ready";'
+        height, width = self.section().shape
+        match message:
+            case b"QUERY:US_WIN_SIZE;":
+                return f"DATA:US_WIN_SIZE {width},{height};".encode()
+            case b"QUERY:B_GEOMETRY_PIXEL:A;":
+                return f"DATA:B_GEOMETRY_PIXEL:A 0,0,{width},{height};".encode()
+            case b"QUERY:B_GEOMETRY_TISSUE:A;":
+                right, down = width * self._mm[0] / 1000, height * self._mm[1] / 1000
+                return f"DATA:B_GEOMETRY_TISSUE:A {-right / 2:g},0,{right / 2:g},{down:g};".encode()
+            case b'QUERY:GRAB_FRAME "ON",20;':
+                return self._frame()
+            case b'QUERY:GRAB_FRAME "OFF",20;':
+                return b"ACK;"
+        self.violations.append(f"unknown message {message!r}")
+        return b'ERROR "unknown";'
+
+    def _frame(self) -> bytes:
+        self._stamp += 50
+        pixels = self.section().tobytes()
+        if self._odd:
+            self._odd, pixels = False, pixels[: len(pixels) // 2]
+        announced = 7 if self._wrong else len(pixels) + 4
+        return bk.encode_frame(bk.GrabbedFrame(self._stamp, pixels, announced))

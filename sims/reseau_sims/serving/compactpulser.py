@@ -1,0 +1,67 @@
+"""A CompactPulser: settings by single letters, no answers but to questions.
+
+Source: *CompactPulser Instruction Manual*, the table of its serial commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from reseau.errors import ProtocolError
+from reseau_drivers.codecs.compactpulser import LETTERS, LIMIT, Setting, decode, encode_answer
+from reseau_drivers.codecs.stream import Damaged, LineDecoder
+
+from .machine import Machine
+from .script import Kind
+
+__all__ = ["CompactPulser"]
+
+_START = {"P": 0.0, "W": 100.0, "V": 300.0, "D": 1.0, "M": 0.0, "T": 0.0, "G": 0.0}
+
+
+class CompactPulser(Machine):
+    """The pulser; its values by letter are in `values`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines = LineDecoder(end=b"\r", limit=LIMIT)
+        self.values = dict(_START)
+        self._deaf, self._mute, self._odd = False, 0, False
+
+    def receive(self, data: bytes) -> Sequence[bytes]:
+        """Answers to questions."""
+        answers: list[bytes] = []
+        for line in self._lines.feed(data):
+            try:
+                if isinstance(line, Damaged):
+                    raise ProtocolError(str(line))
+                setting, is_answer = decode(line)
+                if is_answer:
+                    raise ProtocolError(f"an answer to nothing: {line!r}")
+            except ProtocolError as error:
+                self.violations.append(error.what)
+                continue
+            if setting.value is not None:
+                if not self._deaf:
+                    self.values[setting.letter] = setting.value
+                self._deaf = False
+            elif self._mute:
+                self._mute -= 1
+            else:
+                value = self.values[setting.letter] + (1000.0 if self._odd else 0.0)
+                self._odd = False
+                answers.append(encode_answer(Setting(setting.letter, value)))
+        return answers
+
+    def hung_up(self) -> None:
+        """A command that was begun is forgotten."""
+        self._lines.reset()
+
+    def afflict(self, kind: Kind) -> None:
+        """Stuck: one answer stays out; wrong state: one command is not taken; out of range: a wrong value."""
+        if kind == "stuck":
+            self._mute = 1
+        self._deaf = self._deaf or kind == "wrong state"
+        self._odd = self._odd or kind == "out of range"
+        if kind == "power-cycled":
+            self.values = {letter: _START[letter] for letter in LETTERS}
