@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
@@ -234,7 +235,7 @@ class Conversation(Generic[M]):
 
     def __init__(self, link: Link, decoder: Decoder[M]) -> None:
         self._link, self._decoder = link, decoder
-        self._heard: list[M | Damaged] = []
+        self._heard: deque[M | Damaged] = deque()
         self.ignored = 0
 
     def open(self, deadline: Deadline) -> None:
@@ -276,7 +277,7 @@ class Conversation(Generic[M]):
         damaged: Damaged | None = None
         while True:
             while self._heard:
-                message = self._heard.pop(0)
+                message = self._heard.popleft()
                 if isinstance(message, Damaged):
                     damaged = message
                 elif is_answer(message):
