@@ -1,8 +1,8 @@
 """The method of Cruz, Cardenal and Delgado as their paper says it (sect. 2.2): the baseline of `frames.py`.
 
 Search areas are given, as their user extracts them; each is turned so that its edge is an upper one. The
-template of Prewitt, the threshold of 80, the line with the most white pixels within a tilt of 1°, a window of 30 pixels
-around it, profiles, the three largest gradients of each, a regression line without what is beyond 3σ.
+template of Prewitt, the threshold of 80, the line with the most white pixels within a tilt of 1°, a window of
+30 pixels around it, profiles, the three largest gradients of each, a regression line without what is beyond 3σ.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -13,8 +12,9 @@ from ..adjust import Failure
 from ..data import Array
 from ..formats import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ..scans import Scan
-from .frame_edges import Band, EdgeProfiles, measure_profiles, merged, read_band
-from .frame_lines import EdgeData, FrameShape, Lines, adjust_lines, derived, robust_line, shared_error
+from .frame_channel import FAR, Channel, channels_by_contrast, measure_channel
+from .frame_edges import Band, read_band
+from .frame_lines import FrameShape, Lines, adjust_lines, derived
 from .frame_outline import FrameGuess
 from .frame_search import search_frames
 
@@ -31,14 +31,8 @@ _REACH = 4.0
 """Pixels of the overview by which an approximate edge may be off."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
 """Width of film that is looked at beyond an edge, and that which parts the frame from anything else."""
-_NEIGHBOURHOOD_PX = 0.05
-"""What unevenness of the gate and the picture's own forms add to a profile's standard deviation at least."""
-_TONE = 0.15
-"""Standard deviation of the tone of film along an edge, over that of the noise of a pixel."""
 _MOST_SIGMA_PX = 0.33
 """Standard deviation of a corner's coordinate from which on a frame is not called oriented."""
-_MOST_GOOD = 0.85
-"""Part of an edge's profiles that show a step, from which no wide ones are needed."""
 _MOST_W = 4.0
 """Test value from which on the shape of a frame contradicts its format."""
 
@@ -229,38 +223,31 @@ def _rank(found: list[FrameGuess]) -> float:
     return found[0].score + (2.0 if all(found[0].supported) else 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Channel:
-    """One channel measured: of each edge the profiles kept, how many were not, why it was not found."""
-
-    name: str
-    data: list[EdgeData | None]
-    rejected: list[int]
-    why: list[str]
-
-
 def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions) -> FrameResult:
     """Measure the edges of one frame in all channels, adjust, and keep the best."""
     corners = (guess.corners + 0.5) * reduction - 0.5
     side = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
     scale = float((side[0] + side[2]) / (2 * guess.format_mm[0]))
     reach = max(_REACH * reduction, 6.0)
-    beside = reach + _FILM_MM * scale
 
     @cache
-    def band(k: int, wide: bool) -> Band | None:
+    def band(k: int, wide: bool, far: bool = False) -> Band | None:
         ends = corners[k], corners[(k + 1) % 4]
+        beside = (FAR * reach if far else reach) + _FILM_MM * scale
         return read_band(scan, *ends, beside, beside + 8, wide=wide) if guess.supported[k] else None
 
     shape = options.shape
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
     best: FrameResult | None = None
-    for c, name in enumerate(scan.channels):
-        measured = _channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
+    for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
+        name = scan.channels[c]
+        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
         result = _judged(scan, guess, measured, corners, shape)
         if best is None or _quality(result) > _quality(best):
             best = result
+        if best.status == "oriented":  # the others show the same edges with less contrast
+            break
     assert best is not None
     return best
 
@@ -270,65 +257,8 @@ def _quality(result: FrameResult) -> tuple[int, float]:
     return order, 0.0 if result.lines is None else -float(np.trace(result.lines.covariance))
 
 
-def _channel(
-    name: str,
-    band: Callable[[int, bool], Band | None],
-    channel: int,
-    polarity: int,
-    reach: float,
-    gap: float,
-) -> _Channel:
-    """Profiles of the four edges in one channel, each edge's own line, and what agrees with it."""
-
-    def measured(k: int, wide: bool, width: float | None = None) -> EdgeProfiles | None:
-        pixels = band(k, wide)
-        return None if pixels is None else measure_profiles(pixels, channel, polarity, reach, gap, width)
-
-    profiles = [measured(k, False) for k in range(4)]
-    widths = [p.width for p in profiles if p is not None and p.good.sum() > 20]
-    if widths:
-        # The spread of film and scanner is one for all edges.
-        width = float(np.median(widths))
-        for k, found in enumerate(profiles):
-            if found is not None and abs(np.log(found.width / width)) > 0.12:
-                found = measured(k, False, width) or found
-            if found is not None and found.good.mean() < _MOST_GOOD:
-                more = measured(k, True, width)
-                found = found if more is None else merged(found, more)
-            profiles[k] = found
-    edges = [_edge(band(k, False), found) for k, found in enumerate(profiles)]
-    data, rejected, why = (list(column) for column in zip(*edges, strict=True))
-    return _Channel(name, data, rejected, why)
-
-
-def _edge(band: Band | None, found: EdgeProfiles | None) -> tuple[EdgeData | None, int, str]:
-    """The profiles of an edge that agree with its line; or why it is not found."""
-    if band is None:
-        return None, 0, "is not in the scan, or nothing parts it from the picture"
-    if found is None:
-        return None, 0, "no contrast between film and picture"
-    place, offset, sigma = (part[found.good] for part in (found.place, found.offset, found.sigma))
-    line = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
-    rejected = int((~found.good).sum())
-    if line is None:
-        return None, rejected, f"only {len(place)} of {len(found.place)} profiles show a step"
-    (start, stop, bow), agree = line
-    if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < 0.45:
-        return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
-    if found.clean < 0.6:
-        return None, rejected, "there is no unexposed film beyond it; do frames overlap?"
-    residuals = (offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2))[agree]
-    total = np.hypot(sigma[agree], _NEIGHBOURHOOD_PX)
-    scale = shared_error(place[agree], residuals, total)
-    along = (band.stop - band.start) * ((place[agree] + 1) / 2)[:, None]
-    xy = band.start + along + offset[agree][:, None] * band.normal
-    # An error of the film's tone moves a step by √(2π) of its width for each part of the contrast.
-    common = np.sqrt(2 * np.pi) * found.width * _TONE / found.contrast
-    return EdgeData(xy, total * scale, float(common)), rejected + int((~agree).sum()), ""
-
-
 def _judged(
-    scan: Scan, guess: FrameGuess, measured: _Channel, corners: Array, shape: FrameShape
+    scan: Scan, guess: FrameGuess, measured: Channel, corners: Array, shape: FrameShape
 ) -> FrameResult:
     """Adjust the edges that were found; what contradicts the format is declined."""
     missing = [EDGES[k] for k in range(4) if measured.data[k] is None]
@@ -360,7 +290,7 @@ def _judged(
     return replace(base, status="oriented")
 
 
-def _reports(measured: _Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
+def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
     reports = {}
     for k, name in enumerate(EDGES):
         found = measured.data[k] is not None

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter
 from scipy.special import ndtr
 
 from ..adjust import BatchOptions, adjust_batch, weight_function
@@ -34,14 +34,13 @@ _ENDS = 0.03
 _BINS = 72
 """Places across at which the search for the border looks, at most."""
 _ALONG = 24
-"""Columns over which tones are averaged before they are compared with film."""
+"""Columns over which tones are smoothed before they are compared with film."""
 _SHIFTS, _CHANGE = (3.0,), 0.15
 """Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
 contrast, one sigma."""
 _ROBUST = weight_function("danish", 2.5)
-_SIGNIFICANT = 4.0
-_LEAST_CONTRAST = 0.04
-"""Of the contrast of the picture along its edge: what differs from film by less is film."""
+_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.04
+"""In noise, and of the contrast along the edge: what differs from film by less is film."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,16 +233,19 @@ def _border(grey: Array, band: Band, reach: float, gap: float) -> _Border | None
     tones = _binned(grey, band.distance, low, size, count)
     known = np.isfinite(tones)
     beyond = low + (np.arange(count) + 0.5) * size
-    outer = known & (beyond < -0.5 * reach)
+    outer = known & (beyond < -0.4 * reach)
     if outer.sum() < 3 * len(tones) or known.mean() < 0.5:
         return None
     # A median of a profile, and along the edge of these: dust, print and scratches do not move it.
     own = _row_median(np.where(outer, tones, np.nan))
-    level = median_filter(np.where(np.isfinite(own), own, np.nanmedian(own)), size=51, mode="nearest")
+    level = median_filter(np.where(np.isfinite(own), own, np.nanmedian(own)), size=101, mode="nearest")
     rest = np.where(known, tones - level[:, None], 0.0)
     over = max(1, round(_ALONG / band.columns))
-    smooth = uniform_filter1d(rest, over, axis=0, mode="nearest")
-    noise = 1.4826 * float(np.median(np.abs(smooth[outer])))
+    # Medians: a scratch that crosses the edge is a few columns wide.
+    smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
+    # Within each profile: perforations and the scanner's light change from profile to profile.
+    own = _row_median(np.where(outer, smooth, np.nan))
+    noise = 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
     inner = smooth[:, beyond > 0]
     contrast = float(np.quantile(inner, 0.85))
     least = max(_SIGNIFICANT * noise, _LEAST_CONTRAST * contrast, 1e-9)
@@ -315,14 +317,13 @@ def _fitted(
             value,
             weights=weight / border.noise**2,
             prior=(initial, prior),
-            options=BatchOptions(max_iterations=15, share=0.02, reweight=_ROBUST),
+            options=BatchOptions(max_iterations=7, share=0.05, reweight=_ROBUST),
         )
         p, step, w = fit.estimates[:, 0], fit.estimates[:, 3], np.exp(fit.estimates[:, 2])
         scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
         own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
         told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
-        # By their neighbours': a profile that by chance has a higher step lies further in as well, and would
-        # get a higher weight for it.
+        # By neighbours: a profile with a step too high by chance lies too far in, and would weigh more.
         sigma = _along(np.where(told, own, np.inf))
         ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
         good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
