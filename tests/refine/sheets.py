@@ -12,7 +12,7 @@ from reseau.formats import Mark, ReseauDesign, Rings
 from reseau.optics import RationalPolynomial
 from reseau.optics.formation import Outline, draw
 
-__all__ = ["DESIGN", "Formed", "form", "view"]
+__all__ = ["DESIGN", "Camera", "Formed", "exposed", "form"]
 
 _PITCH, _SIZE = 10.0, 2.6
 _SECTORS: dict[str, tuple[tuple[float, float], ...]] = {
@@ -22,6 +22,7 @@ _SECTORS: dict[str, tuple[tuple[float, float], ...]] = {
 }
 _BARREL = -0.03
 """Distortion at the edge of the frame, as a share of the distance from the middle."""
+_SHAPE = (600, 800)
 
 DESIGN: ReseauDesign = regular_reseau(8, 7, _PITCH, Mark(shape="disk", size=_SIZE), name="sheet").model_copy(
     update={"rings": Rings(inner=5.2, outer=9.0, sectors=_SECTORS)}
@@ -36,52 +37,66 @@ class Formed:
     truth: Array
 
 
-def view(roll: float, tilt: float, shift: tuple[float, float], size: tuple[int, int]) -> RationalPolynomial:
-    """The projectivity of a camera 13 cm above the sheet and 55° wide, turned and tilted by degrees."""
-    k, t = np.deg2rad([roll, tilt])
-    turn = np.array([[np.cos(k), -np.sin(k), 0], [np.sin(k), np.cos(k), 0], [0, 0, 1]])
-    lean = np.array([[1, 0, 0], [0, np.cos(t), -np.sin(t)], [0, np.sin(t), np.cos(t)]])
-    rotation = lean @ turn @ np.diag([1.0, -1.0, -1.0])
-    focal = 0.95 * size[0]
-    camera = np.array([[focal, 0, size[0] / 2 + shift[0]], [0, focal, size[1] / 2 + shift[1]], [0, 0, 1]])
-    h = camera @ np.column_stack([rotation[:, :2], [0.0, 0.0, 130.0]])
-    straight = RationalPolynomial.projective()
-    return straight.with_values((h / h[2, 2]).ravel()[:8])
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera 13 cm above the sheet, turned and tilted, with barrel distortion: 800 × 600 pixels, 55° wide.
 
+    Parameters
+    ----------
+    roll, tilt : float
+        Degrees.
+    shift : (float, float)
+        Of the whole image, pixels.
+    """
 
-def form(
-    roll: float, tilt: float, *, shift: tuple[float, float] = (0.0, 0.0), rings: bool = True, seed: int = 0
-) -> Formed:
-    """A photograph of 800 × 600 pixels with noise of 2 grey values, blur of 0.9 px and barrel distortion."""
-    size = (800, 600)
-    straight = view(roll, tilt, shift, size)
-    middle, half = np.array(size) / 2, max(size) / 2
+    roll: float
+    tilt: float
+    shift: tuple[float, float] = (0.0, 0.0)
 
-    def image(xy: Array) -> tuple[Array, Array]:
-        first = straight.derivatives(xy)
-        flat = straight(xy)
-        u = (flat - middle) / half
+    def image(self, xy: Array) -> tuple[Array, Array]:
+        """Images (n, 2) of points of the sheet (n, 2), millimetres, and the derivatives (n, 2, 2)."""
+        straight, middle, half = self._straight(), np.array(_SHAPE[::-1]) / 2, max(_SHAPE) / 2
+        u = (straight(xy) - middle) / half
         r2 = (u**2).sum(axis=1)[:, None]
-        bent = middle + half * u * (1 + _BARREL * r2)
         slope = (1 + _BARREL * r2)[..., None] * np.eye(2) + 2 * _BARREL * u[:, :, None] * u[:, None, :]
-        return bent, slope @ first.d_xy
+        return middle + half * u * (1 + _BARREL * r2), slope @ straight.derivatives(xy).d_xy
 
-    def drawn(outline: Outline) -> Array:
-        return draw(outline.mapped(image).oriented(), size[::-1], 0.9)
+    def _straight(self) -> RationalPolynomial:
+        k, t = np.deg2rad([self.roll, self.tilt])
+        turn = np.array([[np.cos(k), -np.sin(k), 0], [np.sin(k), np.cos(k), 0], [0, 0, 1]])
+        lean = np.array([[1, 0, 0], [0, np.cos(t), -np.sin(t)], [0, np.sin(t), np.cos(t)]])
+        rotation = lean @ turn @ np.diag([1.0, -1.0, -1.0])
+        height, width = _SHAPE
+        focal = 0.95 * width
+        x0, y0 = width / 2 + self.shift[0], height / 2 + self.shift[1]
+        camera = np.array([[focal, 0, x0], [0, focal, y0], [0, 0, 1]])
+        h = camera @ np.column_stack([rotation[:, :2], [0.0, 0.0, 130.0]])
+        straight = RationalPolynomial.projective()
+        return straight.with_values((h / h[2, 2]).ravel()[:8])
 
-    circle = Outline.circle(_SIZE / 2, 0.05)
-    xy = DESIGN.xy
-    share = drawn(Outline(xy[:, None] + circle.xy, np.broadcast_to(circle.dxy, (len(xy), *circle.dxy.shape))))
-    if rings:
-        assert DESIGN.rings is not None
-        for name, sectors in DESIGN.rings.sectors.items():
-            centre = xy[DESIGN.ids.index(name)]
-            for start, end in sectors:
-                share += drawn(_sector(DESIGN.rings, start, end, centre))
-    rng = np.random.default_rng(seed)
-    u = np.linspace(-1, 1, size[0])
-    grey = 190 * (1 + 0.1 * u) * (1 - 0.85 * share) + rng.normal(0, 2.0, share.shape)
-    return Formed(Frame(grey.round().clip(0, 254).astype(np.uint8), 255.0, "formed"), image(xy)[0])
+    def share(self, outline: Outline) -> Array:
+        """Share of each pixel that plane shapes take, blurred by 0.9 px."""
+        return draw(outline.mapped(self.image).oriented(), _SHAPE, 0.9)
+
+
+def exposed(share: Array, seed: int = 0) -> Frame:
+    """Dark marks on an unevenly lit ground, with noise of 2 grey values."""
+    u = np.linspace(-1, 1, share.shape[1])
+    noise = np.random.default_rng(seed).normal(0, 2.0, share.shape)
+    grey = 190 * (1 + 0.1 * u) * (1 - 0.85 * share) + noise
+    return Frame(grey.round().clip(0, 254).astype(np.uint8), 255.0, "formed")
+
+
+def form(camera: Camera, *, rings: bool = True, seed: int = 0) -> Formed:
+    """A photograph of the sheet."""
+    circle, xy = Outline.circle(_SIZE / 2, 0.05), DESIGN.xy
+    tangents = np.broadcast_to(circle.dxy, (len(xy), *circle.dxy.shape))
+    share = camera.share(Outline(xy[:, None] + circle.xy, tangents))
+    assert DESIGN.rings is not None
+    for name, sectors in DESIGN.rings.sectors.items():
+        for start, end in sectors if rings else ():
+            share += camera.share(_sector(DESIGN.rings, start, end, xy[DESIGN.ids.index(name)]))
+    return Formed(exposed(share, seed), camera.image(xy)[0])
 
 
 def _sector(rings: Rings, start: float, end: float, centre: Array) -> Outline:

@@ -26,7 +26,7 @@ def measured(formed: sheets.Formed, design: ReseauDesign | None = None) -> Resea
 
 @pytest.mark.parametrize(("roll", "tilt"), [(0.0, 0.0), (100.0, 30.0), (200.0, 45.0), (300.0, 45.0)])
 def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll: float, tilt: float) -> None:
-    formed = sheets.form(roll, tilt)
+    formed = sheets.form(sheets.Camera(roll, tilt))
     result = measured(formed)
     error = result.xy - formed.truth
     assert result.ok.all(), result.why
@@ -38,7 +38,7 @@ def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll:
 
 
 def test_disks_beyond_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
-    formed = sheets.form(20.0, 30.0, shift=(330.0, 0.0))
+    formed = sheets.form(sheets.Camera(20.0, 30.0, (330.0, 0.0)))
     result = measured(formed)
     inside = ((formed.truth > 12) & (formed.truth < np.array([787, 587]))).all(axis=1)
     assert 30 < inside.sum() < 50
@@ -48,7 +48,7 @@ def test_disks_beyond_the_frame_are_declined_and_the_others_keep_their_numbers()
 
 
 def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
-    formed = sheets.form(10.0, 20.0)
+    formed = sheets.form(sheets.Camera(10.0, 20.0))
     x, y = np.rint(formed.truth[12]).astype(int)
     formed.frame.pixels[y - 30 : y + 30, x : x + 60] = 190
     result = measured(formed)
@@ -59,13 +59,13 @@ def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
 
 
 def test_a_sheet_whose_rings_are_hidden_has_no_numbers() -> None:
-    result = measure_reseau(sheets.form(10.0, 20.0, rings=False).frame, sheets.DESIGN)
+    result = measure_reseau(sheets.form(sheets.Camera(10.0, 20.0), rings=False).frame, sheets.DESIGN)
     assert not result
     assert "no coded ring tells" in result.reason
 
 
 def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
-    formed = sheets.form(10.0, 20.0)
+    formed = sheets.form(sheets.Camera(10.0, 20.0))
     turned = Frame(np.ascontiguousarray(formed.frame.pixels[:, ::-1]), 255.0)
     result = measure_reseau(turned, sheets.DESIGN)
     assert not result

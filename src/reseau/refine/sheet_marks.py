@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..adjust import Failure
 from ..data import Array, Frame, Mask, Rows
@@ -37,6 +38,8 @@ _GROUND_PX = 5
 """What a window shows around its disk."""
 _EDGE_PX = 3
 """Pixels next to a ring that its blur may reach."""
+_OWN_PX = 2
+"""Pixels next to a disk that its own blur reaches."""
 _SEEN = 0.95
 _UNEASY = 1.4
 """Times the ordinary residuals from which on the ground is tried curved."""
@@ -79,6 +82,12 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
 
 
+def _arc(start: float, end: float) -> Array:
+    """Points (40, 2) on the unit circle from one angle to another, degrees."""
+    angle = np.deg2rad(np.linspace(start, end, 40))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class _Look:
     """What the disks of this frame look like."""
@@ -103,6 +112,7 @@ class _Sheet:
         assert design.mark.size is not None
         self.image, self.screened, self.design, self.options = image, screened, design, options
         self.frame, self.mapping = placed.frame, placed.mapping
+        self.origin = placed.origin
         self.at = design.xy @ placed.frame.T + placed.origin
         self.found = placed.disk >= 0
         self.start = np.where(self.found[:, None], disks.xy[placed.disk], self.mapping(self.at))
@@ -191,20 +201,28 @@ class _Sheet:
 
     def _rings(self) -> Mask:
         """Pixels of the coded rings, which are no ground."""
-        hidden = np.zeros(self.screened.grey.shape, dtype=np.uint8)
+        hidden, own = np.zeros((2, *self.screened.grey.shape), dtype=np.uint8)
         rings = self.design.rings
         assert rings is not None
         for name, sectors in rings.sectors.items():
             centre = self.design.xy[self.design.ids.index(name)]
+            self._fill(own, self.look.size / 2 * _arc(0, 360) + centre)
             for start, end in sectors:
-                angle = np.deg2rad(np.linspace(start, end, 40))
-                arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-                edge = np.concatenate([rings.inner / 2 * arc, rings.outer / 2 * arc[::-1]]) + centre
-                lattice = edge @ self.frame.T + (self.at[0] - self.design.xy[0] @ self.frame.T)
-                xy = self.mapping(lattice)
-                if np.abs(xy).max() < 1e5:
-                    cv2.fillPoly(hidden, [np.rint(xy).astype(np.int32)], 1)
-        return cv2.dilate(hidden, np.ones((2 * _EDGE_PX + 1,) * 2, np.uint8)) > 0
+                arc = _arc(start, end)
+                edge = np.concatenate([rings.inner / 2 * arc, rings.outer / 2 * arc[::-1]])
+                self._fill(hidden, edge + centre)
+        # Seen at a slant a ring comes near its disk; between them the disk has the say.
+        hidden, own = (
+            cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8))
+            for mask, reach in ((hidden, _EDGE_PX), (own, _OWN_PX))
+        )
+        return np.asarray((hidden > 0) & (own == 0))
+
+    def _fill(self, mask: NDArray[np.uint8], corners: Array) -> None:
+        """Fill the image of a polygon of the sheet."""
+        xy = self.mapping(corners @ self.frame.T + self.origin)
+        if np.abs(xy).max() < 1e5:  # else the mapping is used far beyond the disks that it is known from
+            cv2.fillPoly(mask, [np.rint(xy).astype(np.int32)], 1)
 
     def _learn(self, first: Matches, rows: Rows, sure: Mask) -> None:
         """Mapping, sharpness, size and noise from the disks beyond doubt."""
