@@ -31,6 +31,7 @@ from reseau_sims.serving import (
     Wire,
     ZaberChain,
 )
+from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 
 TRANSPORTS = ("pty", "tcp", "in process")
 
@@ -144,6 +145,9 @@ def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
         session = partial(serving.Vxi11Session, machine, machine.execute, script)
         server = tcp = stack.enter_context(TcpServer(session))
         address = f"TCPIP::127.0.0.1,{tcp.port}::inst0::INSTR"
+    elif transport == "usbtmc":
+        plugged = stack.enter_context(plugged_in(UsbInstrument(machine, machine.execute, script)))
+        address = plugged.resource
     else:
         both = serving.HislipInstrument(machine, machine.execute, script)
         server = tcp = stack.enter_context(TcpServer(both.channel))
@@ -200,7 +204,10 @@ RIGS: dict[tuple[str, str], Maker] = {
     **{("ping360", transport): ping360_rig for transport in TRANSPORTS},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},
-    **{("oscilloscope", transport): scope_rig for transport in ("tcp", "vxi-11", "hislip", "in process")},
+    **{
+        ("oscilloscope", transport): scope_rig
+        for transport in ("tcp", "vxi-11", "hislip", "usbtmc", "in process")
+    },
 }
 
 

@@ -16,6 +16,7 @@ from .scpi import HislipInstrument, PortmapperSession, Vxi11Session
 from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
 from .servers import InProcess, PtyServer, Server, TcpServer
 from .smc100 import Smc100Line
+from .usbtmc import UsbInstrument, plugged_in
 from .zaber import ZaberChain
 
 __all__ = [
@@ -42,7 +43,9 @@ __all__ = [
     "SimulatedBench",
     "Smc100Line",
     "TcpServer",
+    "UsbInstrument",
     "Vxi11Session",
     "Wire",
     "ZaberChain",
+    "plugged_in",
 ]

@@ -19,26 +19,30 @@ from reseau_drivers.codecs.stream import Damaged
 from .machine import Machine
 from .script import DEVICE_KINDS, Output, Script
 
-__all__ = ["HislipInstrument", "PortmapperSession", "Vxi11Session"]
+__all__ = ["AnswerQueue", "HislipInstrument", "PortmapperSession", "Vxi11Session"]
 
 _LARGEST = 1 << 20
 """Bytes of the largest message that is taken."""
 
 
-class _Queue:
+class AnswerQueue:
     """Answers that wait to be read, each from its time on; None hangs up."""
 
     def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
         self._machine, self._execute, self._script = machine, execute, script
         self._waiting: list[tuple[float, bytes | None]] = []
+        self._surplus = False
 
     def write(self, message: bytes) -> None:
         """Take a program message."""
         with self._machine.lock:
             if self._waiting and self._waiting[0][0] <= time.monotonic():
                 # IEEE 488.2, 6.3.2.3: what was not read before the next message is gone, and an error.
-                self._machine.violations.append(f"{message!r} interrupted an answer")
+                # One that was given twice is not the client's fault.
+                if not self._surplus:
+                    self._machine.violations.append(f"{message!r} interrupted an answer")
                 self._waiting.clear()
+            self._surplus = False
             answer = self._execute(message)
             if answer is None:
                 return
@@ -48,6 +52,7 @@ class _Queue:
                 if fault.kind in DEVICE_KINDS:
                     self._machine.afflict(fault.kind)
                 sent = self._script.spoil(answer, fault)
+                self._surplus = fault.kind == "repeated"
             self._waiting += [(time.monotonic() + delay, data) for delay, data in sent]
 
     def available(self) -> bool:
@@ -107,8 +112,8 @@ class Vxi11Session:
 
     def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
         self._machine = machine
-        self._open: Callable[[], _Queue] = lambda: _Queue(machine, execute, script)
-        self._links: dict[int, _Queue] = {}
+        self._open: Callable[[], AnswerQueue] = lambda: AnswerQueue(machine, execute, script)
+        self._links: dict[int, AnswerQueue] = {}
         self._begun: dict[int, bytes] = {}
         self._numbers = itertools.count(1)
         self._records = rpc.RecordDecoder(_LARGEST + 1024)
@@ -211,8 +216,8 @@ class HislipInstrument:
 
     def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
         self.machine = machine
-        self.open_queue: Callable[[], _Queue] = lambda: _Queue(machine, execute, script)
-        self.queues: dict[int, _Queue] = {}
+        self.open_queue: Callable[[], AnswerQueue] = lambda: AnswerQueue(machine, execute, script)
+        self.queues: dict[int, AnswerQueue] = {}
         self._numbers = itertools.count(1)
 
     def channel(self) -> _Channel:
@@ -271,7 +276,7 @@ class _Channel:
             return self._fatal(2, "a message before both channels were initialized")
         return self._synchronously(message, queue) if self._synchronous else self._aside(message, queue)
 
-    def _synchronously(self, message: hislip.Message, queue: _Queue) -> list[Output]:
+    def _synchronously(self, message: hislip.Message, queue: AnswerQueue) -> list[Output]:
         match message.type:
             case hislip.Type.DATA | hislip.Type.DATA_END:
                 self._begun += message.payload
@@ -289,7 +294,7 @@ class _Channel:
                 return [(0.0, _coded(hislip.Type.DEVICE_CLEAR_ACKNOWLEDGE, 0, 0))]
         return [(0.0, _coded(hislip.Type.ERROR, 1, 0, b"unrecognized message type"))]
 
-    def _sent(self, queue: _Queue, number: int) -> list[Output]:
+    def _sent(self, queue: AnswerQueue, number: int) -> list[Output]:
         sent: list[Output] = []
         while True:
             wait, data, found = queue.take(float("inf"))
@@ -305,7 +310,7 @@ class _Channel:
                 wait, data = 0.0, data[half:]
             sent.append((wait, _coded(hislip.Type.DATA_END, 0, number, data)))
 
-    def _aside(self, message: hislip.Message, queue: _Queue) -> list[Output]:
+    def _aside(self, message: hislip.Message, queue: AnswerQueue) -> list[Output]:
         match message.type:
             case hislip.Type.ASYNC_MAX_MSG_SIZE:
                 size = struct.pack(">Q", _LARGEST)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from reseau.errors import ProtocolError, SettingError
-from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, vxi11, zaber
+from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
 from reseau_drivers.codecs.stream import Damaged
 
 
@@ -142,3 +142,21 @@ def test_hislip_initialize_as_on_the_wire() -> None:
     assert message == hislip.Message(hislip.Type.INITIALIZE, 0, 0x01007878, b"hislip0")
     assert not isinstance(message, Damaged)
     assert hislip.encode(message) == typed
+
+
+def test_usbtmc_transfers_as_on_the_bus() -> None:
+    # USBTMC 1.0, table 1 to 4: a request for 1000 bytes with tag 3, and an answer of five bytes, padded.
+    assert usbtmc.decode(bytes.fromhex("02 03 fc 00 e8 03 00 00 00 0a 00 00")) == usbtmc.Transfer(
+        2, 3, 1000, False
+    )
+    assert usbtmc.encode_in(3, b"hello", True) == bytes.fromhex("02 03 fc 00 05 00 00 00 01 00 00 00") + (
+        b"hello\0\0\0"
+    )
+    for wrong in (
+        "",
+        "01 01 01 00 01 00 00 00 01 00 00 00 2a",
+        "01 01 fe 00 00 00 00 00 01 00 00 00",
+        "7f" * 12,
+    ):
+        with pytest.raises(ProtocolError):
+            usbtmc.decode(bytes.fromhex(wrong))

@@ -1,0 +1,80 @@
+"""USB Test and Measurement Class: the twelve bytes before each transfer.
+
+Source: *USBTMC* 1.0, tables 1 to 9: MsgID, bTag and its complement, a reserved byte, the size of the
+transfer, its attributes.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from reseau.errors import ProtocolError
+
+from .stream import shown
+
+__all__ = ["END", "HEAD", "OUT", "REQUEST_IN", "Transfer", "decode", "encode_in"]
+
+OUT, REQUEST_IN = 1, 2
+HEAD = 12
+END = 1
+"""Bit of the attributes: the last byte of a message is in this transfer."""
+
+_HEAD = struct.Struct("<BBBBIB3x")
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What a host sends to the bulk-out endpoint.
+
+    Parameters
+    ----------
+    kind : int
+        :data:`OUT` or :data:`REQUEST_IN`.
+    tag : int
+        1 to 255; an answer repeats it.
+    size : int
+        Bytes of the data, or the most that are asked for.
+    end : bool
+        Whether the message ends with it.
+    data : bytes
+        Of an OUT transfer, without padding.
+    """
+
+    kind: int
+    tag: int
+    size: int
+    end: bool
+    data: bytes = b""
+
+
+def decode(packet: bytes) -> Transfer:
+    """The transfer that begins with these bytes.
+
+    Raises
+    ------
+    ProtocolError
+        When it is none: the complement of its tag is wrong, or its data are not of the size that it states.
+
+    Examples
+    --------
+    >>> decode(bytes.fromhex("01 01 fe 00 06 00 00 00 01 00 00 00 2a 49 44 4e 3f 0a 00 00")).data
+    b'*IDN?\\n'
+    """
+    if len(packet) < HEAD:
+        raise ProtocolError(f"no USBTMC transfer: {shown(packet)}")
+    kind, tag, complement, _, size, attributes = _HEAD.unpack_from(packet)
+    if tag == 0 or tag ^ complement != 0xFF or kind not in (OUT, REQUEST_IN):
+        raise ProtocolError(f"no USBTMC transfer: {shown(packet)}")
+    if kind == REQUEST_IN:
+        return Transfer(kind, tag, size, False)
+    # The padding to four bytes may be missing, as some hosts leave it out; data may not.
+    if size == 0 or not size <= len(packet) - HEAD <= size + 3:
+        raise ProtocolError(f"a transfer of {len(packet) - HEAD} bytes states {size}")
+    return Transfer(kind, tag, size, bool(attributes & END), packet[HEAD : HEAD + size])
+
+
+def encode_in(tag: int, data: bytes, end: bool) -> bytes:
+    """A transfer of an instrument's answer."""
+    head = _HEAD.pack(REQUEST_IN, tag, tag ^ 0xFF, 0, len(data), END if end else 0)
+    return head + data + bytes(-len(data) % 4)
