@@ -174,7 +174,9 @@ def bk_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
         shown = np.roll(picture, run, axis=0)
         machine.section = lambda: shown
         scan = device.scan()
-        assert (scan.pixels == shown).all()
+        wrong = int((scan.pixels != shown).sum())
+        # The protocol has no checksum of its own (TCP has): a bit that turns in a pixel cannot be seen.
+        assert wrong == 0 or (wrong == 1 and script.happened[-1].kind == "corrupted")
         assert scan.mm_per_px == pytest.approx((0.2, 0.25))
         assert scan.origin_px == (39.5, 0.0)
 
