@@ -1,9 +1,9 @@
 """Targets measured by us and by other programs on the same formed photographs, of which the truth is known.
 
 Run from the checkout: ``python benchmarks/testfield_peers.py``. The others come with
-``pip install .[peers]``; what is missing is said. A sheet of 8 × 7 disks, and a ChArUco board with its corners
-in the same places, are seen by the same camera. Programs that only locate are told to a pixel where to look.
-The truth is the image of a disk's centre, which in perspective is not the centre of its ellipse.
+``pip install .[peers]``; what is missing is said. A sheet of 8 × 7 disks, and a ChArUco board with its
+corners in the same places, are seen by the same camera. Programs that only locate are told to a pixel where
+to look. The truth is the image of a disk's centre, which in perspective is not the centre of its ellipse.
 """
 
 from __future__ import annotations

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reseau.cli import run
 from reseau.data import Frame
 from reseau.errors import FormatError
-from reseau.formats import ReseauDesign
-from reseau.images import read_frame
+from reseau.formats import ReseauDesign, ReseauMeasurement
+from reseau.images import read_frame, write_image
 from reseau.refine import ReseauResult, measure_reseau
 
 from . import camcal, sheets
@@ -88,6 +89,22 @@ def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the
     content["rings"]["sectors"]["no such disk"] = [[0.0, 90.0]]
     with pytest.raises(FormatError, match="none of the points"):
         ReseauDesign.parse(json.dumps(content), where="file")
+
+
+def test_the_command_measures_one_colour_of_a_photograph(tmp_path: Path) -> None:
+    formed = sheets.form(sheets.Camera(30.0, 20.0))
+    green = formed.frame.pixels
+    # The red image lies two pixels beside the green one.
+    write_image(tmp_path / "photo.png", np.stack([np.roll(green, 2, axis=1), green, green], axis=2))
+    sheets.DESIGN.write(tmp_path / "sheet.json")
+    files = [str(tmp_path / name) for name in ("photo.png", "sheet.json", "marks.json")]
+    arguments = ["measure", "reseau", files[0], "--design", files[1], "--out", files[2]]
+    for channel, beside in (("green", 0.0), ("red", 2.0)):
+        assert run([*arguments, "--channel", channel]) == 0
+        found = ReseauMeasurement.read(files[2])
+        assert found.found == len(formed.truth)
+        error = found.image_points().xy - formed.truth
+        assert np.abs(error.mean(axis=0) - [beside, 0.0]).max() < 0.01
 
 
 @pytest.mark.slow
