@@ -14,7 +14,7 @@ import typer
 
 from .. import __version__
 from ..errors import ReseauError
-from . import apply, bench, bundle, demo, design, measure, orient, refine
+from . import apply, bench, bundle, calibrate, demo, design, measure, orient, refine
 
 __all__ = ["app", "main"]
 
@@ -34,6 +34,7 @@ app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)
 app.command()(bundle.bundle)
+app.command()(calibrate.calibrate)
 
 
 def _version(wanted: bool) -> None:

@@ -24,7 +24,7 @@ from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 
 __all__ = ["bundle_report"]
 
-_MANY_POINTS, _ELLIPSES, _CELLS, _IMAGES = 4000, 250, 12, 200
+_MANY_POINTS, _ELLIPSES, _CELLS, _IMAGES, _WEAK = 4000, 250, 12, 200, 5.0
 _UNITS = {"c": "mm", "x0": "mm", "y0": "mm", "K1": "mm⁻²", "K2": "mm⁻⁴", "K3": "mm⁻⁶", "P1": "mm⁻¹",
           "P2": "mm⁻¹", "fx": "px", "fy": "px", "cx": "px", "cy": "px"}  # fmt: skip
 
@@ -213,6 +213,9 @@ def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], 
     if median == 0:
         return 1.0
     power = nice(size / median)
+    # Weak points, which the warnings name, would cover the others.
+    shown = axis[:, 1] <= _WEAK * median
+    some, axis, vectors = some[shown], axis[shown], vectors[shown]
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     axes.add_collection(
         EllipseCollection(

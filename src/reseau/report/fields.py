@@ -15,7 +15,7 @@ from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 __all__ = ["difference_figure", "uncertainty_figure"]
 
 _SHADES = LinearSegmentedColormap.from_list("reseau", ["#ffffff", "#c9d8e3", BLUE])
-_LEVELS = 8
+_LEVELS, _SPAN = 8, 25.0
 _SIZE = (8.6, 5.2)
 """Inches."""
 _ARROWS = 13
@@ -105,7 +105,8 @@ def _levels(sigma: Array) -> list[float]:
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(known):
         return [0.0, 1.0]
-    low, high = float(known.min()), float(np.quantile(known, 0.995))
+    high = float(np.quantile(known, 0.995))
+    low = max(float(known.min()), high / _SPAN)
     steps = np.geomspace(1.1 * low, max(high, 1.2 * low), _LEVELS)
     digits = 1 - int(np.floor(np.log10(low)))
     rounded = sorted({round(float(step), digits) for step in steps})

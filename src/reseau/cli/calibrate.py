@@ -1,0 +1,164 @@
+"""`reseau calibrate`: from photographs of a target to the calibration of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..bundle import FieldDifference, Lens
+    from ..data import Frame, ImagePoints
+    from ..formats import ReseauDesign, TestfieldDesign
+    from ..procedures.calibration import Calibrated, CameraModel
+
+__all__ = ["calibrate"]
+
+
+def calibrate(
+    images: Annotated[
+        list[Path], typer.Argument(help="Photographs of the target, or coordinates measured in them.")
+    ],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
+    out: Out = None,
+    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    pitch: Annotated[
+        float | None, typer.Option(min=1e-6, help="Size of a pixel, mm; with it Brown's model, in mm.")
+    ] = None,
+    side: Annotated[str, typer.Option(help="Side of Brown's distortion: object or image.")] = "object",
+    free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
+    size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
+    reject: Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")] = False,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
+    against: Annotated[
+        list[Path] | None, typer.Option(help="Calibration of the same camera to compare with.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a camera from photographs of a target, in one command."""
+    from ..bundle import Options, calibration_of
+    from ..formats import write_whole
+    from ..procedures.calibration import calibrate_camera, measurer_of
+    from ..provenance import Provenance, sha256_of
+    from ..refine import TestfieldOptions
+
+    for path, suffixes in ((out, (".json",)), (report, (".html",))):
+        if path is not None:
+            suffix_of(writable(path), suffixes)
+    model = _model(pitch, side, free)
+    target = _design(design)
+    others = {path.name: _lens(path) for path in against or []}
+    measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
+    with progress("measuring", len(images)) as step:
+        found = calibrate_camera(
+            _frames(images, step), target, measure, _size(size), model,
+            Options(outliers="reject" if reject else "keep"),
+        )  # fmt: skip
+    done = required(found, design)
+    inputs = {path.name: sha256_of(path) for path in (design, *images)}
+    settings = {"pitch": pitch, "side": side, "free": free, "reject": reject, "row_jitter": row_jitter,
+                "fill": fill}  # fmt: skip
+    provenance = Provenance(inputs, settings)
+    calibration = calibration_of(done.result, "camera", name=target.name, provenance=provenance.to_dict())
+    differences = _differences(done, others)
+    if report is not None:
+        from ..report.bundle import bundle_report
+
+        title = f"Calibration with {target.name}"
+        page = bundle_report(done.result, title=title, provenance=provenance, against=differences)
+        write_whole(report, page)
+    if out is not None:
+        calibration.write(out)
+    if as_json:
+        say(calibration.to_json())
+    else:
+        _say(done, differences)
+
+
+def _frames(paths: list[Path], step: Callable[[str], None]) -> Iterator[Frame | tuple[str, ImagePoints]]:
+    """Photographs one after the other, or what was measured in them."""
+    from ..images import read_frame
+
+    for path in paths:
+        step(f"measuring {path.name}")
+        yield (path.name, read_measurement(path).image_points()) if is_points(path) else read_frame(path)
+
+
+def _design(path: Path) -> TestfieldDesign | ReseauDesign:
+    """A design, told apart by its schema."""
+    from ..formats import ReseauDesign, TestfieldDesign
+    from ..formats.document import read_text
+
+    if '"testfield-design/' in read_text(path)[:4096]:
+        return TestfieldDesign.read(path)
+    return ReseauDesign.read(path)
+
+
+def _model(pitch: float | None, side: str, free: str) -> CameraModel:
+    from ..errors import UsageError
+    from ..procedures.calibration import CameraModel
+
+    names = tuple(name.strip() for name in free.split(",") if name.strip())
+    if side not in ("object", "image"):
+        raise UsageError(f"is {side!r}", where="--side", do="write `object` or `image`")
+    if pitch is None:
+        return CameraModel("opencv", names)
+    return CameraModel("brown", names, (pitch, pitch), "image" if side == "image" else "object")
+
+
+def _size(text: str) -> tuple[int, int] | None:
+    from ..errors import UsageError
+
+    if not text:
+        return None
+    width, _, height = text.replace("×", "x").partition("x")
+    if not width.isdigit() or not height.isdigit():
+        raise UsageError(f"is {text!r}", where="--size", do="write 640x480")
+    return int(width), int(height)
+
+
+def _lens(path: Path) -> Lens:
+    from ..bundle import Lens
+    from ..calibration import Calibration
+
+    return Lens.of_calibration(Calibration.read(path))
+
+
+def _differences(done: Calibrated, others: dict[str, Lens]) -> dict[str, FieldDifference]:
+    from ..bundle import Lens, calibration_difference
+
+    return {
+        name: calibration_difference(Lens.of_result(done.result, 0), lens) for name, lens in others.items()
+    }
+
+
+def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
+    import numpy as np
+
+    from ..bundle import Lens, projection_field
+
+    result = done.result
+    count = sum(len(points) for points in done.measured.values())
+    say(f"{len(done.measured)} images, {count} image points, redundancy {result.redundancy}\n")
+    say(f"sigma0 {result.sigma0:.4g}")
+    v = result.residuals[~result.rejected]
+    v = v[np.isfinite(v).all(axis=1)]
+    say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
+    names, _, values = result.camera_columns(0)
+    for name, value, s in zip(names, values, result.camera_covariance(0).diagonal() ** 0.5, strict=True):
+        say(f"  {name:<6} {value:14.7g} ± {s:.3g}\n")
+    sigma = projection_field(Lens.of_result(result, 0)).sigma
+    middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
+    say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
+    for name, found in differences.items():
+        size = np.sqrt(np.nanmean((found.difference**2).sum(axis=2)))
+        say(f"beside {name}: {size:.2g} px rms, p = {found.p:.2g}\n")
+    for name, why in done.declined.items():
+        say(f"left out: {name}: {why}\n")
+    for warning in result.warnings:
+        say(f"warning: {warning}\n")
