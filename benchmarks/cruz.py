@@ -2,7 +2,8 @@
 
 Search areas are given, as their user extracts them; each is turned so that its edge is an upper one. The
 template of Prewitt, the threshold of 80, the line with the most white pixels within a tilt of 1°, a window of
-30 pixels around it, profiles, the three largest gradients of each, a regression line without what is beyond 3σ.
+30 pixels around it, profiles, the three largest gradients of each, a regression line without what is
+beyond 3σ.
 """
 
 from __future__ import annotations

@@ -31,8 +31,9 @@ _REACH = 4.0
 """Pixels of the overview by which an approximate edge may be off."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
 """Width of film that is looked at beyond an edge, and that which parts the frame from anything else."""
-_MOST_SIGMA_PX = 0.33
-"""Standard deviation of a corner's coordinate from which on a frame is not called oriented."""
+_MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
+"""Standard deviation of a corner's coordinate from which on a frame is not called oriented: what is greater,
+so that a scan finer than its film is not asked for more than the film shows."""
 _MOST_W = 4.0
 """Test value from which on the shape of a frame contradicts its format."""
 
@@ -284,7 +285,8 @@ def _judged(
         reason = measured.why[EDGES.index(missing[0])]
         why = f"{missing[0]} edge: {reason}; it is where the format has it"
         return replace(base, status="three-edges", why=why)
-    if (most := float(sigma.max())) > _MOST_SIGMA_PX:
+    scale = max(base.px_per_mm or (0.0, 0.0))
+    if (most := float(sigma.max())) > max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale):
         why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
         return replace(base, lines=None, why=why)
     return replace(base, status="oriented")

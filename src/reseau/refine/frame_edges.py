@@ -39,7 +39,7 @@ _SHIFTS, _CHANGE = (3.0,), 0.15
 """Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
 contrast, one sigma."""
 _ROBUST = weight_function("danish", 2.5)
-_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.04
+_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.12
 """In noise, and of the contrast along the edge: what differs from film by less is film."""
 
 
@@ -310,7 +310,7 @@ def _fitted(
         initial = np.stack([start, border.level, np.log(width) * one, border.contrast * one, *none], axis=1)
         # Film is known from its surroundings; that the picture changes at once is an exception.
         changes = [_CHANGE * border.contrast] * len(_SHIFTS)
-        prior = np.array([np.inf, 0.5 * border.noise, spread, np.inf, *changes])
+        prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
         fit = adjust_batch(
             _profile_function(distance),
             initial,
