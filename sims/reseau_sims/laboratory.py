@@ -40,7 +40,7 @@ class Laboratory:
     --------
     >>> laboratory = Laboratory(World.standard(seed=7))
     >>> echoes = laboratory.line(200, 200, 2e-6)
-    >>> len(echoes), laboratory.swept.sum()
+    >>> len(echoes), int(laboratory.swept.sum())
     (200, 1)
     """
 

@@ -62,8 +62,18 @@ def test_what_the_scanner_sweeps_is_drawn_on_the_screen() -> None:
     assert np.abs(left - dark).max() > 50
     assert changed[:, 220:].max() > 50
     assert changed[:, :180].max() < 20
-    frame = laboratory.photograph("PHOTO II")
-    assert frame.pixels.shape == (1200, 1600)
+
+
+@pytest.mark.slow
+def test_the_camera_sees_what_was_swept() -> None:
+    laboratory = Laboratory(World.standard(seed=3))
+    before = laboratory.photograph("PHOTO I").pixels.astype(float)
+    device, _ = sonar(laboratory, half_sector=60)
+    with device:
+        device.scan()
+    after = laboratory.photograph("PHOTO II")
+    assert after.pixels.shape == (1200, 1600)
+    assert np.abs(after.pixels - before).mean() > 20
 
 
 def test_stop_ends_a_scan_from_another_thread_and_the_motor_is_off() -> None:
