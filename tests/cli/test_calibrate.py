@@ -92,6 +92,14 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     assert abs(found.value - 57.5 / 0.027) < 4 * found.sigma
 
 
+def test_sigma_naught_is_that_of_the_sigma_given(reseau: Run, measured: tuple[Path, ...]) -> None:
+    """Twice the sigma that the coordinates have, and half the sigma naught."""
+    status, out, _ = reseau(*common(measured), "--free", "c,x0,y0,K1", "--sigma", 2 * SIGMA)
+    assert status == 0
+    sigma0 = float(out.partition("sigma0 ")[2].partition(",")[0])
+    assert sigma0 == pytest.approx(0.5, abs=0.025)
+
+
 def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tuple[Path, ...]) -> None:
     status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--size", "240x240")
     assert status == 1
@@ -124,7 +132,7 @@ def test_coordinates_without_a_size_are_refused(reseau: Run, measured: tuple[Pat
 def test_documents_of_measurements_serve_as_images(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
-    files = []
+    files: list[Path] = []
     for path in measured[1:]:
         files.append(tmp_path / f"{path.stem}.json")
         ReseauMeasurement.read_csv(path).write(files[-1])

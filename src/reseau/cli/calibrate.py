@@ -32,6 +32,10 @@ def calibrate(
     side: Annotated[str, typer.Option(help="Side of Brown's distortion: object or image.")] = "object",
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
+    sigma: Annotated[
+        float | None,
+        typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
+    ] = None,
     reject: Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")] = False,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
     fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
@@ -57,12 +61,12 @@ def calibrate(
     with progress("measuring", len(images)) as step:
         found = calibrate_camera(
             _frames(images, step), target, measure, _size(size), model,
-            Options(outliers="reject" if reject else "keep"),
+            Options(outliers="reject" if reject else "keep"), sigma,
         )  # fmt: skip
     done = required(found, design)
     inputs = {path.name: sha256_of(path) for path in (design, *images)}
-    settings = {"pitch": pitch, "side": side, "free": free, "reject": reject, "row_jitter": row_jitter,
-                "fill": fill}  # fmt: skip
+    settings = {"pitch": pitch, "side": side, "free": free, "sigma": sigma, "reject": reject,
+                "row_jitter": row_jitter, "fill": fill}  # fmt: skip
     provenance = Provenance(inputs, settings)
     calibration = calibration_of(done.result, "camera", name=target.name, provenance=provenance.to_dict())
     differences = _differences(done, others)

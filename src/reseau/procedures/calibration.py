@@ -139,6 +139,7 @@ def calibrate_camera(
     size: tuple[int, int] | None = None,
     model: CameraModel | None = None,
     options: Options | None = None,
+    sigma_px: float | None = None,
 ) -> Calibrated | Failure:
     """Calibrate a camera from photographs of a target.
 
@@ -156,6 +157,9 @@ def calibrate_camera(
         What is to be estimated.
     options : Options, optional
         How to adjust.
+    sigma_px : float, optional
+        Standard deviation of all image coordinates, where those of the measurement are not what they scatter
+        by: a target that is not what it was designed, a lens that the model does not follow.
 
     Returns
     -------
@@ -193,7 +197,10 @@ def calibrate_camera(
     if size is None:
         raise UsageError("is not known without an image", where="size of the images")
     camera = first_camera(measured, design, size, model or CameraModel())
-    result = adjust_network(network_of(measured, design, camera), options)
+    network = network_of(measured, design, camera)
+    if sigma_px is not None:
+        network = replace(network, cov=np.tile(np.eye(2) * sigma_px**2, (len(network.xy), 1, 1)))
+    result = adjust_network(network, options)
     return result if isinstance(result, Failure) else Calibrated(result, measured, declined)
 
 

@@ -90,6 +90,23 @@ def _summary(result: Result) -> list[tuple[str, str, str]]:
         (f"{unknowns}", "", "unknowns"),
         (f"{result.redundancy}", "", "redundancy"),
         (f"{sigma:.2g}", unit, "σ of a point in space, median"),
+        *_reliability(result),
+    ]
+
+
+def _reliability(result: Result) -> list[tuple[str, str, str]]:
+    """What errors of image coordinates the test finds, and what those it does not find can do."""
+    n = 2 * len(result.network.xy)
+    error, length = result.minimal_detectable_errors(), result.fit.external_lengths()[:n]
+    kept = np.repeat(result.fit.usable.observations & ~result.rejected, 2)
+    error, length = error.ravel()[kept], length[kept]
+    error, length = error[np.isfinite(error)], length[np.isfinite(length)]
+    if not len(error) or not len(length):
+        return []
+    return [
+        (f"{np.median(error):.2g}", "px", "error of an image coordinate that is found, median"),
+        (f"{np.median(length):.2g}", "σ", "most that one not found does to any result, median"),
+        (f"{length.max():.2g}", "σ", "the same, at most"),
     ]
 
 
