@@ -77,6 +77,7 @@ class SerialLink:
         port, self._serial = self._serial, None
         if port is not None:
             with suppress(OSError):
+                port.cancel_read()
                 port.close()
 
     def write(self, data: bytes, deadline: Deadline) -> None:
@@ -147,6 +148,9 @@ class TcpLink:
         """Disconnect, if connected."""
         connection, self._socket = self._socket, None
         if connection is not None:
+            # Closing alone does not wake a thread that waits for bytes.
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 
     def write(self, data: bytes, deadline: Deadline) -> None:

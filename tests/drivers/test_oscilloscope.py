@@ -24,6 +24,7 @@ from reseau_sims import World, serving
 from reseau_sims.laboratory import Laboratory
 from reseau_sims.serving import (
     FAMILIES,
+    Fault,
     HislipInstrument,
     InProcess,
     PortmapperSession,
@@ -32,6 +33,8 @@ from reseau_sims.serving import (
     Vxi11Session,
     Wire,
 )
+
+from .rigs import rig
 
 
 def scope(family: str, **options: Any) -> tuple[Any, serving.Oscilloscope]:
@@ -196,3 +199,29 @@ def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> 
     assert picture is not None
     assert (picture == laboratory.picture(400, 240)).all()
     assert machine.violations == []
+
+
+@pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
+@pytest.mark.parametrize("way", ["stop", "close"])
+def test_a_call_that_hangs_is_broken_off_from_another_thread(transport: str, way: str) -> None:
+    script = Script()
+    with rig("oscilloscope", transport, script) as found:
+        caught: list[Exception] = []
+
+        def look() -> None:
+            try:
+                found.device.screen(30.0)
+            except InstrumentError as error:
+                caught.append(error)
+
+        script.fault_at(script.count, Fault("dropped"))
+        thread = threading.Thread(target=look)
+        thread.start()
+        time.sleep(0.2)
+        began = time.monotonic()
+        getattr(found.device, way)()
+        thread.join(10.0)
+        assert time.monotonic() - began < 4.0
+        assert not thread.is_alive()
+        assert len(caught) == 1
+        found.work(1)

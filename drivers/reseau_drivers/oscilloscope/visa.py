@@ -203,6 +203,9 @@ def _cut(resource: Any) -> None:
                 if isinstance(item, socket.socket):
                     with suppress(OSError):
                         item.shutdown(socket.SHUT_RDWR)
+                    # pyvisa-py takes the end of a VXI-11 stream for silence, and asks again; not of a closed
+                    # one.
+                    item.close()
 
 
 def scpi_link(address: str | Link) -> Link:

@@ -21,7 +21,7 @@ S = TypeVar("S", bound=Settings)
 T = TypeVar("T")
 
 _GRACE_S = 1.0
-"""How long an instrument that went away is waited for before that is an error."""
+"""How long an instrument that went away, or a call that is to end, is waited for."""
 
 
 class Device(ABC, Generic[S]):
@@ -158,7 +158,7 @@ class Device(ABC, Generic[S]):
         """Let go of it; never raises."""
         self._stopping.set()
         # A call that goes on sees the flag; should it hang, its connection is taken from it all the same.
-        got = self._lock.acquire(timeout=1.0)
+        got = self._lock.acquire(timeout=_GRACE_S)
         try:
             self._drop()
         finally:
@@ -173,7 +173,7 @@ class Device(ABC, Generic[S]):
         self.close()
 
     def stop(self, *, success: bool = False) -> None:
-        """Stop whatever it does, from any thread.
+        """Stop whatever it does, from any thread; a call that goes on for more than a second is broken off.
 
         Raises
         ------
@@ -181,6 +181,12 @@ class Device(ABC, Generic[S]):
             When it could not be told so: it may still be moving.
         """
         self._stopping.set()
+        if self._lock.acquire(timeout=_GRACE_S):
+            self._lock.release()
+        else:
+            # A call hangs: its connection is taken from it, and a new one says stop.
+            with suppress(Exception):
+                self._shut()
         with self._exchange("stop") as deadline:
             self._halt(deadline)
 
