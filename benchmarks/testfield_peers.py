@@ -36,9 +36,13 @@ CELLS = 8
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Photographs of the sheet and of the board by one camera, the truth (n, 2) and where to look (n, 2)."""
+    """Photographs of the sheet and of the board by one camera, the truth (n, 2) and where to look (n, 2).
+
+    Programs for stars and particles get the sheet as bright disks without the ground: `dark`.
+    """
 
     sheet: Array
+    dark: Array
     board: Array
     truth: Array
     start: Array
@@ -64,6 +68,7 @@ def viewed(roll: float, tilt: float, seed: int) -> View:
     rng = np.random.default_rng(1000 + seed)
     return View(
         formed.frame.pixels,
+        darkness(formed.frame.pixels),
         sheets.exposed(camera.share(rectangles(cells(), 0.12)), seed).pixels,
         formed.truth,
         formed.truth + rng.uniform(-1, 1, formed.truth.shape),
@@ -145,10 +150,16 @@ def charuco_corners(view: View) -> Array:
     return np.where(off[:, None] < NEAR_PX, found, np.nan)
 
 
-def darkness(view: View) -> Array:
-    """Grey values the other way round, without the ground: bright disks on nought."""
-    ground = np.percentile(view.sheet, 90)
-    return np.clip(ground - view.sheet.astype(np.float64), 0, None)
+def darkness(sheet: Array) -> Array:
+    """Grey values the other way round, less the ground, a plane: bright disks on nought."""
+    grey = sheet.astype(np.float64)
+    v, u = np.mgrid[: grey.shape[0], : grey.shape[1]]
+    plane = np.stack([np.ones(grey.size), u.ravel(), v.ravel()], axis=1)
+    ground = grey.ravel() > np.percentile(grey, 50)
+    for _ in range(4):
+        fitted = plane @ np.linalg.lstsq(plane[ground], grey.ravel()[ground], rcond=None)[0]
+        ground = np.abs(grey.ravel() - fitted) < 8
+    return np.clip(fitted.reshape(grey.shape) - grey, 0, None)
 
 
 def photutils_by(name: str) -> Callable[[ModuleType], Locate]:
@@ -160,7 +171,7 @@ def photutils_by(name: str) -> Callable[[ModuleType], Locate]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 x, y = centroids.centroid_sources(
-                    darkness(view), *view.start.T, box_size=side, centroid_func=getattr(centroids, name)
+                    view.dark, *view.start.T, box_size=side, centroid_func=getattr(centroids, name)
                 )
             return nearest_of_own(np.stack([x, y], axis=1), view)
 
@@ -178,7 +189,7 @@ def trackpy_locate(package: ModuleType) -> Locate:
     def locate(view: View) -> Array:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = package.locate(darkness(view), 2 * view.radius + 1, engine="python")
+            found = package.locate(view.dark, 2 * int(1.4 * view.radius) + 1, engine="python")
         return nearest(found[["x", "y"]].to_numpy(), view)
 
     return locate
