@@ -163,6 +163,18 @@ def test_a_hostile_peer_costs_bounded_time(kind: str) -> None:
     listener.close()
 
 
+def _portmapper(core: int) -> TcpServer:
+    """A portmapper, as soon as port 111 is free: tests run side by side."""
+    patience = time.monotonic() + 40.0
+    while True:
+        try:
+            return TcpServer(lambda: PortmapperSession(core), 111)
+        except OSError as error:
+            if time.monotonic() > patience:
+                pytest.skip(f"port 111 is taken ({error})")
+            time.sleep(0.1)
+
+
 @pytest.mark.skipif(shutil.which("lxi") is None, reason="lxi (Debian's lxi-tools) is not installed")
 @pytest.mark.skipif(os.geteuid() != 0, reason="lxi asks the portmapper on port 111, which only root may open")
 @pytest.mark.parametrize(
@@ -180,10 +192,7 @@ def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> 
     laboratory = Laboratory(World.standard(seed=4))
     machine = serving.Oscilloscope(family, lambda: laboratory.picture(400, 240))
     with TcpServer(partial(Vxi11Session, machine, machine.execute, Script())) as core:
-        try:
-            portmapper = TcpServer(lambda: PortmapperSession(core.port), 111)
-        except OSError as error:
-            pytest.skip(f"port 111 is taken ({error})")
+        portmapper = _portmapper(core.port)
         with portmapper:
             saved = tmp_path / "screen.png"
             done = subprocess.run(
