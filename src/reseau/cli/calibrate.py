@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..data import Frame, ImagePoints
     from ..formats import ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CameraModel
+    from ..provenance import Provenance
 
 __all__ = ["calibrate"]
 
@@ -46,7 +47,6 @@ def calibrate(
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
     from ..bundle import Options, calibration_of
-    from ..formats import write_whole
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..provenance import Provenance, sha256_of
     from ..refine import TestfieldOptions
@@ -71,17 +71,22 @@ def calibrate(
     calibration = calibration_of(done.result, "camera", name=target.name, provenance=provenance.to_dict())
     differences = _differences(done, others)
     if report is not None:
-        from ..report.bundle import bundle_report
-
-        title = f"Calibration with {target.name}"
-        page = bundle_report(done.result, title=title, provenance=provenance, against=differences)
-        write_whole(report, page)
+        _write_report(report, done, f"Calibration with {target.name}", provenance, differences)
     if out is not None:
         calibration.write(out)
     if as_json:
         say(calibration.to_json())
     else:
         _say(done, differences)
+
+
+def _write_report(
+    path: Path, done: Calibrated, title: str, provenance: Provenance, differences: dict[str, FieldDifference]
+) -> None:
+    from ..formats import write_whole
+    from ..report.bundle import bundle_report
+
+    write_whole(path, bundle_report(done.result, title=title, provenance=provenance, against=differences))
 
 
 def _frames(paths: list[Path], step: Callable[[str], None]) -> Iterator[Frame | tuple[str, ImagePoints]]:

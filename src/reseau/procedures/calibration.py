@@ -171,6 +171,24 @@ def calibrate_camera(
     UsageError
         When two photographs have one name or differ in size, or no size is known.
     """
+    measured, declined, size = _measured(frames, measure, size)
+    if len(measured) < _LEAST_IMAGES:
+        why = "".join(f"; {name}: {reason}" for name, reason in declined.items())
+        return Failure(f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}")
+    if size is None:
+        raise UsageError("is not known without an image", where="size of the images")
+    camera = first_camera(measured, design, size, model or CameraModel())
+    network = network_of(measured, design, camera)
+    if sigma_px is not None:
+        network = replace(network, cov=np.tile(np.eye(2) * sigma_px**2, (len(network.xy), 1, 1)))
+    result = adjust_network(network, options)
+    return result if isinstance(result, Failure) else Calibrated(result, measured, declined)
+
+
+def _measured(
+    frames: Iterable[Frame | tuple[str, ImagePoints]], measure: Measurer, size: tuple[int, int] | None
+) -> tuple[dict[str, ImagePoints], dict[str, str], tuple[int, int] | None]:
+    """What is measured in each photograph, why others do not take part, and the size of all."""
     measured: dict[str, ImagePoints] = {}
     declined: dict[str, str] = {}
     for frame in frames:
@@ -191,17 +209,7 @@ def calibrate_camera(
             declined[name] = f"{len(points)} points are too few"
         elif points is not None:
             measured[name] = points
-    if len(measured) < _LEAST_IMAGES:
-        why = "".join(f"; {name}: {reason}" for name, reason in declined.items())
-        return Failure(f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}")
-    if size is None:
-        raise UsageError("is not known without an image", where="size of the images")
-    camera = first_camera(measured, design, size, model or CameraModel())
-    network = network_of(measured, design, camera)
-    if sigma_px is not None:
-        network = replace(network, cov=np.tile(np.eye(2) * sigma_px**2, (len(network.xy), 1, 1)))
-    result = adjust_network(network, options)
-    return result if isinstance(result, Failure) else Calibrated(result, measured, declined)
+    return measured, declined, size
 
 
 def network_of(
