@@ -1,0 +1,58 @@
+"""A camera calibrated by whatever measures a frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.adjust import Failure
+from reseau.data import Frame
+from reseau.errors import UsageError
+from reseau.procedures.calibration import Calibrated, CameraModel, calibrate_camera
+from reseau.refine.measured import Measured
+from reseau_sims import FieldBench, Station
+
+BENCH = FieldBench(seed=8, bend_mm=0.0)
+STATIONS = {s.name: s for s in (Station(45), Station(45, 90, 90), Station(45, 180, 180), Station(30, 270))}
+SIGMA = 0.005
+
+
+def blank(name: str) -> Frame:
+    return Frame(np.zeros((240, 240), dtype=np.uint8), 255.0, name, "0")
+
+
+def measure(frame: Frame) -> Measured | Failure:
+    """The true positions of the large targets with noise, or nothing."""
+    if frame.name not in STATIONS:
+        return Failure(f"{frame.name}: no target")
+    truth = BENCH.truth(STATIONS[frame.name])
+    rng = np.random.default_rng(len(frame.name))
+    n, ok = len(truth.names), BENCH.inside(truth, 8.0) & BENCH.design.large
+    xy = truth.xy + SIGMA * rng.normal(size=(n, 2))
+    nothing = np.full(n, np.nan)
+    return Measured(
+        frame.name, "0", truth.names, xy, np.tile(np.eye(2) * SIGMA**2, (n, 1, 1)), ok, ("",) * n, xy, 0 * xy,
+        nothing, nothing, nothing,
+    )  # fmt: skip
+
+
+def test_any_function_that_measures_a_frame_will_do() -> None:
+    frames = [blank(name) for name in (*STATIONS, "empty")]
+    model = CameraModel("brown", ("c",), (0.027, 0.027))
+    found = calibrate_camera(frames, BENCH.design, measure, model=model)
+    assert isinstance(found, Calibrated)
+    assert found.declined == {"empty": "no target"}
+    _, _, (c,) = found.result.camera_columns(0)
+    assert abs(c - 57.5) < 4 * np.sqrt(found.result.camera_covariance(0)[0, 0])
+
+
+def test_photographs_of_one_name_are_refused() -> None:
+    twice = [blank(next(iter(STATIONS)))] * 2
+    with pytest.raises(UsageError, match="name of two photographs"):
+        calibrate_camera(twice, BENCH.design, measure)
+
+
+def test_photographs_of_two_sizes_are_refused() -> None:
+    small = Frame(np.zeros((120, 240), dtype=np.uint8), 255.0, "small", "0")
+    with pytest.raises(UsageError, match="is not 240×240 pixels"):
+        calibrate_camera([blank(next(iter(STATIONS))), small], BENCH.design, measure)
