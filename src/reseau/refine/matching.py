@@ -26,7 +26,7 @@ Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 _PLAIN = 1.25
 """Times the limit for blunders from which they are looked for in patches that are nearly right."""
 
-_FIRST, _MOST = 10, 100
+_FIRST, _MOST = 10, 50
 """Iterations before blunders have been looked for, and at most."""
 
 SIZE = np.eye(2)[None]
