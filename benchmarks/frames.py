@@ -23,8 +23,7 @@ from cruz import cruz_corners
 from real_frames import print_real
 
 from reseau.data import Array
-from reseau.refine.frame import FrameOptions, FrameResult, orient_frames
-from reseau.refine.frame_camera import roll_of, transformed
+from reseau.refine.frame import FrameOptions, FrameResult, orient_frames, roll_of, transformed
 from reseau.scans import open_scan, scan_of
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

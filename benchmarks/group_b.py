@@ -28,7 +28,7 @@ from reseau.data import Array, ImagePoints
 from reseau.designs import standard_reseau, test_object
 from reseau.optics import RationalPolynomial
 from reseau.refine import CameraCorrection, correct_camera
-from reseau.refine.instrument import correct_instrument
+from reseau.refine.correction import correct_instrument
 
 __all__ = ["COEFFICIENTS", "f_tests"]
 

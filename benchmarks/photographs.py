@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 from reseau.adjust import Failure
 from reseau.data import ImagePoints
 from reseau.procedures.oscilloscope import photo_i, photo_ii, photo_iii
-from reseau.refine.registration import Registration
+from reseau.refine.correction import Registration
 from reseau_sims import World
 
 __all__ = ["Measured", "Physics", "measured"]

@@ -12,7 +12,7 @@ import pytest
 from reseau.calibration import Calibration
 from reseau.cli import demo, run
 from reseau.formats import ReseauDesign, ReseauMeasurement
-from reseau.refine.instrument import InstrumentCorrection
+from reseau.refine.correction import InstrumentCorrection
 
 FILES = {
     "report.html",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.optics.formation import Outline, coverage, draw, mark_outline
-from reseau.refine.candidates import find_candidates
+from reseau.refine.reseau.candidates import find_candidates
 
 SHAPE, SIGMA = (220, 260), 3.0
 _ROWS, _COLUMNS = np.meshgrid(np.arange(30, 200, 34), np.arange(30, 240, 38), indexing="ij")

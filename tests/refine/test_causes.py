@@ -7,7 +7,7 @@ import pytest
 
 from reseau.errors import UsageError
 from reseau.optics import wong_display
-from reseau.refine.causes import CAUSES, COEFFICIENTS, CONDITIONS, physical_causes
+from reseau.refine.correction import CAUSES, COEFFICIENTS, CONDITIONS, physical_causes
 
 _TRUE = dict(zip(CAUSES, np.linspace(-0.02, 0.03, len(CAUSES)), strict=True))
 

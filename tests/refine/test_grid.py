@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from reseau.refine.candidates import Candidates
-from reseau.refine.grid import GridOptions, assign, lay_out
+from reseau.refine.reseau.candidates import Candidates
+from reseau.refine.reseau.grid import GridOptions, assign, lay_out
 
 WIDTH, HEIGHT = 900, 700
 VALID = np.ones((HEIGHT, WIDTH), dtype=bool)

@@ -13,7 +13,7 @@ from reseau.data import ImagePoints
 from reseau.errors import FormatError
 from reseau.formats import DesignPoint
 from reseau.refine import correct_camera
-from reseau.refine.instrument import InstrumentCorrection, correct_instrument
+from reseau.refine.correction import InstrumentCorrection, correct_instrument
 
 from .oscilloscope import INSTRUMENT, RESEAU, RODS, SCALE, displayed, measured, pixels, reseau_marks
 

@@ -7,10 +7,10 @@ import pytest
 
 from reseau.adjust import Failure
 from reseau.data import Array
-from reseau.refine.lattice import LatticeFit, lattices, refit, second_order
-from reseau.refine.lines import Lattice, find_lattice, ridge_points
-from reseau.refine.profiles import blur_of
 from reseau.refine.screening import quiet_noise
+from reseau.refine.testfield.lattice import LatticeFit, lattices, refit, second_order
+from reseau.refine.testfield.lines import Lattice, find_lattice, ridge_points
+from reseau.refine.testfield.profiles import blur_of
 from reseau_sims import FieldBench, Station
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from reseau.optics.formation import Outline, PixelResponse, draw, mark_outline
 from reseau.refine import MatchOptions, match
-from reseau.refine.matching import SIZE
-from reseau.refine.patches import Patches
-from reseau.refine.shapes import GrownOutline
+from reseau.refine.matching.matcher import SIZE
+from reseau.refine.matching.patches import Patches
+from reseau.refine.matching.shapes import GrownOutline
 
 SHAPE, LEVEL, NOISE = (150, 190), 170.0, 2.0
 MARKS = {"disk": (7.0, None), "square": (5.0, None), "cross": (13.0, 2.4), "line-grid": (0.0, 3.0)}

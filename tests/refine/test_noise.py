@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.refine.noise import course, grey_variance
+from reseau.refine.matching.noise import course, grey_variance
 
 A, B = 1.5, 0.08
 STARTS = np.stack(np.meshgrid(np.arange(20, 380, 30), np.arange(20, 280, 30)), axis=-1).reshape(-1, 2) + 0.3

@@ -8,7 +8,7 @@ from reseau.adjust import Failure
 from reseau.data import ImagePoints
 from reseau.optics import RationalPolynomial, wong_display
 from reseau.refine import fit_mapping
-from reseau.refine.rivals import leave_one_out, rivals
+from reseau.refine.correction import leave_one_out, rivals
 
 _SIGMA = 0.05
 

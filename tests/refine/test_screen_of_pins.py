@@ -7,7 +7,7 @@ import pytest
 
 from reseau.data import Array, Mask
 from reseau.refine import find_pins
-from reseau.refine.glow import falloff
+from reseau.refine.pins.glow import falloff
 
 from .test_pins import NOISE, arcs, frame, nearest, picture
 

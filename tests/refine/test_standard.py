@@ -10,8 +10,7 @@ from reseau.adjust import Failure
 from reseau.calibration import Calibration
 from reseau.data import ImagePoints
 from reseau.refine import correct_camera
-from reseau.refine.instrument import InstrumentCorrection, correct_instrument
-from reseau.refine.standard import still_standard
+from reseau.refine.correction import InstrumentCorrection, correct_instrument, still_standard
 
 from .oscilloscope import RESEAU, RODS, SIGMA_PX, displayed, measured, reseau_marks
 

@@ -14,7 +14,7 @@ from reseau.optics import RationalPolynomial
 from reseau.procedures.oscilloscope import PhotoI, PhotoII
 from reseau.provenance import Provenance
 from reseau.refine import CameraCorrection
-from reseau.refine.instrument import InstrumentCorrection
+from reseau.refine.correction import InstrumentCorrection
 from reseau.report import oscilloscope_report
 from reseau.report.comparison import compare_with_truth
 from reseau.report.equations import equations

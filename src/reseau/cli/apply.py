@@ -79,7 +79,7 @@ def _image(
     from ..errors import UsageError
     from ..images import read_frame
     from ..provenance import Provenance, canonical_json, sha256_of
-    from ..refine.corrected import CorrectedImage, write_corrected
+    from ..refine.correction import CorrectedImage, write_corrected
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..formats import ReseauDesign
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
     from ..provenance import Provenance
-    from ..refine.instrument import InstrumentCorrection
+    from ..refine.correction import InstrumentCorrection
 
 __all__ = ["refine"]
 
@@ -231,7 +231,7 @@ def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json
     """True coordinates by a stored calibration."""
     from ..calibration import Calibration
     from ..provenance import canonical_json
-    from ..refine.instrument import InstrumentCorrection
+    from ..refine.correction import InstrumentCorrection
 
     stored: Calibration = Calibration.read(calibration)
     instrument, design, rods = InstrumentCorrection.from_calibration(stored)

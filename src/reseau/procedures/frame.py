@@ -14,8 +14,7 @@ from dataclasses import replace
 
 from ..adjust import Failure
 from ..formats import FrameCorners, FrameOrientation
-from ..refine.frame import FrameOptions, FrameResult, orient_frames
-from ..refine.frame_camera import Kind, Roll, roll_of, transformed
+from ..refine.frame import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
 from ..scans import Scan
 
 __all__ = ["FrameOptions", "FrameResult", "Roll", "described", "helped", "orient_scan", "roll_of"]

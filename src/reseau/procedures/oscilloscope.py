@@ -30,11 +30,17 @@ from ..refine import (
     measure_pins,
     measure_reseau,
 )
-from ..refine.causes import Causes, causes_of
-from ..refine.instrument import InstrumentCorrection, correct_instrument
-from ..refine.registration import Registration, register
-from ..refine.remarks import of_the_camera, of_the_change, of_the_object
-from ..refine.standard import StandardTest, still_standard
+from ..refine.correction import (
+    Causes,
+    InstrumentCorrection,
+    Registration,
+    StandardTest,
+    causes_of,
+    correct_instrument,
+    register,
+    still_standard,
+)
+from ..refine.correction.remarks import of_the_camera, of_the_change, of_the_object
 
 __all__ = [
     "PhotoI",
@@ -205,7 +211,7 @@ def photo_ii(
     options, pins
         How reseau and pins are measured.
     model, alpha, criterion, check
-        As in :func:`reseau.refine.instrument.correct_instrument`; by default equations (7a, b) with F-tests
+        As in :func:`reseau.refine.correction.correct_instrument`; by default equations (7a, b) with F-tests
         at 0.05.
 
     Returns

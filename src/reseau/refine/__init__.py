@@ -4,11 +4,19 @@ from .correction import CameraCorrection, CorrectionFit, correct_camera
 from .field import SmoothField
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
-from .pins import PinDetections, PinOptions, find_pins
+from .pins import (
+    Layout,
+    LayoutOptions,
+    PinDetections,
+    PinOptions,
+    PinResult,
+    Wires,
+    find_pins,
+    lay_wires,
+    measure_pins,
+)
 from .reseau import ReseauOptions, ReseauResult, measure_reseau
-from .rods import PinResult, measure_pins
 from .testfield import TestfieldOptions, TestfieldResult, measure_testfield
-from .wires import Layout, LayoutOptions, Wires, lay_wires
 
 __all__ = [
     "CameraCorrection",

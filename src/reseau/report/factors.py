@@ -13,7 +13,7 @@ from ..formats import ReseauDesign
 from ..optics import PlaneMapping, RationalPolynomial
 from ..procedures.oscilloscope import PhotoII, PhotoIII
 from ..refine import fit_mapping
-from ..refine.instrument import InstrumentCorrection, correct_instrument
+from ..refine.correction import InstrumentCorrection, correct_instrument
 from .tables import rms_pair
 from .truth import Factor, Known, KnownPoints
 

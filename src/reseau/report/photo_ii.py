@@ -12,10 +12,7 @@ from ..data import Array, Frame
 from ..formats import ReseauDesign
 from ..optics import RationalPolynomial, wong_display
 from ..procedures.oscilloscope import PhotoII
-from ..refine.causes import CAUSES, Causes
-from ..refine.correction import unit_of
-from ..refine.instrument import InstrumentCorrection, InstrumentFit
-from ..refine.rivals import Rivalry
+from ..refine.correction import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalry, unit_of
 from .equations import equations
 from .factors import FACTORS, correctors, rods_of
 from .figures import Panel, distortion_figure, residual_figure

@@ -1,0 +1,127 @@
+"""What a mark looks like: the door through which the matcher has images formed.
+
+A shape has a place, a width of the point-spread function, and parameters of its form, all 0 to begin with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ...data import Array, Rows
+from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
+
+__all__ = ["GrownOutline", "Shape", "Some", "Window"]
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Pixels in which images are formed, a window for each mark.
+
+    Parameters
+    ----------
+    columns, rows : ndarray (k, c), (k, r)
+        Their coordinates.
+    response : PixelResponse
+        The pixel.
+    """
+
+    columns: Array
+    rows: Array
+    response: PixelResponse
+
+    def select(self, at: Rows) -> Window:
+        """Windows of some of the marks."""
+        return Window(self.columns[at], self.rows[at], self.response)
+
+
+class Shape(Protocol):
+    """Images of marks as functions of place (px), width of the point-spread function (px) and form."""
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form; all are 0 to begin with."""
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """Share (m, r, c) of each pixel that the marks `at` take, at (m, 2), of widths (m,), forms (m, p)."""
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """The same, and its derivatives (m, 3 + p, r, c) by x, y, width and the parameters of the form."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrownOutline:
+    """Plane shapes, whose outlines are multiplied by 1 + Σ p_i F_i.
+
+    Parameters
+    ----------
+    nodes : Outline
+        Outlines (k, j, 2) in pixels around the point that is to be measured.
+    generators : ndarray (p, 2, 2)
+        The F.
+    """
+
+    nodes: Outline
+    generators: Array
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form."""
+        return len(self.generators)
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`Shape`."""
+        outline = self._placed(xy, form, at)
+        return coverage(outline, window.columns, window.rows, width, window.response)
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`Shape`."""
+        motions = None
+        if self.parameters:
+            motions = np.einsum("pij,knj->kpni", self.generators, self.nodes.xy[at])
+        outline = self._placed(xy, form, at)
+        return coverage_derivatives(outline, window.columns, window.rows, width, window.response, motions)
+
+    def _placed(self, xy: Array, form: Array, at: Rows) -> Outline:
+        nodes, tangents = self.nodes.xy[at], self.nodes.dxy[at]
+        if self.parameters:
+            grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
+            nodes, tangents = nodes @ grown, tangents @ grown
+        return Outline(nodes + xy[:, None, :], tangents)
+
+
+@dataclass(frozen=True, eq=False)
+class Some:
+    """Some marks of a shape, as a shape.
+
+    Parameters
+    ----------
+    whole : Shape
+        All of them.
+    rows : ndarray of int (k,)
+        Which ones.
+    """
+
+    whole: Shape
+    rows: Rows
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form."""
+        return self.whole.parameters
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`Shape`."""
+        return self.whole.image(xy, width, form, self.rows[at], window)
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`Shape`."""
+        return self.whole.derivatives(xy, width, form, self.rows[at], window)
