@@ -18,6 +18,9 @@ from .stochastic import blocks_of
 
 __all__ = ["VarianceComponents", "variance_components"]
 
+# Greatest change of the logarithm of a variance in a step of scoring.
+_STEP = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class VarianceComponents(Generic[F]):
@@ -30,7 +33,8 @@ class VarianceComponents(Generic[F]):
     factors : ndarray (g,)
         The true standard deviations over those given.
     sigma : ndarray (g,)
-        Standard deviations of the factors, to first order factor/√(2·redundancy).
+        Standard deviations of the factors, to first order; factor/√(2·redundancy) where groups are not
+        correlated with each other.
     redundancy : ndarray (g,)
         Redundancy of each group.
     adjustment : Adjustment
@@ -71,7 +75,8 @@ def variance_components(
     problem : GaussMarkov, GaussHelmert, or any Adjustable
         With the covariance as far as it is known.
     groups : mapping of str to array_like of bool
-        Masks of the observations' shape. Observations in no group keep their variance.
+        Masks of the observations' shape. Observations in no group keep their variance. Groups may be
+        correlated with each other: their correlations stay, their standard deviations are multiplied.
     options : Options, optional
         How to adjust.
     tolerance : float
@@ -87,14 +92,19 @@ def variance_components(
     Raises
     ------
     UsageError
-        When groups overlap, are empty, or are correlated with what is outside them.
+        When groups overlap or are empty.
 
     Notes
     -----
-    σ̂² = vᵀPv / Σr of each group, iterated (Förstner 1979, *Ein Verfahren zur Schätzung von Varianz- und
-    Kovarianzkomponenten*, AVN 86); at convergence that of Helmert and of restricted maximum likelihood.
+    σ̂² = Σ vᵢ(Pv)ᵢ / Σr of each group, iterated (Förstner 1979, *Ein Verfahren zur Schätzung von Varianz- und
+    Kovarianzkomponenten*, AVN 86); at convergence that of Helmert and of restricted maximum likelihood. With
+    C = F C₀ F, F diagonal, the score of the logarithm of a factor is Σ vᵢ(Pv)ᵢ less its expectation
+    Σ(QᵥᵥP)ᵢᵢ, also where C₀ correlates the groups. These are then found by scoring, with the information
+    A = (N + Σ C⁻¹∘C)/2 of two groups, N diagonal of their sizes, in the proportion of their redundancy.
     """
-    names, label = tuple(groups), _labels(problem, groups)
+    names = tuple(groups)
+    label, information = _labels(problem, groups)
+    size, correlated = np.bincount(label, minlength=len(names) + 1)[:-1], bool(np.triu(information, 1).any())
     base = np.ones(problem.observations.size) if problem.weights is None else problem.weights.ravel()
     variance, start = np.ones(len(names)), problem
     for iteration in range(1, max_iterations + 1):
@@ -110,17 +120,24 @@ def variance_components(
             weak = names[int(np.argmin(r))]
             return Failure(f"the group {weak} has no redundancy to estimate its variance from")
         change = np.bincount(label, squares, len(names) + 1)[:-1] / r
-        variance = variance * change
-        if not (variance > 0).all():
-            return Failure(f"the group {names[int(np.argmin(variance))]} has no residuals at all")
+        part = np.sqrt(r / size)
+        weight = information * np.outer(part, part)
+        if correlated:
+            step = np.linalg.solve(weight, (change - 1.0) * r)
+            variance = variance * np.exp(np.clip(step, -_STEP, _STEP))
+        elif (change > 0).all():
+            variance = variance * change
+        else:
+            return Failure(f"the group {names[int(np.argmin(change))]} has no residuals at all")
         if np.abs(change - 1.0).max() < tolerance:
             factors = np.sqrt(variance)
-            return VarianceComponents(names, factors, factors / np.sqrt(2.0 * r), r, fit, iteration)
+            sigma = factors * np.sqrt(np.diag(np.linalg.inv(weight)) / 2.0)
+            return VarianceComponents(names, factors, sigma, r, fit, iteration)
     return Failure(f"the variance components have not settled in {max_iterations} adjustments")
 
 
-def _labels(problem: Adjustable[F], groups: Mapping[str, ArrayLike]) -> NDArray[np.intp]:
-    """Number of the group of each observation (n,); one more for none."""
+def _labels(problem: Adjustable[F], groups: Mapping[str, ArrayLike]) -> tuple[NDArray[np.intp], Array]:
+    """Number of the group of each observation (n,), one more for none; and A (g, g), were all redundant."""
     label = np.full(problem.observations.size, len(groups), dtype=np.intp)
     for number, (name, given) in enumerate(groups.items()):
         mask = np.asarray(given)
@@ -131,11 +148,14 @@ def _labels(problem: Adjustable[F], groups: Mapping[str, ArrayLike]) -> NDArray[
         if (label[mask.ravel()] < len(groups)).any():
             raise UsageError("overlaps with another", where=f"group {name}")
         label[mask.ravel()] = number
-    start = 0
+    start, g = 0, len(groups) + 1
+    sums = np.diag(np.bincount(label, minlength=g).astype(np.float64))
     for blocks in blocks_of(problem.covariance, problem.observations.shape):
         b, k, _ = blocks.shape
         own = label[start : start + b * k].reshape(b, k)
-        if ((own[:, :, None] != own[:, None, :]) & (blocks != 0)).any():
-            raise UsageError("are correlated with one another", where="groups")
+        product = blocks * np.linalg.inv(blocks)
+        i, j = np.broadcast_arrays(own[:, :, None], own[:, None, :])
+        np.add.at(sums, (i.ravel(), j.ravel()), product.ravel())
         start += b * k
-    return label
+    information: Array = sums[:-1, :-1] / 2.0
+    return label, information
