@@ -8,6 +8,7 @@
     ├── InputError           a file or a value from outside that cannot be used exit status 2
     │   ├── ImageError       … that should be an image
     │   └── FormatError      … that should be one of the project's documents
+    ├── ArchiveError         the archive cannot keep or give what was asked     exit status 1
     ├── EstimationError      an estimate that was required could not be had     exit status 1
     └── InstrumentError      an instrument did not do what was asked            exit status 1
         ├── ConnectionLost       it cannot be reached, or went away
@@ -26,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 __all__ = [
+    "ArchiveError",
     "BenchError",
     "ConnectionLost",
     "DeadlineError",
@@ -87,6 +89,10 @@ class ImageError(InputError):
 
 class FormatError(InputError):
     """A document that does not keep to its schema."""
+
+
+class ArchiveError(ReseauError):
+    """The archive cannot keep or give what was asked: full, read-only, damaged, or not there."""
 
 
 class EstimationError(ReseauError):

@@ -1,0 +1,28 @@
+"""What was captured and computed, and how it came about: written once, checked by hash, never changed."""
+
+from .archive import Archive
+from .export import described, export
+from .objects import LocalObjects, Objects, RemoteObjects, objects_at
+from .picture import frame_of, tiff_of
+from .records import ArchivedFrame, ArchivedResult, SessionSummary, Verdict
+from .session import Session
+from .verify import Verified, verify
+
+__all__ = [
+    "Archive",
+    "ArchivedFrame",
+    "ArchivedResult",
+    "LocalObjects",
+    "Objects",
+    "RemoteObjects",
+    "Session",
+    "SessionSummary",
+    "Verdict",
+    "Verified",
+    "described",
+    "export",
+    "frame_of",
+    "objects_at",
+    "tiff_of",
+    "verify",
+]

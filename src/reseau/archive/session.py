@@ -1,0 +1,284 @@
+"""One session of an archive: frames, verdicts, results, events, each kept before the next thing happens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Engine
+
+from .. import __version__
+from ..data import Frame
+from ..errors import ArchiveError
+from . import schema
+from .objects import Objects
+from .picture import frame_of, tiff_of
+from .records import ArchivedFrame, ArchivedResult, Verdict, utc
+
+__all__ = ["Session"]
+
+
+class Session:
+    """One session of an archive.
+
+    Parameters
+    ----------
+    engine : Engine
+        Of the index.
+    objects : Objects
+        The files.
+    row : mapping
+        Of the session.
+    """
+
+    def __init__(self, engine: Engine, objects: Objects, row: Mapping[str, Any]) -> None:
+        self._engine, self.objects = engine, objects
+        self._id: int = row["id"]
+        self.name: str = row["name"]
+        self.plan: str = row["plan"]
+        self.parameters: dict[str, Any] = row["parameters"]
+        self.bench: str = row["bench"]
+        self.software: str = row["software"]
+        self.begun = utc(row["begun"])
+
+    def store(
+        self,
+        step: str,
+        picture: Frame | bytes,
+        *,
+        kind: str = "frame",
+        take: int = 0,
+        suffix: str = ".tif",
+        facts: Mapping[str, Any] | None = None,
+        clock: Mapping[str, Any] | None = None,
+    ) -> ArchivedFrame:
+        """Keep a frame: on the disk first, then in the index; when this returns nothing can lose it.
+
+        Parameters
+        ----------
+        step : str
+            Pose or photograph it belongs to.
+        picture : Frame or bytes
+            The frame; or a file as an instrument sent it.
+        kind : str
+            Which of the pictures of the step.
+        take : int
+            The how-manieth attempt, from 0.
+        suffix : str
+            Of the file of bytes.
+        facts, clock : mapping, optional
+            What is known of it; times and counters apart.
+
+        Returns
+        -------
+        ArchivedFrame
+            The one that is there, where one of this step, kind and take is.
+
+        Raises
+        ------
+        ArchiveError
+            When it cannot be kept.
+        """
+        there = self.find(step, kind, take)
+        if there is not None:
+            return there
+        known = dict(facts or {})
+        key = {"session": self.name, "step": step, "kind": kind, "take": take}
+        data = picture if isinstance(picture, bytes) else tiff_of(picture, known | key)
+        suffix = suffix if isinstance(picture, bytes) else ".tif"
+        return self._enter(self.objects.put(data, suffix), suffix, len(data), key, known, dict(clock or {}))
+
+    def _enter(
+        self,
+        sha256: str,
+        suffix: str,
+        size: int,
+        key: Mapping[str, Any],
+        facts: dict[str, Any],
+        clock: dict[str, Any],
+    ) -> ArchivedFrame:
+        """Enter a file that is there into the index."""
+        step, kind, take = key["step"], key["kind"], key["take"]
+        values = {
+            "session_id": self._id,
+            "step": step,
+            "kind": kind,
+            "take": take,
+            "sha256": sha256,
+            "suffix": suffix,
+            "size": size,
+            "facts": facts,
+            "clock": clock,
+            "stored": datetime.now(UTC),
+        }
+        with schema.connected(self._engine) as connection:
+            made = connection.execute(schema.frames.insert().values(values)).inserted_primary_key
+        assert made is not None
+        return ArchivedFrame(made[0], step, kind, take, sha256, suffix, size, facts, clock)
+
+    def recover(self) -> list[ArchivedFrame]:
+        """Enter frames that were brought to the disk, but not into the index when the process was killed."""
+        with schema.connected(self._engine) as connection:
+            known = set(connection.scalars(sa.select(schema.frames.c.sha256)))
+        found = []
+        for sha256, suffix in self.objects.names():
+            if suffix != ".tif" or sha256 in known:
+                continue
+            data = self.objects.get(sha256, suffix)
+            try:
+                _, facts = frame_of(data, sha256)
+            except ArchiveError:
+                continue
+            key = {name: facts.pop(name, None) for name in ("session", "step", "kind", "take")}
+            if key["session"] == self.name and self.find(key["step"], key["kind"], key["take"]) is None:
+                found.append(self._enter(sha256, suffix, len(data), key, facts, {"recovered": True}))
+        return found
+
+    def _frames(self, *where: sa.ColumnElement[bool]) -> list[ArchivedFrame]:
+        f, v = schema.frames.c, schema.verdicts.c
+        given = schema.verdicts.alias().c
+        last = sa.select(sa.func.max(given.id)).where(given.frame_id == f.id).scalar_subquery()
+        columns = (f.id, f.step, f.kind, f.take, f.sha256, f.suffix, f.size, f.facts, f.clock)
+        query = (
+            sa.select(*columns, v.ok, v.why, v.facts)
+            .select_from(schema.frames)
+            .outerjoin(schema.verdicts, v.id == last)
+            .where(f.session_id == self._id, *where)
+            .order_by(f.id)
+        )
+        with schema.connected(self._engine) as connection:
+            rows = connection.execute(query).all()
+        return [
+            ArchivedFrame(*row[:9], verdict=None if row[9] is None else Verdict(*row[9:])) for row in rows
+        ]
+
+    def find(self, step: str, kind: str = "frame", take: int = 0) -> ArchivedFrame | None:
+        """A frame by what it is of, or None."""
+        f = schema.frames.c
+        found = self._frames(f.step == step, f.kind == kind, f.take == take)
+        return found[0] if found else None
+
+    def frames(self, step: str | None = None, kind: str | None = None) -> list[ArchivedFrame]:
+        """Frames in the order in which they were stored, with their last verdicts."""
+        f = schema.frames.c
+        where = [] if step is None else [f.step == step]
+        return self._frames(*where, *([] if kind is None else [f.kind == kind]))
+
+    def picture(self, archived: ArchivedFrame) -> Frame:
+        """The frame of a file, checked against its hash.
+
+        Raises
+        ------
+        ArchiveError
+            When it is lost, damaged, or no frame.
+        """
+        return frame_of(self.objects.get(archived.sha256, archived.suffix), archived.name)[0]
+
+    def judge(self, archived: ArchivedFrame, verdict: Verdict) -> None:
+        """Write down what was found of a frame; the last word counts, and all are kept."""
+        row = {"frame_id": archived.id, "ok": verdict.ok, "why": verdict.why, "facts": verdict.facts}
+        with schema.connected(self._engine) as connection:
+            connection.execute(schema.verdicts.insert().values(row))
+
+    def keep(
+        self,
+        name: str,
+        content: str | bytes,
+        parameters: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
+    ) -> ArchivedResult:
+        """Keep a result with how it came about.
+
+        Parameters
+        ----------
+        name : str
+            Of its file, with suffix.
+        content : str or bytes
+            Of the file.
+        parameters : mapping, optional
+            It was computed with.
+        inputs : mapping, optional
+            SHA-256 of what it was computed from, by role.
+
+        Raises
+        ------
+        ArchiveError
+            When it cannot be kept.
+        """
+        data = content.encode("utf-8") if isinstance(content, str) else content
+        suffix, software, known = Path(name).suffix, f"reseau {__version__}", dict(parameters or {})
+        sha256 = self.objects.put(data, suffix)
+        row = {
+            "session_id": self._id,
+            "name": name,
+            "sha256": sha256,
+            "suffix": suffix,
+            "size": len(data),
+            "parameters": known,
+            "software": software,
+            "stored": datetime.now(UTC),
+        }
+        made_of = dict(inputs or {})
+        with schema.connected(self._engine) as connection:
+            made = connection.execute(schema.results.insert().values(row)).inserted_primary_key
+            assert made is not None
+            roles = [{"result_id": made[0], "role": k, "sha256": v} for k, v in made_of.items()]
+            if roles:
+                connection.execute(schema.inputs.insert(), roles)
+        return ArchivedResult(made[0], name, sha256, suffix, len(data), known, made_of, software)
+
+    def results(self) -> list[ArchivedResult]:
+        """Results in the order in which they were kept."""
+        r, i = schema.results.c, schema.inputs.c
+        columns = (r.id, r.name, r.sha256, r.suffix, r.size, r.parameters, r.software)
+        with schema.connected(self._engine) as connection:
+            query = sa.select(*columns).where(r.session_id == self._id).order_by(r.id)
+            rows = connection.execute(query).all()
+            roles = connection.execute(
+                sa.select(i.result_id, i.role, i.sha256)
+                .join(schema.results)
+                .where(r.session_id == self._id)
+                .order_by(i.id)
+            ).all()
+        return [
+            ArchivedResult(*row[:6], inputs={k: v for n, k, v in roles if n == row[0]}, software=row[6])
+            for row in rows
+        ]
+
+    def content(self, result: ArchivedResult) -> bytes:
+        """The file of a result, checked against its hash."""
+        return self.objects.get(result.sha256, result.suffix)
+
+    def note(self, key: str, kind: str, document: Mapping[str, Any]) -> None:
+        """Write down what happened; what has the key of something written down is that."""
+        e = schema.events
+        with schema.connected(self._engine) as connection:
+            there = sa.select(e.c.id).where(e.c.session_id == self._id, e.c.key == key)
+            if connection.scalar(there) is None:
+                row = {"session_id": self._id, "key": key, "kind": kind, "document": dict(document)}
+                connection.execute(e.insert().values(row))
+
+    def notes(self, kind: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Kind and document of what was written down, in order."""
+        e = schema.events.c
+        query = sa.select(e.kind, e.document).where(e.session_id == self._id).order_by(e.id)
+        with schema.connected(self._engine) as connection:
+            rows = connection.execute(query if kind is None else query.where(e.kind == kind)).all()
+        yield from ((row[0], row[1]) for row in rows)
+
+    def end(self, status: str, why: str = "") -> None:
+        """Say how it ended; a session that is resumed ends once more."""
+        row = {"session_id": self._id, "status": status, "why": why, "at": datetime.now(UTC)}
+        with schema.connected(self._engine) as connection:
+            connection.execute(schema.ends.insert().values(row))
+
+    @property
+    def status(self) -> str:
+        """How it ended last: done, aborted, failed; or that it did not end."""
+        e = schema.ends.c
+        query = sa.select(e.status).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
+        with schema.connected(self._engine) as connection:
+            return connection.scalar(query) or "not ended"
