@@ -1,4 +1,4 @@
-"""Byte streams to instruments: serial ports and TCP, with a deadline for everything; and talk over them."""
+"""Byte streams to instruments: serial ports, TCP, UDP, with a deadline for everything; and talk over them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reseau.instruments import Deadline
 
 from .codecs.stream import Damaged, Decoder
 
-__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "link_to", "serial_ports"]
+__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "UdpLink", "link_to", "serial_ports"]
 
 M = TypeVar("M")
 
@@ -52,10 +52,12 @@ class SerialLink:
         Device, as ``/dev/ttyUSB0``.
     baud : int
         8 bits, no parity, one stop bit.
+    xonxoff : bool
+        Whether both sides may ask the other to wait.
     """
 
-    def __init__(self, port: str, baud: int) -> None:
-        self._port, self._baud = port, baud
+    def __init__(self, port: str, baud: int, *, xonxoff: bool = False) -> None:
+        self._port, self._baud, self._xonxoff = port, baud, xonxoff
         self._serial: serial.Serial | None = None
 
     def open(self, deadline: Deadline) -> None:
@@ -63,7 +65,12 @@ class SerialLink:
         self.close()
         try:
             self._serial = serial.Serial(
-                self._port, self._baud, timeout=0.1, write_timeout=1.0, exclusive=True
+                self._port,
+                self._baud,
+                timeout=0.1,
+                write_timeout=1.0,
+                exclusive=True,
+                xonxoff=self._xonxoff,
             )
             self._serial.reset_input_buffer()
         except (OSError, ValueError) as error:
@@ -188,20 +195,98 @@ class TcpLink:
         return self._socket
 
 
+class UdpLink:
+    """Datagrams to and from one peer, read as one stream; any of them may get lost on the way.
+
+    Parameters
+    ----------
+    host, port : str, int
+        Of the instrument, or of what passes its bytes on.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+
+    @property
+    def _where(self) -> str:
+        return f"udp {self._address[0]}:{self._address[1]}"
+
+    def open(self, deadline: Deadline) -> None:
+        """Take a port of one's own: what is still under way to the one before is lost."""
+        self.close()
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                *self._address, type=socket.SOCK_DGRAM, proto=socket.IPPROTO_UDP
+            )[0]
+            self._socket = socket.socket(family, kind, protocol)
+            self._socket.connect(address)
+        except OSError as error:
+            self.close()
+            raise ConnectionLost(
+                f"{self._where} cannot be reached ({error})", do="is the address right?"
+            ) from None
+
+    def close(self) -> None:
+        """Let go of the port, if there is one."""
+        held, self._socket = self._socket, None
+        if held is not None:
+            # Closing alone does not wake a thread that waits for bytes.
+            with suppress(OSError):
+                held.shutdown(socket.SHUT_RDWR)
+            held.close()
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Send a datagram."""
+        held = self._opened()
+        try:
+            held.settimeout(max(0.01, deadline.left))
+            held.send(data)
+        except TimeoutError:
+            raise DeadlineError("took no bytes in the time allowed") from None
+        except OSError as error:
+            raise ConnectionLost(f"{self._where} does not listen ({error})", do="is it on?") from None
+
+    def pending(self) -> bool:
+        """Whether datagrams have come that were not read yet."""
+        return bool(select.select([self._opened()], [], [], 0)[0])
+
+    def read(self, deadline: Deadline) -> bytes:
+        """A datagram, or nothing after the deadline."""
+        held = self._opened()
+        try:
+            held.settimeout(max(0.001, deadline.left))
+            data = held.recv(_CHUNK)
+        except TimeoutError:
+            return b""
+        except OSError as error:
+            raise ConnectionLost(f"{self._where} does not listen ({error})", do="is it on?") from None
+        if not data and self._socket is None:
+            raise ConnectionLost(f"{self._where} was closed")
+        return data
+
+    def _opened(self) -> socket.socket:
+        if self._socket is None:
+            raise ConnectionLost(f"{self._where} is not open")
+        return self._socket
+
+
 def serial_ports() -> tuple[str, ...]:
     """Serial ports of this machine; found by its entry point."""
     return tuple(sorted(port.device for port in list_ports.comports()))
 
 
-def link_to(address: str | Link, *, baud: int = 115200) -> Link:
+def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -> Link:
     """The link of an address.
 
     Parameters
     ----------
     address : str or Link
-        ``tcp://host:port``, a serial device, or a link, which is passed through.
+        ``tcp://host:port``, ``udp://host:port``, a serial device, or a link, which is passed through.
     baud : int
         Of a serial device; ``device@baud`` says another one.
+    xonxoff : bool
+        Of a serial device.
 
     Raises
     ------
@@ -210,15 +295,19 @@ def link_to(address: str | Link, *, baud: int = 115200) -> Link:
     """
     if not isinstance(address, str):
         return address
-    if address.startswith("tcp://"):
-        host, _, port = address.removeprefix("tcp://").rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65535:
-            raise UsageError("is no address", where=address, do="write tcp://host:port")
-        return TcpLink(host.strip("[]"), int(port))
+    scheme, slashes, rest = address.partition("://")
+    if slashes:
+        host, _, port = rest.rpartition(":")
+        if scheme not in _NETWORK or not host or not port.isdigit() or int(port) > 65535:
+            raise UsageError("is no address", where=address, do="write tcp://host:port or udp://host:port")
+        return _NETWORK[scheme](host.strip("[]"), int(port))
     device, at, speed = address.partition("@")
     if not device or (at and not speed.isdigit()):
         raise UsageError("is no address", where=address, do="write a serial device, or device@baud")
-    return SerialLink(device, int(speed) if at else baud)
+    return SerialLink(device, int(speed) if at else baud, xonxoff=xonxoff)
+
+
+_NETWORK: dict[str, Callable[[str, int], Link]] = {"tcp": TcpLink, "udp": UdpLink}
 
 
 class Conversation(Generic[M]):

@@ -28,12 +28,14 @@ from reseau_sims.serving import (
     Server,
     Smc100Line,
     TcpServer,
+    UdpServer,
     Wire,
     ZaberChain,
 )
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 
 TRANSPORTS = ("pty", "tcp", "in process")
+_SERVERS: dict[str, Callable[..., Server]] = {"pty": PtyServer, "tcp": TcpServer, "udp": UdpServer}
 
 
 @dataclass
@@ -84,7 +86,7 @@ def _wired(stack: ExitStack, transport: str, machine: Machine, script: Script) -
 
     if transport == "in process":
         return InProcess(session), None
-    server: Server = stack.enter_context(PtyServer(session) if transport == "pty" else TcpServer(session))
+    server: Server = stack.enter_context(_SERVERS[transport](session))
     return server.address, server
 
 
@@ -165,7 +167,9 @@ def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
 
 
 def bk_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
-    machine = serving.BkScanner(announces_wrongly=transport == "in process")
+    machine = serving.BkScanner(
+        announces_wrongly=transport == "in process", acknowledges_off=transport != "in process"
+    )
     address, server = _wired(stack, transport, machine, script)
     device = BkScanner("bk", link_to(address), seconds=0.5)
     picture = machine.section()
@@ -203,7 +207,7 @@ Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
-    **{("ping360", transport): ping360_rig for transport in TRANSPORTS},
+    **{("ping360", transport): ping360_rig for transport in (*TRANSPORTS, "udp")},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},
     **{

@@ -65,7 +65,7 @@ def test_a_fault_is_survived_or_said_in_time(driver: str, transport: str, kind: 
 
 
 @pytest.mark.parametrize(
-    ("driver", "transport"), [key for key in RIGS if key[1] not in ("in process", "usbtmc")]
+    ("driver", "transport"), [key for key in RIGS if key[1] not in ("in process", "usbtmc", "udp")]
 )
 def test_a_cable_pulled_and_plugged_in_again(driver: str, transport: str) -> None:
     with rig(driver, transport) as found:

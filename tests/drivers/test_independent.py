@@ -10,7 +10,7 @@ import pytest
 from reseau_drivers.scanner import ping360
 from reseau_drivers.turntable import zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, PtyServer, Script, TcpServer, Wire, ZaberChain
+from reseau_sims.serving import InProcess, PtyServer, Script, TcpServer, UdpServer, Wire, ZaberChain
 
 
 def test_zaber_motion_homes_and_moves_the_turntable() -> None:
@@ -48,6 +48,24 @@ def test_bluerobotics_ping_scans() -> None:
                 client.control_transducer(1, 1, angle, 32, 80, 740, 200, 1, 0)
                 message = client.wait_message([2300, 2], 4.0)
                 assert (message.angle, message.sample_period) == (angle, 80)
+                assert set(message.data) == {angle % 256}
+        finally:
+            client.iodev.close()
+    assert machine.violations == []
+
+
+def test_bluerobotics_ping_scans_over_udp() -> None:
+    brping = pytest.importorskip("brping", reason="bluerobotics-ping is not installed")
+    machine = serving.Ping360()
+    with UdpServer(lambda: Wire(machine, Script())) as server:
+        client = brping.Ping360()
+        client.connect_udp(server.HOST, server.port)
+        try:
+            assert client.initialize()
+            for angle in (0, 199, 399):
+                client.control_transducer(1, 1, angle, 32, 80, 740, 1200, 1, 0)
+                message = client.wait_message([2300, 2], 4.0)
+                assert (message.angle, len(message.data)) == (angle, 1200)
                 assert set(message.data) == {angle % 256}
         finally:
             client.iodev.close()

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
 
-from reseau.errors import ProtocolError, SettingError, StateError
+from reseau.errors import InstrumentError, ProtocolError, SettingError, StateError
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.scanner import Ping360, ping360
 from reseau_sims import Reflectors, World, serving
 from reseau_sims.laboratory import Laboratory
-from reseau_sims.serving import InProcess, Script, Wire
+from reseau_sims.serving import InProcess, Script, UdpServer, Wire
 
 
 def sonar(laboratory: Laboratory | None = None, **settings: float) -> tuple[Ping360, serving.Ping360]:
@@ -112,6 +112,25 @@ def test_settings_are_checked_before_anything_is_sent() -> None:
     assert device.settings.changed({"range_mm": 60_000, "speed_m_s": 1000}).period <= 40_000
     assert machine.violations == []
     device.close()
+
+
+def test_over_udp_a_peer_that_went_away_is_said_and_found_again() -> None:
+    machine = serving.Ping360()
+    with UdpServer(lambda: Wire(machine, Script())) as server:
+        device = ping360("sonar", server.address, seconds=0.5)
+        device.connect()
+        port = server.port
+    with pytest.raises(InstrumentError, match="sonar"):
+        device.line(3)
+    with UdpServer(lambda: Wire(machine, Script()), port):
+        assert set(device.line(3)) == {203}
+        # Another client does not get between: each is answered at its own port.
+        with ping360("other", f"udp://127.0.0.1:{port}", seconds=0.5) as other:
+            for angle in range(5):
+                assert set(other.line(-angle)) == {200 - angle}
+                assert set(device.line(angle)) == {200 + angle}
+    device.close()
+    assert machine.violations == []
 
 
 def test_another_device_at_the_address_is_named() -> None:

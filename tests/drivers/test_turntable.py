@@ -137,7 +137,15 @@ def test_wrong_plans_and_addresses_are_refused() -> None:
     for axes in ({}, {"tilt": {"hight": 3}}, {"tilt": {"low": 5.0, "high": 1.0}}):
         with pytest.raises(SettingError):
             zaber("table", "/dev/null", axes=axes)
-    for address in ("tcp://", "tcp://host", "tcp://host:99999999", "", "/dev/ttyS0@fast"):
+    for address in (
+        "tcp://",
+        "udp://host",
+        "ftp://host:1",
+        "tcp://host",
+        "tcp://host:99999999",
+        "",
+        "/dev/ttyS0@fast",
+    ):
         with pytest.raises(UsageError):
             link_to(address)
     with pytest.raises(ConnectionLost, match="cannot be opened"):

@@ -1,8 +1,10 @@
 """BK Medical's OEM interface: messages between 0x01 and 0x04, with frames and their geometry.
 
-Source: *BK Ultrasound OEM Interface*, "Message Framing" and "GRAB_FRAME". The bytes 0x01, 0x04 and 0x1B
-inside a message stand as 0x1B and their complement. A frame comes as ``DATA:GRAB_FRAME #<n><length><4 bytes
-of a time stamp><pixels>;``. Its length is wrong on some instruments: the end of the message counts.
+Source: BK's document PS12640-44, page 9 (framing), as NifTK's ``BKMedicalDataSourceWorker`` quotes it, and
+PLUS's ``vtkPlusBkProFocusOemVideoSource`` (frames, geometry). The bytes 0x01, 0x04 and 0x1B inside a message
+stand as 0x1B and their complement. A frame comes as ``DATA:GRAB_FRAME #6227332<4 bytes of a time
+stamp><592·384 pixels>;``: its length counts the time stamp. A BK5000 states another one: the end of the
+message counts.
 """
 
 from __future__ import annotations
@@ -128,13 +130,20 @@ def encode_frame(frame: GrabbedFrame) -> bytes:
     return _GRAB + b"#%d" % len(length) + length + stamp + frame.pixels + b";"
 
 
-def parse_frame(content: bytes) -> GrabbedFrame:
+def parse_frame(content: bytes, size: int) -> GrabbedFrame:
     """The frame that a message brings.
+
+    Parameters
+    ----------
+    content : bytes
+        Of the message.
+    size : int
+        Pixels of the window; a semicolon behind them is none of them.
 
     Raises
     ------
     ProtocolError
-        When it brings none.
+        When it brings none, or one of another size.
     """
     head = re.match(rb"DATA:GRAB_FRAME #([1-9])", content)
     digits = int(head[1]) if head else 0
@@ -142,10 +151,14 @@ def parse_frame(content: bytes) -> GrabbedFrame:
     if head is None or len(length) != digits or not length.isdigit():
         raise ProtocolError(f"no frame: {shown(content)}")
     start = head.end() + digits
-    if len(content) < start + _STAMP:
-        raise ProtocolError(f"a frame without a time stamp: {shown(content)}")
-    pixels = content[start + _STAMP :]
-    return GrabbedFrame(int.from_bytes(content[start : start + _STAMP], "little"), pixels[:-1], int(length))
+    stamp, pixels = content[start : start + _STAMP], content[start + _STAMP :]
+    if len(pixels) == size + 1:
+        pixels = pixels.removesuffix(b";")
+    if len(stamp) < _STAMP or len(pixels) != size:
+        raise ProtocolError(
+            f"a frame of {len(pixels)} bytes for {size} pixels", do="colour, or an overlay? switch them off"
+        )
+    return GrabbedFrame(int.from_bytes(stamp, "little"), pixels, int(length))
 
 
 def numbers(content: bytes, name: str) -> tuple[float, ...]:

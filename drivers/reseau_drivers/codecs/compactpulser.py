@@ -1,6 +1,8 @@
-r"""US Ultratek's CompactPulser: one letter, a number, a carriage return; ``G?`` is answered ``G=…\r``.
+r"""US Ultratek's CompactPulser: one letter, a whole number, a carriage return; ``G?`` is answered ``G=…\r``.
 
-Source: *CompactPulser Instruction Manual*, the table of its serial commands.
+Source: ``ultratekPulser.py`` of changbatterygroup/ultrasonicTesting, which runs one: 9600 baud, ``D0``,
+``M0``, ``V300``, ``W220``, ``P500`` (5000 Hz), ``P0``, ``T0`` (internal), ``G?`` → ``G=…``, gains from −120
+to 840. The maker's manual is not public: that gains are tenths of a decibel follows from their range.
 """
 
 from __future__ import annotations
@@ -22,14 +24,14 @@ LETTERS: dict[str, str] = {
     "W": "width of the pulse (ns)",
     "V": "voltage of the pulse (V)",
     "D": "damping",
-    "M": "mode: 0 pulse-echo, 1 through transmission",
+    "M": "mode",
     "T": "trigger: 0 internal, 1 external",
-    "G": "gain (dB)",
+    "G": "gain (0.1 dB)",
 }
 """What each letter sets."""
 
-_COMMAND = re.compile(rb"([A-Z])(\?|-?\d{1,5}(?:\.\d)?)")
-_ANSWER = re.compile(rb"([A-Z])=(-?\d{1,5}(?:\.\d+)?)")
+_COMMAND = re.compile(rb"([A-Z])(\?|-?\d{1,5})")
+_ANSWER = re.compile(rb"([A-Z])=(-?\d{1,5})")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Setting:
     """A letter with its value; none in a question."""
 
     letter: str
-    value: float | None
+    value: int | None
 
 
 def encode(setting: Setting) -> bytes:
@@ -53,7 +55,7 @@ def encode(setting: Setting) -> bytes:
     >>> encode(Setting("P", 100)), encode(Setting("G", None))
     (b'P100\\r', b'G?\\r')
     """
-    text = f"{setting.letter}{'?' if setting.value is None else f'{setting.value:g}'}"
+    text = f"{setting.letter}{'?' if setting.value is None else setting.value}"
     if setting.letter not in LETTERS or _COMMAND.fullmatch(text.encode()) is None:
         raise SettingError("is no command of a CompactPulser", where=repr(text))
     return text.encode("ascii") + b"\r"
@@ -61,7 +63,7 @@ def encode(setting: Setting) -> bytes:
 
 def encode_answer(setting: Setting) -> bytes:
     """Bytes of an answer."""
-    return f"{setting.letter}={setting.value:g}\r".encode("ascii")
+    return f"{setting.letter}={setting.value}\r".encode("ascii")
 
 
 def decode(line: bytes) -> tuple[Setting, bool]:
@@ -76,6 +78,6 @@ def decode(line: bytes) -> tuple[Setting, bool]:
     for pattern, answer in ((_COMMAND, False), (_ANSWER, True)):
         found = pattern.fullmatch(line)
         if found and found[1].decode() in LETTERS:
-            value = None if found[2] == b"?" else float(found[2])
+            value = None if found[2] == b"?" else int(found[2])
             return Setting(found[1].decode(), value), answer
     raise ProtocolError(f"no line of a CompactPulser: {shown(line)}")

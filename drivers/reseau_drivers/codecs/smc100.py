@@ -1,8 +1,9 @@
 r"""Newport's SMC100 and CONEX controllers: ``nnAAxx\r\n``, one axis for each address.
 
-Source: *SMC100CC & SMC100PP User's Manual*, section 2.3 "Command Syntax" and the commands TS and TE. Commands
-that set or move are not acknowledged: whether one was understood is asked with TE, what the axis does with
-TS.
+Source: *SMC100CC & SMC100PP User's Manual*, commands TE (page 61) and TS (page 65), as the drivers of
+PyMeasure, bliss and hvl_ccb have them, which agree; *CONEX-CC Controller Documentation* for what that one has
+besides. Commands that set or move are not acknowledged: whether one was understood is asked with TE, what the
+axis does with TS.
 """
 
 from __future__ import annotations
@@ -38,9 +39,12 @@ ERRORS: dict[str, str] = {
     "L": "command not allowed in HOMING state",
     "M": "command not allowed in MOVING state",
     "N": "current position out of software limit",
+    "P": "command not allowed in TRACKING state",
     "S": "communication time-out",
     "U": "error during EEPROM access",
     "V": "error during command execution",
+    "W": "command not allowed for PP version",
+    "X": "command not allowed for CC version",
 }
 """Answers to TE."""
 
@@ -90,7 +94,10 @@ def phase(code: int) -> Phase:
         (range(0x1E, 0x20), Phase.HOMING),
         (range(0x28, 0x29), Phase.MOVING),
         (range(0x32, 0x36), Phase.READY),
-        (range(0x3C, 0x3F), Phase.DISABLED),
+        # CONEX: ready to track.
+        (range(0x36, 0x39), Phase.READY),
+        (range(0x3C, 0x40), Phase.DISABLED),
+        # CONEX: tracking.
         (range(0x46, 0x48), Phase.JOGGING),
     ):
         if code in codes:

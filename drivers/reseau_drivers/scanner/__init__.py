@@ -7,6 +7,7 @@ from typing import Any
 from ..link import Link, link_to
 from .bk import BkScanner, BkSettings
 from .compactpulser import CompactPulser, CompactPulserSettings
+from .dicom import DicomFiles, DicomSettings
 from .ping360 import Ping360, Ping360Settings
 
 __all__ = [
@@ -14,10 +15,13 @@ __all__ = [
     "BkSettings",
     "CompactPulser",
     "CompactPulserSettings",
+    "DicomFiles",
+    "DicomSettings",
     "Ping360",
     "Ping360Settings",
     "bk_oem",
     "compact_pulser",
+    "dicom_files",
     "ping360",
 ]
 
@@ -32,7 +36,7 @@ def ping360(
     name : str
         On the bench.
     address : str or Link
-        Serial device or ``tcp://host:port``.
+        Serial device, ``tcp://host:port``, or ``udp://host:9092`` of a vehicle's computer.
     settings : dict, optional
         Of :class:`Ping360Settings`.
     **options
@@ -78,3 +82,22 @@ def compact_pulser(
     """
     checked = CompactPulserSettings().changed(settings or {})
     return CompactPulser(name, link_to(address, baud=9600), checked, **options)
+
+
+def dicom_files(
+    name: str, address: str, *, settings: dict[str, Any] | None = None, **options: Any
+) -> DicomFiles:
+    """Files of a scanner, in its stead; found by its entry point ``dicom``.
+
+    Parameters
+    ----------
+    name : str
+        On the bench.
+    address : str
+        A DICOM file, or a folder of them.
+    settings : dict, optional
+        Of :class:`DicomSettings`.
+    **options
+        Of :class:`DicomFiles`.
+    """
+    return DicomFiles(name, address, DicomSettings().changed(settings or {}), **options)

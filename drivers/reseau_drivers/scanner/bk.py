@@ -1,8 +1,9 @@
 """BK scanners through their OEM interface: B-mode frames with the millimetres that the scanner states.
 
-Source: *BK Ultrasound OEM Interface*, "QUERY". The window of the section is told twice, in pixels and in
-metres; their quotient is the size of a pixel. A window that is told wrongly gives no millimetres rather than
-wrong ones.
+Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``, which was tried on the instruments, and BK's document
+PS12640-44. The section is told twice, as a box of pixels of the grabbed frame (its last ones included) and in
+metres of tissue; their quotient is the size of a pixel. A box beyond the frame gives no millimetres rather
+than wrong ones.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from reseau.errors import ProtocolError, RefusedError
+from reseau.errors import ProtocolError, RefusedError, SettingError
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 from reseau.instruments.values import now
 
@@ -23,7 +24,8 @@ from ..link import Conversation, Link
 __all__ = ["BkScanner", "BkSettings"]
 
 _LARGEST_SIDE = 8192
-_ON, _OFF = b'QUERY:GRAB_FRAME "ON",20;', b'QUERY:GRAB_FRAME "OFF",20;'
+_ON, _OFF = b'QUERY:GRAB_FRAME "ON",20;', b'QUERY:GRAB_FRAME "OFF";'
+_BOXES = ("B_GEOMETRY_US_FRAME_GRAB", "B_GEOMETRY_PIXEL")
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,6 @@ class BkSettings(Settings):
 
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 2500.0)
     frequency_khz: float = quantity(6000.0, "kHz", 500.0, 30_000.0)
-    gain: float = quantity(50.0, "%", 0.0, 100.0)
 
 
 class BkScanner(Device[BkSettings]):
@@ -46,6 +47,9 @@ class BkScanner(Device[BkSettings]):
         To its port 7915.
     settings : BkSettings
         What it is set to.
+    box : str
+        What tells the box of the section: ``B_GEOMETRY_US_FRAME_GRAB``, or ``B_GEOMETRY_PIXEL`` for firmware
+        that knows no other; PLUS found the latter to mean more than the section on some instruments.
     seconds : float
         Deadline of calls that name none.
     limits : mapping, optional
@@ -58,16 +62,19 @@ class BkScanner(Device[BkSettings]):
         link: Link,
         settings: BkSettings | None = None,
         *,
+        box: str = _BOXES[0],
         seconds: float = 5.0,
         limits: Limits | None = None,
     ) -> None:
+        if box not in _BOXES:
+            raise SettingError(f"box is one of {', '.join(_BOXES)}", where=name)
         super().__init__(name, settings or BkSettings(), seconds=seconds, limits=limits)
+        self._box = box
         self._talk: Conversation[bytes] = Conversation(link, bk.MessageDecoder())
 
     def _open(self, deadline: Deadline) -> None:
         self._talk.open(deadline)
-        # Frames may still come that another session asked for.
-        self._ask(_OFF, b"ACK", deadline)
+        self._quiet(deadline)
 
     def _shut(self) -> None:
         self._talk.close()
@@ -80,7 +87,7 @@ class BkScanner(Device[BkSettings]):
         return Identity("BK Medical", f"OEM interface, {width}×{height} px")
 
     def _halt(self, deadline: Deadline) -> None:
-        self._ask(_OFF, b"ACK", deadline)
+        self._quiet(deadline)
 
     def _acquire(self) -> dict[str, Any]:
         scan = self.scan()
@@ -107,19 +114,23 @@ class BkScanner(Device[BkSettings]):
             asked = now()
             width, height = self._window(deadline)
             mm, origin = self._geometry(width, height, deadline)
-            grabbed = bk.parse_frame(self._ask(_ON, b"DATA:GRAB_FRAME ", deadline))
-            self._ask(_OFF, b"ACK", deadline)
-            if len(grabbed.pixels) != width * height:
-                raise ProtocolError(
-                    f"a frame of {len(grabbed.pixels)} bytes; {width}×{height} were announced"
-                )
+            gain = self._numbers("B_GAIN:A", 1, deadline)[0]
+            grabbed = bk.parse_frame(self._ask(_ON, b"DATA:GRAB_FRAME ", deadline), width * height)
+            if self._quiet(deadline) != (width, height):
+                raise ProtocolError("changed its window while a frame was taken", do="take it again")
             pixels = np.frombuffer(grabbed.pixels, np.uint8).reshape(height, width)
             s = self.settings
-            return BScan(pixels, mm, origin, s.speed_m_s, s.frequency_khz, s.gain, asked)
+            return BScan(pixels, mm, origin, s.speed_m_s, s.frequency_khz, gain, asked)
+
+    def _quiet(self, deadline: Deadline) -> tuple[int, int]:
+        """Let no more frames come; the window, whose answer comes behind the last of them."""
+        # Some instruments acknowledge this, others do not: nothing may depend on it.
+        self._talk.tell(bk.encode(_OFF), deadline)
+        return self._window(deadline)
 
     def _window(self, deadline: Deadline) -> tuple[int, int]:
-        size = bk.numbers(self._ask(b"QUERY:US_WIN_SIZE;", b"DATA:US_WIN_SIZE ", deadline), "US_WIN_SIZE")
-        if len(size) != 2 or not all(2 <= side <= _LARGEST_SIDE and side == int(side) for side in size):
+        size = self._numbers("US_WIN_SIZE", 2, deadline)
+        if not all(2 <= side <= _LARGEST_SIDE and side == int(side) for side in size):
             raise ProtocolError(f"states a window of {size}")
         return int(size[0]), int(size[1])
 
@@ -127,20 +138,20 @@ class BkScanner(Device[BkSettings]):
         self, width: int, height: int, deadline: Deadline
     ) -> tuple[tuple[float, float] | None, tuple[float, float]]:
         """Millimetres of a pixel, and where the middle of the transducer's face is."""
-        names = ("B_GEOMETRY_PIXEL:A", "B_GEOMETRY_TISSUE:A")
-        windows = [
-            bk.numbers(self._ask(f"QUERY:{name};".encode(), f"DATA:{name} ".encode(), deadline), name)
-            for name in names
-        ]
-        if any(len(window) != 4 for window in windows):
-            raise ProtocolError(f"states a geometry of {windows}")
-        (left, top, right, bottom), (x0, y0, x1, y1) = windows
-        within = min(left, right) >= 0 and max(left, right) <= width
-        within = within and min(top, bottom) >= 0 and max(top, bottom) <= height
-        origin = ((left + right - 1) / 2, top)
-        if not within or left == right or top == bottom or x0 == x1 or y0 == y1:
+        left, top, right, bottom = self._numbers(f"{self._box}:A", 4, deadline)
+        x0, y0, x1, y1 = self._numbers("B_GEOMETRY_TISSUE:A", 4, deadline)
+        origin = ((left + right) / 2, top)
+        if not (0 <= left < right < width and 0 <= top < bottom < height) or x0 == x1 or y0 == y1:
             return None, origin
-        return (abs((x1 - x0) / (right - left)) * 1000, abs((y1 - y0) / (bottom - top)) * 1000), origin
+        return (1000 * abs(x1 - x0) / (right - left + 1), 1000 * abs(y1 - y0) / (bottom - top + 1)), origin
+
+    def _numbers(self, name: str, count: int, deadline: Deadline) -> tuple[float, ...]:
+        """Numbers that the scanner tells under a name."""
+        answer = self._ask(f"QUERY:{name};".encode(), f"DATA:{name} ".encode(), deadline)
+        found = bk.numbers(answer, name)
+        if len(found) != count or not np.isfinite(found).all():
+            raise ProtocolError(f"states {found} for {name}")
+        return found
 
     def _ask(self, question: bytes, head: bytes, deadline: Deadline) -> bytes:
         answer = self._talk.ask(bk.encode(question), lambda got: got.startswith((head, b"ERROR")), deadline)

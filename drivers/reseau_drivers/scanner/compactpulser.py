@@ -1,7 +1,9 @@
 """US Ultratek's CompactPulser: sends pulses and amplifies their echoes; an oscilloscope digitises them.
 
-Source: *CompactPulser Instruction Manual*. Commands are not acknowledged; so every value is asked for after
-it was set, and read back. A sample at the time t after the pulse lies at c·t/2.
+Source: see :mod:`reseau_drivers.codecs.compactpulser`. Commands are not acknowledged; so values are asked for
+after they were set. That ``G?`` is answered is known of all; where the other letters are silent the gain
+vouches for them: it is set one step off before them, and right behind them. A sample at the time t after the
+pulse lies at c·t/2.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from reseau.data import Array
-from reseau.errors import StateError
+from reseau.errors import DeadlineError, StateError
 from reseau.instruments import Deadline, Device, Identity, Limits, Oscilloscope, Settings, Waveform, quantity
 
 from ..codecs.compactpulser import LIMIT, Setting, decode, encode
@@ -20,7 +22,7 @@ from ..link import Conversation, Link
 
 __all__ = ["CompactPulser", "CompactPulserSettings"]
 
-_ROUNDED = 0.51
+_MOST_GAIN = 840
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,10 @@ class CompactPulserSettings(Settings):
     """How pulses are sent and echoes amplified; nothing is sent at 0 Hz."""
 
     repetition_hz: float = quantity(0.0, "Hz", 0.0, 5000.0)
-    width_ns: float = quantity(100.0, "ns", 10.0, 1000.0)
+    width_ns: float = quantity(220.0, "ns", 10.0, 1000.0)
     voltage: float = quantity(300.0, "V", 40.0, 300.0)
-    gain_db: float = quantity(0.0, "dB", -20.0, 80.0)
-    damping: int = quantity(1, "", 0, 15)
+    gain_db: float = quantity(0.0, "dB", -12.0, 84.0)
+    damping: int = quantity(0, "", 0, 15)
     mode: int = quantity(0, "", 0, 1)
     trigger: int = quantity(0, "", 0, 1)
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 7000.0)
@@ -73,25 +75,31 @@ class CompactPulser(Device[CompactPulserSettings]):
         super().__init__(name, settings or CompactPulserSettings(), seconds=seconds, limits=limits)
         self._talk: Conversation[bytes] = Conversation(link, LineDecoder(end=b"\r", limit=LIMIT))
         self._digitiser, self._answer_s = digitiser, answer_s
+        self._told = "G"
 
     def _open(self, deadline: Deadline) -> None:
         self._talk.open(deadline)
         # Ends what may have been begun on the line. The first answer only shows that somebody is there.
         self._talk.tell(b"\r", deadline)
-        self._value("M", deadline)
+        self._value("G", deadline)
+        self._told = "".join(_letters(self.settings)) if self._tells("W", deadline) else "G"
 
     def _shut(self) -> None:
         self._talk.close()
 
     def _push(self, settings: CompactPulserSettings, deadline: Deadline) -> None:
         wanted = _letters(settings)
-        for letter, value in wanted.items():
+        off = wanted["G"] + (1 if wanted["G"] < _MOST_GAIN else -1)
+        # Pulses last: they begin when all else is set.
+        for letter, value in ({"G": off} | {k: v for k, v in wanted.items() if k != "G"}).items():
             self._set(letter, value, deadline)
+        self._verify({"G": off}, deadline)
+        self._set("G", wanted["G"], deadline)
         # It may have lost its power in between, and all that was set before.
         self._verify(wanted, deadline)
 
     def verify(self, seconds: float | None = None) -> None:
-        """Read all settings back.
+        """Read settings back: all of them, or the gain where the instrument tells no other.
 
         Raises
         ------
@@ -105,7 +113,8 @@ class CompactPulser(Device[CompactPulserSettings]):
         """Who it is, and whether its settings are those that were pushed."""
         found = {"identity": str(self.connect(seconds))}
         self.verify(seconds)
-        return found | {"settings": "as pushed"}
+        alone = len(self._told) == 1
+        return found | {"settings": "gain as pushed; it tells no other" if alone else "as pushed"}
 
     def _identify(self, deadline: Deadline) -> Identity:
         self._value("G", deadline)
@@ -146,34 +155,41 @@ class CompactPulser(Device[CompactPulserSettings]):
         depths: Array = self.settings.speed_m_s * 1e3 * line.seconds / 2
         return depths
 
-    def _set(self, letter: str, value: float, deadline: Deadline) -> None:
+    def _set(self, letter: str, value: int, deadline: Deadline) -> None:
         self._talk.tell(encode(Setting(letter, value)), deadline)
         self._verify({letter: value}, deadline)
 
-    def _verify(self, wanted: Mapping[str, float], deadline: Deadline) -> None:
+    def _verify(self, wanted: Mapping[str, int], deadline: Deadline) -> None:
         for letter, value in wanted.items():
-            found = self._value(letter, deadline)
-            # The instrument rounds.
-            if not abs(found - value) <= _ROUNDED:
+            if letter in self._told and (found := self._value(letter, deadline)) != value:
                 raise StateError(
-                    f"has {letter} = {found:g} and not {value:g}", do="is it in local mode, or was it off?"
+                    f"has {letter} = {found} and not {value}", do="is it in local mode, or was it off?"
                 )
 
-    def _value(self, letter: str, deadline: Deadline) -> float:
+    def _tells(self, letter: str, deadline: Deadline) -> bool:
+        """Whether a letter is told; asked twice, as an answer may get lost."""
+        for _ in range(2):
+            try:
+                self._value(letter, deadline)
+                return True
+            except DeadlineError:
+                continue
+        return False
+
+    def _value(self, letter: str, deadline: Deadline) -> int | None:
         head = f"{letter}=".encode()
         line = self._talk.ask(
             encode(Setting(letter, None)), lambda line: line.startswith(head), deadline.part(self._answer_s)
         )
-        setting, _ = decode(line)
-        return float("nan") if setting.value is None else setting.value
+        return decode(line)[0].value
 
 
-def _letters(s: CompactPulserSettings) -> dict[str, float]:
-    """Values by letter; pulses last: they begin when all else is set."""
+def _letters(s: CompactPulserSettings) -> dict[str, int]:
+    """Values by letter."""
     return {
-        "W": s.width_ns,
-        "V": s.voltage,
-        "G": s.gain_db,
+        "W": round(s.width_ns),
+        "V": round(s.voltage),
+        "G": round(10 * s.gain_db),
         "D": s.damping,
         "M": s.mode,
         "T": s.trigger,

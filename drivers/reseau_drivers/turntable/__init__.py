@@ -54,11 +54,11 @@ def smc100(
     Parameters
     ----------
     name, address, axes, settings, **options
-        As for :func:`zaber`.
+        As for :func:`zaber`; a CONEX wants ``device@921600``.
     """
     return Table(
         name,
-        Smc100(link_to(address, baud=57600)),
+        Smc100(link_to(address, baud=57600, xonxoff=True)),
         AxisPlan.read(axes),
         TableSettings().changed(settings or {}),
         **options,

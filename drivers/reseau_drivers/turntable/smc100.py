@@ -1,6 +1,6 @@
 """Newport SMC100 controllers on one line.
 
-Source: *SMC100CC & SMC100PP User's Manual*, section 2.3. Commands are not acknowledged; so the error is asked
+Source: see :mod:`reseau_drivers.codecs.smc100`. Commands are not acknowledged; so the error is asked
 for after each (TE), and the state (TS) tells when a movement ends.
 """
 
@@ -18,7 +18,7 @@ from .table import AxisPlan
 
 __all__ = ["Smc100"]
 
-_STATES = "DEHIJKLM"
+_STATES = "DEHIJKLMP"
 """Errors that mean: not in this state."""
 
 
@@ -52,9 +52,10 @@ class Smc100:
         return Identity("Newport", "SMC100", "", ", ".join(versions))
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
-        """Speed of an axis."""
-        # Not taken while it moves; and as it moves, only the line was lost, and the speed is as it was set.
-        if not self.state(plan, deadline).moving:
+        """Speed of an axis; one without a reference does not take it, and gets it when it is homed."""
+        # Nor while it moves; and as it moves, only the line was lost, and the speed is as it was set.
+        phase = decode_status(self._ask(plan, "TS", deadline)).phase
+        if phase in (Phase.READY, Phase.DISABLED):
             self._tell(plan, "VA", f"{units_per_s * plan.per_unit:.6g}", deadline)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:

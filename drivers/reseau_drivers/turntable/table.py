@@ -270,6 +270,9 @@ class Table(Device[TableSettings]):
         state = self._arrived(axis, plan, deadline, command)
         if not state.homed:
             raise StateError("did not find its reference", where=self.name, command=command)
+        with self._exchange(command) as time:
+            # Some controllers take a speed only then.
+            self._controller.set_speed(plan, self.settings.speed, time)
         return state
 
     def move(self, axis: str, position: float, seconds: float | None = None) -> AxisState:

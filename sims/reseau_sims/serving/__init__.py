@@ -1,4 +1,4 @@
-"""Simulators behind the protocols of the real instruments: pseudo-terminals, TCP, SCPI, VXI-11, HiSLIP.
+"""Simulators behind the protocols of the real instruments: pseudo-terminals, TCP, UDP, SCPI, VXI-11, HiSLIP.
 
 An instrument is a :class:`~reseau_sims.serving.machine.Machine`: bytes in, answers out, a list of what its
 client did wrong. A :class:`~reseau_sims.serving.machine.Wire` spoils answers by a script; a server, or a link
@@ -8,6 +8,7 @@ within the process, carries it to a client. All of them listen on the loopback i
 from .bench import SimulatedBench
 from .bk import BkScanner
 from .compactpulser import CompactPulser
+from .datagrams import UdpServer
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -43,6 +44,7 @@ __all__ = [
     "SimulatedBench",
     "Smc100Line",
     "TcpServer",
+    "UdpServer",
     "UsbInstrument",
     "Vxi11Session",
     "Wire",

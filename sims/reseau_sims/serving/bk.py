@@ -1,6 +1,6 @@
 """A BK scanner's OEM interface: its windows in pixels and metres, and grabbed frames.
 
-Source: *BK Ultrasound OEM Interface*, "QUERY" and "GRAB_FRAME".
+Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``. While frames are asked for, one comes before every answer.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ class BkScanner(Machine):
         Of it, along x and down.
     announces_wrongly : bool
         Whether the length before a frame is wrong, as on a BK5000.
+    acknowledges_off : bool
+        Whether the end of frames is acknowledged; reports of instruments differ.
     """
 
     def __init__(
@@ -43,10 +45,12 @@ class BkScanner(Machine):
         mm_per_px: tuple[float, float] = (0.2, 0.25),
         *,
         announces_wrongly: bool = False,
+        acknowledges_off: bool = True,
     ) -> None:
         super().__init__()
         self.section, self._mm, self._wrong = section, mm_per_px, announces_wrongly
         self._messages = bk.MessageDecoder(4096)
+        self._acknowledges_off, self.streaming = acknowledges_off, False
         self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
 
     def receive(self, data: bytes) -> Sequence[bytes]:
@@ -56,16 +60,21 @@ class BkScanner(Machine):
             if isinstance(message, Damaged):
                 self.violations.append(str(message))
                 continue
+            frames = self.streaming
             content = self._answer(message)
             if self._mute:
                 self._mute -= 1
-            else:
-                answers.append(bk.encode(content))
+                continue
+            found = [self._frame()] if frames else []
+            found += [content] if content is not None else []
+            found += [self._frame()] if self.streaming and not frames else []
+            answers += [bk.encode(each) for each in found]
         return answers
 
     def hung_up(self) -> None:
-        """A message that was begun is forgotten."""
+        """A message that was begun is forgotten, and frames go to nobody."""
         self._messages.reset()
+        self.streaming = False
 
     def afflict(self, kind: Kind) -> None:
         """Stuck: one answer stays out; wrong state: an error; out of range: too few rows."""
@@ -75,8 +84,9 @@ class BkScanner(Machine):
         self._odd = self._odd or kind == "out of range"
         if kind == "power-cycled":
             self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
+            self.streaming = False
 
-    def _answer(self, message: bytes) -> bytes:
+    def _answer(self, message: bytes) -> bytes | None:
         if self._refuse:
             self._refuse = False
             return b'ERROR "not ready";'
@@ -84,15 +94,22 @@ class BkScanner(Machine):
         match message:
             case b"QUERY:US_WIN_SIZE;":
                 return f"DATA:US_WIN_SIZE {width},{height};".encode()
+            case b"QUERY:B_GEOMETRY_US_FRAME_GRAB:A;":
+                return f"DATA:B_GEOMETRY_US_FRAME_GRAB:A 0,0,{width - 1},{height - 1};".encode()
             case b"QUERY:B_GEOMETRY_PIXEL:A;":
-                return f"DATA:B_GEOMETRY_PIXEL:A 0,0,{width},{height};".encode()
+                # Of the whole screen, on which the section is a part.
+                return f"DATA:B_GEOMETRY_PIXEL:A 200,50,{200 + width},{50 + height};".encode()
             case b"QUERY:B_GEOMETRY_TISSUE:A;":
                 right, down = width * self._mm[0] / 1000, height * self._mm[1] / 1000
-                return f"DATA:B_GEOMETRY_TISSUE:A {-right / 2:g},0,{right / 2:g},{down:g};".encode()
+                return f"DATA:B_GEOMETRY_TISSUE:A {-right / 2:g},0,{right / 2:g},{-down:g};".encode()
+            case b"QUERY:B_GAIN:A;":
+                return b"DATA:B_GAIN:A 57;"
             case b'QUERY:GRAB_FRAME "ON",20;':
-                return self._frame()
-            case b'QUERY:GRAB_FRAME "OFF",20;':
+                self.streaming = True
                 return b"ACK;"
+            case b'QUERY:GRAB_FRAME "OFF";':
+                self.streaming = False
+                return b"ACK;" if self._acknowledges_off else None
         self.violations.append(f"unknown message {message!r}")
         return b'ERROR "unknown";'
 

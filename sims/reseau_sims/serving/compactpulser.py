@@ -1,6 +1,6 @@
 """A CompactPulser: settings by single letters, no answers but to questions.
 
-Source: *CompactPulser Instruction Manual*, the table of its serial commands.
+Source: see :mod:`reseau_drivers.codecs.compactpulser`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,21 @@ from .script import Kind
 
 __all__ = ["CompactPulser"]
 
-_START = {"P": 0.0, "W": 100.0, "V": 300.0, "D": 1.0, "M": 0.0, "T": 0.0, "G": 0.0}
+_START = {"P": 0, "W": 100, "V": 100, "D": 1, "M": 0, "T": 0, "G": 5}
 
 
 class CompactPulser(Machine):
-    """The pulser; its values by letter are in `values`."""
+    """The pulser; its values by letter are in `values`.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    tells : str
+        The letters that it answers questions about.
+    """
+
+    def __init__(self, tells: str = "".join(LETTERS)) -> None:
         super().__init__()
+        self._told = tells
         self._lines = LineDecoder(end=b"\r", limit=LIMIT)
         self.values = dict(_START)
         self._deaf, self._mute, self._odd = False, 0, False
@@ -45,10 +52,12 @@ class CompactPulser(Machine):
                 if not self._deaf:
                     self.values[setting.letter] = setting.value
                 self._deaf = False
+            elif setting.letter not in self._told:
+                continue
             elif self._mute:
                 self._mute -= 1
             else:
-                value = self.values[setting.letter] + (1000.0 if self._odd else 0.0)
+                value = self.values[setting.letter] + (1000 if self._odd else 0)
                 self._odd = False
                 answers.append(encode_answer(Setting(setting.letter, value)))
         return answers

@@ -171,7 +171,7 @@ class Server(ABC):
         if connection is None or not events & selectors.EVENT_READ:
             return
         try:
-            data = os.read(fd, _CHUNK)
+            data = self._read(fd)
         except BlockingIOError:
             return
         except OSError:
@@ -181,11 +181,19 @@ class Server(ABC):
             return
         connection.put(connection.session.receive(data))
 
+    def _read(self, fd: int) -> bytes:
+        """What a client has sent; nothing when it went away."""
+        return os.read(fd, _CHUNK)
+
+    def _write(self, fd: int, data: bytes) -> int:
+        """Send as much as is taken; how much that is."""
+        return os.write(fd, data)
+
     def _flush(self, connection: _Connection) -> None:
         alive = connection.mature()
         try:
             while connection.ready:
-                sent = os.write(connection.fd, connection.ready[:_CHUNK])
+                sent = self._write(connection.fd, bytes(connection.ready[:_CHUNK]))
                 del connection.ready[:sent]
         except BlockingIOError:
             pass

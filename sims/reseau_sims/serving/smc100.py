@@ -1,6 +1,7 @@
 """Newport SMC100 controllers on one line.
 
-Source: *SMC100CC & SMC100PP User's Manual*, sections 2.2 (states) and 2.3 (commands).
+Source: see :mod:`reseau_drivers.codecs.smc100`. Where the manual leaves doubt it is strict: a velocity is not
+taken without a reference.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ class Smc100Line(Machine):
             case "VA":
                 if value is None or value <= 0:
                     return "C"
-                if state in (0x1E, 0x28):
+                if state in (0x0A, 0x1E, 0x28):
                     return forbidden[state]
                 motor.speed = value
             case "MM":

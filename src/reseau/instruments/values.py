@@ -113,7 +113,9 @@ class BScan:
     speed_m_s : float
         Of sound, that the millimetres were computed with.
     frequency_khz, gain : float
-        That it was taken with.
+        That it was taken with; NaN where nobody tells.
+    region_px : (int, int, int, int), optional
+        Left, top, right and bottom pixel of where the millimetres hold; by default everywhere.
     """
 
     pixels: NDArray[np.uint8]
@@ -123,6 +125,7 @@ class BScan:
     frequency_khz: float
     gain: float
     taken: datetime = field(default_factory=now)
+    region_px: tuple[int, int, int, int] | None = None
 
     def frame(self, name: str = "scan") -> Frame:
         """The section as an image."""

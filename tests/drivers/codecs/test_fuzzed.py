@@ -137,7 +137,7 @@ def test_decoding_one_message_gives_a_value_or_says_what_is_wrong(data: bytes) -
         ping.Transducer.parse,
         ping.DeviceData.parse,
         ping.Information.parse,
-        bk.parse_frame,
+        lambda content: bk.parse_frame(content, 8),
         lambda line: bk.numbers(line, "US_WIN_SIZE"),
         ieee488.missing_of,
         ieee488.parse_block,

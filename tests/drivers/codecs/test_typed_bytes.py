@@ -41,23 +41,51 @@ def test_zaber_sends_nothing_that_ends_a_message() -> None:
 
 
 def test_smc100_lines_of_the_manual() -> None:
+    # SMC100CC/PP User's Manual, "Command Syntax" (nnAAxx) and TP, as PyMeasure and bliss send and read them.
     assert smc100.encode(smc100.Line(1, "OR")) == b"1OR\r\n"
     assert smc100.decode(b"1TP2.0001\r\n") == smc100.Line(1, "TP", "2.0001")
     assert smc100.decode(b"1TS000033") == smc100.Line(1, "TS", "000033")
-    assert smc100.decode_status("000033").phase is smc100.Phase.READY
-    assert smc100.decode_status("000010").phase is smc100.Phase.NOT_REFERENCED
-    assert smc100.decode_status("00001E").phase is smc100.Phase.HOMING
-    assert smc100.decode_status("000128").complaints == ("negative end of run",)
+    assert smc100.decode(b"1TE@\r\n") == smc100.Line(1, "TE", "@")
     for wrong in ("", "0000", "0000FF", "00003Z"):
         with pytest.raises(ProtocolError):
             smc100.decode_status(wrong)
 
 
+@pytest.mark.parametrize(
+    ("codes", "phase"),
+    [
+        # The manual's table of TS (page 65); 36 to 38 and 3F of the CONEX-CC's.
+        ("0A 0B 0C 0D 0E 0F 10 11", smc100.Phase.NOT_REFERENCED),
+        ("14", smc100.Phase.CONFIGURATION),
+        ("1E 1F", smc100.Phase.HOMING),
+        ("28", smc100.Phase.MOVING),
+        ("32 33 34 35 36 37 38", smc100.Phase.READY),
+        ("3C 3D 3E 3F", smc100.Phase.DISABLED),
+        ("46 47", smc100.Phase.JOGGING),
+    ],
+)
+def test_smc100_states_of_the_manual(codes: str, phase: smc100.Phase) -> None:
+    for code in codes.split():
+        assert smc100.decode_status(f"0000{code}").phase is phase
+
+
 def test_smc100_status_bits_are_the_first_four_digits() -> None:
-    status = smc100.decode_status("002132")
-    assert status.complaints == ("negative end of run", "following error")
-    assert status.phase is smc100.Phase.READY
+    # The manual's own example of TS: 0x004C is homing time-out, RMS and peak current limit.
+    assert smc100.decode_status("004C0A").complaints == (
+        "peak current limit",
+        "RMS current limit",
+        "homing time-out",
+    )
+    assert smc100.decode_status("002132").complaints == ("negative end of run", "following error")
     assert smc100.decode_status("000232").complaints == ("positive end of run",)
+    assert smc100.decode_status("030033").complaints == ("DC voltage too low", "80 W output power exceeded")
+
+
+def test_smc100_errors_are_those_of_the_manual() -> None:
+    # TE, page 61: @, A to N but for none, S, U to X; P is the CONEX-CC's.
+    assert "".join(smc100.ERRORS) == "@ABCDEFGHIJKLMNPSUVWX"
+    assert "NOT REFERENCED" in smc100.ERRORS["H"]
+    assert smc100.ERRORS["G"] == "displacement out of limits"
 
 
 def test_ping_request_of_the_documentation() -> None:
@@ -75,27 +103,57 @@ def test_ping_transducer_payload_has_the_documented_fields() -> None:
     assert ping.Transducer.parse(payload) == asked
 
 
-def test_compactpulser_commands_of_the_manual() -> None:
-    assert compactpulser.encode(compactpulser.Setting("V", 300)) == b"V300\r"
-    assert compactpulser.decode(b"G=12.5\r") == (compactpulser.Setting("G", 12.5), True)
-    assert compactpulser.decode(b"P0") == (compactpulser.Setting("P", 0.0), False)
-    for wrong in (b"", b"X1", b"P", b"G=?", b"P1e9", b"\xff"):
+def test_compactpulser_commands_as_public_code_sends_them() -> None:
+    # changbatterygroup/ultrasonicTesting, ultratekPulser.py: all of them drive a real one.
+    for typed, setting in {
+        b"P500\r": compactpulser.Setting("P", 500),
+        b"P0\r": compactpulser.Setting("P", 0),
+        b"W220\r": compactpulser.Setting("W", 220),
+        b"V300\r": compactpulser.Setting("V", 300),
+        b"D0\r": compactpulser.Setting("D", 0),
+        b"M0\r": compactpulser.Setting("M", 0),
+        b"T0\r": compactpulser.Setting("T", 0),
+        b"G-120\r": compactpulser.Setting("G", -120),
+        b"G?\r": compactpulser.Setting("G", None),
+    }.items():
+        assert compactpulser.encode(setting) == typed
+        assert compactpulser.decode(typed) == (setting, False)
+    assert compactpulser.decode(b"G=600\r") == (compactpulser.Setting("G", 600), True)
+    for wrong in (b"", b"X1", b"P", b"G=?", b"P1e9", b"\xff", b"G=12.5"):
         with pytest.raises(ProtocolError):
             compactpulser.decode(wrong)
     with pytest.raises(SettingError):
-        compactpulser.encode(compactpulser.Setting("G", float("nan")))
+        compactpulser.encode(compactpulser.Setting("G", 1_000_000))
 
 
 def test_bk_messages_and_a_frame_with_every_escape() -> None:
+    # PS12640-44, page 9: 1, 4 and 27 stand as 27 and their complement; the frame as NifTK reads it.
     typed = (
         bytes.fromhex("01") + b"DATA:GRAB_FRAME #15" + bytes.fromhex("00 1b fb 00 00 1b fe 1b e4 ff 3b 04")
     )
     (content,) = bk.MessageDecoder().feed(typed)
     assert isinstance(content, bytes)
-    frame = bk.parse_frame(content)
+    frame = bk.parse_frame(content, 3)
     # The announced length (5) is wrong, as on a BK5000: the end of the message counts.
     assert frame == bk.GrabbedFrame(0x0400, bytes([0x01, 0x1B, 0xFF]), 5)
     assert bk.encode(bk.encode_frame(frame)) == typed
+
+
+def test_bk_queries_and_answers_as_public_clients_have_them() -> None:
+    # PLUS, NifTK and scikit-surgerybk send these; a 592×384 frame is announced as 227332, its stamp included.
+    assert bk.encode(b"QUERY:US_WIN_SIZE;") == b"\x01QUERY:US_WIN_SIZE;\x04"
+    assert bk.numbers(b"DATA:US_WIN_SIZE 640,480;", "US_WIN_SIZE") == (640, 480)
+    scan = b"DATA:B_GEOMETRY_SCANAREA:A 0.0017218,-0.000171398,1.37236,0,-0.00174855,-0.000176821,1.77236,"
+    scan += b"0.0203479;"
+    assert bk.numbers(scan, "B_GEOMETRY_SCANAREA:A")[7] == 0.0203479
+    pixels = bytes(592 * 384)
+    frame = bk.parse_frame(b"DATA:GRAB_FRAME #6227332" + bytes(4) + pixels + b";", 592 * 384)
+    assert (len(frame.pixels), frame.announced) == (592 * 384, 592 * 384 + 4)
+    # A last pixel that looks like the semicolon is a pixel.
+    assert bk.parse_frame(b"DATA:GRAB_FRAME #16" + bytes(4) + b";;", 2).pixels == b";;"
+    for wrong in (b"DATA:GRAB_FRAME #16" + bytes(6), b"DATA:GRAB_FRAME #19" + bytes(4 + 9), b"ACK;"):
+        with pytest.raises(ProtocolError):
+            bk.parse_frame(wrong, 3)
 
 
 def test_blocks_and_pictures_end_where_they_say() -> None:
