@@ -5,6 +5,7 @@ from __future__ import annotations
 from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
 from .calibrated import calibration_of
+from .components import estimate_components, reweighted
 from .document import to_document
 from .fields import FieldDifference, ProjectionField, calibration_difference, projection_field
 from .lens import Lens
@@ -33,7 +34,9 @@ __all__ = [
     "calibration_difference",
     "calibration_of",
     "common_pattern",
+    "estimate_components",
     "problem_of",
     "projection_field",
+    "reweighted",
     "to_document",
 ]

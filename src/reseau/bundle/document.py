@@ -48,6 +48,8 @@ def to_document(result: Result, *, covariances: bool = False) -> dict[str, Any]:
         },
         "warnings": list(result.warnings),
     }  # fmt: skip
+    if result.rejected.any():
+        document["left_out"] = _left_out(result)
     if len(result.network.distance):
         document["distances"] = _distances(result)
     return document
@@ -91,6 +93,8 @@ def _images(result: Result) -> dict[str, Any]:
         "sigma": _rows(np.hstack([sigma[:, 3:], sigma[:, :3]])),
         "angles_deg": _rows(np.degrees(result.angles)),
         "angles_sigma_deg": _rows(np.degrees(result.angle_sigma)),
+        # Of the sigmas given, x and y: what they should have been multiplied with.
+        "factors": _rows(result.variance_factors),
     }
 
 
@@ -121,6 +125,7 @@ def _points(result: Result, covariances: bool) -> dict[str, Any]:
 def _image_points(result: Result) -> dict[str, Any]:
     network = result.network
     v, r, w = result.residuals, result.redundancy_numbers, result.test_values
+    least, effect = result.minimal_detectable_errors(), result.external_reliability()
     return {
         "image": [network.images[i] for i in network.image_of],
         "point": [network.points[j] for j in network.point_of],
@@ -131,6 +136,23 @@ def _image_points(result: Result) -> dict[str, Any]:
         "wx": _column(w[:, 0]),
         "wy": _column(w[:, 1]),
         "rejected": result.rejected.tolist(),
+        # Minimal detectable errors (px), and what they do at most to any result (in its sigmas).
+        "mx": _column(least[:, 0]),
+        "my": _column(least[:, 1]),
+        "ex": _column(effect[:, 0]),
+        "ey": _column(effect[:, 1]),
+    }
+
+
+def _left_out(result: Result) -> dict[str, Any]:
+    """What data snooping left out, with the test values at which it did."""
+    rows, network = np.flatnonzero(result.rejected), result.network
+    tests = result.rejected_tests[rows]
+    return {
+        "image": [network.images[i] for i in network.image_of[rows]],
+        "point": [network.points[j] for j in network.point_of[rows]],
+        "w": _column(tests[:, 0]),
+        "critical": _column(tests[:, 1]),
     }
 
 

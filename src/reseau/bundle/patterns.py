@@ -17,20 +17,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 import scipy.special
 
 from ..data import Array, Rows
 from ..errors import UsageError
+from .normal import SEGMENTS
 from .result import Result
 
 __all__ = ["CommonPattern", "by_place", "by_point", "common_pattern"]
 
 # Part of a shift that the unknowns leave, below which they have taken it up.
 _RANK = 1e-6
-# Unknowns, or shifts, from which on the full matrices take too much memory.
-_MOST = 6000
+# Shifts from which on their full matrices take too long, and columns of them that are worked on at once.
+_MOST, _AT_ONCE = 6000, 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +153,7 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     Raises
     ------
     UsageError
-        When no class has two image points, or the network is too large for it.
+        When no class has two image points, or there are too many classes.
     """
     fit, network = result.fit, result.network
     linear, unknowns = fit.linear, fit.unknowns
@@ -159,12 +162,9 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     good = (found >= 0) & (count > 1)
     if not good.any():
         raise UsageError("no two image points are in a class", where="common_pattern")
-    shifts, points = int(good.sum()), np.flatnonzero((unknowns.kept < 0) & fit.usable.points)
-    if max(2 * shifts, unknowns.size + 3 * len(points)) > _MOST:
-        raise UsageError(
-            f"{shifts} classes with {unknowns.size + 3 * len(points)} unknowns are too many",
-            where="common_pattern",
-        )
+    shifts = int(good.sum())
+    if 2 * shifts > _MOST:
+        raise UsageError(f"{shifts} classes are too many, {_MOST // 2} can be tested", where="common_pattern")
     at = np.where(good, np.cumsum(good) - 1, -1)[number]
     root = linear.system.seen.root
     own = np.flatnonzero(at >= 0)
@@ -172,7 +172,7 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     turned = np.swapaxes(root[own], 1, 2)
     np.add.at(g, at[own], (turned @ linear.misfits[own][:, :, None])[:, :, 0])
     np.add.at(normal, at[own], turned @ root[own])
-    m = _left(result, at, points, normal)
+    m = _left(result, at, normal)
     statistic, degrees, rest = _tested(m, g.ravel(), normal, fit.cost, fit.redundancy)
     variance = rest**2 if np.isfinite(rest) else fit.variance
     inverse, k = np.linalg.inv(normal), np.arange(shifts)
@@ -198,29 +198,46 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     )
 
 
-def _left(result: Result, at: Rows, points: Rows, normal: Array) -> Array:
-    """M (2k, 2k): what the unknowns leave of the normal equations of the shifts."""
-    linear, unknowns = result.fit.linear, result.fit.unknowns
-    pattern, size = linear.system.pattern, unknowns.size
-    place = np.full(len(unknowns.kept), -1, dtype=np.intp)
-    place[points] = size + 3 * np.arange(len(points))
-    h = np.zeros((len(normal), 2, size + 3 * len(points)))
-    last = linear.rows.shape[2] - 3
-    for k in np.flatnonzero(at >= 0):
-        slope = linear.system.seen.root[k].T @ linear.rows[k]
-        for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
-            if start >= 0:
-                h[at[k], :, start : start + width] += slope[:, column : column + width]
-        begin = place[linear.system.seen.point[k]]
-        if begin >= 0:
-            h[at[k], :, begin : begin + 3] += slope[:, last:]
-    flat = h.reshape(2 * len(normal), -1)
-    cofactor = result.fit.cofactors.joint(np.arange(size), points)
-    m: Array = -(flat @ cofactor @ flat.T)
-    blocks = m.reshape(len(normal), 2, len(normal), 2)
+def _left(result: Result, at: Rows, normal: Array) -> Array:
+    """M (2k, 2k): what the unknowns leave of the normal equations of the shifts.
+
+    Points are eliminated as from all others: with the derivatives H by the reduced unknowns and K by the
+    points, CᵀA Q AᵀC = K V⁻¹ Kᵀ + (H − K V⁻¹ Wᵀ) Z (H − K V⁻¹ Wᵀ)ᵀ, in whatever datum Z is.
+    """
+    cofactors = result.fit.cofactors
+    shifts, p = 2 * len(normal), len(cofactors.points)
+    turned, by_points = _slopes(result, at, shifts)
+    columns = scipy.sparse.csc_array(by_points)
+    for k in range(0, shifts, _AT_ONCE):
+        side = columns[:, k : k + _AT_ONCE].toarray().reshape(p, 3, -1)
+        turned[:, k : k + _AT_ONCE] += cofactors.normal.reduced_sides(side)
+    z = cofactors.reduced if cofactors.referral is None else cofactors.referral.before
+    inverse = scipy.sparse.bsr_array((cofactors.normal.inverse, np.arange(p), np.arange(p + 1)))
+    m: Array = -(turned.T @ (z @ turned)) - (by_points.T @ (inverse @ by_points)).toarray()
     own = np.arange(len(normal))
-    blocks[own, :, own, :] += normal
+    m.reshape(len(normal), 2, len(normal), 2)[own, :, own, :] += normal
     return m
+
+
+def _slopes(result: Result, at: Rows, shifts: int) -> tuple[Array, Any]:
+    """Cᵀ of the weighted derivatives: by the reduced unknowns (u, 2k), by the points (3p, 2k), sparse."""
+    linear, unknowns = result.fit.linear, result.fit.unknowns
+    pattern, own, last = linear.system.pattern, np.flatnonzero(at >= 0), linear.rows.shape[2] - 3
+    slope = np.swapaxes(linear.system.seen.root[own], 1, 2) @ linear.rows[own]
+    column = 2 * at[own][:, None] + np.arange(2)
+    turned = np.zeros((unknowns.size, shifts))
+    for s in range(SEGMENTS):
+        width, start, first = pattern.width[own, s], pattern.start[own, s], pattern.column[own, s]
+        for i in range(int(width.max(initial=0))):
+            k = np.flatnonzero(width > i)
+            np.add.at(turned, (start[k, None] + i, column[k]), slope[k, :, first[k] + i])
+    point = linear.system.seen.point[own]
+    k = np.flatnonzero(pattern.eliminated[point] == 1)
+    place = 3 * point[k, None, None] + np.arange(3) + np.zeros((2, 1), dtype=np.intp)
+    shape = (3 * len(linear.prior), shifts)
+    where = (place.ravel(), np.repeat(column[k].ravel(), 3))
+    by_points = scipy.sparse.coo_array((slope[k, :, last:].ravel(), where), shape=shape).tocsr()
+    return turned, by_points
 
 
 def _tested(

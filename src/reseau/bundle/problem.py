@@ -22,7 +22,7 @@ from .further import Further
 from .iteration import Iterated, iterate
 from .network import Network, finite
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import undetermined, weak_points
+from .rank import steady_points, undetermined, weak_points
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .usable import Usable, usable
@@ -168,6 +168,8 @@ class BundleFit(Fitted):
         Corrections still to come, in standard deviations.
     counts : tuple of int
         Observations, unknowns before datum constraints, datum constraints.
+    datum : ndarray of bool (p,), optional
+        Points over which inner constraints hold: those chosen, or all but the weak ones.
     """
 
     problem: BundleProblem
@@ -187,6 +189,7 @@ class BundleFit(Fitted):
     scale: str
     offset: float
     counts: tuple[int, int, int]
+    datum: Mask | None = None
 
     @property
     def variance(self) -> float:
@@ -266,6 +269,8 @@ class _Run:
         if inner:
             if int(chosen.sum()) < 3:
                 return Failure("inner constraints need three datum points that are determined")
+            if network.datum_points.all():
+                chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)
         linear = self.system.linearise(values)
         freedom = freedom_of(self.system, values, self.usable.points)
@@ -276,7 +281,7 @@ class _Run:
             if len(weak) and problem.rounds < _ROUNDS:
                 return self._without(weak, values).adjusted()
             return undetermined(linear, freedom, tuple(found.costs))
-        return self._fit(linear, freedom, cofactors, counts, found)
+        return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
 
     def _without(self, points: Rows, values: Values) -> BundleProblem:
         """The problem begun at the estimates, without points whose rays turn out to be parallel."""
@@ -324,6 +329,7 @@ class _Run:
         cofactors: Cofactors,
         counts: tuple[int, int, int],
         found: Iterated,
+        datum: Mask | None,
     ) -> BundleFit:
         redundancy, cost = counts[0] - counts[1] + counts[2], linear.cost
         whole, n = self.problem.network, len(self.problem.network.xy)
@@ -362,6 +368,7 @@ class _Run:
             scale="a-posteriori" if redundancy > 0 else "a-priori",
             offset=found.offset,
             counts=counts,
+            datum=datum,
         )
 
     def _residuals(self, values: Values) -> Array:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array, Rows
+from ..data import Array, Mask, Rows
 from .datum import Freedom, held_for
 from .system import Linear
 
-__all__ = ["PARALLEL", "undetermined", "weak_points"]
+__all__ = ["PARALLEL", "steady_points", "undetermined", "weak_points"]
 
 # Eigenvalues of the scaled normal equations that count as zero.
 _ZERO = 1e-11
 # Of the scaled normal equations of a point whose rays are parallel: they cut at less than 3e-5 rad.
 PARALLEL = 1e-9
 _LISTED = 8
+# A point of a datum may be this many times as uncertain, by its own rays, as the median of all.
+_UNSTEADY = 5.0
 
 
 def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> Failure:
@@ -44,17 +46,48 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
 
 def weak_points(linear: Linear) -> Rows:
     """Points whose own normal equations are singular: rays along one line."""
-    system = linear.system
-    network, pattern, last = system.unknowns.network, system.pattern, linear.rows.shape[2] - 3
-    b = linear.rows[:, :, last:].reshape(-1, 2, 3)
-    v = np.zeros((len(network.points), 3, 3))
-    np.add.at(v, system.seen.point, np.swapaxes(b, 1, 2) @ b)
-    v[:, np.arange(3), np.arange(3)] += linear.prior[:, :, 0]
+    v = _own_normals(linear)
     size = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
-    known = (size > 0).all(axis=1) & (pattern.eliminated == 1)
+    known = (size > 0).all(axis=1) & (linear.system.pattern.eliminated == 1)
     scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
     least = np.linalg.eigvalsh(scaled[known])[:, 0]
     return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
+
+
+def steady_points(linear: Linear, chosen: Mask) -> Mask:
+    """Those of the chosen points (p,) that are fit to carry a datum.
+
+    A point that its rays hardly determine is no place to refer others to: inner constraints over it make all
+    of them as uncertain as itself. What its rays say with the images held does not depend on any datum.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem at the estimates.
+    chosen : ndarray of bool (p,)
+        Points that are determined.
+    """
+    v = _own_normals(linear)
+    rows = np.flatnonzero(chosen & (linear.system.pattern.eliminated == 1))
+    spread = np.linalg.eigvalsh(v[rows])[:, 0]
+    size = np.full(len(chosen), 0.0)
+    size[rows] = 1.0 / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
+    median = float(np.median(size[rows])) if len(rows) else 0.0
+    return np.asarray(chosen & (size <= _UNSTEADY * median)) if median > 0 else chosen
+
+
+def _own_normals(linear: Linear) -> Array:
+    """Normal equations (p, 3, 3) of each point by itself, the images held."""
+    system = linear.system
+    last = linear.rows.shape[2] - 3
+    b = linear.rows[:, :, last:]
+    v = np.zeros((len(linear.prior), 3, 3))
+    rays = np.diff(system.unknowns.first)
+    lit = np.flatnonzero(rays)
+    if len(lit):
+        v[lit] = np.add.reduceat(np.swapaxes(b, 1, 2) @ b, system.unknowns.first[lit])
+    v[:, np.arange(3), np.arange(3)] += linear.prior[:, :, 0]
+    return v
 
 
 def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+import scipy.special
 
 from ..adjust import critical_w
 from ..data import Rows
+from ..errors import UsageError
 from .network import Network
+from .patterns import by_place, common_pattern
 from .problem import BundleFit
 from .result import Result
 
@@ -18,6 +21,10 @@ LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
 # Corrections still to come that are none, in standard deviations.
 _NEAR = 1e-3
+# Redundancy from which on the scatter of an image is compared with that of the others.
+_LEAST = 5.0
+# Images of a camera from which on they are asked for what they have in common.
+_IN_COMMON = 3
 # A corner is this part of width and height.
 _CORNER = 0.2
 
@@ -78,6 +85,9 @@ def remarks(result: Result) -> list[str]:
         *_large(result),
         *_correlations(result),
         *_weak(result),
+        *_datum(result),
+        *_scatter(result),
+        *_patterns(result),
         *_behind(network, fit),
         *_corners(network, fit),
     ]
@@ -173,6 +183,69 @@ def _weak(result: Result) -> list[str]:
     rows = rows[np.argsort(-sigma[rows], kind="stable")]
     names = [f"{network.points[j]} ({sigma[j]:.3g} {network.unit}, {network.rays[j]} rays)" for j in rows]
     return [f"weak {_plural('point', rows)}, sigma above {_WEAK:g} times the median: {listed(names)}"]
+
+
+def _datum(result: Result) -> list[str]:
+    """Points that inner constraints over all do not hold for."""
+    network, fit = result.network, result.fit
+    if fit.datum is None or not network.datum_points.all():
+        return []
+    rows = np.flatnonzero(fit.usable.points & ~fit.datum)
+    if not len(rows):
+        return []
+    names = listed(network.points[j] for j in rows)
+    return [f"{len(rows)} weak {_plural('point', rows)} left out of the datum: {names}"]
+
+
+def _scatter(result: Result) -> list[str]:
+    """Images, and axes, whose coordinates scatter more or less than the others."""
+    if not result.redundancy > 0 or not result.sigma0 > 0:
+        return []
+    factor, r = result.variance_factors, result.image_redundancy
+    known = result.fit.usable.images & (r.sum(axis=1) > _LEAST)
+    own, number = np.where(known[:, None], factor**2 * r, 0.0).sum(axis=1), r.sum(axis=1)
+    rest = result.redundancy - number
+    others = (result.fit.cost - own) / np.maximum(rest, 1.0)
+    known &= (rest > _LEAST) & (others > 0)
+    ratio = own[known] / number[known] / others[known]
+    p = scipy.special.fdtrc(number[known], rest[known], ratio)
+    rows = np.flatnonzero(known)[p < _ALPHA / max(1, len(p))]
+    size = np.sqrt(own[rows] / number[rows] / others[rows])
+    order = np.argsort(-size, kind="stable")
+    names = [f"{result.network.images[i]} ({s:.2g})" for i, s in zip(rows[order], size[order], strict=True)]
+    found = []
+    if names:
+        found.append(
+            f"image coordinates scatter more than those of the other images, by the factor in brackets, in "
+            f"{_plural('image', rows)} {listed(names)}"
+        )
+    x, y = result.axis_factors
+    count = r.sum(axis=0)
+    larger, smaller = ("x", "y") if x > y else ("y", "x")
+    a, b = (count[0], count[1]) if x > y else (count[1], count[0])
+    if min(a, b) > _LEAST and min(x, y) > 0:
+        times = max(x, y) / min(x, y)
+        if scipy.special.fdtrc(a, b, times**2) < _ALPHA:
+            found.append(f"{larger} scatters {times:.2f} times as much as {smaller}, by the sigmas given")
+    return found
+
+
+def _patterns(result: Result) -> list[str]:
+    """Cameras whose residuals have a pattern in common, by place in the image."""
+    network, found = result.network, []
+    images = np.bincount(network.camera_of[result.fit.usable.images], minlength=len(network.cameras))
+    for c in np.flatnonzero(images >= _IN_COMMON)[:LISTED]:
+        try:
+            pattern = common_pattern(result, by_place(result, int(c)))
+        except UsageError:
+            continue
+        if pattern.p < _ALPHA:
+            found.append(
+                f"camera {network.cameras[c].id}: residuals of its images have a pattern in common by place "
+                f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
+                "sigmas do not cover"
+            )
+    return found
 
 
 def _behind(network: Network, fit: BundleFit) -> list[str]:

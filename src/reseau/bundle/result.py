@@ -20,6 +20,8 @@ from .problem import BundleFit
 __all__ = ["Result"]
 
 _STEP = 1e-6
+# Redundancy below which an image says nothing of its own scatter.
+_UNCONTROLLED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,11 +240,59 @@ class Result:
         """Errors of single image coordinates (n, 2) that the test finds with this power, px."""
         return self._of_image_points(self.fit.minimal_detectable_errors(alpha, power))
 
+    def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> Array:
+        """What errors that are just not found do at most to any result (n, 2), in its standard deviations."""
+        return self._of_image_points(self.fit.external_lengths(alpha, power))
+
+    @cached_property
+    def image_redundancy(self) -> Array:
+        """Sums of the redundancy numbers of x and of y in each image (m, 2)."""
+        return self._of_images_and_axes(np.nan_to_num(self.redundancy_numbers))
+
+    @cached_property
+    def variance_factors(self) -> Array:
+        """Roots of Σ vᵢ(Pv)ᵢ / Σ rᵢ of x and y in each image (m, 2): by what the sigmas given are too small.
+
+        A first step of :func:`~reseau.bundle.components.estimate_components`; NaN without redundancy.
+        """
+        return self._factors(self._squares, self.image_redundancy)
+
+    @property
+    def axis_factors(self) -> Array:
+        """The same of all images together, x and y (2,)."""
+        return self._factors(self._squares.sum(axis=0), self.image_redundancy.sum(axis=0))
+
+    @cached_property
+    def _squares(self) -> Array:
+        return self._of_images_and_axes(np.nan_to_num(self._of_image_points(self.fit.weighted_squares)))
+
+    @staticmethod
+    def _factors(squares: Array, redundancy: Array) -> Array:
+        known = redundancy > _UNCONTROLLED
+        return np.sqrt(
+            np.maximum(np.divide(squares, redundancy, out=np.full_like(squares, np.nan), where=known), 0)
+        )
+
+    def _of_images_and_axes(self, values: Array) -> Array:
+        m, of = len(self.network.images), self.network.image_of
+        return np.stack([np.bincount(of, values[:, k], m) for k in (0, 1)], axis=1)
+
     def rejected_names(self) -> tuple[list[str], list[str]]:
         """Images and points of the image points that data snooping left out."""
         rows = np.flatnonzero(self.rejected)
         images = [self.network.images[i] for i in self.network.image_of[rows]]
         return images, [self.network.points[j] for j in self.network.point_of[rows]]
+
+    @cached_property
+    def rejected_tests(self) -> Array:
+        """Test values of the image points left out, when they were, and their bounds (n, 2), or NaN."""
+        tests = np.full((len(self.network.xy), 2), np.nan)
+        for step in self.steps:
+            row = step.index[0] // 2
+            if row < len(tests):
+                tests[row] = step.statistic, step.critical
+        tests[~self.rejected] = np.nan
+        return tests
 
     def _of_image_points(self, flat: Array) -> Array:
         n = len(self.network.xy)
