@@ -14,6 +14,7 @@ from reseau.bundle import (
     calibration_difference,
     calibration_of,
     projection_field,
+    projection_field_at,
 )
 from reseau.bundle.fields import FieldDifference
 from reseau.errors import UsageError
@@ -142,3 +143,42 @@ def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
     np.testing.assert_allclose(
         projection_field(read).sigma, projection_field(direct).sigma, atol=1e-12, rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("datum", ["control", "free"])
+@pytest.mark.parametrize("distance", [3.0, 40.0])
+def test_normalised_errors_at_a_distance_have_the_mean_square_one(datum: str, distance: float) -> None:
+    """Points before the camera, carried into object space by the true poses and back by the estimates."""
+    world = networks.world(points=40, datum=datum, control=0 if datum == "free" else 6)
+    network, n = world.network, 4
+    mapping = networks.mapping_of(network.cameras[0])
+    xy = np.stack(np.meshgrid(np.linspace(0, 639, n), np.linspace(0, 479, 3)), axis=-1).reshape(-1, 2)
+    ray = np.column_stack([mapping.inverse(xy), np.ones(len(xy))])
+    p = distance * ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    found = []
+    for seed in range(60):
+        fit = world.problem(world.noisy(seed)).adjusted().required()
+        values = fit.values
+        back = [
+            (p @ world.rotation[i] + world.x0[i] - values.x0[i]) @ values.rotation[i].T
+            for i in range(len(network.images))
+        ]
+        there = np.mean(back, axis=0)
+        estimate = mapping.with_values(values.cameras[0, : len(mapping.names)])
+        off = estimate(there[:, :2] / there[:, 2:]) - xy
+        result = Result(network, fit, np.zeros(len(network.xy), dtype=bool))
+        field = projection_field_at(result, 0, distance, across=n, down=3)
+        cov = field.cov.reshape(-1, 2, 2) / fit.variance
+        found.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off) / 2)
+    mean = np.mean(found, axis=0)
+    # Of 60 normalised errors of two coordinates: 1/√60 = 0.13; the places know of each other.
+    np.testing.assert_allclose(mean, 1.0, atol=3.5 * 0.13)
+    assert mean.mean() == pytest.approx(1.0, abs=3 * 0.13 / 2)
+
+
+def test_a_distance_that_is_none_is_refused() -> None:
+    world = networks.world(points=20, datum="free", control=0)
+    fit = world.problem(world.noisy(0)).adjusted().required()
+    result = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool))
+    with pytest.raises(UsageError, match="not above zero"):
+        projection_field_at(result, 0, 0.0)

@@ -7,7 +7,13 @@ from .approximate import Approximate, approximate
 from .calibrated import calibration_of
 from .components import estimate_components, reweighted
 from .document import to_document
-from .fields import FieldDifference, ProjectionField, calibration_difference, projection_field
+from .fields import (
+    FieldDifference,
+    ProjectionField,
+    calibration_difference,
+    projection_field,
+    projection_field_at,
+)
 from .lens import Lens
 from .network import Additional, Camera, Network
 from .patterns import CommonPattern, by_place, by_point, common_pattern
@@ -37,6 +43,7 @@ __all__ = [
     "estimate_components",
     "problem_of",
     "projection_field",
+    "projection_field_at",
     "reweighted",
     "to_document",
 ]

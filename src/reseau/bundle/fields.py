@@ -15,13 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.special
 
-from ..data import Array
+from ..data import Array, Rows
 from ..errors import UsageError
 from ..optics.poses import rotation_matrix
-from .lens import Lens
+from .lens import Lens, own_columns
 from .network import finite
+from .result import Result
 
-__all__ = ["FieldDifference", "ProjectionField", "calibration_difference", "projection_field"]
+__all__ = [
+    "FieldDifference",
+    "ProjectionField",
+    "calibration_difference",
+    "projection_field",
+    "projection_field_at",
+]
 
 # Singular values of the covariance root, over the largest, that are rounding.
 _RANK = 1e-6
@@ -118,6 +125,86 @@ def projection_field(lens: Lens, across: int = 25, down: int | None = None) -> P
     cov = np.full((len(xy), 2, 2), np.nan)
     cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
     return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+
+
+def projection_field_at(
+    result: Result,
+    c: int,
+    distance: float,
+    additional: str | None = None,
+    across: int = 25,
+    down: int | None = None,
+) -> ProjectionField:
+    """Uncertainty of where a camera images points of the object's space at a finite distance.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    c : int
+        Row of the camera.
+    distance : float
+        Of the points from the projection centre, in the unit of object space.
+    additional : str, optional
+        Which set of additional parameters, where there are several.
+    across, down : int
+        Places along the axes, from edge to edge; `down` by default in proportion.
+
+    Raises
+    ------
+    UsageError
+        For a distance that is not above zero, a camera without images, places without a field.
+
+    Notes
+    -----
+    A point p before the camera is carried into object space by the pose of each of its images, and comes back
+    by the estimate of it: dp = mean(δᵢ × p − Rᵢ dX0ᵢ). What the errors of all poses together make up for in
+    those of the interior orientation does not count; their joint covariance is used (Kogan, *mrcal*:
+    projection uncertainty by the mean of p over the frames). It is in the datum of the network.
+    """
+    if not distance > 0:
+        raise UsageError(f"{distance:g} is not above zero", where="distance")
+    lens = Lens.of_result(result, c, additional)
+    _, columns, _ = own_columns(result, c, additional)
+    covariance = _with_mean_pose(result, c, columns)
+    xy, shape = _places(lens, across, down)
+    uv = lens.mapping.inverse(xy)
+    known = np.isfinite(uv).all(axis=1)
+    seen = lens.mapping.derivatives(uv[known])
+    ray = np.column_stack([uv[known], np.ones(int(known.sum()))])
+    z = distance / np.linalg.norm(ray, axis=1)
+    by_point = np.zeros((len(z), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+    by_point[:, :, 2] = -uv[known] / z[:, None]
+    slope = np.concatenate(
+        [
+            seen.d_parameters[:, :, lens.rows],
+            seen.d_xy @ _by_rotation(uv[known]),
+            seen.d_xy @ by_point,
+        ],
+        axis=2,
+    )
+    cov = np.full((len(xy), 2, 2), np.nan)
+    cov[known] = slope @ covariance @ np.swapaxes(slope, 1, 2)
+    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+
+
+def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:
+    """Joint covariance of parameters of a camera, and of the means of δᵢ and of −Rᵢ dX0ᵢ over its images."""
+    unknowns, rotation = result.fit.unknowns, result.fit.values.rotation
+    images = np.flatnonzero((unknowns.pose >= 0) & (result.network.camera_of == c))
+    if not len(images):
+        raise UsageError("has no image", where=f"camera {result.network.cameras[c].id}")
+    k, m = len(columns), len(images)
+    at = np.concatenate([columns, (unknowns.pose[images, None] + np.arange(6)).ravel()])
+    turn = np.zeros((k + 6, len(at)))
+    turn[:k, :k] = np.eye(k)
+    poses = turn[k:, k:].reshape(6, m, 6)
+    poses[:3, :, :3] = np.eye(3)[:, None, :] / m
+    poses[3:, :, 3:] = -np.swapaxes(rotation[images], 0, 1) / m
+    cofactor = turn @ result.fit.cofactors.reduced[np.ix_(at, at)] @ turn.T
+    covariance: Array = cofactor * result.fit.variance
+    return covariance
 
 
 def calibration_difference(

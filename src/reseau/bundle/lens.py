@@ -16,7 +16,7 @@ from ..optics import Brown, Derivatives, EbnerCorrection, OpenCV, PixelGrid, Pla
 from .network import Additional, Camera
 from .result import Result
 
-__all__ = ["Lens"]
+__all__ = ["Lens", "own_columns"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +112,10 @@ class Lens:
         UsageError
             When there is no such set, or several and none is named.
         """
-        camera = result.network.cameras[c]
-        names, _, values = result.camera_columns(c)
-        keep = list(range(len(names)))
-        if camera.additional is not None and camera.additional.per != "camera":
-            keep = [k for k, name in enumerate(names) if " of " not in name]
-            own = [k for k, name in enumerate(names) if name.endswith(f" of {additional}")]
-            if not own:
-                raise UsageError("is no set of additional parameters of it", where=f"{additional or 'none'}")
-            keep += own
-        found = {names[k].partition(" of ")[0]: float(values[k]) for k in keep}
-        covariance = result.camera_covariance(c)[np.ix_(keep, keep)]
-        return cls._of(camera, found, tuple(found), covariance)
+        names, columns, values = own_columns(result, c, additional)
+        covariance = result.fit.cofactors.reduced[np.ix_(columns, columns)] * result.fit.variance
+        found = dict(zip(names, values.tolist(), strict=True))
+        return cls._of(result.network.cameras[c], found, names, covariance)
 
     @classmethod
     def of_calibration(cls, calibration: Calibration) -> Self:
@@ -150,6 +142,20 @@ class Lens:
         mapping = mapping.with_values({name: found[name] for name in mapping.names if name in found})
         rows = np.array([mapping.names.index(name) for name in names], dtype=np.intp)
         return cls(mapping, camera.width, camera.height, rows, covariance)
+
+
+def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:
+    """Names, columns and values of what was estimated of a camera, of its additional parameters one set."""
+    names, columns, values = result.camera_columns(c)
+    camera = result.network.cameras[c]
+    if camera.additional is None or camera.additional.per == "camera":
+        return names, columns, values
+    keep = [k for k, name in enumerate(names) if " of " not in name]
+    own = [k for k, name in enumerate(names) if name.endswith(f" of {additional}")]
+    if not own:
+        raise UsageError("is no set of additional parameters of it", where=f"{additional or 'none'}")
+    keep += own
+    return tuple(names[k].partition(" of ")[0] for k in keep), columns[keep], values[keep]
 
 
 def _camera(name: str, model: dict[str, Any], values: dict[str, float]) -> Camera:

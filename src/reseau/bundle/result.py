@@ -74,7 +74,7 @@ class Result:
 
     # -- cameras
 
-    def camera_columns(self, c: int) -> tuple[tuple[str, ...], Array, Array]:
+    def camera_columns(self, c: int) -> tuple[tuple[str, ...], Rows, Array]:
         """Names, columns among the reduced unknowns and values of what was estimated of a camera.
 
         Sets of additional parameters are named ``b1`` … ``b12``; where a camera has several, with the group
