@@ -1,31 +1,87 @@
-"""The world in motion: what the scanner sweeps is drawn on the screen that oscilloscope and camera see.
+"""The world in motion: what the scanner sweeps is on the screen that oscilloscope and camera see; where the
+turntable stands is where the camera sees the testfield.
 
-All simulators of one bench share one laboratory; it may be asked from several threads.
+All simulators of one bench share one laboratory; it may be asked from several threads. Its axes are asked
+where they stand whenever someone looks: a table that moves is seen moving. An exposure is taken to be short.
 """
 
 from __future__ import annotations
 
+import copy
 import threading
-from dataclasses import replace
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from hashlib import sha256
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from reseau.data import Array, Frame
+from reseau.errors import UsageError
+from reseau.optics import Pose, matrix_to_vector, rotation_matrix
 
 from .reflectors import Reflectors
 from .scanner import Video
 from .screen import Screen
+from .testfield import FieldBench, FieldTruth, Station
 from .world import World
 
-__all__ = ["GRADIANS", "Laboratory"]
+__all__ = ["AXES", "GRADIANS", "Laboratory", "Room"]
 
+AXES = ("tilt", "roll", "camera_roll", "z")
+"""Of the turntable: the board's tilt and its turn in its mount, the camera's turn (degrees), and the way of
+the table away from the camera (mm)."""
 GRADIANS = 400
 """Of a turn of the scanner's head; 200 looks straight down into the tank."""
 _AHEAD = 200
 _NOISE = 1.5
 """Of an echo's samples, of 255."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """What changes of itself while the clock runs.
+
+    Parameters
+    ----------
+    light_per_hour : float
+        By which share the lamp gets brighter.
+    drift_mm_per_hour : (float, float, float)
+        How the camera creeps on its stand: along x, y and its axis.
+    """
+
+    light_per_hour: float = 0.0
+    drift_mm_per_hour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Room:
+        """A room as one meets it: half a per cent, and hundredths of a millimetre, in an hour."""
+        x, y, z = rng.normal(0.0, 0.02, 3)
+        return cls(float(rng.normal(0.0, 0.005)), (float(x), float(y), float(z)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Mounted(FieldBench):
+    """The testfield on its turntable: set up once, then moved; the paper's stations are set up anew."""
+
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, field: FieldBench, shift: Array) -> _Mounted:
+        """The same bench, with the camera elsewhere by so much."""
+        same = {each.name: getattr(field, each.name) for each in fields(FieldBench)}
+        return cls(**same, shift_mm=(float(shift[0]), float(shift[1]), float(shift[2])))
+
+    def pose(self, station: Station) -> Pose:
+        """Of the camera in the system of the board: that of the first setup, carried along."""
+        first = super().pose(Station(0.0))
+        phi, kappa, camera = np.deg2rad(station)
+        board = rotation_matrix(np.array([0.0, phi, 0.0])) @ rotation_matrix(np.array([0.0, 0.0, kappa]))
+        matrix = rotation_matrix(np.array([0.0, 0.0, camera])) @ first.matrix @ board
+        return Pose(matrix_to_vector(matrix), board.T @ (first.x0 + np.array(self.shift_mm)))
 
 
 class Laboratory:
@@ -35,6 +91,12 @@ class Laboratory:
     ----------
     world : World
         Screen, scanner, camera and tank.
+    field : FieldBench, optional
+        Testfield and camera on the turntable; by default those of the paper, of the world's seed.
+    room : Room, optional
+        By default drawn from the world's seed.
+    clock : callable
+        Seconds.
 
     Examples
     --------
@@ -42,20 +104,48 @@ class Laboratory:
     >>> echoes = laboratory.line(200, 200, 2e-6)
     >>> len(echoes), int(laboratory.swept.sum())
     (200, 1)
+    >>> laboratory.attach("tilt", lambda: 30.0)
+    >>> laboratory.axes["tilt"], laboratory.expose("testfield").pixels.shape
+    (30.0, (240, 240))
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(
+        self,
+        world: World,
+        field: FieldBench | None = None,
+        *,
+        room: Room | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.world = world
+        self.field = field or FieldBench(seed=world.seed)
+        self.room = room or Room.drawn(world.rng("room"))
         self.lock = threading.RLock()
         self.swept = np.zeros(GRADIANS, dtype=bool)
         """Head angles of which echoes have been drawn."""
-        self.axes: dict[str, float] = {}
-        """Where the axes of the turntable stand."""
         self.echoes: NDArray[np.uint8] = np.zeros(0, np.uint8)
         """The last line of echoes; the oscilloscope's first channel shows it."""
+        self._axes: dict[str, Callable[[], float]] = {}
+        self._clock, self._began = clock, clock()
         self._tank = world.rods
         self._drawn: tuple[bytes, Screen] | None = None
-        self._lines = 0
+        self._lines, self._exposures = 0, 0
+
+    @property
+    def hours(self) -> float:
+        """Since it was opened."""
+        return (self._clock() - self._began) / 3600
+
+    def attach(self, axis: str, where: Callable[[], float]) -> None:
+        """Have an axis of :data:`AXES` stand where this says (degrees or millimetres)."""
+        if axis not in AXES:
+            raise UsageError(f"is none of {', '.join(AXES)}", where=axis)
+        self._axes[axis] = where
+
+    @property
+    def axes(self) -> dict[str, float]:
+        """Where the axes stand at this moment; one that nothing moves stands at 0."""
+        return {name: self._axes[name]() if name in self._axes else 0.0 for name in AXES}
 
     @property
     def tank(self) -> Reflectors:
@@ -123,9 +213,56 @@ class Laboratory:
         )
 
     def photograph(self, name: str) -> Frame:
-        """What the camera sees now: the reseau in front of the tube."""
+        """What the camera sees now of the reseau before the tube; the same name has the same noise."""
         with self.lock:
-            return self.world.photograph(name, self.screen())
+            return self._standing().photograph(name, self.screen())
+
+    def field_truth(self) -> FieldTruth:
+        """Where the targets of the testfield are now, in space and in the image."""
+        with self.lock:
+            station, bench = self._moved()
+            return bench.truth(station)
+
+    def expose(self, sight: Literal["screen", "testfield"], light: float = 1.0, gain: float = 1.0) -> Frame:
+        """A frame of what a camera sees now; no two have the same noise.
+
+        Parameters
+        ----------
+        sight : {"screen", "testfield"}
+            The reseau before the tube, or the testfield on the turntable.
+        light : float
+            Exposure, of the nominal one.
+        gain : float
+            Factor of the amplifier.
+        """
+        with self.lock:
+            self._exposures += 1
+            name = f"exposure {self._exposures}"
+            level = light * gain * max(0.0, 1 + self.room.light_per_hour * self.hours)
+            if sight == "screen":
+                screen = copy.copy(self.screen())
+                screen.light = screen.light * np.float32(level)
+                return self._standing().photograph(name, screen)
+            rng = self.world.rng(name)
+            station, bench = self._moved()
+            sensor = bench.sensor
+            shifts = sensor.row_shifts(rng) if sensor.row_jitter_px else None
+            pixels = sensor.expose(level * bench.light(station, shifts), rng)
+            return Frame(pixels, sensor.full_scale, name, sha256(pixels.tobytes()).hexdigest())
+
+    def _drift(self) -> Array:
+        """How far the cameras have crept (mm)."""
+        return self.hours * np.array(self.room.drift_mm_per_hour)
+
+    def _standing(self) -> World:
+        """The world with the camera where it stands now."""
+        return replace(self.world, camera=self.world.camera.moved(self._drift(), 0.0))
+
+    def _moved(self) -> tuple[Station, FieldBench]:
+        """How the table stands, and the testfield on it."""
+        axes = self.axes
+        station = Station(axes["tilt"], axes["roll"], axes["camera_roll"])
+        return station, _Mounted.of(self.field, self._drift() + np.array([0.0, 0.0, axes["z"]]))
 
     def _draw(self) -> Screen:
         world = self.world

@@ -18,7 +18,8 @@ from .zaber import ZaberChain
 
 __all__ = ["SimulatedBench", "serve"]
 
-_AXES = {(1, 1): "tilt", (1, 2): "roll", (2, 1): "camera_roll", (3, 1): "z"}
+_AXES = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
+_PER_UNIT = 1000.0
 _SCREEN = (800, 480)
 
 _BENCH = """\
@@ -31,7 +32,7 @@ address = "{table}"
 settings = {{speed = 50.0}}
 
 [instruments.table.options.axes]
-tilt = {{device = 1, axis = 1, per_unit = 1000.0, low = 0.0, high = 90.0, backlash = 0.2}}
+tilt = {{device = 1, axis = 1, per_unit = 1000.0, low = 0.0, high = 75.0, backlash = 0.2}}
 roll = {{device = 1, axis = 2, per_unit = 1000.0, low = 0.0, high = 360.0, backlash = 0.2}}
 camera_roll = {{device = 2, axis = 1, per_unit = 1000.0, low = 0.0, high = 360.0, backlash = 0.2}}
 z = {{device = 3, axis = 1, per_unit = 1000.0, unit = "mm", low = 0.0, high = 300.0}}
@@ -67,13 +68,12 @@ class SimulatedBench:
 
     def __init__(self, seed: int = 0) -> None:
         self.laboratory = laboratory = Laboratory(World.standard(seed))
-
-        def moved(device: int, axis: int, position: float) -> None:
-            laboratory.axes[_AXES[device, axis]] = position / 1000
-
+        table = ZaberChain([2, 1, 1])
+        for name, (device, axis) in _AXES.items():
+            laboratory.attach(name, partial(_units, table, device, axis))
         scope = Oscilloscope("keysight", lambda: laboratory.picture(*_SCREEN), lambda: laboratory.echoes)
         self.machines: dict[str, Machine] = {
-            "table": ZaberChain([2, 1, 1], moved=moved),
+            "table": table,
             "scanner": Ping360(laboratory.line),
             "oscilloscope": scope,
         }
@@ -107,6 +107,11 @@ class SimulatedBench:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _units(table: ZaberChain, device: int, axis: int) -> float:
+    """Where an axis stands, in degrees or millimetres."""
+    return table.position(device, axis) / _PER_UNIT
 
 
 def serve(seed: int = 0) -> SimulatedBench:

@@ -23,15 +23,12 @@ class Motor:
         Steps per second.
     clock : callable
         Seconds.
-    moved : callable
-        Told the position whenever it is asked for: the world follows.
     """
 
     low: float
     high: float
     speed: float
     clock: Clock = time.monotonic
-    moved: Callable[[float], None] = lambda position: None
     homed: bool = False
     homing: bool = False
     stalled: bool = False
@@ -61,7 +58,6 @@ class Motor:
             if self.homing:
                 self.homing, self.homed = False, True
             self._stand(self._target)
-        self.moved(now)
         return now
 
     @property

@@ -7,7 +7,7 @@ taken without a reference.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from reseau.errors import ProtocolError
 from reseau_drivers.codecs.smc100 import LIMIT, Line, decode, encode
@@ -33,8 +33,6 @@ class Smc100Line(Machine):
         Units per second.
     clock : callable
         Seconds.
-    moved : callable
-        Told address and position.
     """
 
     def __init__(
@@ -45,23 +43,19 @@ class Smc100Line(Machine):
         high: float = 180.0,
         speed: float = 20.0,
         clock: Clock = time.monotonic,
-        moved: Callable[[int, float], None] = lambda address, position: None,
     ) -> None:
         super().__init__()
         self._lines = LineDecoder(limit=LIMIT)
         self.motors = {
-            address: Motor(
-                low - 1.0,
-                high + 1.0,
-                speed,
-                clock,
-                at=1.5,
-                moved=lambda p, a=address: moved(a, p),  # type: ignore[misc]
-            )
-            for address in range(1, count + 1)
+            address: Motor(low - 1.0, high + 1.0, speed, clock, at=1.5) for address in range(1, count + 1)
         }
         self._limits = (low, high)
         self._errors = dict.fromkeys(self.motors, "@")
+
+    def position(self, address: int) -> float:
+        """Where an axis stands at this moment (units), whether anybody asks it or not."""
+        with self.lock:
+            return self.motors[address].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Answers to these bytes; most commands have none."""

@@ -35,8 +35,6 @@ class ZaberChain(Machine):
         Limits of all axes (steps).
     clock : callable
         Seconds.
-    moved : callable
-        Told device, axis and position.
     """
 
     def __init__(
@@ -46,22 +44,20 @@ class ZaberChain(Machine):
         low: float = 0.0,
         high: float = 400_000.0,
         clock: Clock = time.monotonic,
-        moved: Callable[[int, int, float], None] = lambda device, axis, position: None,
     ) -> None:
         super().__init__()
         self._lines = LineDecoder(limit=_LONGEST)
         self.motors = {
-            (device, axis): Motor(
-                low,
-                high,
-                20_000.0,
-                clock,
-                moved=lambda p, d=device, a=axis: moved(d, a, p),  # type: ignore[misc]
-            )
+            (device, axis): Motor(low, high, 20_000.0, clock)
             for device, count in enumerate(axes, 1)
             for axis in range(1, count + 1)
         }
         self._interrupted: set[tuple[int, int]] = set()
+
+    def position(self, device: int, axis: int) -> float:
+        """Where an axis stands at this moment (steps), whether anybody asks it or not."""
+        with self.lock:
+            return self.motors[device, axis].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Replies to these bytes."""
