@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from reseau.instruments import Device
+from reseau_drivers.camera import v4l2
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
@@ -32,7 +33,9 @@ from reseau_sims.serving import (
     Wire,
     ZaberChain,
 )
+from reseau_sims.serving.imaging import CameraBody, Pattern
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
+from reseau_sims.serving.v4l2 import VideoCamera
 
 TRANSPORTS = ("pty", "tcp", "in process")
 _SERVERS: dict[str, Callable[..., Server]] = {"pty": PtyServer, "tcp": TcpServer, "udp": UdpServer}
@@ -46,7 +49,7 @@ class Rig:
     ----------
     device : Device
         The driver.
-    machine : Machine
+    machine : Machine or CameraBody
         What it drives.
     script : Script
         What goes wrong between them.
@@ -58,7 +61,7 @@ class Rig:
     """
 
     device: Device[Any]
-    machine: Machine
+    machine: Machine | CameraBody
     script: Script
     work: Callable[[int], None]
     recover: Callable[[], object]
@@ -203,6 +206,24 @@ def pulser_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.stop, server)
 
 
+def v4l2_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    body = CameraBody(script=script)
+    camera = VideoCamera(body, first=(1 << 32) - 20)
+    device = v4l2("camera", camera.open, settings={"exposure_us": 2000.0, "gain": 3}, seconds=0.5)
+
+    def work(run: int) -> None:
+        for k in range(5):
+            pattern = Pattern(shift=5 * run + k)
+            body.look_at(pattern)
+            shot = device.expose()
+            # A frame that began before the camera was turned would show the pattern of before.
+            assert shot.fresh
+            assert (shot.pixels == pattern(camera.view)).all()
+            assert (shot.exposure_us, camera.view.exposure_us, camera.view.gain_db) == (2000.0, 2000.0, 3.0)
+
+    return Rig(device, body, script, work, device.expose, extra={"camera": camera})
+
+
 Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
@@ -214,6 +235,7 @@ RIGS: dict[tuple[str, str], Maker] = {
         ("oscilloscope", transport): scope_rig
         for transport in ("tcp", "vxi-11", "hislip", "usbtmc", "in process")
     },
+    ("v4l2", "in process"): v4l2_rig,
 }
 
 

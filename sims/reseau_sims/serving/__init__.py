@@ -9,6 +9,7 @@ from .bench import SimulatedBench
 from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .datagrams import UdpServer
+from .imaging import CameraBody, Pattern, Sight, View
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -18,6 +19,7 @@ from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
 from .servers import InProcess, PtyServer, Server, TcpServer
 from .smc100 import Smc100Line
 from .usbtmc import UsbInstrument, plugged_in
+from .v4l2 import VideoCamera
 from .zaber import ZaberChain
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "KINDS",
     "LINE_KINDS",
     "BkScanner",
+    "CameraBody",
     "CompactPulser",
     "Family",
     "Fault",
@@ -35,17 +38,21 @@ __all__ = [
     "Machine",
     "Motor",
     "Oscilloscope",
+    "Pattern",
     "Ping360",
     "PortmapperSession",
     "PtyServer",
     "Script",
     "Server",
     "Session",
+    "Sight",
     "SimulatedBench",
     "Smc100Line",
     "TcpServer",
     "UdpServer",
     "UsbInstrument",
+    "VideoCamera",
+    "View",
     "Vxi11Session",
     "Wire",
     "ZaberChain",

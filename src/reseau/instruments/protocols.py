@@ -7,7 +7,7 @@ protocols of the same names ask for, so that its plans drive them as they are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Any, Protocol, runtime_checkable
 
@@ -125,7 +125,11 @@ class Exposure(Protocol):
 
     @property
     def frame(self) -> Frame:
-        """The image."""
+        """The image; grey values as the camera sent them, of a mosaic of colours all of them."""
+
+    @property
+    def pattern(self) -> str:
+        """Of colour that is kept raw: filters of the first two rows (RGGB …), YUYV, MJPEG; empty for grey."""
 
     @property
     def sequence(self) -> int:
@@ -136,16 +140,24 @@ class Exposure(Protocol):
         """When its exposure began, UTC."""
 
     @property
+    def taken_within_s(self) -> float:
+        """How far from that it may have begun (s)."""
+
+    @property
+    def fresh(self) -> bool:
+        """Whether its exposure surely began after it was asked for."""
+
+    @property
     def exposure_us(self) -> float:
-        """Exposure time."""
+        """Exposure time; NaN where the camera does not tell."""
 
     @property
     def gain(self) -> float:
-        """Gain (dB)."""
+        """Gain, dB where the camera has a unit for it; NaN where it does not tell."""
 
     @property
     def dropped(self) -> int:
-        """Frames lost since the camera was started."""
+        """Frames lost or damaged since the camera was connected."""
 
 
 @runtime_checkable
@@ -154,3 +166,6 @@ class Camera(Instrument, Protocol):
 
     def expose(self, seconds: float | None = None) -> Exposure:
         """A frame whose exposure began after this call."""
+
+    def frames(self, count: int, seconds: float | None = None) -> Iterator[Exposure]:
+        """Frames one after the other, as the camera delivers them; each says whether it is fresh."""

@@ -1,0 +1,339 @@
+"""Cameras of Video4Linux: webcams, frame grabbers, sensors of boards.
+
+Buffers are shared with the kernel and copied out at once. The kernel counts frames, also those for which
+there was no buffer, and stamps them by the monotonic clock, at the start of the exposure or at the end of the
+frame.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reseau.errors import ConnectionLost, ProtocolError, RefusedError
+from reseau.instruments import Deadline, Identity, choice, quantity
+
+from ..codecs import v4l2 as uapi
+from ..codecs.pixels import VIDEO, decode, size_of
+from .camera import CameraSettings, Taken
+from .clocks import Span, Wrapping
+from .kernel import Mapping, Node, OpenNode
+
+__all__ = ["V4l2", "V4l2Settings"]
+
+_UNKNOWN_PERIOD_NS = 1_000_000_000
+"""From frame to frame, where the driver does not tell: none is slower."""
+_TICK_NS = 100_000
+"""By which a stamp may lie ahead of the moment in which it is read: clocks of processors differ by less."""
+_MOST_CONTROLS = 500
+
+
+@dataclass(frozen=True)
+class V4l2Settings(CameraSettings):
+    """Settings of a camera of V4L2; a gain or brightness below 0 leaves it as it is. Gains have no unit."""
+
+    format: str = choice("GREY", *VIDEO)
+    brightness: int = quantity(-1, "", -1, 65535)
+
+
+class V4l2:
+    """A camera of V4L2.
+
+    Parameters
+    ----------
+    open_node : callable
+        Opens its node.
+    """
+
+    def __init__(self, open_node: OpenNode) -> None:
+        self._open_node = open_node
+        self._node: Node | None = None
+        self._maps: list[Mapping] = []
+        self._streaming = False
+        self._numbers = Wrapping(1 << 32)
+        self._damaged = 0
+        self._buffers = 4
+        self._format, self._layout = uapi.Format(0, 0, "GREY"), VIDEO["GREY"]
+        self._period_ns = _UNKNOWN_PERIOD_NS
+        self._exposure_ns: int | None = None
+        self._gain = float("nan")
+        self._stamp_ns, self._stamped_at_start = 0, False
+        self._controls: dict[int, uapi.Control] = {}
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were lost or damaged."""
+        return self._numbers.lost + self._damaged
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of its frames."""
+        return self._format.height, self._format.width
+
+    def open(self, deadline: Deadline) -> None:
+        """Open the node anew; nothing of an earlier one is used again."""
+        self.close()
+        self._numbers, self._damaged = Wrapping(1 << 32), 0
+        self._node = self._open_node()
+        with self._told("query"):
+            found = uapi.Capability.parse(self._ask(uapi.QUERYCAP, bytearray(uapi.Capability.SIZE)))
+        if not found.capabilities & uapi.Capability.VIDEO_CAPTURE:
+            raise RefusedError("is no camera", do="name the node that captures; see v4l2-ctl --list-devices")
+        if not found.capabilities & uapi.Capability.STREAMING:
+            raise RefusedError("cannot share its buffers")
+        self._identity = Identity(found.driver, found.card, found.bus, ".".join(map(str, found.version)))
+        self._controls = {control.identifier: control for control in self._listed()}
+
+    def close(self) -> None:
+        """Close it, if it is open."""
+        node, self._node = self._node, None
+        maps, self._maps = self._maps, []
+        self._streaming = False
+        for each in maps:
+            with suppress(OSError, ValueError, BufferError):
+                each.close()
+        if node is not None:
+            node.close()
+
+    def identify(self, deadline: Deadline) -> Identity:
+        """What the driver says it is."""
+        return self._identity
+
+    def apply(self, settings: V4l2Settings, deadline: Deadline) -> None:
+        """Stop, and have it set so."""
+        self.halt()
+        self._buffers = settings.buffers
+        with self._told("set"):
+            self._set_format(settings)
+            self._set_rate(settings.rate)
+        self._set_exposure(settings.exposure_us)
+        self._set_gain(settings.gain)
+        if settings.brightness >= 0:
+            self._set(uapi.BRIGHTNESS, settings.brightness, "brightness")
+
+    def dark(self, settings: V4l2Settings) -> V4l2Settings:
+        """Settings with the shortest exposure, where it has a control for that."""
+        control = self._controls.get(uapi.EXPOSURE_ABSOLUTE)
+        return settings if control is None else replace(settings, exposure_us=max(1, control.low) * 100.0)
+
+    def start(self, deadline: Deadline) -> None:
+        """Have it deliver frames, if it does not yet."""
+        if self._streaming:
+            return
+        with self._told("start"):
+            count = uapi.Request.parse(self._ask(uapi.REQBUFS, uapi.Request(self._buffers).build())).count
+            for index in range(count):
+                asked = uapi.Buffer(index).build()
+                buffer = uapi.Buffer.parse(self._ask(uapi.QUERYBUF, asked))
+                self._maps.append(self._opened().map(buffer.length, buffer.offset))
+                self._ask(uapi.QBUF, uapi.Buffer(index).build())
+            self._ask(uapi.STREAMON, uapi.stream_type())
+        self._streaming = True
+        self._numbers.restart()
+        self._stamp_ns = 0
+
+    def request(self, deadline: Deadline) -> None:
+        """Nothing to send: it runs freely."""
+
+    def take(self, deadline: Deadline) -> Taken | None:
+        """The next whole frame that is newer than the last."""
+        with self._told("fetch"):
+            if not self._opened().wait(deadline.left):
+                return None
+            try:
+                buffer = uapi.Buffer.parse(self._ask(uapi.DQBUF, uapi.Buffer().build()))
+            except BlockingIOError:
+                return None
+            now = time.monotonic_ns()
+            if not buffer.index < len(self._maps):
+                raise ProtocolError(f"delivered a buffer {buffer.index}, of {len(self._maps)}")
+            data = self._maps[buffer.index][: buffer.used]
+            self._ask(uapi.QBUF, uapi.Buffer(buffer.index).build())
+        sequence = self._numbers.next(buffer.sequence)
+        if sequence is None:
+            return None
+        if not self._whole(buffer):
+            self._damaged += 1
+            return None
+        began = self._began(buffer, now)
+        try:
+            pixels = decode(self._layout, self._format.width, self._format.height, data, self._format.stride)
+        except ProtocolError:
+            # A picture that was compressed tells its damage only here.
+            self._damaged += 1
+            return None
+        exposure_us = float("nan") if self._exposure_ns is None else self._exposure_ns / 1000
+        raw = data if self._layout.pattern in ("YUYV", "MJPEG") else b""
+        return Taken(
+            pixels,
+            self._layout.full_scale,
+            self._layout.pattern,
+            raw,
+            sequence,
+            began,
+            exposure_us,
+            self._gain,
+        )
+
+    def halt(self) -> None:
+        """Stop, and give the buffers back."""
+        if self._node is None:
+            return
+        maps, self._maps = self._maps, []
+        for each in maps:
+            each.close()
+        if self._streaming or maps:
+            self._streaming = False
+            with self._told("stop"):
+                self._ask(uapi.STREAMOFF, uapi.stream_type())
+                self._ask(uapi.REQBUFS, uapi.Request(0).build())
+
+    def clock(self, deadline: Deadline) -> str:
+        """Frames are stamped by the clock of this machine."""
+        where = "start of the exposure" if self._stamped_at_start else "end of the frame"
+        return f"offset 0 s, stamped by the kernel at the {where}"
+
+    def _whole(self, buffer: uapi.Buffer) -> bool:
+        need = size_of(self._layout, self._format.width, self._format.height, self._format.stride)
+        return not buffer.flags & uapi.Buffer.ERROR and buffer.used >= max(1, need)
+
+    def _began(self, buffer: uapi.Buffer, now: int) -> Span:
+        """When the exposure began; see the documentation of ``v4l2_buffer``'s flags."""
+        if buffer.flags & uapi.Buffer.CLOCKS != uapi.Buffer.MONOTONIC:
+            raise ProtocolError("stamps its frames by an unknown clock")
+        stamp = buffer.stamp_ns
+        if stamp > now + _TICK_NS or stamp < self._stamp_ns:
+            raise ProtocolError(f"stamped a frame {(stamp - now) / 1e9:+.3g} s from now, or out of order")
+        self._stamp_ns = stamp
+        self._stamped_at_start = buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
+        if self._stamped_at_start:
+            return Span(stamp, stamp + 1000)
+        # Rows are read one after the other, which takes up to a period; an unknown exposure may fill one.
+        exposure = self._exposure_ns
+        longest = self._period_ns if exposure is None else exposure
+        return Span(stamp - self._period_ns - longest, stamp - (exposure or 0))
+
+    def _set_format(self, settings: V4l2Settings) -> None:
+        now = uapi.Format.parse(self._ask(uapi.G_FMT, uapi.Format(0, 0, "GREY").build()))
+        width, height = settings.width or now.width, settings.height or now.height
+        if settings.left or settings.top:
+            region = uapi.Selection(settings.left, settings.top, width, height)
+            got = uapi.Selection.parse(self._ask(uapi.S_SELECTION, region.build()))
+            if got != region:
+                raise RefusedError(f"reads the region {got}, not {region}")
+        self._layout = VIDEO[settings.format]
+        wanted = uapi.Format(width, height, str(self._layout.code))
+        took = uapi.Format.parse(self._ask(uapi.S_FMT, wanted.build()))
+        if (took.width, took.height, took.fourcc) != (width, height, wanted.fourcc):
+            offered = ", ".join(self._offered())
+            raise RefusedError(
+                f"delivers {took.width}×{took.height} {took.fourcc.strip()}, not {width}×{height} "
+                f"{settings.format}",
+                do=f"it offers {offered}",
+            )
+        self._format = took
+
+    def _set_rate(self, rate: float) -> None:
+        self._period_ns = _UNKNOWN_PERIOD_NS
+        # Not every driver knows of intervals; one that does tells the one that it took.
+        with suppress(OSError):
+            if rate:
+                self._ask(uapi.S_PARM, uapi.Interval(1000, round(rate * 1000)).build())
+            got = uapi.Interval.parse(self._ask(uapi.G_PARM, uapi.Interval(0, 0).build()))
+            self._period_ns = got.ns or _UNKNOWN_PERIOD_NS
+        if rate and abs(self._period_ns * rate - 1e9) > 5e7:
+            raise RefusedError(f"delivers {1e9 / self._period_ns:.4g} frames in a second, not {rate:g}")
+
+    def _set_exposure(self, exposure_us: float) -> None:
+        known = uapi.EXPOSURE_ABSOLUTE in self._controls
+        if exposure_us and not known:
+            raise RefusedError("has no control of the exposure time")
+        if exposure_us:
+            if uapi.EXPOSURE_AUTO in self._controls:
+                self._set(uapi.EXPOSURE_AUTO, uapi.EXPOSURE_MANUAL, "exposure mode")
+            self._set(uapi.EXPOSURE_ABSOLUTE, max(1, round(exposure_us / 100)), "exposure_us / 100")
+        automatic = (
+            uapi.EXPOSURE_AUTO in self._controls and self._get(uapi.EXPOSURE_AUTO) != uapi.EXPOSURE_MANUAL
+        )
+        self._exposure_ns = self._get(uapi.EXPOSURE_ABSOLUTE) * 100_000 if known and not automatic else None
+
+    def _set_gain(self, gain: float) -> None:
+        if gain >= 0:
+            if uapi.AUTOGAIN in self._controls:
+                self._set(uapi.AUTOGAIN, 0, "automatic gain")
+            self._set(uapi.GAIN, round(gain), "gain")
+        self._gain = float(self._get(uapi.GAIN)) if uapi.GAIN in self._controls else float("nan")
+
+    def _set(self, identifier: int, value: int, name: str) -> None:
+        control = self._controls.get(identifier)
+        if control is None:
+            raise RefusedError(f"has no control of {name}")
+        if not control.low <= value <= control.high:
+            raise RefusedError(f"{name} {value} is beyond its {control.low}…{control.high}")
+        with self._told(f"set {control.name}"):
+            self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
+        if (got := self._get(identifier)) != value:
+            raise RefusedError(f"{name} is {got}, not {value}", do="is it driven automatically?")
+
+    def _get(self, identifier: int) -> int:
+        with self._told("get"):
+            data = self._ask(uapi.G_CTRL, uapi.control_value(identifier))
+        return int(np.frombuffer(data, "<i4")[1])
+
+    def _listed(self) -> Iterator[uapi.Control]:
+        """Controls with their limits, as the driver goes through them."""
+        last = 0
+        for _ in range(_MOST_CONTROLS):
+            try:
+                data = self._ask(uapi.QUERYCTRL, uapi.Control.after(last))
+            except OSError as error:
+                if error.errno in (errno.EINVAL, errno.ENOTTY):
+                    return
+                raise
+            control = uapi.Control.parse(data)
+            last = control.identifier
+            if not control.flags & uapi.Control.DISABLED:
+                yield control
+
+    def _offered(self) -> Iterator[str]:
+        """Pixel formats that it has, by the names of the settings where they have one."""
+        names = {str(layout.code): name for name, layout in VIDEO.items()}
+        for index in range(64):
+            try:
+                code = uapi.Format.listed(self._ask(uapi.ENUM_FMT, uapi.Format.ask(index)))
+            except OSError:
+                return
+            yield names.get(code, code.strip())
+
+    def _ask(self, request: int, data: bytearray) -> bytes:
+        self._opened().ioctl(request, data)
+        return bytes(data)
+
+    def _opened(self) -> Node:
+        if self._node is None:
+            raise ConnectionLost("the camera is not open")
+        return self._node
+
+    @contextmanager
+    def _told(self, what: str) -> Iterator[None]:
+        """Name what the kernel's numbers mean."""
+        try:
+            yield
+        except OSError as error:
+            number = error.errno or 0
+            if number == errno.EBUSY:
+                raise RefusedError(f"is used by another process ({what})", do="end that, or wait") from None
+            if number in (errno.EINVAL, errno.ENOTTY, errno.ERANGE, errno.EACCES):
+                raise RefusedError(f"does not do that ({what}: {os.strerror(number)})") from None
+            if number == errno.EIO:
+                raise ProtocolError(f"reports a fault of its own ({what})", do="is the cable good?") from None
+            raise ConnectionLost(f"went away ({what}: {error.strerror})", do="is it plugged in?") from None
+        except ValueError:
+            # Memory that another thread has given back.
+            raise ConnectionLost("was closed meanwhile") from None

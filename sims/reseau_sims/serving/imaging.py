@@ -1,0 +1,143 @@
+"""What every simulated camera has: something to look at, and settings that act on the picture."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .script import Script
+
+__all__ = ["CameraBody", "Pattern", "Sight", "View"]
+
+NOMINAL_US = 10_000.0
+"""Exposure at which a sight has its own brightness."""
+
+
+@dataclass(frozen=True)
+class View:
+    """How a camera is set.
+
+    Parameters
+    ----------
+    exposure_us : float
+        Exposure time.
+    gain_db : float
+        Of its amplifier.
+    offset : float
+        Grey values added at the end.
+    left, top, width, height : int
+        Region of the sensor.
+    full_scale : float
+        Grey value at which it saturates.
+    """
+
+    exposure_us: float
+    gain_db: float
+    offset: float
+    left: int
+    top: int
+    width: int
+    height: int
+    full_scale: float
+
+    @property
+    def light(self) -> float:
+        """Light that is gathered, of that of the nominal exposure."""
+        return self.exposure_us / NOMINAL_US
+
+    @property
+    def gain(self) -> float:
+        """Factor of the amplifier."""
+        return float(10 ** (self.gain_db / 20))
+
+    def seen(self, whole: NDArray[Any]) -> NDArray[Any]:
+        """The region of a whole picture that already has exposure and gain, with the offset."""
+        part = whole[self.top : self.top + self.height, self.left : self.left + self.width]
+        if not self.offset:
+            return part
+        return np.clip(part + self.offset, 0, self.full_scale).astype(whole.dtype)
+
+
+class Sight(Protocol):
+    """What a camera looks at."""
+
+    def __call__(self, view: View) -> NDArray[Any]:
+        """The picture; the same view gives the same one."""
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Slanted stripes that tell their shift: a picture that is no other's.
+
+    Parameters
+    ----------
+    width, height : int
+        Of the sensor.
+    shift : int
+        Of the stripes.
+    """
+
+    width: int = 96
+    height: int = 64
+    shift: int = 0
+
+    def __call__(self, view: View) -> NDArray[Any]:
+        """The picture of a view."""
+        y, x = np.mgrid[: self.height, : self.width]
+        stripes = (3 * x + 5 * y + 7 * self.shift) % 101 + 20
+        grey = np.minimum(stripes * (view.full_scale / 255 * view.light * view.gain), view.full_scale)
+        return view.seen(grey.astype(np.uint8 if view.full_scale <= 255 else np.uint16))
+
+
+class CameraBody:
+    """A sensor that looks at something; the doors in front of it are V4L2 or GigE Vision.
+
+    Parameters
+    ----------
+    sight : Sight
+        What it looks at first.
+    width, height : int
+        Of its sensor.
+    script : Script, optional
+        Which frames suffer which fault.
+
+    Attributes
+    ----------
+    violations : list of str
+        What its client did wrong.
+    before_change : list of callable
+        Called before it looks at something else, so that what was exposed until then is what was seen then.
+    """
+
+    def __init__(
+        self, sight: Sight | None = None, width: int = 96, height: int = 64, script: Script | None = None
+    ) -> None:
+        self.lock = threading.RLock()
+        self.width, self.height = width, height
+        self.script = script or Script()
+        self.violations: list[str] = []
+        self.before_change: list[Callable[[], None]] = []
+        self._sight: Sight = sight or Pattern(width, height)
+
+    def look_at(self, sight: Sight) -> None:
+        """Turn it to something else."""
+        with self.lock:
+            for each in self.before_change:
+                each()
+            self._sight = sight
+
+    def draw(self, view: View) -> NDArray[Any]:
+        """The picture that it takes now."""
+        with self.lock:
+            return self._sight(view)
+
+    def forget(self, hook: Callable[[], None]) -> None:
+        """Call it no more before changes."""
+        with self.lock, suppress(ValueError):
+            self.before_change.remove(hook)

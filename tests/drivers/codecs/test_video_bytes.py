@@ -1,0 +1,179 @@
+"""Structures of V4L2: sizes, numbers and places typed from <linux/videodev2.h>, as a compiler gives them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.errors import ProtocolError
+from reseau_drivers.codecs import v4l2 as uapi
+from reseau_drivers.codecs.pixels import GENICAM, VIDEO, decode, encode, size_of
+
+
+def test_requests_are_those_of_the_header() -> None:
+    assert {
+        "QUERYCAP": uapi.QUERYCAP,
+        "ENUM_FMT": uapi.ENUM_FMT,
+        "G_FMT": uapi.G_FMT,
+        "S_FMT": uapi.S_FMT,
+        "REQBUFS": uapi.REQBUFS,
+        "QUERYBUF": uapi.QUERYBUF,
+        "QBUF": uapi.QBUF,
+        "DQBUF": uapi.DQBUF,
+        "STREAMON": uapi.STREAMON,
+        "STREAMOFF": uapi.STREAMOFF,
+        "G_PARM": uapi.G_PARM,
+        "S_PARM": uapi.S_PARM,
+        "G_CTRL": uapi.G_CTRL,
+        "S_CTRL": uapi.S_CTRL,
+        "QUERYCTRL": uapi.QUERYCTRL,
+        "G_SELECTION": uapi.G_SELECTION,
+        "S_SELECTION": uapi.S_SELECTION,
+    } == {
+        "QUERYCAP": 0x80685600,
+        "ENUM_FMT": 0xC0405602,
+        "G_FMT": 0xC0D05604,
+        "S_FMT": 0xC0D05605,
+        "REQBUFS": 0xC0145608,
+        "QUERYBUF": 0xC0585609,
+        "QBUF": 0xC058560F,
+        "DQBUF": 0xC0585611,
+        "STREAMON": 0x40045612,
+        "STREAMOFF": 0x40045613,
+        "G_PARM": 0xC0CC5615,
+        "S_PARM": 0xC0CC5616,
+        "G_CTRL": 0xC008561B,
+        "S_CTRL": 0xC008561C,
+        "QUERYCTRL": 0xC0445624,
+        "G_SELECTION": 0xC040565E,
+        "S_SELECTION": 0xC040565F,
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("GREY", 0x59455247),
+        ("Y10", 0x20303159),
+        ("Y12", 0x20323159),
+        ("Y16", 0x20363159),
+        ("YUYV", 0x56595559),
+        ("MJPEG", 0x47504A4D),
+        ("SRGGB8", 0x42474752),
+    ],
+)
+def test_pixel_formats_have_the_header_s_numbers(name: str, code: int) -> None:
+    assert uapi.fourcc_of(str(VIDEO[name].code)) == code
+    assert uapi.fourcc_text(code) == VIDEO[name].code
+
+
+def test_capabilities_of_the_node_not_of_the_whole_device() -> None:
+    data = bytearray(104)
+    data[0:5], data[16:22], data[48:64] = b"vivid", b"vivid!", b"platform:vivid-0"
+    data[80:84] = bytes([56, 1, 6, 0])  # 6.1.56
+    data[84:88] = (0x85201003).to_bytes(4, "little")
+    data[88:92] = (0x05200001).to_bytes(4, "little")
+    found = uapi.Capability.parse(data)
+    assert found == uapi.Capability("vivid", "vivid!", "platform:vivid-0", (6, 1, 56), 0x05200001)
+
+
+def test_a_format_lies_where_the_header_says() -> None:
+    data = bytearray(208)
+    data[0:4] = b"\x01\0\0\0"
+    data[8:12], data[12:16], data[16:20] = b"\x40\x06\0\0", b"\xb0\x04\0\0", b"Y16 "
+    data[20:24], data[24:28], data[28:32] = b"\x01\0\0\0", b"\x80\x0c\0\0", b"\0\x98\x3a\0"
+    wanted = uapi.Format(1600, 1200, "Y16 ", 3200, 3840000)
+    assert uapi.Format.parse(data) == wanted
+    assert wanted.build() == data
+
+
+def test_a_buffer_lies_where_the_header_says() -> None:
+    data = bytearray(88)
+    data[0:4], data[4:8], data[8:12] = b"\x02\0\0\0", b"\x01\0\0\0", b"\0\x10\0\0"
+    data[12:16], data[16:20] = b"\x40\x20\x01\0", b"\x01\0\0\0"
+    data[24:32], data[32:40] = (77).to_bytes(8, "little"), (123456).to_bytes(8, "little")
+    data[56:60], data[60:64] = b"\xfe\xff\xff\xff", b"\x01\0\0\0"
+    data[64:68], data[72:76] = b"\0\x20\0\0", b"\0\x10\0\0"
+    buffer = uapi.Buffer(2, 4096, 0x12040, 77_123_456_000, 0xFFFFFFFE, 8192, 4096)
+    assert uapi.Buffer.parse(data) == buffer
+    assert buffer.build() == data
+    assert buffer.flags & uapi.Buffer.ERROR
+    assert buffer.flags & uapi.Buffer.CLOCKS == uapi.Buffer.MONOTONIC
+    assert buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
+
+
+def test_a_control_with_negative_limits() -> None:
+    data = bytearray(68)
+    data[0:4], data[4:8], data[8:18] = b"\x00\x09\x98\0", b"\x01\0\0\0", b"Brightness"
+    data[40:44], data[44:48] = (-64).to_bytes(4, "little", signed=True), (64).to_bytes(4, "little")
+    data[48:52], data[56:60] = b"\x01\0\0\0", b"\x10\0\0\0"
+    control = uapi.Control(uapi.BRIGHTNESS, "Brightness", 1, -64, 64, 1, 0, uapi.Control.INACTIVE)
+    assert uapi.Control.parse(data) == control
+    assert control.build() == data
+    assert uapi.Control.after(uapi.BRIGHTNESS)[:4] == b"\x00\x09\x98\x80"
+
+
+def test_intervals_and_regions() -> None:
+    data = bytearray(204)
+    data[0:4], data[4:8], data[12:16], data[16:20] = (
+        b"\1\0\0\0",
+        b"\0\x10\0\0",
+        b"\xe9\3\0\0",
+        b"\x60\xea\0\0",
+    )
+    assert uapi.Interval.parse(data) == uapi.Interval(1001, 60000)
+    assert uapi.Interval(1001, 60000).build() == data
+    assert uapi.Interval(1001, 60000).ns == 16_683_333
+    region = bytearray(64)
+    region[0:4], region[12:16], region[16:20] = b"\1\0\0\0", b"\x10\0\0\0", b"\x20\0\0\0"
+    region[20:24], region[24:28] = b"\x80\2\0\0", b"\xe0\1\0\0"
+    assert uapi.Selection(16, 32, 640, 480).build() == region
+    assert uapi.Selection.parse(region) == uapi.Selection(16, 32, 640, 480)
+
+
+@pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "SRGGB8"])
+def test_grey_values_come_back_as_they_went_in(name: str) -> None:
+    layout, rng = VIDEO[name], np.random.default_rng(3)
+    pixels = rng.integers(0, int(layout.full_scale) + 1, (5, 6)).astype(layout.dtype)
+    assert (decode(layout, 6, 5, encode(layout, pixels)) == pixels).all()
+
+
+def test_rows_may_lie_apart() -> None:
+    data = bytes([1, 2, 99, 3, 4])
+    assert decode(VIDEO["GREY"], 2, 2, data, 3).tolist() == [[1, 2], [3, 4]]
+    words = bytes([1, 0, 9, 2, 0])
+    assert decode(VIDEO["Y16"], 1, 2, words, 3).tolist() == [[1], [2]]
+    assert size_of(VIDEO["Y16"], 4, 3, 100) == 208
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("GREY", bytes(3)),
+        ("Y16", bytes(7)),
+        ("Y10", bytes([0, 4] * 4)),
+        ("MJPEG", b""),
+        ("MJPEG", b"\xff\xd8" + bytes(50)),
+        ("MJPEG", b"\xff\xd8" + bytes(50) + b"\xff\xd9"),
+    ],
+)
+def test_what_is_no_whole_frame_is_refused(name: str, data: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        decode(VIDEO[name], 2, 2, data)
+
+
+def test_a_jpeg_gives_the_luminance_that_its_decoder_gives() -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
+    data = cv2.imencode(".jpg", pixels)[1].tobytes()
+    wanted = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert (decode(VIDEO["MJPEG"], 24, 16, data + bytes(9)) == wanted).all()
+    with pytest.raises(ProtocolError, match="24×16"):
+        decode(VIDEO["MJPEG"], 24, 17, data)
+
+
+def test_genicam_s_numbers_tell_the_bits_of_a_pixel() -> None:
+    for name, layout in GENICAM.items():
+        assert isinstance(layout.code, int)
+        assert (layout.code >> 16 & 0xFF) == 8 * layout.stored, name
+        assert int("".join(c for c in name if c.isdigit())) == layout.bits

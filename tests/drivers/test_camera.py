@@ -1,0 +1,260 @@
+"""What is safe with a camera: fresh, whole, counted; settings checked; shared; unplugged and plugged in."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.errors import ConnectionLost, DeadlineError, ProtocolError, RefusedError, SettingError, StateError
+from reseau.instruments import Camera
+from reseau_drivers import camera as cameras
+from reseau_drivers.camera import V4l2Settings, v4l2
+from reseau_drivers.codecs import v4l2 as uapi
+from reseau_sims.serving import CameraBody, Fault, Pattern, VideoCamera
+
+Cam = cameras.Camera[V4l2Settings]
+
+
+@pytest.fixture
+def device() -> VideoCamera:
+    return VideoCamera(CameraBody())
+
+
+@pytest.fixture
+def camera(device: VideoCamera) -> Iterator[Cam]:
+    with v4l2("camera", device.open, settings={"exposure_us": 2000.0}, seconds=1.0) as made:
+        yield made
+    assert device.body.violations == []
+
+
+def test_it_is_a_camera_by_the_protocol(camera: Cam) -> None:
+    assert isinstance(camera, Camera)
+
+
+@pytest.mark.parametrize("at_start", [False, True])
+def test_no_frame_began_before_it_was_asked_for(at_start: bool) -> None:
+    device = VideoCamera(CameraBody(), start_of_exposure=at_start)
+    with v4l2("camera", device.open, settings={"exposure_us": 3000.0, "rate": 200.0}) as camera:
+        for shift in range(30):
+            pattern = Pattern(shift=shift)
+            device.body.look_at(pattern)
+            asked = datetime.now(UTC)
+            shot = camera.expose()
+            assert shot.fresh
+            assert (shot.pixels == pattern(device.view)).all()
+            # The truth lies in the interval that is told.
+            assert (shot.taken - asked).total_seconds() + shot.taken_within_s >= 0
+        assert camera.skipped > 0
+        assert device.body.violations == []
+
+
+def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
+    for at_start, within in ((True, 1e-4), (False, 6e-3)):
+        device = VideoCamera(CameraBody(), start_of_exposure=at_start)
+        with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
+            shot = camera.expose()
+            assert 0 < shot.taken_within_s < within
+            assert abs((datetime.now(UTC) - shot.taken).total_seconds()) < 1.0
+
+
+def test_a_series_has_every_frame_once_and_says_which_are_fresh(device: VideoCamera, camera: Cam) -> None:
+    camera.expose()
+    time.sleep(0.1)  # as many frames as there are buffers wait now; what came besides is lost
+    shots = list(camera.frames(12))
+    numbers = [shot.sequence for shot in shots]
+    assert numbers == sorted(set(numbers))
+    assert not shots[0].fresh
+    assert shots[-1].dropped - shots[0].dropped == numbers[-1] - numbers[0] - 11
+    assert shots[-1].dropped >= 3
+
+
+@pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "SRGGB8"])
+def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, name: str) -> None:
+    with v4l2("camera", device.open, settings={"format": name, "exposure_us": 2000.0}) as camera:
+        shot = camera.expose()
+        assert (shot.pixels == Pattern()(device.view)).all()
+        assert shot.full_scale == {"Y10": 1023, "Y12": 4095, "Y16": 65535}.get(name, 255)
+        assert shot.pattern == {"YUYV": "YUYV", "SRGGB8": "RGGB"}.get(name, "")
+        assert shot.frame.pixels is shot.pixels
+        assert len(shot.raw) == (shot.pixels.size * 2 if name == "YUYV" else 0)
+
+
+def test_a_compressed_frame_keeps_its_file(device: VideoCamera) -> None:
+    with v4l2("camera", device.open, settings={"format": "MJPEG", "exposure_us": 2000.0}) as camera:
+        shot = camera.expose()
+        assert shot.pattern == "MJPEG"
+        assert shot.raw.startswith(b"\xff\xd8")
+        wanted = Pattern()(device.view).astype(float)
+        assert np.sqrt(((shot.pixels - wanted) ** 2).mean()) < 8
+
+
+def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCamera, camera: Cam) -> None:
+    before = camera.expose().pixels.astype(float)
+    camera.configure(exposure_us=4000.0)
+    assert camera.expose().pixels.mean() == pytest.approx(2 * before.mean(), rel=0.03)
+    camera.configure(exposure_us=2000.0, gain=6)
+    assert camera.expose().pixels.mean() == pytest.approx(10**0.3 * before.mean(), rel=0.03)
+    camera.configure(gain=0, brightness=138)
+    assert (camera.expose().pixels == before + 10).all()
+    camera.configure(brightness=128, left=8, top=4, width=32, height=16)
+    assert (camera.expose().pixels == before[4:20, 8:40]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"gain": 99.0}, "gain 99 is beyond its 0…24"),
+        ({"exposure_us": 2e6}, "beyond its 1…10000"),
+        ({"brightness": 300}, "brightness 300 is beyond its 0…255"),
+        ({"width": 4000}, "delivers 96×64 GREY, not 4000×64"),
+        ({"format": "SBGGR8"}, "it offers GREY, Y10, Y12, Y16, YUYV, MJPEG, SRGGB8"),
+        ({"rate": 5000.0}, "frames in a second"),
+    ],
+)
+def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
+    device: VideoCamera, camera: Cam, changes: dict[str, Any], said: str
+) -> None:
+    camera.expose()
+    before, view = camera.settings, device.view
+    with pytest.raises(RefusedError, match=said):
+        camera.configure(**changes)
+    assert (camera.settings, device.view) == (before, view)
+    assert camera.expose().fresh
+    assert camera.reconnections == 1
+
+
+def test_wrong_settings_are_refused_before_anything_is_sent(camera: Cam) -> None:
+    for changes in ({"format": "RGB"}, {"exposure_us": -1.0}, {"colour": 3}, {"width": 1.5}):
+        with pytest.raises(SettingError):
+            camera.configure(**changes)
+
+
+def test_unplugged_and_plugged_in_again_it_is_set_as_before(device: VideoCamera, camera: Cam) -> None:
+    camera.configure(gain=6, exposure_us=1000.0)
+    camera.expose()
+    device.plugged_in = False
+    device.unplug(power=True)
+    with pytest.raises(ConnectionLost, match="camera"):
+        camera.expose()
+    device.plugged_in = True
+    assert camera.expose().exposure_us == 1000.0
+    assert (device.view.gain_db, device.view.exposure_us) == (6.0, 1000.0)
+    assert camera.reconnections == 2
+
+
+def test_another_process_s_camera_is_refused_and_left_alone(device: VideoCamera, camera: Cam) -> None:
+    first = camera.expose()
+    other = v4l2("other", device.open)
+    with pytest.raises(RefusedError, match="another process"):
+        other.connect()
+    other.close()
+    assert camera.expose().sequence > first.sequence
+    camera.stop()
+    with v4l2("other", device.open, settings={"exposure_us": 1000.0}) as taken_over:
+        assert taken_over.expose().fresh
+        with pytest.raises(RefusedError, match="another process"):
+            camera.expose()
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost"), [("dropped", 1), ("truncated", 1), ("corrupted", 1), ("repeated", 0), ("late", None)]
+)
+def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
+    device: VideoCamera, camera: Cam, kind: Any, lost: int | None
+) -> None:
+    script = device.body.script
+    camera.expose()
+    before = next(camera.frames(1))
+    script.fault_at(script.count + 2, Fault(kind, 0.02))
+    shots = list(camera.frames(6))
+    assert [fault.kind for fault in script.happened] == [kind]
+    wanted = Pattern()(device.view)
+    assert all((shot.pixels == wanted).all() for shot in shots)
+    steps = shots[-1].sequence - before.sequence
+    assert steps == 6 + shots[-1].dropped - before.dropped
+    if lost is not None:
+        assert shots[-1].dropped - before.dropped == lost
+
+
+def test_a_stuck_camera_is_given_up_in_time_and_started_anew(device: VideoCamera, camera: Cam) -> None:
+    camera.expose()
+    device.body.script.fault_at(device.body.script.count, Fault("stuck"))
+    with pytest.raises(DeadlineError, match="no new frame within"):
+        camera.expose(0.3)
+    assert camera.expose().fresh
+
+
+def test_a_stamp_from_the_future_is_not_believed(device: VideoCamera, camera: Cam) -> None:
+    camera.expose()
+    device.body.script.fault_at(device.body.script.count + 1, Fault("out of range"))
+    with pytest.raises(ProtocolError, match="from now"):
+        list(camera.frames(9))
+    assert camera.expose().fresh
+
+
+def test_numbers_of_32_bits_wrap_without_a_gap() -> None:
+    device = VideoCamera(CameraBody(), first=(1 << 32) - 3)
+    with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
+        numbers = [shot.sequence for shot in camera.frames(8)]
+        assert [b - a for a, b in itertools.pairwise(numbers)] == [1] * 7
+
+
+def test_an_exposure_that_takes_longer_than_one_waits_ends_in_time(camera: Cam) -> None:
+    camera.configure(exposure_us=1e6)
+    began = time.monotonic()
+    with pytest.raises(DeadlineError):
+        camera.expose(0.3)
+    assert time.monotonic() - began < 1.0
+
+
+def test_stop_from_another_thread_ends_an_exposure(camera: Cam) -> None:
+    camera.configure(exposure_us=1e6)
+    threading.Timer(0.15, camera.stop).start()
+    with pytest.raises(StateError, match="was stopped"):
+        camera.expose(5.0)
+
+
+def test_the_self_test_tells_rate_losses_clock_and_dark_noise(device: VideoCamera, camera: Cam) -> None:
+    camera.configure(rate=50.0)
+    before = camera.settings
+    found = camera.check(5.0)
+    assert found["identity"].startswith("simulated Simulated camera")
+    assert found["frames"].startswith("96 × 64, 50 1/s")
+    assert found["dropped"] == "0 of 12"
+    assert "offset 0 s" in found["clock"]
+    assert "noise 0 at the shortest exposure" in found["dark"]
+    assert camera.settings == before
+
+
+def test_a_reading_is_what_bluesky_takes(camera: Cam) -> None:
+    camera.trigger().wait(2.0)
+    reading, kinds = camera.read(), camera.describe()
+    assert set(reading) == set(kinds)
+    assert kinds["camera_image"]["shape"] == [64, 96]
+
+
+def test_a_node_that_is_none_or_no_camera_is_said() -> None:
+    with pytest.raises(ConnectionLost, match="cannot be opened"):
+        v4l2("camera", "/dev/no-such-video").connect()
+    with pytest.raises(RefusedError, match="query"):
+        v4l2("camera", "/dev/null").connect()
+
+
+def test_a_camera_that_tells_nothing_of_itself_is_trusted_with_nothing() -> None:
+    device = VideoCamera(CameraBody())
+    # In automatic mode the exposure may be as long as the period, and it is not told.
+    with v4l2("camera", device.open) as camera:
+        shot = camera.expose()
+        assert math.isnan(shot.exposure_us)
+        assert shot.taken_within_s == pytest.approx(0.01, abs=1e-3)
+    device.period = uapi.Interval(0, 0)
+    with v4l2("camera", device.open) as camera, pytest.raises(DeadlineError, match="may have begun before"):
+        camera.expose(0.4)
