@@ -7,7 +7,7 @@ from typing import Any
 
 import threadpoolctl  # type: ignore[import-untyped]
 
-__all__ = ["one_thread"]
+__all__ = ["always_one_thread", "one_thread"]
 
 
 @cache
@@ -24,3 +24,8 @@ def one_thread() -> Any:
     public calls do it, once each.
     """
     return _controller().limit(limits=1, user_api="blas")
+
+
+def always_one_thread() -> None:
+    """Hold BLAS to one thread for good, in a process that is one of several."""
+    threadpoolctl.threadpool_limits(1, user_api="blas")

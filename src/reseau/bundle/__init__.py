@@ -5,8 +5,8 @@ from __future__ import annotations
 from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
 from .calibrated import calibration_of
-from .components import estimate_components, reweighted
-from .document import to_document
+from .components import Kind, estimate_components, reweighted
+from .document import searched_document, to_document
 from .fields import (
     FieldDifference,
     ProjectionField,
@@ -15,6 +15,7 @@ from .fields import (
     projection_field_at,
 )
 from .lens import Lens
+from .model_search import Searched, search_model
 from .network import Additional, Camera, Network
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .problem import BundleFit, BundleProblem
@@ -28,11 +29,13 @@ __all__ = [
     "Camera",
     "CommonPattern",
     "FieldDifference",
+    "Kind",
     "Lens",
     "Network",
     "Options",
     "ProjectionField",
     "Result",
+    "Searched",
     "adjust_network",
     "approximate",
     "by_place",
@@ -45,5 +48,7 @@ __all__ = [
     "projection_field",
     "projection_field_at",
     "reweighted",
+    "search_model",
+    "searched_document",
     "to_document",
 ]

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Array
+from .model_search import Searched
 from .network import finite
 from .result import Result
 
-__all__ = ["SCHEMA", "to_document"]
+__all__ = ["SCHEMA", "searched_document", "to_document"]
 
 SCHEMA = "reseau-bundle/1"
 
@@ -53,6 +54,28 @@ def to_document(result: Result, *, covariances: bool = False) -> dict[str, Any]:
     if len(result.network.distance):
         document["distances"] = _distances(result)
     return document
+
+
+def searched_document(searched: Searched) -> dict[str, Any]:
+    """How the model of an adjustment was found, JSON values; empty where nothing was looked for."""
+    found: dict[str, Any] = {}
+    components = searched.components
+    if components is not None:
+        found["variance_components"] = {
+            "names": list(components.names),
+            "factors": components.factors.tolist(),
+            "sigma": components.sigma.tolist(),
+            "redundancy": components.redundancy.tolist(),
+        }
+    if searched.eliminated is not None:
+        found["eliminated"] = [
+            {"camera": step.camera, "name": step.test.name, "statistic": _number(step.test.statistic),
+             "critical": step.test.critical, "p": step.test.p, "sigma0": _number(step.sigma0)}
+            for step in searched.eliminated
+        ]  # fmt: skip
+    if searched.validation is not None:
+        found["cross_validation"] = {"all": searched.validation[0], "kept": searched.validation[1]}
+    return found
 
 
 def _camera(result: Result, c: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import typer
 
 from .. import __version__
 from ..errors import ReseauError
-from . import apply, bench, bundle, calibrate, demo, design, measure, orient, refine
+from . import apply, bench, bundle, bundle_compare, calibrate, demo, design, measure, orient, refine
 
 __all__ = ["app", "main"]
 
@@ -35,6 +35,7 @@ app.command()(refine.refine)
 app.command()(apply.apply)
 app.command()(bundle.bundle)
 app.command()(calibrate.calibrate)
+app.command()(bundle_compare.compare)
 
 
 def _version(wanted: bool) -> None:

@@ -7,10 +7,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .bundle_options import (
+    Alpha,
+    ComponentsOf,
+    Distances,
+    Eliminate,
+    Reject,
+    component_kind,
+    level_of,
+    say_left_out,
+    say_model,
+)
 from .common import AsJson, Out, progress, required, say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import Network, Result
+    from ..bundle import Network, Searched
 
 __all__ = ["bundle", "read_network"]
 
@@ -20,20 +31,21 @@ def bundle(
         Path, typer.Argument(help="Network: reseau-network/1, or a file of PhotoModeler, BAL or COLMAP.")
     ],
     out: Out = None,
-    reject: Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")] = False,
-    alpha: Annotated[float, typer.Option(help="Level of the single test of data snooping.")] = 0.001,
+    reject: Reject = False,
+    alpha: Alpha = 0.001,
+    components: ComponentsOf = None,
+    eliminate: Eliminate = None,
     cov: Annotated[bool, typer.Option("--cov", help="Full covariances of the points in the result.")] = False,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    distance: Distances = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust a bundle: orientation, calibration and points from image coordinates, with all their quality."""
-    from ..bundle import Options, adjust_network, to_document
-    from ..errors import UsageError
+    from ..bundle import Options, search_model, searched_document, to_document
     from ..formats import write_whole
     from ..provenance import Provenance, canonical_json, sha256_of
 
-    if not 0 < alpha < 1:
-        raise UsageError(f"{alpha:g} is not between 0 and 1", where="--alpha")
+    level_of(alpha, "--alpha")
     for path, suffixes in ((out, (".json",)), (report, (".html",))):
         if path is not None:
             suffix_of(writable(path), suffixes)
@@ -42,20 +54,25 @@ def bundle(
         options = Options(
             outliers="reject" if reject else "keep", alpha=alpha, watch=lambda k, cost: step(f"iteration {k}")
         )
-        result = required(adjust_network(content, options), network)
-    document = to_document(result, covariances=cov)
+        found = search_model(content, options, component_kind(components), level_of(eliminate, "--eliminate"))
+        searched = required(found, network)
+    document = to_document(searched.result, covariances=cov) | searched_document(searched)
     if report is not None:
         from ..report.bundle import bundle_report
 
         inputs = {network.name: sha256_of(network)} if network.is_file() else {}
-        provenance = Provenance(inputs, {"reject": reject, "alpha": alpha})
-        write_whole(report, bundle_report(result, title=network.name, provenance=provenance))
+        settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
+                    "eliminate": eliminate}  # fmt: skip
+        page = bundle_report(
+            searched, title=network.name, provenance=Provenance(inputs, settings), distances=distance or ()
+        )
+        write_whole(report, page)
     if out is not None:
         write_whole(out, canonical_json(document))
     if as_json:
         say(canonical_json(document))
     else:
-        _say(network, result)
+        _say(network, searched)
 
 
 def read_network(path: Path) -> Network:
@@ -69,7 +86,8 @@ def read_network(path: Path) -> Network:
     return Network.from_document(Network1.read(path))
 
 
-def _say(path: Path, result: Result) -> None:
+def _say(path: Path, searched: Searched) -> None:
+    result = searched.result
     observations, unknowns, constraints = result.fit.counts
     say(
         f"{path.name}: {observations} observations, {unknowns} unknowns, {constraints} constraints, "
@@ -85,7 +103,7 @@ def _say(path: Path, result: Result) -> None:
         sigma = result.camera_covariance(c).diagonal() ** 0.5
         for name, value, s in zip(names, values, sigma, strict=True):
             say(f"  {name:<6} {value:14.7g} ± {s:.3g}\n")
-    for image, point in zip(*result.rejected_names(), strict=True):
-        say(f"left out: point {point} in image {image}\n")
+    say_model(searched)
+    say_left_out(result)
     for warning in result.warnings:
         say(f"warning: {warning}\n")

@@ -8,13 +8,27 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .bundle_compare import read_lens
+from .bundle_options import (
+    ComponentsOf,
+    Distances,
+    Eliminate,
+    Reject,
+    component_kind,
+    level_of,
+    say_difference,
+    say_left_out,
+    say_model,
+)
 from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
+from .measure import Channel
 
 if TYPE_CHECKING:
-    from ..bundle import FieldDifference, Lens
+    from ..bundle import FieldDifference, Kind, Lens
+    from ..calibration import Calibration
     from ..data import Frame, ImagePoints
     from ..formats import ReseauDesign, TestfieldDesign
-    from ..procedures.calibration import Calibrated, CameraModel
+    from ..procedures.calibration import Calibrated, CalibrationOptions, CameraModel
     from ..provenance import Provenance
 
 __all__ = ["calibrate"]
@@ -33,20 +47,31 @@ def calibrate(
     side: Annotated[str, typer.Option(help="Side of Brown's distortion: object or image.")] = "object",
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
+    channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
     sigma: Annotated[
         float | None,
         typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
     ] = None,
-    reject: Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")] = False,
+    control: Annotated[
+        Path | None,
+        typer.Option(help="Known points of the target, CSV id,x,y,z[,sx,sy,sz]; without, a free network."),
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None, typer.Option(help="Image point to leave out, as photo.jpg:A1; repeatable.")
+    ] = None,
+    reject: Reject = False,
+    components: ComponentsOf = None,
+    eliminate: Eliminate = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
     fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
     against: Annotated[
         list[Path] | None, typer.Option(help="Calibration of the same camera to compare with.")
     ] = None,
+    distance: Distances = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores by default.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
-    from ..bundle import Options, calibration_of
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..provenance import Provenance, sha256_of
     from ..refine import TestfieldOptions
@@ -54,24 +79,24 @@ def calibrate(
     for path, suffixes in ((out, (".json",)), (report, (".html",))):
         if path is not None:
             suffix_of(writable(path), suffixes)
-    model = _model(pitch, side, free)
-    target = _design(design)
-    others = {path.name: _lens(path) for path in against or []}
+    model, target = _model(pitch, side, free), _design(design)
+    others = {path.name: read_lens(path) for path in against or []}
+    options = _options(sigma, control, leave_out or [], reject, component_kind(components),
+                       level_of(eliminate, "--eliminate"), _processes(images, jobs))  # fmt: skip
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     with progress("measuring", len(images)) as step:
-        found = calibrate_camera(
-            _frames(images, step), target, measure, _size(size), model,
-            Options(outliers="reject" if reject else "keep"), sigma,
-        )  # fmt: skip
-    done = required(found, design)
-    inputs = {path.name: sha256_of(path) for path in (design, *images)}
+        frames = _frames(images, channel, step)
+        done = required(calibrate_camera(frames, target, measure, _size(size), model, options), design)
+    inputs = {path.name: sha256_of(path) for path in (design, *images, *([control] if control else []))}
     settings = {"pitch": pitch, "side": side, "free": free, "sigma": sigma, "reject": reject,
-                "row_jitter": row_jitter, "fill": fill}  # fmt: skip
+                "row_jitter": row_jitter, "fill": fill, "channel": channel.value,
+                "leave_out": list(leave_out or []), "eliminate": eliminate,
+                "components": component_kind(components)}  # fmt: skip
     provenance = Provenance(inputs, settings)
-    calibration = calibration_of(done.result, "camera", name=target.name, provenance=provenance.to_dict())
     differences = _differences(done, others)
+    calibration = _calibration(done, target.name, provenance)
     if report is not None:
-        _write_report(report, done, f"Calibration with {target.name}", provenance, differences)
+        _write_report(report, done, f"Calibration with {target.name}", provenance, differences, distance)
     if out is not None:
         calibration.write(out)
     if as_json:
@@ -80,22 +105,78 @@ def calibrate(
         _say(done, differences)
 
 
+def _options(
+    sigma: float | None,
+    control: Path | None,
+    leave_out: list[str],
+    reject: bool,
+    components: Kind | None,
+    level: float | None,
+    workers: int,
+) -> CalibrationOptions:
+    """The options as the procedure takes them."""
+    from ..bundle import Options
+    from ..errors import UsageError
+    from ..exchange import read_control
+    from ..procedures.calibration import CalibrationOptions
+
+    pairs = []
+    for text in leave_out:
+        image, colon, point = text.rpartition(":")
+        if not colon or not image or not point:
+            raise UsageError(f"is {text!r}", where="--leave-out", do="write image:point, as photo.jpg:A1")
+        pairs.append((image, point))
+    return CalibrationOptions(
+        Options(outliers="reject" if reject else "keep"), sigma,
+        None if control is None else read_control(control), tuple(pairs), components, level, workers,
+    )  # fmt: skip
+
+
+def _processes(images: list[Path], jobs: int | None) -> int:
+    """Processes for the photographs; none for what was measured before."""
+    from ..procedures.measuring import cores
+
+    return max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
+
+
+def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:
+    """The calibration, with how its model was found."""
+    from ..bundle import calibration_of, searched_document
+
+    calibration = calibration_of(done.result, "camera", name=name, provenance=provenance.to_dict())
+    more = searched_document(done.searched)
+    return calibration.model_copy(update={"validity": calibration.validity | more}) if more else calibration
+
+
 def _write_report(
-    path: Path, done: Calibrated, title: str, provenance: Provenance, differences: dict[str, FieldDifference]
+    path: Path,
+    done: Calibrated,
+    title: str,
+    provenance: Provenance,
+    differences: dict[str, FieldDifference],
+    distances: list[float] | None,
 ) -> None:
     from ..formats import write_whole
     from ..report.bundle import bundle_report
 
-    write_whole(path, bundle_report(done.result, title=title, provenance=provenance, against=differences))
+    page = bundle_report(
+        done.searched, title=title, provenance=provenance, against=differences, distances=distances or ()
+    )
+    write_whole(path, page)
 
 
-def _frames(paths: list[Path], step: Callable[[str], None]) -> Iterator[Frame | tuple[str, ImagePoints]]:
+def _frames(
+    paths: list[Path], channel: Channel, step: Callable[[str], None]
+) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs one after the other, or what was measured in them."""
     from ..images import read_frame
 
     for path in paths:
         step(f"measuring {path.name}")
-        yield (path.name, read_measurement(path).image_points()) if is_points(path) else read_frame(path)
+        if is_points(path):
+            yield path.name, read_measurement(path).image_points()
+        else:
+            yield read_frame(path, channel.value)
 
 
 def _design(path: Path) -> TestfieldDesign | ReseauDesign:
@@ -131,13 +212,6 @@ def _size(text: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _lens(path: Path) -> Lens:
-    from ..bundle import Lens
-    from ..calibration import Calibration
-
-    return Lens.of_calibration(Calibration.read(path))
-
-
 def _differences(done: Calibrated, others: dict[str, Lens]) -> dict[str, FieldDifference]:
     from ..bundle import Lens, calibration_difference
 
@@ -164,9 +238,10 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
     sigma = projection_field(Lens.of_result(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
+    say_model(done.searched)
     for name, found in differences.items():
-        size = np.sqrt(np.nanmean((found.difference**2).sum(axis=2)))
-        say(f"beside {name}: {size:.2g} px rms, p = {found.p:.2g}\n")
+        say_difference(name, found)
+    say_left_out(result)
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
     for warning in result.warnings:

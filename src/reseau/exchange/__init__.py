@@ -9,9 +9,10 @@ from ..errors import FormatError, InputError
 from ..formats import read_text
 from .bal import read_bal
 from .colmap import read_colmap
+from .control import read_control
 from .photomodeler import read_photomodeler
 
-__all__ = ["read_bal", "read_colmap", "read_foreign", "read_photomodeler"]
+__all__ = ["read_bal", "read_colmap", "read_control", "read_foreign", "read_photomodeler"]
 
 
 def read_foreign(path: Path | str) -> Network:

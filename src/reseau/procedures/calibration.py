@@ -2,30 +2,31 @@
 
 The target is not taken at its word: the coordinates of its design are approximate, all points are unknowns,
 and the network has inner constraints over them (a free network). Size and place of object space are those of
-the design in the mean of its points; its unevenness comes out as heights.
+the design in the mean of its points; its unevenness comes out as heights. Points of the target that were
+measured otherwise may be given as control points instead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import cv2
 import numpy as np
 
 from ..adjust import Failure
-from ..bundle import Camera, Network, Options, Result, adjust_network
+from ..bundle import Camera, Kind, Network, Options, Result, Searched, search_model
 from ..data import Array, Frame, ImagePoints
 from ..errors import UsageError
-from ..formats import ReseauDesign, TestfieldDesign
 from ..formats.network import CAMERA_PARAMETERS
-from ..refine import TestfieldOptions, measure_reseau, measure_testfield
-from ..refine.measured import Measured
+from .measuring import Measurer, measured_in_order, measurer_of
 
 __all__ = [
     "Calibrated",
+    "CalibrationOptions",
     "CameraModel",
+    "ControlPoints",
     "Measurer",
     "calibrate_camera",
     "first_camera",
@@ -33,8 +34,6 @@ __all__ = [
     "network_of",
 ]
 
-Measurer = Callable[[Frame], Measured | Failure]
-"""What measures a target in a frame; all that this procedure knows of how that is done."""
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
 
@@ -92,44 +91,85 @@ class CameraModel:
 
 
 @dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Points of the target whose coordinates are known.
+
+    Parameters
+    ----------
+    names : tuple of str (k,)
+        Names, as in the design.
+    xyz : ndarray (k, 3)
+        Coordinates.
+    sigma : ndarray (k, 3)
+        0 holds a coordinate, NaN leaves it free, otherwise it is an observation.
+    """
+
+    names: tuple[str, ...]
+    xyz: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationOptions:
+    """How a camera is calibrated.
+
+    Parameters
+    ----------
+    adjustment : Options
+        How to adjust.
+    sigma_px : float, optional
+        Standard deviation of all image coordinates, where those of the measurement are not what they scatter
+        by: a target that is not what it was designed, a lens that the model does not follow.
+    control : ControlPoints, optional
+        Where the datum comes from; without, inner constraints over all points.
+    without : tuple of (str, str)
+        Image points to be left out, by image and point.
+    components : {"axes", "images", "cameras"}, optional
+        What gets a factor of its own on its standard deviations; see :func:`reseau.bundle.search_model`.
+    level : float, optional
+        Level of the tests by which distortion parameters that are not needed are dropped.
+    workers : int
+        Processes that measure.
+    """
+
+    adjustment: Options = field(default_factory=Options)
+    sigma_px: float | None = None
+    control: ControlPoints | None = None
+    without: tuple[tuple[str, str], ...] = ()
+    components: Kind | None = None
+    level: float | None = None
+    workers: int = 1
+
+
+@dataclass(frozen=True, eq=False)
 class Calibrated:
     """A calibration with what it was made of; truthy.
 
     Parameters
     ----------
-    result : Result
-        Of the adjustment; its network has one camera, `camera`.
+    searched : Searched
+        The adjustment and how its model was found.
     measured : dict
         What was measured, by image.
     declined : dict
         Why images do not take part.
     """
 
-    result: Result
+    searched: Searched
     measured: dict[str, ImagePoints]
     declined: dict[str, str]
 
     def __bool__(self) -> bool:
         return True
 
+    def required(self) -> Calibrated:
+        """The calibration itself; see :meth:`~reseau.adjust.Failure.required`."""
+        return self
 
-def measurer_of(
-    design: TestfieldDesign | ReseauDesign, testfield: TestfieldOptions | None = None
-) -> Measurer:
-    """What measures a design in a frame.
-
-    Parameters
-    ----------
-    design : TestfieldDesign or ReseauDesign
-        A coded testfield, or any design of marks.
-    testfield : TestfieldOptions, optional
-        How a testfield is measured.
-    """
-    if isinstance(design, TestfieldDesign):
-        field = design
-        return lambda frame: measure_testfield(frame, field, testfield)
-    marks = design
-    return lambda frame: measure_reseau(frame, marks)
+    @property
+    def result(self) -> Result:
+        """The adjustment; its network has one camera, `camera`."""
+        return self.searched.result
 
 
 def calibrate_camera(
@@ -138,8 +178,7 @@ def calibrate_camera(
     measure: Measurer,
     size: tuple[int, int] | None = None,
     model: CameraModel | None = None,
-    options: Options | None = None,
-    sigma_px: float | None = None,
+    options: CalibrationOptions | None = None,
 ) -> Calibrated | Failure:
     """Calibrate a camera from photographs of a target.
 
@@ -150,16 +189,13 @@ def calibrate_camera(
     design : PlaneDesign
         The target.
     measure : callable
-        What measures it in a frame; see :func:`measurer_of`.
+        What measures it in a frame; see :func:`~reseau.procedures.measuring.measurer_of`.
     size : (int, int), optional
         Width and height in pixels, where no frame tells.
     model : CameraModel, optional
         What is to be estimated.
-    options : Options, optional
-        How to adjust.
-    sigma_px : float, optional
-        Standard deviation of all image coordinates, where those of the measurement are not what they scatter
-        by: a target that is not what it was designed, a lens that the model does not follow.
+    options : CalibrationOptions, optional
+        How.
 
     Returns
     -------
@@ -169,9 +205,12 @@ def calibrate_camera(
     Raises
     ------
     UsageError
-        When two photographs have one name or differ in size, or no size is known.
+        When two photographs have one name or differ in size, no size is known, or a point to be left out was
+        not measured.
     """
-    measured, declined, size = _measured(frames, measure, size)
+    options = options or CalibrationOptions()
+    measured, declined, size = _measured(frames, measure, size, options.workers)
+    measured = _without(measured, options.without)
     if len(measured) < _LEAST_IMAGES:
         why = "".join(f"; {name}: {reason}" for name, reason in declined.items())
         return Failure(f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}")
@@ -179,37 +218,73 @@ def calibrate_camera(
         raise UsageError("is not known without an image", where="size of the images")
     camera = first_camera(measured, design, size, model or CameraModel())
     network = network_of(measured, design, camera)
-    if sigma_px is not None:
-        network = replace(network, cov=np.tile(np.eye(2) * sigma_px**2, (len(network.xy), 1, 1)))
-    result = adjust_network(network, options)
-    return result if isinstance(result, Failure) else Calibrated(result, measured, declined)
+    if options.control is not None:
+        network = _controlled(network, options.control)
+    if options.sigma_px is not None:
+        network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
+    found = search_model(network, options.adjustment, options.components, options.level)
+    return found if isinstance(found, Failure) else Calibrated(found, measured, declined)
 
 
 def _measured(
-    frames: Iterable[Frame | tuple[str, ImagePoints]], measure: Measurer, size: tuple[int, int] | None
+    frames: Iterable[Frame | tuple[str, ImagePoints]],
+    measure: Measurer,
+    size: tuple[int, int] | None,
+    workers: int,
 ) -> tuple[dict[str, ImagePoints], dict[str, str], tuple[int, int] | None]:
     """What is measured in each photograph, why others do not take part, and the size of all."""
+    names = set[str]()
+
+    def checked() -> Iterator[Frame | tuple[str, ImagePoints]]:
+        nonlocal size
+        for frame in frames:
+            name = frame.name if isinstance(frame, Frame) else frame[0]
+            if name in names:
+                raise UsageError("is the name of two photographs", where=name)
+            names.add(name)
+            if isinstance(frame, Frame):
+                if size is not None and size != (frame.width, frame.height):
+                    raise UsageError(f"is not {size[0]}×{size[1]} pixels like the others", where=name)
+                size = (frame.width, frame.height)
+            yield frame
+
     measured: dict[str, ImagePoints] = {}
     declined: dict[str, str] = {}
-    for frame in frames:
-        name = frame.name if isinstance(frame, Frame) else frame[0]
-        if name in measured or name in declined:
-            raise UsageError("is the name of two photographs", where=name)
-        if isinstance(frame, Frame):
-            if size is not None and size != (frame.width, frame.height):
-                raise UsageError(f"is not {size[0]}×{size[1]} pixels like the others", where=name)
-            size = (frame.width, frame.height)
-            found = measure(frame)
-            points = None if isinstance(found, Failure) else found.points
-            if isinstance(found, Failure):
-                declined[name] = found.reason.removeprefix(f"{name}: ")
+    for name, found in measured_in_order(checked(), measure, workers):
+        if isinstance(found, Failure):
+            declined[name] = found.reason.removeprefix(f"{name}: ")
+        elif len(found) < _LEAST_POINTS:
+            declined[name] = f"{len(found)} points are too few"
         else:
-            points = frame[1]
-        if points is not None and len(points) < _LEAST_POINTS:
-            declined[name] = f"{len(points)} points are too few"
-        elif points is not None:
-            measured[name] = points
+            measured[name] = found
     return measured, declined, size
+
+
+def _without(
+    measured: dict[str, ImagePoints], leave_out: Sequence[tuple[str, str]]
+) -> dict[str, ImagePoints]:
+    """What was measured without some of it."""
+    for image, point in leave_out:
+        points = measured.get(image)
+        if points is None or point not in points.names:
+            raise UsageError("was not measured", where=f"point {point} in image {image}", do="name what was")
+        keep = np.array([name != point for name in points.names])
+        names = tuple(name for name in points.names if name != point)
+        measured = measured | {image: ImagePoints(names, points.xy[keep], points.cov[keep])}
+    return measured
+
+
+def _controlled(network: Network, control: ControlPoints) -> Network:
+    """The network with known points, and its datum from them."""
+    row = {name: k for k, name in enumerate(network.points)}
+    xyz, sigma, role = network.xyz.copy(), network.sigma.copy(), list(network.role)
+    for name, given, own in zip(control.names, control.xyz, control.sigma, strict=True):
+        if name not in row:
+            raise UsageError("was measured in no image", where=f"control point {name}")
+        at, known = row[name], np.isfinite(own)
+        xyz[at, known], sigma[at] = given[known], own
+        role[at] = "control"
+    return replace(network, xyz=xyz, sigma=sigma, role=tuple(role), datum="control")
 
 
 def network_of(

@@ -24,7 +24,7 @@ _SURE = 0.01
 def patterns_of(result: Result) -> list[dict[str, Any]]:
     """Common patterns of a network, as a report shows them: by place of each camera, and by groups of images.
 
-    Networks too large for the test, and what has nothing that could be in common, are passed over.
+    Where there is no test, `why_not` says why.
     """
     network = result.network
     patterns = [
@@ -33,11 +33,12 @@ def patterns_of(result: Result) -> list[dict[str, Any]]:
     ]
     if any(group is not None for group in network.groups):
         patterns.append(("of one point in the images of a group", by_point(result, network.groups), True))
-    found = []
+    found = list[dict[str, Any]]()
     for title, key, grouped in patterns:
         try:
             pattern = common_pattern(result, key)
-        except UsageError:
+        except UsageError as error:
+            found.append({"title": title, "why_not": error.what})
             continue
         found.append(
             {

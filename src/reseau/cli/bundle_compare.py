@@ -1,0 +1,84 @@
+"""`reseau compare`: two calibrations of one camera, place by place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .bundle_options import say_difference
+from .common import AsJson, Out, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..bundle import FieldDifference, Lens
+
+__all__ = ["compare", "read_lens"]
+
+SCHEMA = "reseau-difference/1"
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="Calibration of a camera, reseau-calibration/1.")],
+    second: Annotated[Path, typer.Argument(help="Another, of the same camera.")],
+    out: Out = None,
+    figure: Annotated[Path | None, typer.Option(help="Map of the difference to draw, SVG.")] = None,
+    places: Annotated[int, typer.Option(min=2, help="Places across the image.")] = 25,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two calibrations as a field over the image, with its significance."""
+    from ..bundle import calibration_difference
+    from ..formats import write_whole
+    from ..provenance import canonical_json
+
+    for path, suffixes in ((out, (".json",)), (figure, (".svg",))):
+        if path is not None:
+            suffix_of(writable(path), suffixes)
+    found = calibration_difference(read_lens(first), read_lens(second), places)
+    document = canonical_json(_document(first, second, found))
+    if figure is not None:
+        from ..report.fields import difference_figure
+
+        write_whole(figure, difference_figure(found))
+    if out is not None:
+        write_whole(out, document)
+    if as_json:
+        say(document)
+    else:
+        say_difference(second.name, found)
+
+
+def read_lens(path: Path) -> Lens:
+    """A camera from its calibration."""
+    from ..bundle import Lens
+    from ..calibration import Calibration
+
+    return Lens.of_calibration(Calibration.read(path))
+
+
+def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, Any]:
+    """The field in rows of the image; null where no ray is imaged by both."""
+    import numpy as np
+
+    from ..provenance import sha256_of
+
+    def rows(values: Any) -> list[list[float | None]]:
+        return [[float(v) if np.isfinite(v) else None for v in row] for row in values]
+
+    return {
+        "schema": SCHEMA,
+        "inputs": {path.name: sha256_of(path) for path in (first, second)},
+        "unit": "px",
+        "statistic": found.statistic,
+        "degrees": found.degrees,
+        "p": found.p,
+        "rotation_rad": found.rotation.tolist(),
+        "x": found.xy[0, :, 0].tolist(),
+        "y": found.xy[:, 0, 1].tolist(),
+        "dx": rows(found.difference[..., 0]),
+        "dy": rows(found.difference[..., 1]),
+        "sx": rows(np.sqrt(found.cov[..., 0, 0])),
+        "sy": rows(np.sqrt(found.cov[..., 1, 1])),
+        "rho": rows(found.cov[..., 0, 1] / np.sqrt(found.cov[..., 0, 0] * found.cov[..., 1, 1])),
+        "p_at": rows(found.p_at),
+    }

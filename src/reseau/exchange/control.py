@@ -1,0 +1,72 @@
+"""Control points in a table: coordinates of an object that were measured otherwise."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import FormatError
+from ..formats import read_text
+from ..procedures.calibration import ControlPoints
+
+__all__ = ["read_control"]
+
+_COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
+
+
+def read_control(path: Path | str) -> ControlPoints:
+    """Control points from a CSV ``id,x,y,z[,sx,sy,sz]`` with a header.
+
+    Without columns of standard deviations all coordinates are held, as with a standard deviation of 0. A
+    field that is empty leaves its coordinate free.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    FormatError
+        When it is no such table, names a point twice, or holds what is no number or a negative sigma.
+    """
+    path = Path(path)
+    lines = [line for line in csv.reader(read_text(path).splitlines()) if any(word.strip() for word in line)]
+    header = [word.strip().lower() for word in lines[0]] if lines else []
+    if header not in (_COLUMNS[:4], _COLUMNS):
+        raise FormatError("is no table of control points", where=path, do="begin it with id,x,y,z[,sx,sy,sz]")
+    names, rows = list[str](), list[list[float]]()
+    for number, line in enumerate(lines[1:], start=2):
+        where = f"{path}, line {number}"
+        if len(line) != len(header):
+            raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
+        name = line[0].strip()
+        if name in names:
+            raise FormatError(f"names point {name} a second time", where=where)
+        names.append(name)
+        rows.append([_number(word, where) for word in line[1:]])
+    if not names:
+        raise FormatError("has no points", where=path)
+    values = np.array(rows, dtype=np.float64)
+    sigma = values[:, 3:] if len(header) == len(_COLUMNS) else np.zeros_like(values)
+    sigma = np.where(np.isnan(values[:, :3]), np.nan, sigma)
+    if (sigma < 0).any():
+        name = names[int(np.flatnonzero((sigma < 0).any(axis=1))[0])]
+        raise FormatError(f"gives point {name} a sigma below zero", where=path)
+    return ControlPoints(tuple(names), values[:, :3], sigma)
+
+
+def _number(word: str, where: str) -> float:
+    if not word.strip():
+        return float("nan")
+    try:
+        value = float(word)
+    except ValueError:
+        raise FormatError(f"{word.strip()!r} is no number", where=where) from None
+    if not np.isfinite(value):
+        raise FormatError(f"{word.strip()!r} is no number", where=where)
+    return value

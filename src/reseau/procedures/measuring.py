@@ -1,0 +1,121 @@
+"""Targets measured in many photographs, in several processes at once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+
+import cv2
+
+from ..adjust import Failure
+from ..adjust.threads import always_one_thread
+from ..data import Frame, ImagePoints
+from ..errors import EstimationError
+from ..formats import ReseauDesign, TestfieldDesign
+from ..refine import TestfieldOptions, measure_reseau, measure_testfield
+from ..refine.measured import Measured
+
+__all__ = ["Measurer", "cores", "measured_in_order", "measurer_of"]
+
+Measurer = Callable[[Frame], Measured | Failure]
+"""What measures a target in a frame; all that a procedure knows of how that is done."""
+# Frames sent ahead of each process, so that none waits.
+_AHEAD = 2
+
+
+def measurer_of(
+    design: TestfieldDesign | ReseauDesign, testfield: TestfieldOptions | None = None
+) -> Measurer:
+    """What measures a design in a frame.
+
+    Parameters
+    ----------
+    design : TestfieldDesign or ReseauDesign
+        A coded testfield, or any design of marks.
+    testfield : TestfieldOptions, optional
+        How a testfield is measured.
+    """
+    if isinstance(design, TestfieldDesign):
+        return partial(measure_testfield, design=design, options=testfield)
+    return partial(measure_reseau, design=design)
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def measured_in_order(
+    frames: Iterable[Frame | tuple[str, ImagePoints]], measure: Measurer, workers: int = 1
+) -> Iterator[tuple[str, ImagePoints | Failure]]:
+    """Names of frames with the points measured in them, in their order.
+
+    Parameters
+    ----------
+    frames : iterable of Frame, or of (name, ImagePoints)
+        Read as they are needed; what was measured before is passed on.
+    measure : callable
+        Something that can be sent to a process, where there are several.
+    workers : int
+        Processes; with one all is done in this one.
+
+    Raises
+    ------
+    ReseauError
+        What reading or measuring raises; EstimationError where a process dies.
+    """
+    work = partial(_points, measure)
+    if workers == 1:
+        for frame in frames:
+            yield (frame.name, work(frame)) if isinstance(frame, Frame) else frame
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_one_thread)
+    waiting: deque[tuple[str, ImagePoints | Future[ImagePoints | Failure]]] = deque()
+    try:
+        for frame in frames:
+            waiting.append((frame.name, pool.submit(work, frame)) if isinstance(frame, Frame) else frame)
+            if len(waiting) > _AHEAD * workers:
+                yield _next(waiting)
+        while waiting:
+            yield _next(waiting)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
+    found = measure(frame)
+    return found if isinstance(found, Failure) else found.points
+
+
+def _next(
+    waiting: deque[tuple[str, ImagePoints | Future[ImagePoints | Failure]]],
+) -> tuple[str, ImagePoints | Failure]:
+    name, found = waiting.popleft()
+    if isinstance(found, ImagePoints):
+        return name, found
+    try:
+        return name, found.result()
+    except BrokenProcessPool:
+        raise EstimationError(
+            "a process that measured has died", where=name, do="use fewer processes: memory may be short"
+        ) from None
+
+
+def _context() -> multiprocessing.context.BaseContext:
+    """Processes that share no threads with this one; what they need is imported once for all."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    return context
+
+
+def _one_thread() -> None:
+    """A core for each process."""
+    cv2.setNumThreads(1)
+    always_one_thread()

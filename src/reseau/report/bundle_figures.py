@@ -1,0 +1,172 @@
+"""Figures of a bundle adjustment: the network, residuals over the image, distortion with its uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+
+from ..bundle import Lens, Result
+from ..data import Array, Rows
+from .figures import nice
+from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
+
+__all__ = ["distortion_figure", "network_figure", "residual_figure"]
+
+_MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
+_BAND = 3.0
+"""Standard deviations of the band."""
+_DIRECTIONS, _RADII = 24, 60
+_ORIENTATION = ("c", "x0", "y0", "fx", "fy", "cx", "cy")
+"""Parameters of the interior orientation that are no distortion."""
+
+
+def network_figure(result: Result) -> str:
+    """Plan and elevation: projection centres, points, and ellipses of their standard deviations, enlarged."""
+    values, part = result.fit.values, result.fit.usable
+    points = np.flatnonzero(part.points)
+    points = points[:: max(1, len(points) // _MANY_POINTS)].astype(np.intp)
+    with drawing():
+        figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+        for axes, (a, b), title in zip(
+            figure.subplots(1, 2), ((0, 1), (0, 2)), ("plan", "elevation"), strict=True
+        ):
+            xyz, x0 = values.xyz[points], values.x0[part.images]
+            axes.plot(xyz[:, a], xyz[:, b], ".", color=FAINT, markersize=2)
+            view = values.rotation[part.images][:, 2]
+            size = 0.08 * float(np.ptp(np.concatenate([xyz, x0]), axis=0).max())
+            axes.quiver(
+                x0[:, a], x0[:, b], size * view[:, a], size * view[:, b], color=BLUE, angles="xy",
+                scale_units="xy", scale=1, width=0.003,
+            )  # fmt: skip
+            axes.plot(x0[:, a], x0[:, b], "^", color=BLUE, markersize=4)
+            enlarged = _ellipses(axes, result, points, (a, b), 0.4 * size)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_title(f"{title}; ellipses × {enlarged:.3g}")
+            axes.set_xlabel(f"{'XYZ'[a]} [{result.network.unit}]")
+            axes.set_ylabel(f"{'XYZ'[b]} [{result.network.unit}]")
+        return to_svg(figure)
+
+
+def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], size: float) -> float:
+    """Standard ellipses of some points, and how much they are enlarged."""
+    some = points[:: max(1, len(points) // _ELLIPSES)]
+    q = result.point_covariance[some][:, plane][:, :, plane]
+    values, vectors = np.linalg.eigh(q)
+    axis = np.sqrt(np.maximum(values, 0.0))
+    median = float(np.median(axis[:, 1])) if len(axis) else 0.0
+    if median == 0:
+        return 1.0
+    power = nice(size / median)
+    # Weak points, which the warnings name, would cover the others.
+    shown = axis[:, 1] <= _WEAK * median
+    some, axis, vectors = some[shown], axis[shown], vectors[shown]
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    axes.add_collection(
+        EllipseCollection(
+            2 * power * axis[:, 1], 2 * power * axis[:, 0], angle, units="xy",
+            offsets=result.fit.values.xyz[some][:, plane], transOffset=axes.transData, facecolors="none",
+            edgecolors=ACCENT, linewidths=0.5,
+        )
+    )  # fmt: skip
+    return float(power)
+
+
+def residual_figure(result: Result, c: int, rows: Rows) -> str:
+    """Coverage of the image, mean residuals in its cells, and test values against the normal distribution."""
+    camera, network = result.network.cameras[c], result.network
+    across, down = _CELLS, max(2, round(_CELLS * camera.height / camera.width))
+    xy, v = network.xy[rows], result.residuals[rows]
+    cell = np.clip(
+        (xy / [camera.width, camera.height] * [across, down]).astype(int), 0, [across - 1, down - 1]
+    )
+    flat = cell[:, 1] * across + cell[:, 0]
+    number = np.bincount(flat, minlength=across * down)
+    total = np.stack([np.bincount(flat, v[:, k], across * down) for k in (0, 1)], axis=1)
+    mean: Array = total / np.maximum(number, 1)[:, None]
+    with drawing():
+        figure = Figure(figsize=(8.6, 3.6), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
+        extent = (0, camera.width, camera.height, 0)
+        left.imshow(number.reshape(down, across), extent=extent, cmap="Greys", alpha=0.35, aspect="equal")
+        x = (np.arange(across) + 0.5) * camera.width / across
+        y = (np.arange(down) + 0.5) * camera.height / down
+        longest = float(np.hypot(*mean.T).max()) or 1.0
+        scale = longest / (0.8 * camera.width / across)
+        gx, gy = np.meshgrid(x, y)
+        left.quiver(
+            gx, gy, mean[:, 0].reshape(gx.shape), mean[:, 1].reshape(gx.shape), color=ACCENT, angles="xy",
+            scale_units="xy", scale=scale, width=0.004,
+        )  # fmt: skip
+        left.set_title(f"coverage and mean residuals (longest {longest:.3f} px)")
+        w = result.test_values[rows]
+        w = w[np.isfinite(w)]
+        bins = np.linspace(0, 5, 41)
+        right.hist(
+            np.minimum(w, 5), bins=list(bins), density=True, color=PALE, edgecolor=FAINT, linewidth=0.4
+        )
+        right.plot(bins, np.sqrt(2 / np.pi) * np.exp(-(bins**2) / 2), color=INK, linewidth=1)
+        right.set_title("test values w and the normal distribution")
+        return to_svg(figure)
+
+
+def distortion_figure(lens: Lens) -> str | None:
+    """Draw the radial part of the distortion with its band, and the standard deviation by itself.
+
+    Parameters
+    ----------
+    lens : Lens
+        A calibrated camera.
+
+    Returns
+    -------
+    str or None
+        An SVG element; None where no distortion was estimated.
+    """
+    found = _radial(lens)
+    if found is None:
+        return None
+    r, curve, sigma = found
+    with drawing():
+        figure = Figure(figsize=(8.6, 3.0), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.fill_between(
+            r, curve - _BAND * sigma, curve + _BAND * sigma, color=ACCENT, alpha=0.3, linewidth=0
+        )
+        left.plot(r, curve, color=INK, linewidth=1)
+        left.axhline(0, color=FAINT, linewidth=0.6, zorder=0)
+        left.set_title(f"radial distortion ± {_BAND:g} σ [px] by radius [px]")
+        right.fill_between(r, 0, _BAND * sigma, color=PALE, linewidth=0)
+        right.plot(r, sigma, color=ACCENT, linewidth=1)
+        right.set_ylim(bottom=0)
+        right.set_title(f"its σ [px]; up to {_BAND:g} σ in grey")
+        return to_svg(figure)
+
+
+def _radial(lens: Lens) -> tuple[Array, Array, Array] | None:
+    """Radius, radial distortion in the mean of all directions, and its standard deviation (px).
+
+    The distortion is what the mapping adds to the central projection by its own slope on the axis.
+    """
+    own = [k for k, name in enumerate(lens.names) if name not in _ORIENTATION]
+    if not own:
+        return None
+    axis = lens.mapping.derivatives(np.zeros((1, 2)))
+    corner = lens.mapping.inverse(np.array([[0.0, 0.0], [lens.width - 1.0, lens.height - 1.0]]))
+    if not np.isfinite(corner).all():
+        return None
+    reach = float(np.hypot(*corner.T).max())
+    angle = np.linspace(0, 2 * np.pi, _DIRECTIONS, endpoint=False)
+    away = np.column_stack([np.cos(angle), np.sin(angle)])
+    uv = np.linspace(0, reach, _RADII)[:, None, None] * away
+    seen = lens.mapping.derivatives(uv.reshape(-1, 2))
+    ideal = axis.value + uv.reshape(-1, 2) @ axis.d_xy[0].T
+    out = away @ axis.d_xy[0].T
+    out = np.tile(out / np.linalg.norm(out, axis=1, keepdims=True), (_RADII, 1))
+    curve = ((seen.value - ideal) * out).sum(axis=1).reshape(_RADII, -1).mean(axis=1)
+    slope = np.einsum("ni,niu->nu", out, seen.d_parameters[:, :, lens.rows[own]])
+    slope = slope.reshape(_RADII, _DIRECTIONS, -1).mean(axis=1)
+    variance = np.einsum("ri,ij,rj->r", slope, lens.covariance[np.ix_(own, own)], slope)
+    radius = np.hypot(*(ideal - axis.value).T).reshape(_RADII, -1).mean(axis=1)
+    return radius, curve, np.sqrt(np.maximum(variance, 0.0))

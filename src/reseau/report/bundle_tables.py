@@ -1,0 +1,117 @@
+"""Tables of a bundle adjustment: images, the worst image points, how its model was found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..bundle import Result, Searched
+from ..data import Array
+
+__all__ = ["components_table", "dropped_table", "images_table", "left_out_table", "worst_points"]
+
+_WORST = 20
+"""Image points that are listed."""
+
+
+def images_table(result: Result) -> list[tuple[str, ...]]:
+    """A row for each image: points, residuals, factors on sigmas, reliability, orientation."""
+    network = result.network
+    v = np.where(result.rejected[:, None], np.nan, result.residuals)
+    r, least, effect = (
+        result.redundancy_numbers, result.minimal_detectable_errors(), result.external_reliability()
+    )  # fmt: skip
+    angle, sigma = np.degrees(result.angles), np.degrees(result.angle_sigma)
+    q = np.sqrt(np.maximum(np.diagonal(result.pose_covariance, axis1=1, axis2=2), 0.0))[:, 3:]
+    rows: list[tuple[str, ...]] = []
+    for i, name in enumerate(network.images):
+        at = network.image_of == i
+        at[at] = np.isfinite(v[at]).all(axis=1)
+        if not result.fit.usable.images[i]:
+            rows.append((name, str(int(at.sum())), "left out", *[""] * 7))
+            continue
+        rows.append(
+            (
+                name,
+                str(int(at.sum())),
+                _pair(np.sqrt((v[at] ** 2).mean(axis=0)), ".3f"),
+                _pair(result.variance_factors[i], ".2f"),
+                _pair(r[at].mean(axis=0), ".2f"),
+                f"{_median(least[at]):.2g}",
+                f"{_largest(effect[at]):.2g}",
+                " / ".join(f"{s:.2g}" for s in q[i]),
+                " / ".join(f"{a:.4f}" for a in angle[i]),
+                " / ".join(f"{s:.2g}" for s in sigma[i]),
+            )
+        )
+    return rows
+
+
+def worst_points(result: Result) -> list[tuple[str, ...]]:
+    """The image points of the largest test values, with all their reliability."""
+    network, w = result.network, np.nan_to_num(result.test_values)
+    order = np.argsort(-w.max(axis=1), kind="stable")[:_WORST]
+    v, r = result.residuals, result.redundancy_numbers
+    least, effect = result.minimal_detectable_errors(), result.external_reliability()
+    return [
+        (
+            network.images[network.image_of[k]],
+            network.points[network.point_of[k]],
+            _pair(v[k], ".3f"),
+            _pair(r[k], ".2f"),
+            _pair(w[k], ".1f"),
+            _pair(least[k], ".2g"),
+            _pair(effect[k], ".2g"),
+        )
+        for k in order
+        if w[k].max() > 0
+    ]
+
+
+def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
+    """What data snooping left out: image, point, test value, bound."""
+    tests = result.rejected_tests[np.flatnonzero(result.rejected)]
+    return [
+        (image, point, f"{value:.1f}", f"{critical:.1f}")
+        for image, point, (value, critical) in zip(*result.rejected_names(), tests, strict=True)
+    ]
+
+
+def components_table(searched: Searched) -> list[tuple[str, str, str, str]]:
+    """Variance components: name, factor, its standard deviation, redundancy."""
+    found = searched.components
+    if found is None:
+        return []
+    columns = zip(found.names, found.factors, found.sigma, found.redundancy, strict=True)
+    return [(name, f"{factor:.3f}", f"{sigma:.2g}", f"{r:.1f}") for name, factor, sigma, r in columns]
+
+
+def dropped_table(searched: Searched) -> dict[str, Any] | None:
+    """Parameters dropped, and how well points are predicted before and after; None where it was not asked."""
+    if searched.eliminated is None:
+        return None
+    before, after = searched.validation or (np.nan, np.nan)
+    return {
+        "steps": [
+            (step.camera, step.test.name, f"{step.test.statistic:.2f}", f"{step.test.critical:.2f}",
+             f"{step.test.p:.2g}", f"{step.sigma0:.5g}")
+            for step in searched.eliminated
+        ],
+        "before": f"{before:.4g}",
+        "after": f"{after:.4g}",
+    }  # fmt: skip
+
+
+def _pair(values: Array, form: str) -> str:
+    return " / ".join(f"{value:{form}}" if np.isfinite(value) else "–" for value in values)
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _largest(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else float("nan")
