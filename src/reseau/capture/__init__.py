@@ -1,5 +1,39 @@
-"""From instruments to frames: the bench, and what is found on it."""
+"""From instruments to frames: the bench, plans, and what carries them out into an archive."""
 
+from .acquisition import Acquisition, Plan, Procedure, Watch
 from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
+from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
+from .goal import Goal
+from .lock import BenchLock
+from .rerun import Rerun, rerun
+from .run import Decision, carry_out
+from .step import Step, paper_steps, read_steps
 
-__all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
+__all__ = [
+    "Acquisition",
+    "Bench",
+    "BenchFile",
+    "BenchLock",
+    "Checked",
+    "Decision",
+    "Goal",
+    "InstrumentEntry",
+    "Limits",
+    "Plan",
+    "Procedure",
+    "Readiness",
+    "Rerun",
+    "Step",
+    "Watch",
+    "carry_out",
+    "drivers",
+    "edge_sigma",
+    "exposure_fault",
+    "found_instruments",
+    "paper_steps",
+    "plugin",
+    "read_steps",
+    "readiness",
+    "rerun",
+    "shift_between",
+]

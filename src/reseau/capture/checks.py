@@ -1,0 +1,207 @@
+"""Whether pictures are worth being taken: exposure, focus, vibration, drift."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import scipy.ndimage
+
+from ..data import Array, Frame
+from ..errors import UsageError
+
+__all__ = ["Limits", "Readiness", "edge_sigma", "exposure_fault", "readiness", "shift_between"]
+
+
+_SMOOTH = 1.5
+_SLOPE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What is still good.
+
+    Parameters
+    ----------
+    saturated : float
+        Share of pixels at full scale.
+    darkest : float
+        The brightest thousandth of the pixels must reach this share of full scale.
+    edge_px : float
+        Width (one sigma) of the sharpest edges.
+    vibration_px : float
+        Shift from frame to frame.
+    drift_px, drift_level : float
+        Shift, and relative change of brightness, from the first frame to the last.
+    """
+
+    saturated: float = 0.01
+    darkest: float = 0.15
+    edge_px: float = 2.5
+    vibration_px: float = 0.05
+    drift_px: float = 0.1
+    drift_level: float = 0.02
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """What a series of frames of an unmoved scene showed; truthy when nothing is wrong.
+
+    Parameters
+    ----------
+    saturated, bright : float
+        Share of saturated pixels; grey value that a thousandth exceeds, of full scale.
+    edge_px : float
+        Width (one sigma) of the sharpest edges; of a step edge that of the point-spread function and a pixel.
+    vibration_px, vibration_sigma_px : float
+        Rms shift from frame to frame, and the standard deviation that noise alone gives it.
+    drift_px, drift_level : float
+        From the first frame to the last.
+    faults : tuple of str
+        What is beyond its limit, and what would help.
+    """
+
+    saturated: float
+    bright: float
+    edge_px: float
+    vibration_px: float
+    vibration_sigma_px: float
+    drift_px: float
+    drift_level: float
+    faults: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        return not self.faults
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON values."""
+        return asdict(self) | {"faults": list(self.faults)}
+
+
+def exposure_fault(frame: Frame, limits: Limits | None = None) -> str:
+    """What is wrong with the exposure of a frame; empty when nothing is."""
+    limits = limits or Limits()
+    saturated, bright = _exposure(frame)
+    if saturated > limits.saturated:
+        return f"{100 * saturated:.2g} % of the pixels are saturated; expose less"
+    if bright < limits.darkest:
+        return f"reaches {100 * bright:.2g} % of full scale only; expose more"
+    return ""
+
+
+def _exposure(frame: Frame) -> tuple[float, float]:
+    pixels = frame.pixels
+    bright = np.partition(pixels.ravel(), -1 - pixels.size // 1000)[-1 - pixels.size // 1000]
+    return float(np.mean(pixels >= frame.full_scale)), float(bright) / frame.full_scale
+
+
+def edge_sigma(frame: Frame) -> float:
+    """Width (one sigma, px) of the sharpest edges of a frame; infinite where there is none above the noise.
+
+    Notes
+    -----
+    A step of height h, blurred by a Gaussian of σ, has the slope h / (σ √(2π)) in its middle. The central
+    difference sees the mean slope over two pixels, which widens σ² by 2²/12.
+    """
+    grey = frame.pixels.astype(np.float64)
+    # Along each row, then along each column: the steepest places, and the levels on both sides of them.
+    widths = [_steepest(grey), _steepest(grey.T)]
+    return min(widths)
+
+
+def _steepest(grey: Array) -> float:
+    reach = 6
+    if grey.shape[1] < 2 * reach + 3:
+        return float("inf")
+    slope = 0.5 * np.abs(grey[:, 2:] - grey[:, :-2])
+    inner = slope[:, reach:-reach]
+    count = max(5, inner.size // 5000)
+    at = np.argpartition(inner, -count, axis=None)[-count:]
+    row, column = np.unravel_index(at, inner.shape)
+    centre = column + reach + 1
+    around = grey[row[:, None], centre[:, None] + np.arange(-reach, reach + 1)]
+    height = np.abs(around[:, -2:].mean(axis=1) - around[:, :2].mean(axis=1))
+    noise = 1.4826 * np.median(np.abs(np.diff(grey, axis=1))) / np.sqrt(2)
+    real = height > 10 * noise
+    if not real.any():
+        return float("inf")
+    sigma = height[real] / (np.sqrt(2 * np.pi) * slope[row, column + reach][real])
+    return float(np.sqrt(max(np.median(sigma) ** 2 - 4 / 12, 0.0)))
+
+
+def shift_between(first: Frame, second: Frame) -> tuple[Array, Array]:
+    """By how much the second frame shows everything further right and down, of the same scene.
+
+    Returns
+    -------
+    ndarray (2,), ndarray (2,)
+        Shift and its standard deviations (px), of all pixels together; for shifts below a pixel.
+
+    Notes
+    -----
+    Least-squares matching of whole frames (Förstner 1982): g₂ = a g₁ + b − ∇g·d, the gradient taken of the
+    mean of both, with which the linearisation is good to the second order. Both are smoothed first, since finite
+    differences see less than the slope of what is sharp; for that the covariance is N⁻¹ (SA)ᵀ(SA) N⁻¹ of the
+    noise before, which was the residuals' times 4πs².
+    """
+    if first.pixels.shape != second.pixels.shape:
+        raise UsageError("frames of different sizes are of no one scene", where=second.name)
+    one, two = (scipy.ndimage.gaussian_filter(f.pixels.astype(np.float64), _SMOOTH) for f in (first, second))
+    both = 0.5 * (one + two)
+    right, down = (scipy.ndimage.correlate1d(both, _SLOPE, axis) for axis in (1, 0))
+    columns = [-right, -down, one, np.ones_like(one)]
+    design = np.column_stack([column.ravel() for column in columns])
+    try:
+        inverse = np.linalg.inv(design.T @ design)
+    except np.linalg.LinAlgError:
+        return np.full(2, np.nan), np.full(2, np.inf)
+    estimate = inverse @ (design.T @ two.ravel())
+    rest = two.ravel() - design @ estimate
+    variance = 4 * np.pi * _SMOOTH**2 * float(rest @ rest) / max(rest.size - 4, 1)
+    again = [scipy.ndimage.gaussian_filter(column, _SMOOTH) for column in columns]
+    seen = np.column_stack([column.ravel() for column in again]) @ inverse
+    return estimate[:2], np.sqrt(variance * np.diagonal(seen.T @ seen)[:2])
+
+
+def readiness(frames: Sequence[Frame], limits: Limits | None = None) -> Readiness:
+    """What a series of at least two frames of an unmoved scene shows.
+
+    Raises
+    ------
+    UsageError
+        When there are fewer, or they differ in size.
+    """
+    if len(frames) < 2:
+        raise UsageError("vibration needs two frames", where="checks")
+    limits = limits or Limits()
+    saturated, bright = _exposure(frames[0])
+    edge = edge_sigma(frames[0])
+    steps = [shift_between(one, two) for one, two in itertools.pairwise(frames)]
+    moved = np.array([step for step, _ in steps])
+    noise = np.array([sigma for _, sigma in steps])
+    vibration = float(np.sqrt(np.mean(moved**2)))
+    sigma = float(np.sqrt(np.mean(noise**2)))
+    drift, drift_sigma = shift_between(frames[0], frames[-1])
+    means = [float(frame.pixels.mean()) for frame in (frames[0], frames[-1])]
+    level = means[1] / means[0] - 1 if means[0] else 0.0
+    faults = [exposure_fault(frames[0], limits)]
+    if edge > limits.edge_px:
+        faults.append(f"the sharpest edges are {edge:.1f} px wide; focus")
+    if not vibration <= limits.vibration_px + 3 * sigma:
+        faults.append(f"moves by {vibration:.2g} px from frame to frame; look for what shakes it")
+    if not np.hypot(*drift) <= limits.drift_px + 3 * float(np.hypot(*drift_sigma)):
+        faults.append(f"drifted by {np.hypot(*drift):.2g} px; let it warm up")
+    if abs(level) > limits.drift_level:
+        faults.append(f"its brightness drifted by {100 * level:.2g} %; let it warm up")
+    return Readiness(
+        saturated,
+        bright,
+        edge,
+        vibration,
+        sigma,
+        float(np.hypot(*drift)),
+        level,
+        tuple(fault for fault in faults if fault),
+    )

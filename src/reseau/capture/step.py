@@ -1,0 +1,103 @@
+"""Steps of an acquisition: where the table stands, and what the pictures taken there are called."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..errors import FormatError
+from ..formats import read_text
+
+__all__ = ["Step", "paper_steps", "read_steps"]
+
+TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
+"""Axes of the testfield's mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One pose.
+
+    Parameters
+    ----------
+    name : str
+        Unique in a session; pictures are stored under it.
+    position : mapping of str to float
+        Where the axes of the table stand, in their units; axes that are not named stay where they are.
+    """
+
+    name: str
+    position: Mapping[str, float] = field(default_factory=dict)
+
+
+def _named(position: Mapping[str, float]) -> Step:
+    return Step(" ".join(f"{axis} {value:g}" for axis, value in position.items()), dict(position))
+
+
+def paper_steps(
+    tilts: Sequence[float] = (0.0, 30.0, 45.0), heights: Sequence[float] = (), axes: Sequence[str] = ()
+) -> tuple[Step, ...]:
+    """The 36 recordings of Vosselman and Förstner: nine positions, each with the camera turned four times.
+
+    Parameters
+    ----------
+    tilts : sequence of float
+        φ (degrees). The board that is not tilted is recorded from one position, another from four.
+    heights : sequence of float
+        Of the board (mm), where a z-stage makes the testfield three-dimensional; each pose at each.
+    axes : sequence of str, optional
+        Names of the axes that the table has; by default those of the paper. What it lacks is not turned.
+    """
+    quarters = (0.0, 90.0, 180.0, 270.0)
+    have = set(axes or (TILT, ROLL, CAMERA_ROLL, HEIGHT))
+    steps: dict[str, Step] = {}
+    for height in heights or (None,):
+        for phi in tilts if TILT in have else (0.0,):
+            for kappa in quarters if phi and ROLL in have else (0.0,):
+                for camera in quarters if CAMERA_ROLL in have else (0.0,):
+                    position = {TILT: phi, ROLL: kappa, CAMERA_ROLL: camera}
+                    position = {axis: value for axis, value in position.items() if axis in have}
+                    if height is not None and HEIGHT in have:
+                        position[HEIGHT] = height
+                    step = _named(position)
+                    steps.setdefault(step.name, step)
+    return tuple(steps.values())
+
+
+def read_steps(path: Path) -> tuple[Step, ...]:
+    """Poses of a CSV: its header names axes of the table, and, where it has one, the column `name` the poses.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no such table; says in which line.
+    """
+    rows = list(csv.reader(io.StringIO(read_text(path))))
+    if len(rows) < 2 or not rows[0]:
+        raise FormatError("has no poses", where=path, do="write a header of axes, and a line for each pose")
+    header = [cell.strip() for cell in rows[0]]
+    steps: dict[str, Step] = {}
+    for number, row in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise FormatError(f"line {number} has {len(row)} cells, not {len(header)}", where=path)
+        cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
+        name = cells.pop("name", None)
+        try:
+            position = {axis: float(value) for axis, value in cells.items()}
+        except ValueError:
+            raise FormatError(f"line {number} holds what is no number", where=path) from None
+        if not all(math.isfinite(value) for value in position.values()):
+            raise FormatError(f"line {number} holds what is no number", where=path)
+        step = Step(name, position) if name else _named(position)
+        if step.name in steps:
+            raise FormatError(f"line {number}: {step.name!r} stands twice", where=path, do="name poses apart")
+        steps[step.name] = step
+    return tuple(steps.values())

@@ -1,0 +1,299 @@
+"""The procedures as an acquisition needs them: frame by frame as they come, what has been reached, what next.
+
+The calls are those that work on files, in another order of arrival: the same frames give the same results,
+to the byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..adjust import Failure
+from ..archive import Verdict
+from ..bundle import Lens, Network, Result, adjust_network, calibration_of
+from ..data import Frame, ImagePoints
+from ..errors import EstimationError
+from ..formats import ReseauDesign
+from ..optics import Pose, project
+from ..optics.poses import matrix_to_vector, rotation_matrix
+from ..provenance import Provenance
+from .calibration import Calibrated, CameraModel, PlaneDesign, calibrate_camera
+from .measuring import Measurer
+from .mount import Mount
+from .oscilloscope import PhotoI, PhotoII, PhotoIII, photo_i, photo_ii, photo_iii
+
+__all__ = ["LiveOscilloscope", "LiveTestfield", "Place"]
+
+_LEAST_IMAGES = 3
+_MARGIN_PX = 6.0
+
+
+class Place(Protocol):
+    """A pose of the table; see :class:`reseau.capture.Step`."""
+
+    @property
+    def name(self) -> str:
+        """What its frame is called."""
+
+    @property
+    def position(self) -> Mapping[str, float]:
+        """Where the axes stand."""
+
+
+class LiveTestfield:
+    """A camera calibrated while its photographs of a target come in.
+
+    Parameters
+    ----------
+    design : PlaneDesign
+        The target.
+    measure : callable
+        What measures it in a frame.
+    model : CameraModel
+        What is to be estimated.
+    name : str
+        Of the calibration.
+    options : mapping
+        What of the parameters influenced the result, for its provenance.
+    least_points : int
+        A frame with fewer is no good.
+    """
+
+    def __init__(
+        self,
+        design: PlaneDesign,
+        measure: Measurer,
+        model: CameraModel,
+        *,
+        name: str,
+        options: Mapping[str, Any] | None = None,
+        least_points: int = 8,
+    ) -> None:
+        self.design, self.model, self.name = design, model, name
+        self._measure, self._options, self._least = measure, dict(options or {}), least_points
+        self._measured: dict[str, ImagePoints] = {}
+        self._places: dict[str, Mapping[str, float]] = {}
+        self._inputs: dict[str, str] = {}
+        self._size: tuple[int, int] | None = None
+        self._current: tuple[int, Calibrated | Failure] | None = None
+
+    def on_frame(self, frame: Frame, step: Place) -> Verdict:
+        """Measure the target in a frame."""
+        found = self._measure(frame)
+        if isinstance(found, Failure):
+            return Verdict(False, found.reason.removeprefix(f"{frame.name}: "))
+        if len(found.points) < self._least:
+            return Verdict(False, f"{len(found.points)} points are too few")
+        self._size = (frame.width, frame.height)
+        self._measured[step.name] = found.points
+        self._places[step.name], self._inputs[step.name] = dict(step.position), frame.sha256
+        return Verdict(True, facts={"points": len(found.points)})
+
+    def calibrated(self) -> Calibrated | Failure:
+        """The calibration by what has been measured so far."""
+        count = len(self._measured)
+        if self._current is None or self._current[0] != count:
+            points = list(self._measured.items())
+            found = calibrate_camera(points, self.design, self._measure, self._size, self.model)
+            self._current = (count, found)
+        return self._current[1]
+
+    def progress(self) -> dict[str, float]:
+        """Standard deviations of the camera's parameters, and sigma0; nothing before the third image."""
+        if len(self._measured) < _LEAST_IMAGES:
+            return {}
+        found = self.calibrated()
+        if isinstance(found, Failure):
+            return {}
+        names, _, _ = found.result.camera_columns(0)
+        sigma = np.sqrt(np.diag(found.result.camera_covariance(0)))
+        reached = {f"sigma_{name}": float(s) for name, s in zip(names, sigma, strict=True)}
+        return reached | {"sigma0": float(found.result.sigma0)}
+
+    def next_pose(self, candidates: Sequence[Place], wanted: str) -> tuple[Place, float | None] | None:
+        """The pose that lowers the standard deviation of a parameter most, and to what.
+
+        Each candidate's image is predicted, and joins the network as if it had been measured as the others
+        were: its covariance follows from the design matrix alone. While there are too few images for any
+        calibration it is the first candidate, and nothing is predicted.
+
+        Raises
+        ------
+        EstimationError
+            When the parameter is not estimated, or the table's axes do not turn the target as its mount's
+            should.
+        """
+        if not candidates:
+            return None
+        found = self.calibrated() if len(self._measured) >= _LEAST_IMAGES else Failure("too few images")
+        if isinstance(found, Failure):
+            return candidates[0], None
+        names, _, _ = found.result.camera_columns(0)
+        if wanted not in names:
+            raise EstimationError(f"is none of {', '.join(names)}", where=f"sigma_{wanted}")
+        column = names.index(wanted)
+        network, result = _adjusted(found.result), found.result
+        mount = Mount.of(
+            [self._places[name] for name in network.images],
+            np.array([rotation_matrix(vector) for vector in result.rotation]),
+            network.x0,
+        )
+        if isinstance(mount, Failure):
+            raise EstimationError(mount.reason, where="next pose")
+        sigma0 = float(result.sigma0)
+        best: tuple[Place, float] | None = None
+        for candidate in candidates:
+            joined = _joined(network, result, mount.pose(candidate.position))
+            predicted = sigma0 * _sigma(network if joined is None else joined, column)
+            if best is None or predicted < best[1]:
+                best = candidate, predicted
+        return best
+
+    def finish(self) -> dict[str, str]:
+        """The calibration; ``times`` stay empty, the archive knows them.
+
+        Raises
+        ------
+        EstimationError
+            When it fails.
+        """
+        found = self.calibrated()
+        if isinstance(found, Failure):
+            raise EstimationError(found.reason, where=self.name)
+        provenance = Provenance(self._inputs, self._options)
+        calibration = calibration_of(found.result, "camera", name=self.name, provenance=provenance.to_dict())
+        return {"calibration.json": calibration.to_json()}
+
+
+def _adjusted(result: Result) -> Network:
+    """The network begun at its estimates: adjusted again, it is there at once."""
+    network, values = result.network, result.fit.values
+    camera = replace(network.cameras[0], values=values.cameras[0, : len(network.cameras[0].values)])
+    return replace(network, cameras=(camera,), x0=values.x0, rotation=result.rotation, xyz=values.xyz)
+
+
+def _joined(network: Network, result: Result, pose: Pose) -> Network | None:
+    """The network with an image from another pose; None when it would show next to nothing."""
+    camera = network.cameras[0]
+    seen = project(Lens.of_result(result, 0).mapping, pose, network.xyz).xy
+    size = np.array([camera.width, camera.height]) - 1
+    inside = np.flatnonzero(((seen >= _MARGIN_PX) & (seen <= size - _MARGIN_PX)).all(axis=1))
+    if len(inside) < 4:
+        return None
+    m = len(network.images)
+    cov = np.median(network.cov, axis=0)
+    return replace(
+        network,
+        images=(*network.images, "predicted"),
+        camera_of=np.append(network.camera_of, 0),
+        x0=np.vstack([network.x0, pose.x0]),
+        rotation=np.vstack([network.rotation, matrix_to_vector(pose.matrix)]),
+        image_of=np.concatenate([network.image_of, np.full(len(inside), m)]),
+        point_of=np.concatenate([network.point_of, inside]),
+        xy=np.concatenate([network.xy, seen[inside]]),
+        cov=np.concatenate([network.cov, np.tile(cov, (len(inside), 1, 1))]),
+        groups=(*network.groups, None),
+        files=(*network.files, "predicted"),
+    )
+
+
+def _sigma(network: Network, column: int) -> float:
+    """Standard deviation of unit weight one that a network gives a parameter of its camera."""
+    found = adjust_network(network)
+    if isinstance(found, Failure):
+        return float("inf")
+    return float(np.sqrt(found.camera_covariance(0)[column, column] / found.fit.variance))
+
+
+class LiveOscilloscope:
+    """The oscilloscope procedure while PHOTO I, II and III come in.
+
+    Parameters
+    ----------
+    reseau, test_object : ReseauDesign
+        The reseau; the rods.
+    name : str
+        Of the calibration.
+    options : mapping
+        For its provenance.
+    """
+
+    def __init__(
+        self,
+        reseau: ReseauDesign,
+        test_object: ReseauDesign,
+        *,
+        name: str,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.reseau, self.test_object, self.name = reseau, test_object, name
+        self._options, self._inputs = dict(options or {}), dict[str, str]()
+        self.first: PhotoI | None = None
+        self.second: PhotoII | None = None
+        self.third: PhotoIII | None = None
+
+    def on_frame(self, frame: Frame, step: Place) -> Verdict:
+        """Refine a photograph; which one it is, its step says."""
+        found = self._refined(frame, step.name)
+        if isinstance(found, Failure):
+            return Verdict(False, found.reason.removeprefix(f"{frame.name}: "))
+        self._inputs[step.name] = frame.sha256
+        points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
+        return Verdict(True, facts={"points": len(getattr(found, points))})
+
+    def _refined(self, frame: Frame, photo: str) -> PhotoI | PhotoII | PhotoIII | Failure:
+        if photo == "PHOTO I":
+            one = photo_i(frame, self.reseau)
+            self.first = None if isinstance(one, Failure) else one
+            return one
+        if photo == "PHOTO II":
+            if self.first is None:
+                return Failure("PHOTO I is not refined")
+            two = photo_ii(frame, self.reseau, self.test_object, self.first.camera)
+            self.second = None if isinstance(two, Failure) else two
+            return two
+        if photo == "PHOTO III":
+            if self.second is None:
+                return Failure("PHOTO II is not refined")
+            three = photo_iii(frame, self.second.instrument, self.reseau)
+            self.third = None if isinstance(three, Failure) else three
+            return three
+        return Failure(f"{photo} is no photograph of this procedure")
+
+    def progress(self) -> dict[str, float]:
+        """Sigma of the refined image coordinates, where there is a correction."""
+        return {}
+
+    def next_pose(self, candidates: Sequence[Place], wanted: str) -> tuple[Place, float | None] | None:
+        """None: its three photographs are taken from one place."""
+        return None
+
+    def finish(self) -> dict[str, str]:
+        """The calibration of camera and instrument, and the true coordinates of the body, where there is one.
+
+        Raises
+        ------
+        EstimationError
+            When PHOTO I or II could not be refined.
+        """
+        if self.second is None:
+            what = "PHOTO I" if self.first is None else "PHOTO II"
+            raise EstimationError("could not be refined", where=what, do="see the verdicts on its frames")
+        provenance = Provenance(self._inputs, self._options)
+        calibration = self.second.instrument.calibration(
+            self.reseau, self.test_object, name=self.name, provenance=provenance.to_dict(), times={}
+        )
+        made = {"calibration.json": calibration.to_json()}
+        if self.third is not None:
+            made["true.csv"] = _table(self.third.true)
+        return made
+
+
+def _table(points: ImagePoints) -> str:
+    rows = zip(points.names, points.xy, points.sigma, strict=True)
+    lines = [f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}" for name, (x, y), (sx, sy) in rows]
+    return "\n".join(["id,x,y,sx,sy", *lines]) + "\n"

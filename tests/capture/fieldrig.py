@@ -1,0 +1,169 @@
+"""A testfield on a table before a camera, without protocols; the same pose gives the same frame."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from reseau.archive import Session
+from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry
+from reseau.data import Frame
+from reseau.designs import coded_testfield
+from reseau.errors import StateError
+from reseau.formats import TestfieldDesign
+from reseau.instruments import AxisState, Deadline, Device, Identity, Settings, Status, quantity
+from reseau.procedures.calibration import CameraModel
+from reseau.procedures.live import LiveTestfield
+from reseau.procedures.measuring import measurer_of
+from reseau.refine import TestfieldOptions
+from reseau_sims import FieldBench, Station
+
+AXES = ("tilt", "roll", "camera_roll")
+DESIGN = coded_testfield()
+
+
+@dataclass(frozen=True)
+class CameraSettings(Settings):
+    """How a frame is taken."""
+
+    exposure_us: float = quantity(1000.0, "µs", 1.0, 1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A frame with what is known of it."""
+
+    frame: Frame
+    sequence: int
+    taken: datetime
+    exposure_us: float
+    gain: float = 0.0
+    dropped: int = 0
+    pattern: str = ""
+    taken_within_s: float = 1e-3
+    fresh: bool = True
+
+
+class _Simple(Device[Any]):
+    """An instrument that is always there."""
+
+    def _open(self, deadline: Deadline) -> None: ...
+    def _shut(self) -> None: ...
+    def _push(self, settings: Any, deadline: Deadline) -> None: ...
+    def _halt(self, deadline: Deadline) -> None: ...
+    def _identify(self, deadline: Deadline) -> Identity:
+        return Identity("reseau", "simulated")
+
+    def _acquire(self) -> dict[str, Any]:
+        return {}
+
+    def _kinds(self) -> dict[str, dict[str, Any]]:
+        return {}
+
+
+class Axis:
+    """One axis."""
+
+    parent = None
+
+    def __init__(self, table: FieldTable, key: str) -> None:
+        self._table, self.key, self.name = table, key, f"table_{key}"
+
+    def set(self, value: float) -> Status:
+        return Status(lambda: self._table.move(self.key, value), self.name)
+
+    def stop(self, *, success: bool = False) -> None:
+        self._table.stop()
+
+    def read(self) -> dict[str, Any]:
+        return {self.name: {"value": self._table.stands[self.key], "timestamp": 0.0}}
+
+    def describe(self) -> dict[str, Any]:
+        return {self.name: {"source": "sim", "dtype": "number", "shape": []}}
+
+
+class FieldTable(_Simple):
+    """A table that is where it is told to be."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, Settings())
+        self.stands = dict.fromkeys(AXES, 0.0)
+        self.moves: list[tuple[str, float]] = []
+        self.stops = 0
+        self.before: Callable[[str, float], None] = lambda axis, position: None
+
+    @property
+    def axes(self) -> Mapping[str, Axis]:
+        return {key: Axis(self, key) for key in AXES}
+
+    def home(self, axis: str, seconds: float | None = None) -> AxisState:
+        return self.move(axis, 0.0)
+
+    def move(self, axis: str, position: float, seconds: float | None = None) -> AxisState:
+        if self._stopping.is_set():
+            raise StateError("was stopped", where=self.name, command="move")
+        self.before(axis, position)
+        self.moves.append((axis, position))
+        self.stands[axis] = position
+        return self.state(axis)
+
+    def state(self, axis: str, seconds: float | None = None) -> AxisState:
+        return AxisState(self.stands[axis], False, True)
+
+    def _halt(self, deadline: Deadline) -> None:
+        self.stops += 1
+
+
+class FieldCamera(_Simple):
+    """A camera that looks at the testfield on the table."""
+
+    def __init__(self, name: str, table: FieldTable, field: FieldBench) -> None:
+        super().__init__(name, CameraSettings())
+        self.table, self.field = table, field
+        self.exposures = 0
+        self.spoil: Callable[[int, np.ndarray], np.ndarray] = lambda number, pixels: pixels
+        self.during: Callable[[int], None] = lambda number: None
+
+    def expose(self, seconds: float | None = None) -> Taken:
+        self.exposures += 1
+        self.during(self.exposures)
+        frame = self.field.record(Station(*(self.table.stands[axis] for axis in AXES)))
+        pixels = self.spoil(self.exposures, frame.pixels)
+        return Taken(Frame(pixels, 255.0), self.exposures, datetime.now(UTC), self.settings.exposure_us)
+
+    def frames(self, count: int, seconds: float | None = None) -> Iterator[Taken]:
+        return (self.expose(seconds) for _ in range(count))
+
+
+class FieldRig:
+    """Bench, table and camera."""
+
+    def __init__(self, seed: int = 3) -> None:
+        self.table = FieldTable("table")
+        self.camera = FieldCamera("camera", self.table, FieldBench(seed=seed, bend_mm=0.0))
+        entries = {name: InstrumentEntry(driver="sim", address=f"sim-{name}") for name in ("table", "camera")}
+        made = {"table": self.table, "camera": self.camera}
+        self.bench = Bench(BenchFile(name="field", instruments=entries), lambda name, entry: made[name])
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.lock = threading.Lock()
+
+    def procedure(self, design: TestfieldDesign = DESIGN) -> LiveTestfield:
+        """The testfield procedure with Brown's model, as the paper's camera wants it."""
+        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
+        measure = measurer_of(design, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
+        return LiveTestfield(design, measure, model, name="field")
+
+    def acquisition(self, kept: Session, procedure: LiveTestfield | None = None, **more: Any) -> Acquisition:
+        """An acquisition on this bench."""
+        return Acquisition(
+            self.bench,
+            kept,
+            procedure,
+            watch=lambda kind, facts: self.events.append((kind, facts)),
+            **more,
+        )

@@ -1,0 +1,268 @@
+"""Acquisitions: nothing is taken twice, nothing is lost, and the bench comes to rest whatever happens."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.archive import Archive, Session
+from reseau.capture import Goal, Plan, Step, carry_out, paper_steps, plans, rerun
+from reseau.errors import EstimationError, StateError, UsageError
+
+from .fieldrig import FieldRig
+
+EVERY = paper_steps()
+FEW = (EVERY[0], EVERY[4], EVERY[9], EVERY[14], EVERY[19])
+"""The board at right angles, and tilted by 30° from four sides, each with another turn of the camera."""
+
+
+@pytest.fixture
+def rig() -> FieldRig:
+    return FieldRig()
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Session:
+    return Archive.open(tmp_path / "archive", create=True).begin("monday", "testfield", {"design": "field"})
+
+
+def test_the_papers_recordings_are_36_and_each_has_a_name() -> None:
+    assert len(EVERY) == len({step.name for step in EVERY}) == 36
+    assert len(paper_steps(heights=(0.0, 100.0))) == 72
+    assert [step.position for step in paper_steps(axes=("tilt",))] == [{"tilt": t} for t in (0.0, 30.0, 45.0)]
+
+
+def test_a_plan_leaves_frames_verdicts_documents_and_results(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW, checks=2))
+    frames = kept.frames(kind="frame")
+    assert [f.step for f in frames] == [step.name for step in FEW]
+    assert all(f.verdict is not None and f.verdict.ok and f.verdict.facts["points"] > 200 for f in frames)
+    assert [f.facts["position"] for f in frames] == [step.position for step in FEW]
+    assert len(kept.frames(kind="check")) == 2
+    kinds = [kind for kind, _ in kept.notes()]
+    assert [kinds.count(kind) for kind in ("start", "descriptor", "event", "stop", "check")] == [
+        1,
+        1,
+        5,
+        1,
+        1,
+    ]
+    events = [note["data"] for kind, note in kept.notes("event")]
+    assert [event["frame"] for event in events] == [f.sha256 for f in frames]
+    (result,) = kept.results()
+    calibration = json.loads(kept.content(result))
+    c = calibration["parameters"]["c"]
+    assert abs(c["value"] - 57.5) < 4 * c["sigma"] < 1.0
+    assert calibration["times"] == {}
+    assert result.inputs == {f.name: f.sha256 for f in frames}
+    assert calibration["provenance"]["inputs"] == {f.step: f.sha256 for f in frames}
+    assert kept.status == "done"
+    assert rig.table.stops > 0
+
+
+def test_offline_equals_live_to_the_byte(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    (again,) = rerun(kept, rig.procedure())
+    assert again.same
+    other = rig.procedure()
+    other.name = "another"
+    assert not rerun(kept, other)[0].same
+
+
+def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, kept: Session) -> None:
+    rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 255) if number == 2 else pixels
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    takes = kept.frames(FEW[1].name)
+    assert [(f.take, f.verdict.ok) for f in takes if f.verdict] == [(0, False), (1, True)]
+    assert takes[0].verdict is not None
+    assert "saturated; expose less" in takes[0].verdict.why
+    assert rig.camera.exposures == 6
+
+
+def test_retakes_end_and_the_session_goes_on(rig: FieldRig, kept: Session) -> None:
+    grey = np.full((240, 240), 120, np.uint8)
+    rig.camera.spoil = lambda number, pixels: grey if rig.table.stands["roll"] == 90 else pixels
+    run = rig.acquisition(kept, rig.procedure(), retakes=1)
+    carry_out(run, plans.poses(run, FEW))
+    assert [len(kept.frames(step.name)) for step in FEW] == [1, 1, 2, 1, 1]
+    assert kept.status == "done"
+    declined = [f.verdict.why for f in kept.frames() if f.verdict and not f.verdict.ok]
+    assert len(declined) == 2
+    assert declined[0]
+
+
+def test_a_frame_exposed_while_the_table_moves_is_no_good(rig: FieldRig, kept: Session) -> None:
+    def push(number: int) -> None:
+        if number == 1:
+            rig.table.stands["tilt"] += 0.5
+
+    rig.camera.during = push
+    run = rig.acquisition(kept)
+    carry_out(run, plans.poses(run, FEW[:1]))
+    assert [f.verdict.why for f in kept.frames() if f.verdict] == ["the table moved during the exposure", ""]
+
+
+@pytest.mark.parametrize("when", ["moving", "exposing"])
+def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, kept: Session, when: str) -> None:
+    """The engine replays all messages since the checkpoint, the exposure among them."""
+    pid, asked = os.getpid(), []
+
+    def interrupt(*_: object) -> None:
+        if not asked:
+            asked.append(time.monotonic())
+            os.kill(pid, signal.SIGINT)
+            time.sleep(0.02)
+            os.kill(pid, signal.SIGINT)
+            time.sleep(0.2)
+
+    if when == "exposing":
+        rig.camera.during = lambda number: interrupt() if number == 3 else None
+    else:
+        rig.table.before = lambda axis, position: interrupt() if position == 180 else None
+    run = rig.acquisition(kept, rig.procedure())
+    stops: list[int] = []
+
+    def paused() -> Any:
+        stops.append(rig.table.stops)
+        return "resume"
+
+    carry_out(run, plans.poses(run, FEW), paused=paused)
+    assert len(stops) == 1
+    assert stops[0] > 0  # the table stood before anyone was asked
+    assert rig.camera.exposures == len(FEW)
+    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
+    assert [kind for kind, _ in kept.notes()].count("event") == len(FEW)
+    assert kept.status == "done"
+
+
+def test_a_session_that_was_stopped_goes_on_where_it_stood_and_ends_the_same(
+    rig: FieldRig, kept: Session, tmp_path: Path
+) -> None:
+    pid = os.getpid()
+    rig.camera.during = lambda number: os.kill(pid, signal.SIGTERM) if number == 3 else None
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    assert kept.status == "stopped"
+    assert len(kept.frames()) < len(FEW)
+    assert not kept.results()
+    rig.camera.during = lambda number: None
+    moves = len(rig.table.moves)
+    again = rig.acquisition(kept, rig.procedure())
+    carry_out(again, plans.poses(again, FEW))
+    assert kept.status == "done"
+    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
+    assert rig.camera.exposures == len(FEW)
+    assert len(rig.table.moves) - moves <= 3 * 3  # poses that were done are not gone to again
+    other = FieldRig()
+    undisturbed = Archive.open(tmp_path / "other", create=True).begin(
+        "monday", "testfield", {"design": "field"}
+    )
+    straight = other.acquisition(undisturbed, other.procedure())
+    carry_out(straight, plans.poses(straight, FEW))
+    assert kept.content(kept.results()[-1]) == undisturbed.content(undisturbed.results()[-1])
+
+
+def test_an_instrument_that_fails_ends_the_session_at_rest_and_nothing_is_lost(
+    rig: FieldRig, kept: Session
+) -> None:
+    def stall(axis: str, position: float) -> None:
+        if position == 180:
+            raise StateError("stalled", where="table", command="move", do="free the axis")
+
+    rig.table.before = stall
+    run = rig.acquisition(kept, rig.procedure())
+    with pytest.raises(StateError, match="stalled; free the axis"):
+        carry_out(run, plans.poses(run, FEW))
+    assert kept.status == "failed"
+    assert len(kept.frames()) == 3
+    assert rig.table.stops > 0
+    assert rig.table.stands["tilt"] != 0  # it stays where it stopped
+
+
+def test_it_parks_only_where_it_is_told_to_and_only_when_all_is_done(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept)
+    carry_out(run, plans.poses(run, FEW[:2]))
+    assert rig.table.stands["tilt"] == 30
+    again = rig.acquisition(kept)
+    carry_out(again, plans.poses(again, FEW[:2]), park={"tilt": 5.0})
+    assert rig.table.stands["tilt"] == 5
+    assert rig.camera.exposures == 2
+
+
+def test_a_plan_of_ones_own_is_a_generator(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept)
+
+    def twice_from_both_sides() -> Plan:
+        for tilt in (10.0, 350.0):
+            found = yield from run.at(Step(f"from {tilt:g}", {"tilt": tilt}), average=2)
+            assert found.facts["averaged"] == 2
+        return "seen"
+
+    assert carry_out(run, twice_from_both_sides()) == "seen"
+    picture = kept.picture(kept.frames()[0])
+    assert picture.pixels.dtype == np.float32
+    assert rig.camera.exposures == 4
+
+
+def test_what_cannot_be_meant_is_told_before_anything_moves(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept)
+    with pytest.raises(UsageError, match=r"has no axis height; it has tilt, roll, camera_roll"):
+        carry_out(run, plans.poses(run, [Step("a", {"height": 1.0})]))
+    with pytest.raises(UsageError, match="has none for a UltrasonicScanner"):
+        carry_out(run, plans.scan(run))
+    with pytest.raises(UsageError, match="needs an operator"):
+        carry_out(run, plans.oscilloscope(run))
+    wrong = rig.acquisition(kept, camera="table")
+    with pytest.raises(UsageError, match="is no Camera"):
+        carry_out(wrong, plans.frames(wrong, 1))
+
+
+def test_checks_stop_what_would_be_worth_nothing(rig: FieldRig, kept: Session) -> None:
+    rig.camera.spoil = lambda number, pixels: pixels // 20
+    run = rig.acquisition(kept)
+    with pytest.raises(StateError, match=r"full scale only; expose more.*--checks 0"):
+        carry_out(run, plans.poses(run, FEW, checks=3))
+    assert len(kept.frames(kind="check")) == 3
+    assert not kept.frames(kind="frame")
+
+
+def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, kept: Session) -> None:
+    """What was predicted of a pose from the design matrix comes about."""
+    run = rig.acquisition(kept, rig.procedure())
+    goal = Goal("c", 0.007, "mm")
+    first = (EVERY[0], EVERY[4], EVERY[9])
+    candidates = [step for step in EVERY if step.position["camera_roll"] == 0]
+    assert carry_out(run, plans.until(run, goal, first, candidates)) == ""
+    reached = run.reached("c")
+    assert reached is not None
+    assert reached < goal.limit
+    predicted = [(f["step"], f["sigma_c"]) for kind, f in rig.events if kind == "next"]
+    came = {f["step"]: f["sigma_c"] for kind, f in rig.events if kind == "precision"}
+    assert predicted
+    for name, sigma in predicted:
+        assert sigma is None or 0.9 < came[name] / sigma < 1.1
+    # It begins anew: every choice is remembered.
+    again = rig.acquisition(kept, rig.procedure())
+    exposures = rig.camera.exposures
+    assert carry_out(again, plans.until(again, goal, first, candidates)) == ""
+    assert rig.camera.exposures == exposures
+
+
+def test_the_closed_loop_says_when_no_pose_helps(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept, rig.procedure())
+    why = carry_out(run, plans.until(run, Goal("c", 1e-9, "mm"), FEW[:3], FEW[3:]))
+    assert "no pose is left" in why
+
+
+def test_a_goal_for_what_is_not_estimated_is_told(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept, rig.procedure())
+    with pytest.raises(EstimationError, match="is none of c, x0, y0, K1"):
+        carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))

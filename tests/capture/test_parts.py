@@ -1,0 +1,119 @@
+"""Poses from tables, goals from words, and what frames say of focus, vibration and drift."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reseau.capture import Goal, Limits, edge_sigma, exposure_fault, read_steps, readiness, shift_between
+from reseau.data import Frame
+from reseau.errors import FormatError, UsageError
+
+
+def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: float = 0.5, seed: int = 0,
+          level: float = 1.0) -> Frame:  # fmt: skip
+    """Some bright disks with Gaussian edges, moved by a shift."""
+    import scipy.special
+
+    y, x = np.mgrid[:120, :160].astype(float)
+    light = np.full(x.shape, 40.0)
+    for cx, cy in ((40, 30), (110, 40), (60, 90), (125, 95)):
+        r = np.hypot(x - cx - shift[0], y - cy - shift[1])
+        light += 120 * scipy.special.ndtr((12 - r) / sigma)
+    rng = np.random.default_rng(seed)
+    return Frame(
+        np.clip(level * light + rng.normal(0, noise, x.shape), 0, 255).round().astype(np.uint8), 255.0
+    )
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])
+def test_the_width_of_edges_is_told(sigma: float) -> None:
+    # Sampled at points: the scene has no pixels to integrate over. Curvature and noise leave a tenth.
+    assert edge_sigma(scene(sigma=sigma)) == pytest.approx(sigma, abs=0.12 * sigma)
+
+
+def test_a_frame_without_edges_has_no_focus() -> None:
+    flat = np.random.default_rng(0).normal(100, 3, (60, 60)).round().astype(np.uint8)
+    assert edge_sigma(Frame(flat, 255.0)) == float("inf")
+
+
+@given(dx=st.floats(-0.4, 0.4), dy=st.floats(-0.4, 0.4), seed=st.integers(0, 5))
+def test_a_shift_is_found_within_its_sigma(dx: float, dy: float, seed: int) -> None:
+    found, sigma = shift_between(scene(seed=seed), scene((dx, dy), seed=seed + 100))
+    assert np.all(np.abs(found - [dx, dy]) < 5 * sigma + 0.004)  # the linearisation leaves thousandths
+    assert np.all(sigma < 0.01)
+
+
+def test_a_quiet_bench_is_ready() -> None:
+    found = readiness([scene(seed=k) for k in range(4)])
+    assert found
+    assert found.vibration_px < 3 * found.vibration_sigma_px
+
+
+@pytest.mark.parametrize(
+    ("frames", "fault"),
+    [
+        ([scene((0.3 * (k % 2), 0), seed=k) for k in range(4)], "what shakes it"),
+        ([scene((0.06 * k, 0), seed=k) for k in range(5)], "drifted by 0.24 px; let it warm up"),
+        ([scene(level=1 - 0.01 * k, seed=k) for k in range(5)], "brightness drifted by -4 %"),
+        ([scene(sigma=4, seed=k) for k in range(3)], "focus"),
+        ([scene(level=3, seed=k) for k in range(3)], "expose less"),
+        ([scene(level=0.1, seed=k) for k in range(3)], "expose more"),
+    ],
+)
+def test_what_is_wrong_before_an_acquisition_is_told(frames: list[Frame], fault: str) -> None:
+    assert fault in "; ".join(readiness(frames).faults)
+
+
+def test_checks_need_two_frames_of_one_scene() -> None:
+    with pytest.raises(UsageError, match="two frames"):
+        readiness([scene()])
+    with pytest.raises(UsageError, match="no one scene"):
+        readiness([scene(), Frame(np.zeros((9, 9), np.uint8), 255.0)])
+
+
+def test_limits_are_the_laboratorys() -> None:
+    assert exposure_fault(scene(level=0.3)) == ""
+    assert "expose more" in exposure_fault(scene(level=0.3), Limits(darkest=0.5))
+
+
+def test_poses_of_a_table_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("name,tilt,roll\nfirst, 0,0\n,10.5,-90\n\n")
+    first, second = read_steps(path)
+    assert (first.name, dict(first.position)) == ("first", {"tilt": 0.0, "roll": 0.0})
+    assert (second.name, dict(second.position)) == ("tilt 10.5 roll -90", {"tilt": 10.5, "roll": -90.0})
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "has no poses"),
+        ("tilt\n", "has no poses"),
+        ("tilt\nx\n", "line 2 holds what is no number"),
+        ("tilt\nnan\n", "line 2 holds what is no number"),
+        ("tilt,roll\n1\n", "line 2 has 1 cells, not 2"),
+        ("tilt\n1\n1\n", "line 3: 'tilt 1' stands twice"),
+    ],
+)
+def test_a_table_that_is_none_is_told_with_its_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=says):
+        read_steps(path)
+
+
+def test_goals_are_read_in_their_units() -> None:
+    assert Goal.parse("sigma_c < 0.5 um").limit == pytest.approx(5e-4, abs=1e-12)
+    assert Goal.parse("sigma_fx<=0.02 px") == Goal("fx", 0.02, "px")
+    assert str(Goal.parse("sigma_K1 < 1e-7")) == "sigma_K1 < 1e-07"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "c < 1", "sigma_c > 1 um", "sigma_c < um", "sigma_c < 1 parsec", "sigma_c < 0 um"]
+)
+def test_what_is_no_goal_is_told(text: str) -> None:
+    with pytest.raises(UsageError, match=r"write it like 'sigma_c < 0\.5 um'"):
+        Goal.parse(text)
