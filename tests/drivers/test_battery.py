@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -27,24 +27,32 @@ CELLS = [
 
 @pytest.fixture(scope="session")
 def _libraries_are_loaded() -> None:
-    """What VISA's libraries open once for the process (libusb) is not counted."""
+    """What libraries open once for the process (libusb, GLib) is not counted."""
     with rig("oscilloscope", "vxi-11"), rig("oscilloscope", "hislip"):
         pass
+    if not aravis_is_missing():
+        with rig("aravis", "gige"):
+            pass
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_left_open(_libraries_are_loaded: None) -> Iterator[None]:
+def _nothing_is_left_open(_libraries_are_loaded: None, request: pytest.FixtureRequest) -> Iterator[None]:
     before = left_open()
     yield
     deadline = time.monotonic() + 5.0
     while left_open() != before and time.monotonic() < deadline:
         time.sleep(0.01)
+    request.node.user_properties.append(("nothing left open", left_open() == before))
     assert left_open() == before
 
 
 @pytest.mark.parametrize(("driver", "transport", "kind", "at"), CELLS)
-def test_a_fault_is_survived_or_said_in_time(driver: str, transport: str, kind: Kind, at: int) -> None:
+def test_a_fault_is_survived_or_said_in_time(
+    driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
+) -> None:
     script = Script()
+    for key, value in {"driver": driver, "transport": transport, "fault": kind}.items():
+        record_property(key, value)
     with rig(driver, transport, script) as found:
         found.work(0)
         script.fault_at(script.count + at, Fault(kind, 0.2))
@@ -54,8 +62,11 @@ def test_a_fault_is_survived_or_said_in_time(driver: str, transport: str, kind: 
             found.work(1)
         except InstrumentError as error:
             said = error
+        took = time.monotonic() - began
+        record_property("outcome", "right" if said is None else type(said).__name__)
+        record_property("seconds", took)
         assert said is None or (said.instrument, bool(said.command)) == (found.device.name, True)
-        assert time.monotonic() - began < 10.0
+        assert took < 10.0
         assert [fault.kind for fault in script.happened] == [kind]
         _recovered(found)
         found.work(2)
@@ -85,15 +96,18 @@ def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) ->
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("driver", "transport"), list(RIGS))
-def test_endurance(driver: str, transport: str) -> None:
-    _endure(driver, transport, exchanges=int(os.environ.get("RESEAU_EXCHANGES", "10000")), rate=0.01)
+def test_endurance(driver: str, transport: str, record_property: Callable[[str, object], None]) -> None:
+    found = _endure(driver, transport, exchanges=int(os.environ.get("RESEAU_EXCHANGES", "10000")), rate=0.01)
+    for key, value in {"driver": driver, "transport": transport, **found}.items():
+        record_property(key, value)
 
 
-def _endure(driver: str, transport: str, exchanges: int, rate: float) -> None:
+def _endure(driver: str, transport: str, exchanges: int, rate: float) -> dict[str, float]:
     script = Script()
     with rig(driver, transport, script) as found:
-        start, run, failed = script.count, 0, 0
+        start, run, failed, longest = script.count, 0, 0, 0.0
         script.at_random(rate, seed=7, seconds=0.05)
         while script.count - start < exchanges:
             run += 1
@@ -103,11 +117,18 @@ def _endure(driver: str, transport: str, exchanges: int, rate: float) -> None:
             except InstrumentError:
                 failed += 1
                 _recovered(found)
-            assert time.monotonic() - began < 30.0
+            longest = max(longest, time.monotonic() - began)
+            assert longest < 30.0
         script.at_random(0.0)
         _recovered(found)
         found.work(run + 1)
         assert failed <= len(script.happened)
+        return {
+            "exchanges": script.count - start,
+            "faults": len(script.happened),
+            "errors": failed,
+            "longest": longest,
+        }
 
 
 def _recovered(found: Rig) -> None:

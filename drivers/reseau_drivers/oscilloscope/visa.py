@@ -1,13 +1,13 @@
 """VISA resources as links: VXI-11, HiSLIP and USBTMC through pyvisa-py, with deadlines that hold.
 
 pyvisa-py's own time-outs are per chunk, or none at all while a connection is opened; so its calls run in a
-thread of their own, and one that is not back in time has its sockets taken away.
+thread of their own, one that is not back in time has its sockets taken away, and none takes more than its
+budget of bytes.
 """
 
 from __future__ import annotations
 
 import queue
-import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,11 +20,14 @@ from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, UsageE
 from reseau.instruments import Deadline
 
 from ..link import Link, TcpLink, link_to
+from .budget import Account
 
 __all__ = ["VisaLink", "resources", "scpi_link"]
 
 _READ = 1 << 20
 """Bytes asked for at once; what is longer comes in several reads."""
+_MOST = 16 << 20
+"""Bytes that one call may take; several reads make a picture."""
 _GRACE_S = 0.3
 _MESSAGE_AVAILABLE = 0x10
 
@@ -60,6 +63,7 @@ class _Worker:
     """A thread that does one thing after the other for a link."""
 
     def __init__(self) -> None:
+        self.account = Account(_MOST)
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], queue.SimpleQueue[tuple[Any, Any]]] | None] = (
             queue.SimpleQueue()
         )
@@ -70,7 +74,8 @@ class _Worker:
         while (job := self._jobs.get()) is not None:
             work, answer = job
             try:
-                answer.put((work(), None))
+                with self.account.open():
+                    answer.put((work(), None))
             except Exception as error:
                 answer.put((None, error))
 
@@ -114,6 +119,9 @@ class VisaLink:
 
         try:
             self._do(work, deadline, "open")
+        except InstrumentError:
+            self._worker.account.cut()
+            raise
         finally:
             if opened:
                 self._resource = opened[0]
@@ -127,10 +135,9 @@ class VisaLink:
             return
         if resource is not None:
             # A VXI-11 link is closed by a call that a dead instrument does not answer.
-            try:
+            with suppress(queue.Empty):
                 worker.do(lambda: self._quietly(resource), _GRACE_S)
-            except queue.Empty:
-                _cut(resource)
+        worker.account.cut()
         worker.end()
 
     @staticmethod
@@ -178,9 +185,7 @@ class VisaLink:
         try:
             return worker.do(work, deadline.left + _GRACE_S)
         except queue.Empty:
-            resource = self._resource
-            if resource is not None:
-                _cut(resource)
+            worker.account.cut()
             raise DeadlineError(f"{what} was not done within {deadline.seconds:g} s") from None
         except pyvisa.errors.VisaIOError as error:
             if error.error_code == constants.StatusCode.error_timeout:
@@ -191,21 +196,6 @@ class VisaLink:
         except Exception as error:
             # Its back end raises OSError, RuntimeError, RPCError, USBError, ValueError and bare Exception.
             raise ConnectionLost(f"{self._name}: {what} failed ({error})", do="is it switched on?") from None
-
-
-def _cut(resource: Any) -> None:
-    """Take the sockets away from a resource whose call hangs."""
-    with suppress(Exception):
-        session = resource.visalib.sessions[resource.session]
-        for owner in (session, session.interface, getattr(session.interface, "sock", None)):
-            held = [owner, *vars(owner).values()] if hasattr(owner, "__dict__") else [owner]
-            for item in held:
-                if isinstance(item, socket.socket):
-                    with suppress(OSError):
-                        item.shutdown(socket.SHUT_RDWR)
-                    # pyvisa-py takes the end of a VXI-11 stream for silence, and asks again; not of a closed
-                    # one.
-                    item.close()
 
 
 def scpi_link(address: str | Link) -> Link:

@@ -98,6 +98,12 @@ class CompactPulser(Device[CompactPulserSettings]):
         # It may have lost its power in between, and all that was set before.
         self._verify(wanted, deadline)
 
+    def stage(self) -> list[Any]:
+        """Connect, and send pulses again, which the end of the run before had stopped."""
+        staged = super().stage()
+        self.configure()
+        return staged
+
     def verify(self, seconds: float | None = None) -> None:
         """Read settings back: all of them, or the gain where the instrument tells no other.
 

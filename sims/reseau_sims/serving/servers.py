@@ -109,14 +109,19 @@ class Server(ABC):
         if self._closing:
             return
         self._closing = True
-        os.write(self._wake_in, b"x")
+        self._wake()
         self._thread.join(10.0)
         os.close(self._wake_in)
 
     def hang_up(self) -> None:
         """Break all connections, as when a cable is pulled."""
         self._drop_all = True
-        os.write(self._wake_in, b"x")
+        self._wake()
+
+    def _wake(self) -> None:
+        # The thread may have seen the flag by itself, and be gone.
+        with suppress(BrokenPipeError):
+            os.write(self._wake_in, b"x")
 
     def __enter__(self) -> Self:
         return self.start()

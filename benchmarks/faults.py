@@ -1,0 +1,34 @@
+"""The table driver × transport × fault, from the tests that fill its cells: `python benchmarks/faults.py`.
+
+With `--exchanges 10000` the endurance of every driver on every transport too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "faults.md")
+    parser.add_argument("--exchanges", type=int, default=0, help="of each driver with 1 %% faults")
+    asked = parser.parse_args()
+    which = ["-k", "a_fault_is_survived"]
+    if asked.exchanges:
+        os.environ["RESEAU_EXCHANGES"] = str(asked.exchanges)
+        which = ["-k", "a_fault_is_survived or endurance", "-m", "slow or not slow"]
+    battery = str(ROOT / "tests" / "drivers" / "test_battery.py")
+    status = pytest.main(["-q", "-n", "2", *which, battery, "--evidence", str(asked.out.resolve())])
+    print(asked.out.read_text())
+    return int(status)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

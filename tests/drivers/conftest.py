@@ -1,0 +1,93 @@
+"""`--evidence FILE` writes what the battery found as a table: driver × transport × fault."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from reseau_sims.serving import KINDS
+
+HEAD = """\
+# Faults: what happens
+
+Written by `python benchmarks/faults.py`; every cell is one or more tests of `tests/drivers/test_battery.py`.
+A fault befalls an answer in the middle of the driver's work: in process the 1st, 2nd, 3rd and 5th after the
+work began, elsewhere the 3rd. In a cell stands what came of it, and the longest time until it was known:
+*right*, the work was done as if nothing had happened, or the error of the tree, which names instrument and
+command. Deadlines are short here: 0.15 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for
+a call of BK and of a camera, 0.7 s of an oscilloscope. Asserted in every cell besides: no answer was taken
+for that to another question, the instrument could be brought back, the work after it was right, and file
+descriptors, sockets and threads are as many as before.
+
+Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disconnected; of the instrument:
+stuck, wrong state, out of range, power-cycled. `test_endurance` goes on with one fault in a hundred answers.
+
+"""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--evidence", metavar="FILE", help="write the table of faults there (Markdown)")
+
+
+_LOG: list[pytest.TestReport] = []
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    _LOG.append(report)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    path = session.config.getoption("--evidence", None)
+    if not path or hasattr(session.config, "workerinput"):
+        return
+    cells: dict[tuple[str, str], dict[str, list[tuple[str, float]]]] = {}
+    for report in _LOG:
+        found = dict(report.user_properties)
+        if report.when != "teardown" or "fault" not in found:
+            continue
+        outcome = found["outcome"] if found.get("nothing left open") else "LEFT SOMETHING OPEN"
+        row = cells.setdefault((str(found["driver"]), str(found["transport"])), {})
+        row.setdefault(str(found["fault"]), []).append((str(outcome), float(found["seconds"])))
+    endured = [
+        dict(report.user_properties)
+        for report in _LOG
+        if report.when == "teardown" and "exchanges" in dict(report.user_properties)
+    ]
+    failed = {report.nodeid for report in _LOG if report.failed}
+    Path(path).write_text(
+        HEAD + _table(cells) + _endurance(endured) + "".join(f"\nFAILED: {name}\n" for name in sorted(failed))
+    )
+
+
+def _table(cells: dict[tuple[str, str], dict[str, list[tuple[str, float]]]]) -> str:
+    rows = [["driver", "transport", *KINDS], ["---"] * (2 + len(KINDS))]
+    for (driver, transport), row in sorted(cells.items()):
+        rows.append([driver, transport, *(_cell(row.get(kind, [])) for kind in KINDS)])
+    count = sum(len(cell) for row in cells.values() for cell in row.values())
+    lines = "".join("| " + " | ".join(row) + " |\n" for row in rows)
+    return f"{lines}\n{count} tests in {len(cells) * len(KINDS)} cells.\n"
+
+
+def _endurance(found: list[dict[str, object]]) -> str:
+    """What came of many exchanges with random faults."""
+    if not found:
+        return ""
+    keys = ("driver", "transport", "exchanges", "faults", "errors", "longest")
+    rows = [
+        ["driver", "transport", "exchanges", "faults", "typed errors", "longest work"],
+        ["---"] * len(keys),
+        *sorted([f"{f[key]:.1f} s" if key == "longest" else str(f[key]) for key in keys] for f in found),
+    ]
+    return (
+        "\n## Endurance\n\nOne fault in a hundred answers, of all kinds; everything else was right.\n\n"
+        + "".join("| " + " | ".join(row) + " |\n" for row in rows)
+    )
+
+
+def _cell(found: list[tuple[str, float]]) -> str:
+    """What came of a fault, each outcome once, with the longest time that it took."""
+    longest: dict[str, float] = {}
+    for outcome, seconds in found:
+        longest[outcome] = max(longest.get(outcome, 0.0), seconds)
+    return "; ".join(f"{outcome} {seconds:.1f} s" for outcome, seconds in sorted(longest.items())) or "–"
