@@ -11,7 +11,7 @@ from reseau.bundle import Additional, BundleProblem, Camera, Network, approximat
 from reseau.bundle.unknowns import Unknowns
 from reseau.bundle.values import Values
 from reseau.data import Array
-from reseau.optics import Brown, OpenCV, PixelGrid
+from reseau.optics import Brown, Chain, OpenCV, PixelGrid, RationalPolynomial, Similarity, wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
 
 BROWN = (8.0, 0.03, -0.02, 2e-3, -3e-5, 0.0, 4e-5, -3e-5, 2e-4, -1e-4)
@@ -153,6 +153,27 @@ def mapping_of(cam: Camera) -> Any:
     return Brown(cam.values, cam.side, cam.balance_radius_mm, PixelGrid(cam.width, cam.height, cam.pitch_mm))
 
 
+def wong() -> Camera:
+    """A lens and Wong's display behind it, all its terms free but those a lens has too."""
+    lens = OpenCV([800.0, 800.0, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 0.0])
+    chain = Chain(lens, Chain(wong_display(), Similarity([320.0, 240.0, 1.0, 0.0])), ("lens.", "display."))
+    values = np.array(chain.values)
+    return Camera("chain", 640, 480, (0.01, 0.01), "mapping", values, (
+        "lens.fx", "lens.k1", chain.names[10], chain.names[-1]), mapping=chain)  # fmt: skip
+
+
+def polynomial() -> Camera:
+    """Rays imaged by a pinhole, then by a polynomial whose terms are data."""
+    bent = RationalPolynomial(
+        {"k": {"X": "x3 + xy2", "Y": "y3 + yx2"}, "s": {"X": "y", "Y": ""}, "q": {"X": "x2", "Y": "xy"}},
+        [3e-7, 2e-3, 1e-5], {"X": "x", "Y": "y"},
+    )  # fmt: skip
+    pinhole = OpenCV([800.0, 800.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    chain = Chain(pinhole, Chain(bent, Similarity([320.0, 240.0, 1.0, 0.0])), ("lens.", ""))
+    free = ("lens.fx", *(name for name in chain.names if name.rpartition(".")[2] in "ksq"))
+    return Camera("poly", 640, 480, (0.01, 0.01), "mapping", np.array(chain.values), free, mapping=chain)
+
+
 def with_ebner(per: Any, base_mm: float = 1.2) -> Camera:
     """A camera with Ebner's parameters beside c, x0, y0."""
     return camera(free=(), additional=Additional(base_mm, True, per))
@@ -182,3 +203,16 @@ def normalised_errors(world: World, fit: Any) -> dict[str, float]:
     squares = np.einsum("pi,pij,pj->p", e, np.linalg.inv(fit.cofactors.points[free]), e)
     found["points"] = float(squares.mean()) / 3
     return found
+
+
+BATTERY = {
+    "brown-object": camera("brown-object"),
+    "brown-image": camera("brown-image"),
+    "opencv-5": camera("opencv", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
+    "opencv-8": camera("opencv-8", ("fx", "fy", "cx", "cy", "k1", "p1", "p2", "k4")),
+    "ebner": with_ebner("camera"),
+    "ebner-per-group": with_ebner("group"),
+    "wong": wong(),
+    "polynomial": polynomial(),
+}
+"""Every model of a camera that can be calibrated."""

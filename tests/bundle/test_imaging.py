@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
-from reseau.bundle import Camera
 from reseau.bundle.further import Further
 from reseau.bundle.system import Linear, System, residuals
 from reseau.bundle.unknowns import Unknowns
 from reseau.bundle.values import Correction, Values
 from reseau.data import Array
-from reseau.optics import Chain, EbnerCorrection, OpenCV, Similarity, wong_display
+from reseau.optics import EbnerCorrection
 from reseau.optics.poses import Pose, matrix_to_vector, project
 
 from . import networks
@@ -97,15 +96,6 @@ def test_image_side_reckons_with_the_corrected_image_point() -> None:
     np.testing.assert_allclose(off[:, 0], -1e-3 * slope[:, 0, 0], rtol=0, atol=1e-8)
 
 
-def polynomial() -> Camera:
-    """A lens and a distorted display behind it: a chain of a camera and Wong's model, 23 parameters."""
-    lens = OpenCV([800.0, 800.0, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 0.0])
-    chain = Chain(lens, Chain(wong_display(), Similarity([320.0, 240.0, 1.0, 0.0])), ("lens.", "display."))
-    names = ("lens.fx", "lens.k1", chain.names[10], chain.names[-1])
-    values = np.array(chain.values)
-    return Camera("chain", 640, 480, (0.01, 0.01), "mapping", values, names, mapping=chain)
-
-
 CASES = {
     "brown on the object side": (networks.camera("brown-object"),),
     "brown on the image side": (networks.camera("brown-image", balance_radius_mm=2.0),),
@@ -116,7 +106,9 @@ CASES = {
     "ebner per image, image side": (replace(networks.with_ebner("image"), side="image"),),
     "any mapping": (networks.mapped(networks.camera("opencv")),),
     "a mapping, image side": (networks.mapped(networks.camera("brown-image")),),
-    "a polynomial behind a lens": (polynomial(),),
+    "wong's display behind a lens": (networks.wong(),),
+    "a polynomial behind a lens": (networks.polynomial(),),
+    "opencv with k3": (networks.BATTERY["opencv-5"],),
     "a mapping beside a compiled camera": (networks.mapped(networks.camera("opencv")), networks.camera()),
     "two cameras": (networks.camera("brown-image"), networks.camera("opencv", ("fx", "k1"))),
 }

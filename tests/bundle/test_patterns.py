@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Result, by_place, by_point, common_pattern
+from reseau.bundle import Network, Result, by_place, by_point, common_pattern, patterns
 from reseau.errors import UsageError
 
 from . import networks
@@ -91,3 +91,48 @@ def test_classes_of_single_points_are_no_classes() -> None:
     result = adjusted(paper())
     with pytest.raises(UsageError, match="no two image points"):
         common_pattern(result, np.arange(len(result.network.xy)))
+
+
+def test_a_network_of_any_size_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the eliminated points as by all unknowns at once; columns in parts or whole make no difference."""
+    world = networks.world(points=40, images=8, datum="free", control=0)
+    fit = world.problem(world.noisy(4)).adjusted().required()
+    result = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool))
+    key = by_place(result, 0, 6)
+    found = common_pattern(result, key)
+    monkeypatch.setattr(patterns, "_AT_ONCE", 5)
+    again = common_pattern(result, key)
+    assert again.statistic == pytest.approx(found.statistic, rel=1e-9)
+    # Of all unknowns at once: M = N − H Q Hᵀ with the whole cofactor matrix.
+    points = np.flatnonzero(fit.usable.points)
+    joint = fit.cofactors.joint(np.arange(fit.unknowns.size), points)
+    h = np.zeros((2 * len(found.count), fit.unknowns.size + 3 * len(points)))
+    rows = np.flatnonzero(fit.usable.observations)[fit.unknowns.order]
+    normal = np.zeros((2 * len(found.count),) * 2)
+    linear, last = fit.linear, fit.linear.rows.shape[2] - 3
+    for k, row in enumerate(rows):
+        at = found.key[row]
+        if at < 0:
+            continue
+        full = np.zeros((2, h.shape[1]))
+        pattern = linear.system.pattern
+        for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
+            full[:, start : start + width] += linear.rows[k, :, column : column + width]
+        j = int(np.flatnonzero(points == linear.system.seen.point[k])[0])
+        full[:, fit.unknowns.size + 3 * j : fit.unknowns.size + 3 * j + 3] = linear.rows[k, :, last:]
+        root = linear.system.seen.root[k]
+        h[2 * at : 2 * at + 2] += root.T @ full
+        normal[2 * at : 2 * at + 2, 2 * at : 2 * at + 2] += root.T @ root
+    m = normal - h @ joint @ h.T
+    own = np.arange(len(found.count))
+    blocks = np.linalg.inv(normal) @ m @ np.linalg.inv(normal) * found.sigma0**2
+    whole = blocks.reshape(len(own), 2, len(own), 2)[own, :, own, :]
+    np.testing.assert_allclose(found.cov, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
+
+
+def test_a_pattern_of_the_frame_is_a_remark() -> None:
+    network = paper()
+    offset = 0.05 * np.sign(np.sin(network.xy / 20.0))
+    result = adjusted(replace(network, xy=network.xy + offset))
+    assert any("have a pattern in common by place" in warning for warning in result.warnings)
+    assert not any("have a pattern in common" in warning for warning in adjusted(network).warnings)

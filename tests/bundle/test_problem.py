@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
 from reseau.adjust import Options as AdjustOptions
 from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
 from reseau.bundle.careful import careful_inverse
+from reseau.bundle.problem import _Run
+from reseau.bundle.remarks import remarks
+from reseau.bundle.system import residuals
 from reseau.data import Array
 from reseau.errors import UsageError
 from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
@@ -167,13 +171,68 @@ def test_the_joint_covariance_of_a_free_network_agrees_with_that_of_its_points()
 
 
 @pytest.mark.parametrize("datum", ["control", "minimal", "free"])
-@pytest.mark.parametrize("model", ["brown-object", "brown-image", "opencv", "ebner"])
+@pytest.mark.parametrize("model", networks.BATTERY)
 def test_redundancy_numbers_sum_to_the_redundancy(datum: str, model: str) -> None:
-    cam = networks.with_ebner("group") if model == "ebner" else networks.camera(model)
+    cam = networks.BATTERY[model]
     world = networks.world(images=8, datum=datum, cameras=(cam,), control=5 if datum == "control" else 0)
     fit = required(world.problem(world.noisy(1)))
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
     assert fit.counts[2] == (0 if datum == "control" else 7)
+    assert 0.7 < fit.sigma0 < 1.3
+
+
+@pytest.mark.parametrize("model", networks.BATTERY)
+def test_estimates_are_within_their_covariances_of_the_truth(model: str) -> None:
+    """Parameters of every camera, one network: χ² of the errors within its bounds of 1e-4."""
+    cam = networks.BATTERY[model]
+    world = networks.world(images=8, points=40, cameras=(cam,))
+    fit = required(world.problem(world.noisy(2)))
+    result = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool))
+    names, _, values = result.camera_columns(0)
+    true = np.array([cam.parameters.get(name, 0.0) for name in names])
+    off = values - true
+    covariance = result.camera_covariance(0) / fit.variance
+    square = float(off @ np.linalg.solve(covariance, off))
+    assert scipy.stats.chi2.sf(square, len(off)) > 1e-4
+    assert scipy.stats.chi2.cdf(square, len(off)) > 1e-4
+
+
+def test_parameters_of_each_image_are_those_of_the_image() -> None:
+    """Image-variant: every image with twelve parameters of its own, bent by another of them."""
+    cam = networks.with_ebner("image")
+    world = networks.world(images=6, points=60, cameras=(cam,), control=30)
+    problem = world.problem()
+    true = np.random.default_rng(4).normal(0, 2e-3, (6, 12))
+    system = _Run(problem).system
+    start = replace(problem.start, extra=true)
+    seen = residuals(world.network, system.unknowns, np.arange(len(world.network.xy)), start)
+    bent = replace(world, network=replace(world.network, xy=world.network.xy + seen))
+    fit = required(bent.problem(bent.noisy(5)))
+    assert 0.9 < fit.sigma0 < 1.1
+    result = Result(bent.network, fit, np.zeros(len(bent.network.xy), dtype=bool))
+    names, _, values = result.camera_columns(0)
+    assert len(names) == 72
+    assert names[12] == "b1 of image i1"
+    off = values - true.ravel()
+    square = float(off @ np.linalg.solve(result.camera_covariance(0) / fit.variance, off))
+    assert 1e-3 < scipy.stats.chi2.sf(square, 72) < 1 - 1e-3
+
+
+def test_an_observed_interior_orientation_is_drawn_to_what_was_observed() -> None:
+    """With a sigma far below what the images tell the estimate is the observation; far above, theirs."""
+    world = networks.world()
+    network, cam = world.noisy(1), world.network.cameras[0]
+    shifted = replace(cam, values=cam.values + np.eye(10)[1] * 0.02)
+    alone = required(world.problem(network, **TOLERANCE))
+    found = {}
+    for sigma in (1e-7, 1e3):
+        observed = replace(network, cameras=(replace(shifted, sigma={"x0": sigma}),))
+        fit = required(world.problem(observed, **TOLERANCE))
+        assert fit.counts[0] == alone.counts[0] + 1
+        assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
+        found[sigma] = fit.values.cameras[0, 1]
+    assert found[1e-7] == pytest.approx(shifted.values[1], abs=1e-6)
+    assert found[1e3] == pytest.approx(alone.values.cameras[0, 1], abs=1e-6)
 
 
 @pytest.mark.parametrize("model", ["brown-object", "opencv"])
@@ -244,6 +303,42 @@ def test_inner_constraints_have_the_least_trace_over_the_chosen_points() -> None
     assert np.abs(off.mean(axis=0)).max() < 1e-12
     assert abs(float((off * about).sum())) < 1e-9
     assert np.abs(np.cross(about, off).sum(axis=0)).max() < 1e-9
+
+
+def test_weak_points_carry_no_datum_unless_they_are_chosen() -> None:
+    """Two points far behind the others spoil no one's covariance, and are named."""
+    world = networks.world(datum="free", control=0, points=26, images=12)
+    # Seen by two neighbouring images alone, from nearly the same place.
+    x0, rotation, xyz = world.x0.copy(), world.rotation.copy(), world.xyz.copy()
+    x0[1] = x0[0] + [0.0, 0.05, 0.0]
+    rotation[1] = networks.looking_at(x0[1], np.zeros(3), 0.7)
+    along = -x0[0] / np.linalg.norm(x0[0])
+    xyz[24], xyz[25] = x0[0] + 30.0 * along + [0.5, 0.0, 1.0], x0[0] + 33.0 * along - [0.4, 0.5, 0.2]
+    network = world.network
+    cam, keep = network.cameras[0], (network.point_of < 24) | (network.image_of < 2)
+    network = network.select(keep)
+    xy = np.concatenate(
+        [
+            networks.image_points(cam, rotation[i], x0[i], xyz[network.point_of[network.image_of == i]])
+            for i in range(12)
+        ]
+    )
+    world = networks.World(replace(network, xy=xy), rotation, x0, xyz)
+    fit = required(world.problem(world.noisy(3), **TOLERANCE))
+    assert fit.datum is not None
+    assert np.flatnonzero(~fit.datum).tolist() == [24, 25]
+    every = np.ones(26, dtype=bool)
+    every[5] = False
+    chosen = required(world.problem(replace(world.noisy(3), datum_points=every), **TOLERANCE))
+    near = np.arange(24)
+    sigma, spoilt = (
+        np.sqrt(np.trace(f.cofactors.points[near], axis1=1, axis2=2)).mean() for f in (fit, chosen)
+    )
+    assert sigma < 0.5 * spoilt
+    np.testing.assert_allclose(fit.residuals, chosen.residuals, atol=1e-5)
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
+    result = Result(world.network, fit, np.zeros(len(xy), dtype=bool))
+    assert any("2 weak points left out of the datum: p24, p25" in said for said in remarks(result))
 
 
 def test_large_coordinates_lose_nothing() -> None:

@@ -125,7 +125,7 @@ def test_the_report_stands_alone_and_names_what_deserves_attention(
     assert (status, err) == (0, "")
     page = (tmp_path / "report.html").read_text()
     assert "camera spare has no image" in page
-    assert page.count("<svg") == 5
+    assert page.count("<svg") == 6
     assert "http://" not in page.replace("http://www.w3.org", "").replace(
         "http://creativecommons", ""
     ).replace("http://purl", "")

@@ -198,35 +198,32 @@ def _datum(result: Result) -> list[str]:
 
 
 def _scatter(result: Result) -> list[str]:
-    """Images, and axes, whose coordinates scatter more or less than the others."""
+    """Images, and axes, whose coordinates scatter more than the others."""
     if not result.redundancy > 0 or not result.sigma0 > 0:
         return []
-    factor, r = result.variance_factors, result.image_redundancy
-    known = result.fit.usable.images & (r.sum(axis=1) > _LEAST)
-    own, number = np.where(known[:, None], factor**2 * r, 0.0).sum(axis=1), r.sum(axis=1)
-    rest = result.redundancy - number
-    others = (result.fit.cost - own) / np.maximum(rest, 1.0)
-    known &= (rest > _LEAST) & (others > 0)
-    ratio = own[known] / number[known] / others[known]
-    p = scipy.special.fdtrc(number[known], rest[known], ratio)
-    rows = np.flatnonzero(known)[p < _ALPHA / max(1, len(p))]
-    size = np.sqrt(own[rows] / number[rows] / others[rows])
-    order = np.argsort(-size, kind="stable")
+    squares, number = result.scatter
+    own, r = squares.sum(axis=1), number.sum(axis=1)
+    others, rest = own.sum() - own, r.sum() - r
+    rows = np.flatnonzero(result.fit.usable.images & (r > _LEAST) & (rest > _LEAST) & (others > 0))
+    ratio = own[rows] / r[rows] / (others[rows] / rest[rows])
+    more = scipy.special.fdtrc(r[rows], rest[rows], ratio) < _ALPHA / max(1, len(rows))
+    rows, size = rows[more], np.sqrt(ratio[more])
+    order, found = np.argsort(-size, kind="stable"), []
     names = [f"{result.network.images[i]} ({s:.2g})" for i, s in zip(rows[order], size[order], strict=True)]
-    found = []
     if names:
         found.append(
             f"image coordinates scatter more than those of the other images, by the factor in brackets, in "
             f"{_plural('image', rows)} {listed(names)}"
         )
-    x, y = result.axis_factors
-    count = r.sum(axis=0)
-    larger, smaller = ("x", "y") if x > y else ("y", "x")
-    a, b = (count[0], count[1]) if x > y else (count[1], count[0])
-    if min(a, b) > _LEAST and min(x, y) > 0:
-        times = max(x, y) / min(x, y)
-        if scipy.special.fdtrc(a, b, times**2) < _ALPHA:
-            found.append(f"{larger} scatters {times:.2f} times as much as {smaller}, by the sigmas given")
+    total, count = squares.sum(axis=0), number.sum(axis=0)
+    if count.min() > _LEAST and total.min() > 0:
+        mean = total / count
+        a = int(mean.argmax())
+        times = mean[a] / mean[1 - a]
+        if scipy.special.fdtrc(count[a], count[1 - a], times) < _ALPHA:
+            found.append(
+                f"{'xy'[a]} scatters {np.sqrt(times):.2f} times as much as {'xy'[1 - a]}, by the sigmas given"
+            )
     return found
 
 

@@ -245,37 +245,36 @@ class Result:
         return self._of_image_points(self.fit.external_lengths(alpha, power))
 
     @cached_property
-    def image_redundancy(self) -> Array:
-        """Sums of the redundancy numbers of x and of y in each image (m, 2)."""
-        return self._of_images_and_axes(np.nan_to_num(self.redundancy_numbers))
+    def scatter(self) -> tuple[Array, Array]:
+        """Sums of v²/σ² of x and y in each image (m, 2), and what is expected of them with true sigmas.
+
+        That is the sum of the variances of the residuals over σ²: of the redundancy numbers, where x and y
+        are not correlated.
+        """
+        cov = self.network.cov
+        variance = np.diagonal(cov, axis1=1, axis2=2)
+        kept = (self.fit.usable.observations & ~self.rejected)[:, None]
+        hat = next(iter(self.fit.solution.hats()))
+        left = np.diagonal(cov - cov @ hat @ cov, axis1=1, axis2=2) / variance
+        squares = np.nan_to_num(self.residuals) ** 2 / variance
+        sums = np.zeros((2, len(self.network.images), 2))
+        for total, values in zip(sums, (squares, left), strict=True):
+            np.add.at(total, self.network.image_of, np.where(kept, values, 0.0))
+        return sums[0], sums[1]
 
     @cached_property
     def variance_factors(self) -> Array:
-        """Roots of Σ vᵢ(Pv)ᵢ / Σ rᵢ of x and y in each image (m, 2): by what the sigmas given are too small.
+        """By what the sigmas given are too small, of x and y in each image (m, 2); NaN without redundancy.
 
-        A first step of :func:`~reseau.bundle.components.estimate_components`; NaN without redundancy.
+        To first order: :func:`~reseau.bundle.components.estimate_components` iterates.
         """
-        return self._factors(self._squares, self.image_redundancy)
+        return _factors(*self.scatter)
 
     @property
     def axis_factors(self) -> Array:
         """The same of all images together, x and y (2,)."""
-        return self._factors(self._squares.sum(axis=0), self.image_redundancy.sum(axis=0))
-
-    @cached_property
-    def _squares(self) -> Array:
-        return self._of_images_and_axes(np.nan_to_num(self._of_image_points(self.fit.weighted_squares)))
-
-    @staticmethod
-    def _factors(squares: Array, redundancy: Array) -> Array:
-        known = redundancy > _UNCONTROLLED
-        return np.sqrt(
-            np.maximum(np.divide(squares, redundancy, out=np.full_like(squares, np.nan), where=known), 0)
-        )
-
-    def _of_images_and_axes(self, values: Array) -> Array:
-        m, of = len(self.network.images), self.network.image_of
-        return np.stack([np.bincount(of, values[:, k], m) for k in (0, 1)], axis=1)
+        squares, expected = self.scatter
+        return _factors(squares.sum(axis=0), expected.sum(axis=0))
 
     def rejected_names(self) -> tuple[list[str], list[str]]:
         """Images and points of the image points that data snooping left out."""
@@ -297,3 +296,8 @@ class Result:
     def _of_image_points(self, flat: Array) -> Array:
         n = len(self.network.xy)
         return flat[: 2 * n].reshape(n, 2)
+
+
+def _factors(squares: Array, expected: Array) -> Array:
+    known = expected > _UNCONTROLLED
+    return np.sqrt(np.divide(squares, expected, out=np.full_like(squares, np.nan), where=known))
