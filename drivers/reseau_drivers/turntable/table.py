@@ -131,7 +131,14 @@ class Axis:
         return self._table.state(self._key).position
 
     def set(self, value: float) -> Status:
-        """Begin to move there; the status is done when it is there."""
+        """Begin to move there; the status is done when it is there.
+
+        Raises
+        ------
+        SettingError
+            When it cannot be moved there.
+        """
+        self.check_value(value)
         return Status(lambda: self._table.move(self._key, value), self.name)
 
     def stop(self, *, success: bool = False) -> None:
@@ -140,7 +147,7 @@ class Axis:
 
     def check_value(self, value: float) -> None:
         """Raise SettingError when it cannot be moved there; for plans that are checked before they run."""
-        self._table.plans[self._key].checked(self._key, value)
+        self._table.plans[self._key].checked(f"{self._key} of {self._table.name}", value)
 
     def read(self) -> dict[str, Any]:
         """Where it stands."""
@@ -288,7 +295,7 @@ class Table(Device[TableSettings]):
             When it was not done in time; the axis has been told to stop.
         """
         command, plan = f"move {axis} to {position:g} {self._plan(axis).unit}", self._plan(axis)
-        plan.checked(axis, position)
+        plan.checked(f"{axis} of {self.name}", position)
         self._stopping.clear()
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         state = self.state(axis, deadline.at_most(self._seconds))

@@ -24,8 +24,8 @@ class Status:
     --------
     >>> status = Status(lambda: None, "nothing")
     >>> status.wait(5.0)
-    >>> status.done, status.success
-    (True, True)
+    >>> status.done, status.success, status
+    (True, True, <nothing: done>)
     """
 
     def __init__(self, work: Callable[[], object], name: str) -> None:
@@ -45,6 +45,11 @@ class Status:
             callbacks = list(self._callbacks)
         for callback in callbacks:
             callback(self)
+
+    def __repr__(self) -> str:
+        # bluesky's FailedStatus says no more than this.
+        how = "done" if self.success else f"failed: {self._error}" if self.done else "under way"
+        return f"<{self._thread.name}: {how}>"
 
     @property
     def done(self) -> bool:

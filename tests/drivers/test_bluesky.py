@@ -1,0 +1,185 @@
+"""bluesky's own plans drive every instrument as it is: count, scan, grids, moves; paused and aborted."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.errors import SettingError, StateError
+from reseau_drivers.oscilloscope import oscilloscope
+from reseau_drivers.scanner import bk_oem, compact_pulser, dicom_files, ping360
+from reseau_drivers.turntable import smc100, zaber
+from reseau_sims import serving
+from reseau_sims.serving import InProcess, Machine, Script, Smc100Line, Wire, ZaberChain
+
+bluesky: Any = pytest.importorskip("bluesky", reason="bluesky is not installed")
+import bluesky.plan_stubs as bps  # noqa: E402
+import bluesky.plans as bp  # noqa: E402
+from bluesky import protocols  # noqa: E402
+
+EVERY = ("Readable", "Triggerable", "Stageable", "Stoppable", "Configurable")
+Pair = tuple[Any, Machine | None]
+
+
+def linked(machine: Machine) -> InProcess:
+    return InProcess(lambda: Wire(machine, Script()))
+
+
+def a_zaber() -> Pair:
+    chain = ZaberChain([2], low=-100_000.0)
+    axes = {
+        "tilt": {"per_unit": 1000.0, "high": 90.0, "backlash": 0.5},
+        "roll": {"axis": 2, "per_unit": 1000.0, "low": -90.0, "high": 90.0},
+    }
+    return zaber("table", linked(chain), axes=axes, settings={"speed": 900.0}), chain
+
+
+def an_smc100() -> Pair:
+    line = Smc100Line(2, low=-10.0, high=100.0)
+    axes = {
+        "tilt": {"device": 1, "high": 90.0, "backlash": 0.5},
+        "roll": {"device": 2, "low": -9.0, "high": 90.0},
+    }
+    return smc100("table", linked(line), axes=axes, settings={"speed": 900.0}), line
+
+
+def a_sonar(tmp_path: Path) -> Pair:
+    head = serving.Ping360()
+    return ping360("sonar", linked(head), settings={"half_sector": 3}), head
+
+
+def an_oscilloscope(tmp_path: Path) -> Pair:
+    machine = serving.Oscilloscope("keysight")
+    return oscilloscope("scope", linked(machine)), machine
+
+
+def a_bk(tmp_path: Path) -> Pair:
+    machine = serving.BkScanner()
+    return bk_oem("bk", linked(machine)), machine
+
+
+def a_pulser(tmp_path: Path) -> Pair:
+    machine = serving.CompactPulser()
+    scope = oscilloscope("scope", linked(serving.Oscilloscope("rigol-1000z")))
+    return compact_pulser(
+        "pulser", linked(machine), digitiser=scope, settings={"repetition_hz": 100.0}
+    ), machine
+
+
+def some_files(tmp_path: Path) -> Pair:
+    pytest.importorskip("pydicom", reason="pydicom is not installed")
+    from .test_dicom import PICTURE, file, region
+
+    file(tmp_path / "a.dcm", region(), pixels=np.stack([PICTURE] * 9), NumberOfFrames=9)
+    return dicom_files("files", str(tmp_path)), None
+
+
+DETECTORS: list[Callable[[Path], Pair]] = [a_sonar, an_oscilloscope, a_bk, a_pulser, some_files]
+TABLES: list[Callable[[], Pair]] = [a_zaber, an_smc100]
+
+
+@pytest.fixture
+def engine() -> Any:
+    return bluesky.RunEngine(context_managers=[], call_returns_result=True)
+
+
+@pytest.mark.parametrize("make_table", TABLES)
+@pytest.mark.parametrize("make", DETECTORS)
+def test_count_and_scan_with_every_detector_on_every_table(
+    make: Callable[[Path], Pair], make_table: Callable[[], Pair], tmp_path: Path, engine: Any
+) -> None:
+    (detector, machine), (table, controller) = make(tmp_path), make_table()
+    for wanted in EVERY:
+        assert isinstance(detector, getattr(protocols, wanted)), wanted
+    documents: list[tuple[str, dict[str, Any]]] = []
+    with table, detector:
+        table.home("tilt")
+        engine(bp.count([detector, table], 2), lambda *d: documents.append(d))
+        engine(bp.scan([detector], table.axes["tilt"], 10.0, 30.0, 3), lambda *d: documents.append(d))
+    events = [document["data"] for kind, document in documents if kind == "event"]
+    assert [event.get("table_tilt") for event in events[2:]] == pytest.approx([10.0, 20.0, 30.0])
+    described = [document for kind, document in documents if kind == "descriptor"]
+    for event, keys in zip(events[1::3], (described[0]["data_keys"], described[1]["data_keys"]), strict=True):
+        assert set(event) == set(keys)
+        for name, value in event.items():
+            shape = keys[name]["shape"]
+            assert list(np.shape(value)) == list(shape), name
+    assert detector.name in described[0]["configuration"]
+    assert [d["exit_status"] for kind, d in documents if kind == "stop"] == ["success", "success"]
+    assert controller is not None
+    assert controller.violations == []
+    assert machine is None or machine.violations == []
+
+
+@pytest.mark.parametrize("make_table", TABLES)
+def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], engine: Any) -> None:
+    table, controller = make_table()
+    tilt, roll = table.axes["tilt"], table.axes["roll"]
+    for wanted in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable"):
+        assert isinstance(tilt, getattr(protocols, wanted)), wanted
+    for wanted in EVERY:
+        assert isinstance(table, getattr(protocols, wanted)), wanted
+    events: list[dict[str, Any]] = []
+
+    def kept(kind: str, document: dict[str, Any]) -> None:
+        if kind == "event":
+            events.append(document["data"])
+
+    with table:
+        for axis in table.axes:
+            table.home(axis)
+        engine(bps.mv(tilt, 12.0, roll, -5.0))
+        assert (tilt.position, roll.position) == pytest.approx((12.0, -5.0), abs=2e-3)
+        table.configure(speed=500.0)
+        engine(bp.grid_scan([], tilt, 5.0, 15.0, 2, roll, 0.0, 10.0, 2), kept)
+        with pytest.raises(SettingError, match=r"axis tilt of table.*beyond"):
+            engine(bps.mv(tilt, 91.0))
+        with pytest.raises(SettingError):
+            tilt.check_value(-1.0)
+    assert [(e["table_tilt"], e["table_roll"]) for e in events] == [
+        pytest.approx(where, abs=2e-3) for where in ((5, 0), (5, 10), (15, 0), (15, 10))
+    ]
+    assert controller is not None
+    assert controller.violations == []
+
+
+@pytest.mark.parametrize("make_table", TABLES)
+def test_an_aborted_plan_leaves_the_table_standing(make_table: Callable[[], Pair], engine: Any) -> None:
+    table, controller = make_table()
+    with table:
+        table.home("tilt")
+        table.configure(speed=5.0)
+
+        def moving() -> Any:
+            yield from bps.open_run()
+            yield from bps.abs_set(table.axes["tilt"], 80.0, group="move")
+            yield from bps.wait("move")
+
+        # The engine runs in this thread: another one asks it to pause.
+        threading.Timer(0.5, engine.request_pause).start()
+        with pytest.raises(bluesky.utils.RunEngineInterrupted):
+            engine(moving())
+        engine.abort("enough")
+        state = table.state("tilt")
+        assert not state.moving
+        assert state.position < 40.0
+    assert controller is not None
+    assert controller.violations == []
+
+
+def test_a_failure_of_an_instrument_ends_the_plan_with_its_name(engine: Any) -> None:
+    table, chain = a_zaber()
+    with table:
+        table.home("tilt")
+        assert isinstance(chain, ZaberChain)
+        chain.motors[1, 1].cut_power()
+        with pytest.raises(
+            bluesky.utils.FailedStatus, match=r"table \(move tilt to 10 deg\): is not homed"
+        ) as caught:
+            engine(bp.scan([], table.axes["tilt"], 10.0, 20.0, 2))
+    assert isinstance(caught.value.__cause__, StateError)
