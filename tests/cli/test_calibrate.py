@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,6 +72,124 @@ def test_a_calibration_is_compared_with_another_of_the_same_recordings(
     assert "p = 1\n" in out
 
 
+def test_two_calibrations_are_compared_as_a_field(
+    reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
+    """Of six recordings each: they differ by their sigmas; of another lens: significantly."""
+    design, images = measured[0], measured[1:]
+    options = ("-d", design, "--size", "240x240", "--pitch", 0.027, "--free", "c,x0,y0,K1")
+    for name, part in (("A", images[::2]), ("B", images[1::2])):
+        assert reseau("calibrate", *part, *options, "-o", tmp_path / f"{name}.json")[0] == 0
+    files = ("-o", tmp_path / "D.json", "--figure", tmp_path / "D.svg")
+    status, out, err = reseau("compare", tmp_path / "A.json", tmp_path / "B.json", *files)
+    assert (status, err) == (0, "")
+    assert out.startswith("beside B.json: ")
+    found = json.loads((tmp_path / "D.json").read_text())
+    assert found["schema"] == "reseau-difference/1"
+    assert found["p"] > 1e-3
+    assert np.array(found["dx"]).shape == np.array(found["p_at"]).shape == (25, 25)
+    size = np.hypot(found["dx"], found["dy"]) / np.hypot(found["sx"], found["sy"])
+    assert np.median(size) < 2.5
+    assert "<svg" in (tmp_path / "D.svg").read_text()
+    content = json.loads((tmp_path / "B.json").read_text())
+    content["parameters"]["K1"]["value"] += 30 * content["parameters"]["K1"]["sigma"]
+    (tmp_path / "C.json").write_text(json.dumps(content))
+    status, out, _ = reseau("compare", tmp_path / "A.json", tmp_path / "C.json", "--json")
+    assert status == 0
+    assert json.loads(out)["p"] < 1e-6
+
+
+def test_what_cannot_be_compared_is_refused(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+    status, out, err = reseau("compare", measured[0], measured[0])
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+
+
+def test_control_points_are_the_datum(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+    """Three corners of the board, one of them in its height alone: no freedom left, nothing redundant."""
+    names, xy = BENCH.design.targets.id, BENCH.design.xy
+    seen = np.abs(xy).max(axis=1) < 250
+    corners = [
+        int(np.argmin(np.where(seen, xy @ np.array(way), np.inf))) for way in ((1, 1), (-1, 1), (1, -1))
+    ]
+    sigmas = ("0,0,0", "0,0,0", ",,0.001")
+    rows = [
+        f"{names[k]},{float(xy[k, 0])},{float(xy[k, 1])},0,{s}" for k, s in zip(corners, sigmas, strict=True)
+    ]
+    path = tmp_path / "control.csv"
+    path.write_text("id,x,y,z,sx,sy,sz\n" + "\n".join(rows) + "\n")
+    free = reseau(*common(measured), "--free", "c,x0,y0,K1", "--json")
+    status, out, err = reseau(*common(measured), "--free", "c,x0,y0,K1", "--control", path, "--json")
+    assert (status, err) == (0, "")
+    found, without = json.loads(out), json.loads(free[1])
+    # Six coordinates held, one observed: as much as the seven constraints of the free network.
+    assert found["redundancy"] == without["redundancy"]
+    assert found["parameters"]["c"]["value"] == pytest.approx(without["parameters"]["c"]["value"], abs=1e-6)
+    assert "control.csv" in found["provenance"]["inputs"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("id,x,y\na,1,2\n", "begin it with id,x,y,z"),
+        ("id,x,y,z\na,1,2,3\na,1,2,3\n", "line 3: names point a a second time"),
+        ("id,x,y,z\na,1,2\n", "line 2: has 3 fields, not 4"),
+        ("id,x,y,z\na,1,two,3\n", "line 2: 'two' is no number"),
+        ("id,x,y,z,sx,sy,sz\na,1,2,3,0,-1,0\n", "gives point a a sigma below zero"),
+        ("id,x,y,z\nnowhere,1,2,3\n", "control point nowhere: was measured in no image"),
+        ("id,x,y,z\n", "has no points"),
+    ],
+)
+def test_a_bad_table_of_control_points_is_refused(
+    content: str, words: str, reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "control.csv").write_text(content)
+    status, out, err = reseau(*common(measured), "--control", tmp_path / "control.csv")
+    assert (status, out) == (2, "")
+    assert words in err
+    assert err.count("\n") == 1
+
+
+def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]) -> None:
+    name = measured[3].read_text().splitlines()[5].partition(",")[0]
+    point = f"{measured[3].name}:{name}"
+    whole = json.loads(reseau(*common(measured), "--json")[1])
+    status, out, _ = reseau(*common(measured), "--leave-out", point, "--json")
+    assert status == 0
+    assert json.loads(out)["redundancy"] == whole["redundancy"] - 2
+    for wrong, words in (("02.csv:none", "was not measured"), ("none", "write image:point")):
+        status, _, err = reseau(*common(measured), "--leave-out", wrong)
+        assert status == 2
+        assert words in err
+
+
+def test_the_model_is_searched(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+    """Without K2, P1 and P2, that the lens has not; x and y are as good as given; fields at distances."""
+    files = (
+        "-o",
+        tmp_path / "K.json",
+        "--report",
+        tmp_path / "F.html",
+        "--distance",
+        1500,
+        "--distance",
+        9000,
+    )
+    free = ("--free", "c,x0,y0,K1,K2,P1,P2", "--eliminate", 0.001, "--components", "axes")
+    status, out, err = reseau(*common(measured), *free, *files)
+    assert (status, err) == (0, "")
+    assert "sigmas of x times " in out
+    assert "cross-validation" in out
+    content = json.loads((tmp_path / "K.json").read_text())["validity"]
+    assert {step["name"] for step in content["eliminated"]} == {"K2", "P1", "P2"}
+    assert content["cross_validation"]["kept"] < content["cross_validation"]["all"]
+    for factor, sigma in zip(*(content["variance_components"][k] for k in ("factors", "sigma")), strict=True):
+        assert abs(factor - 1.0) < 4 * sigma
+    page = (tmp_path / "F.html").read_text()
+    for words in ("Variance components", "Parameters dropped", "points at 1.5e+03 mm", "points at 9e+03 mm"):
+        assert words in page
+
+
 def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path: Path) -> None:
     """Four photographs with OpenCV's model and nothing known of the camera; one that shows no testfield."""
     bench = FieldBench(seed=4, bend_mm=0.0)
@@ -84,12 +203,29 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     images = sorted(tmp_path.glob("*.png"))
     status, out, err = reseau(
         "calibrate", *images, "-d", tmp_path / "field.json", "--free", "fx,fy,cx,cy", "--fill", 0.8,
-        "-o", tmp_path / "K.json",
+        "-o", tmp_path / "K.json", "--jobs", 1,
     )  # fmt: skip
     assert (status, err) == (0, "")
     assert "left out: blank.png: " in out
     found = Calibration.read(tmp_path / "K.json").parameters["fx"]
     assert abs(found.value - 57.5 / 0.027) < 4 * found.sigma
+    # Two processes find the same to the byte, whichever is first.
+    again = reseau(
+        "calibrate", *images, "-d", tmp_path / "field.json", "--free", "fx,fy,cx,cy", "--fill", 0.8, "--json",
+        "--jobs", 2,
+    )  # fmt: skip
+    assert again[1] == (tmp_path / "K.json").read_text()
+
+
+def test_what_a_process_raises_is_said_in_one_line(reseau: Run, tmp_path: Path) -> None:
+    FieldBench(seed=4).design.write(tmp_path / "field.json")
+    for name in "abc":
+        write_image(tmp_path / f"{name}.png", np.full((240, 240), 80, dtype=np.uint8))
+    images = sorted(tmp_path.glob("*.png"))
+    status, out, err = reseau("calibrate", *images, "-d", tmp_path / "field.json", "--jobs", 2)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "a.png" in err
 
 
 def test_sigma_naught_is_that_of_the_sigma_given(reseau: Run, measured: tuple[Path, ...]) -> None:
