@@ -137,7 +137,9 @@ def test_list_tells_what_was_found_and_why_a_search_failed(
     assert "visa: VISA cannot search" in capsys.readouterr().out
     assert run(["bench", "list", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["found"] == {"serial": ["/dev/ttyUSB0"], "visa": []}
+    assert document["found"]["serial"] == ["/dev/ttyUSB0"]
+    assert document["found"]["visa"] == []
+    assert list(document["errors"]) == ["visa"]
     assert "zaber" in document["drivers"]
 
 

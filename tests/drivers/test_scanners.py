@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from reseau.errors import ProtocolError, SettingError, StateError
+from reseau.capture import Bench, BenchFile
+from reseau.errors import BenchError, DeadlineError, ProtocolError, SettingError, StateError
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.codecs import bk
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import BkScanner, CompactPulser, bk_oem, compact_pulser
+from reseau_drivers.turntable import zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, Script, Wire
+from reseau_sims.serving import InProcess, Machine, Script, Wire, ZaberChain
+
+
+def linked(machine: Machine) -> InProcess:
+    return InProcess(lambda: Wire(machine, Script()))
 
 
 def bk_pair() -> tuple[BkScanner, serving.BkScanner]:
@@ -131,6 +138,71 @@ def test_where_the_gain_alone_is_told_it_vouches_for_the_rest() -> None:
         with pytest.raises(StateError, match="local mode"):
             device.configure(width_ns=90.0)
     assert machine.violations == []
+
+
+def test_a_transducer_that_is_carried_along_makes_sections() -> None:
+    chain, shown = ZaberChain([1]), serving.Oscilloscope("keysight")
+    where, speed, step_s = np.array([12.0, 300.0]), 1480.0, 1e-6
+
+    def samples() -> NDArray[np.uint8]:
+        # An oscillation of 100 kHz, as it comes back from a point at 12 mm along and 300 mm deep.
+        off = chain.position(1, 1) / 1000 - where[0]
+        range_mm = np.hypot(off, where[1])
+        late = -5e-4 + step_s * np.arange(1000) - 2 * range_mm * 1e-3 / speed
+        echo = np.exp(-0.5 * (late / 8e-6) ** 2 - 0.5 * (off / 4) ** 2) * np.cos(2 * np.pi * 1e5 * late)
+        return np.asarray(np.rint(128 + 100 * echo), np.uint8)
+
+    shown.samples = samples
+    scope = oscilloscope("scope", linked(shown))
+    axes = {"z": {"per_unit": 1000.0, "unit": "mm", "high": 300.0}}
+    table = zaber("table", linked(chain), axes=axes, settings={"speed": 1000.0})
+    wanted = {"repetition_hz": 100.0, "speed_m_s": speed, "lines": 25, "full_scale_v": 5.0, "gain_db": 20.0}
+    device, machine = pulser(digitiser=scope, carrier=table, settings=wanted)
+    with scope, table, device:
+        assert isinstance(device, UltrasonicScanner)
+        with pytest.raises(StateError, match="home z first"):
+            device.scan()
+        table.home("z")
+        scan = device.scan()
+        assert device.describe()["pulser_mm_per_px"]["shape"] == [2]
+        with pytest.raises(DeadlineError):
+            device.scan(0.05)
+    assert scan.pixels.shape == (500, 25)
+    assert scan.mm_per_px == pytest.approx((1.0, speed * 1e3 * step_s / 2))
+    assert scan.gain == 20.0
+    row, column = np.unravel_index(int(scan.pixels.argmax()), scan.pixels.shape)
+    depth = (row - scan.origin_px[1]) * scan.mm_per_px[1]
+    along = (column - scan.origin_px[0]) * scan.mm_per_px[0] + 12.0
+    assert (along, depth) == (pytest.approx(12.0), pytest.approx(300.0, abs=0.8))
+    assert scan.pixels.max() == pytest.approx(255 * 4 / 5, abs=3)
+    assert machine.violations == chain.violations == shown.violations == []
+
+
+def test_what_works_together_is_named_on_the_bench() -> None:
+    text = """
+        schema = "reseau-bench/1"
+        [instruments.pulser]
+        driver = "compactpulser"
+        address = "tcp://127.0.0.1:1"
+        options = {digitiser = "scope", carrier = "table"}
+        [instruments.scope]
+        driver = "oscilloscope"
+        address = "tcp://127.0.0.1:1"
+        [instruments.table]
+        driver = "zaber"
+        address = "tcp://127.0.0.1:1"
+        options = {axes = {z = {unit = "mm"}}}
+    """
+    bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
+    assert bench["pulser"]._digitiser is bench["scope"]  # type: ignore[attr-defined]
+    assert bench["pulser"]._carrier is bench["table"]  # type: ignore[attr-defined]
+    for wrong, said in (
+        (text.replace('"scope", carrier', '"table", carrier'), "digitiser 'table' is no oscilloscope"),
+        (text.replace("axes = {z", "axes = {tilt"), "no table with an axis 'z'"),
+        (text.replace('carrier = "table"', 'carrier = "none"'), "carrier 'none'"),
+    ):
+        with pytest.raises(BenchError, match=said):
+            Bench(BenchFile.parse_toml(wrong, where="bench.toml"))
 
 
 def test_a_knob_that_was_turned_is_found() -> None:

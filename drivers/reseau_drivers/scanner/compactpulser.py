@@ -3,7 +3,7 @@
 Source: see :mod:`reseau_drivers.codecs.compactpulser`. Commands are not acknowledged; so values are asked for
 after they were set. That ``G?`` is answered is known of all; where the other letters are silent the gain
 vouches for them: it is set one step off before them, and right behind them. A sample at the time t after the
-pulse lies at c·t/2.
+pulse lies at c·t/2. A table that carries the transducer along makes sections of the lines.
 """
 
 from __future__ import annotations
@@ -13,12 +13,26 @@ from dataclasses import dataclass
 from typing import Any
 
 from reseau.data import Array
-from reseau.errors import DeadlineError, StateError
-from reseau.instruments import Deadline, Device, Identity, Limits, Oscilloscope, Settings, Waveform, quantity
+from reseau.errors import DeadlineError, SettingError, StateError
+from reseau.instruments import (
+    BScan,
+    Deadline,
+    Device,
+    Identity,
+    Instrument,
+    Limits,
+    Oscilloscope,
+    Settings,
+    Turntable,
+    Waveform,
+    quantity,
+)
+from reseau.instruments.values import now
 
 from ..codecs.compactpulser import LIMIT, Setting, decode, encode
 from ..codecs.stream import LineDecoder
 from ..link import Conversation, Link
+from .section import section
 
 __all__ = ["CompactPulser", "CompactPulserSettings"]
 
@@ -38,6 +52,10 @@ class CompactPulserSettings(Settings):
     trigger: int = quantity(0, "", 0, 1)
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 7000.0)
     channel: int = quantity(1, "", 1, 8)
+    first_mm: float = quantity(0.0, "mm", -1000.0, 1000.0)
+    step_mm: float = quantity(1.0, "mm", 0.01, 100.0)
+    lines: int = quantity(41, "", 2, 4096)
+    full_scale_v: float = quantity(1.0, "V", 1e-3, 100.0)
 
 
 class CompactPulser(Device[CompactPulserSettings]):
@@ -51,8 +69,12 @@ class CompactPulser(Device[CompactPulserSettings]):
         To it.
     settings : CompactPulserSettings
         Pushed on every connection.
-    digitiser : Oscilloscope, optional
-        Sees its echoes.
+    digitiser : Oscilloscope or str, optional
+        Sees its echoes; a name is that of one on the same bench.
+    carrier : Turntable or str, optional
+        Carries the transducer along for sections; likewise.
+    axis : str
+        Of the carrier, in millimetres.
     seconds : float
         Deadline of calls that name none.
     answer_s : float
@@ -67,15 +89,39 @@ class CompactPulser(Device[CompactPulserSettings]):
         link: Link,
         settings: CompactPulserSettings | None = None,
         *,
-        digitiser: Oscilloscope | None = None,
+        digitiser: Oscilloscope | str | None = None,
+        carrier: Turntable | str | None = None,
+        axis: str = "z",
         seconds: float = 5.0,
         answer_s: float = 0.5,
         limits: Limits | None = None,
     ) -> None:
         super().__init__(name, settings or CompactPulserSettings(), seconds=seconds, limits=limits)
         self._talk: Conversation[bytes] = Conversation(link, LineDecoder(end=b"\r", limit=LIMIT))
-        self._digitiser, self._answer_s = digitiser, answer_s
+        self._digitiser, self._carrier, self._axis = digitiser, carrier, axis
+        self._answer_s = answer_s
         self._told = "G"
+
+    def combine(self, instruments: Mapping[str, Instrument]) -> None:
+        """Find what was named among the instruments of the bench.
+
+        Raises
+        ------
+        SettingError
+            When there is none of this name and kind.
+        """
+        if isinstance(self._digitiser, str):
+            found = instruments.get(self._digitiser)
+            if not isinstance(found, Oscilloscope):
+                raise SettingError(f"digitiser {self._digitiser!r} is no oscilloscope here", where=self.name)
+            self._digitiser = found
+        if isinstance(self._carrier, str):
+            table = instruments.get(self._carrier)
+            if not isinstance(table, Turntable) or self._axis not in table.axes:
+                raise SettingError(
+                    f"carrier {self._carrier!r} is no table with an axis {self._axis!r} here", where=self.name
+                )
+            self._carrier = table
 
     def _open(self, deadline: Deadline) -> None:
         self._talk.open(deadline)
@@ -130,9 +176,17 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._set("P", 0, deadline)
 
     def _acquire(self) -> dict[str, Any]:
-        return {f"{self.name}_volts": self.line().volts}
+        if self._carrier is None:
+            return {f"{self.name}_volts": self.line().volts}
+        scan = self.scan()
+        return {f"{self.name}_section": scan.pixels, f"{self.name}_mm_per_px": list(scan.mm_per_px or ())}
 
     def _kinds(self) -> dict[str, dict[str, Any]]:
+        if self._carrier is not None:
+            return {
+                f"{self.name}_section": {"dtype": "array", "shape": [0, self.settings.lines]},
+                f"{self.name}_mm_per_px": {"dtype": "array", "shape": [2], "units": "mm"},
+            }
         reading = self._reading.get(f"{self.name}_volts")
         shape = [len(reading["value"])] if reading else [0]
         return {f"{self.name}_volts": {"dtype": "array", "shape": shape, "units": "V"}}
@@ -148,13 +202,42 @@ class CompactPulser(Device[CompactPulserSettings]):
             When it did not answer.
         """
         s = self.settings
-        if self._digitiser is None:
+        if not isinstance(self._digitiser, Oscilloscope):
             raise StateError(
                 "has no digitiser", where=self.name, command="line", do="give it an oscilloscope"
             )
         if not s.repetition_hz:
             raise StateError("sends no pulses", where=self.name, command="line", do="set repetition_hz")
         return self._digitiser.waveform(s.channel, seconds)
+
+    def scan(self, seconds: float | None = None) -> BScan:
+        """A section: a line at each place that the carrier brings the transducer to.
+
+        Raises
+        ------
+        StateError
+            When there is no carrier, the carrier is not homed, or it was stopped.
+        InstrumentError
+            When a line did not come, or the time ran out.
+        """
+        s, asked = self.settings, now()
+        if not isinstance(self._carrier, Turntable):
+            raise StateError("is not carried along", where=self.name, command="scan", do="give it a carrier")
+        deadline = Deadline(self._seconds * s.lines if seconds is None else seconds)
+        self._stopping.clear()
+        lines: list[Waveform] = []
+        for k in range(s.lines):
+            if self._stopping.is_set():
+                raise StateError("was stopped", where=self.name, command="scan")
+            if deadline.over:
+                what = f"was not done within {deadline.seconds:g} s"
+                raise DeadlineError(what, where=self.name, command="scan")
+            self._carrier.move(self._axis, s.first_mm + k * s.step_mm, max(0.05, deadline.left))
+            lines.append(self.line(max(0.05, deadline.left)))
+        with self._exchange("scan", max(0.05, deadline.left)):
+            pixels, row, step_s = section(lines, s.full_scale_v)
+        mm = (s.step_mm, s.speed_m_s * 1e3 * step_s / 2)
+        return BScan(pixels, mm, ((s.lines - 1) / 2, row), s.speed_m_s, float("nan"), s.gain_db, asked)
 
     def depths_mm(self, line: Waveform) -> Array:
         """Where the samples of a line lie (n,)."""

@@ -22,7 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 from pydantic import Field
 
@@ -33,6 +33,15 @@ from ..instruments import Identity, Instrument
 __all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
 
 T = TypeVar("T")
+
+
+@runtime_checkable
+class _Combined(Protocol):
+    """An instrument that works with others of its bench."""
+
+    def combine(self, instruments: Mapping[str, Instrument]) -> None:
+        """Find them by the names that its options tell."""
+
 
 INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "reseau.simulators"
 """Groups of entry points: drivers; functions that list addresses; simulated benches behind real protocols."""
@@ -165,6 +174,12 @@ class Bench:
         for name, entry in file.instruments.items():
             try:
                 made[name] = (build or _built)(name, entry)
+            except ReseauError as error:
+                failures.append(error)
+        for each in made.values():
+            try:
+                if isinstance(each, _Combined):
+                    each.combine(made)
             except ReseauError as error:
                 failures.append(error)
         if failures:
