@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from reseau.instruments import Device
-from reseau_drivers.camera import v4l2
+from reseau_drivers.camera import aravis, v4l2
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
@@ -33,7 +33,8 @@ from reseau_sims.serving import (
     Wire,
     ZaberChain,
 )
-from reseau_sims.serving.imaging import CameraBody, Pattern
+from reseau_sims.serving.gige import GigeCamera
+from reseau_sims.serving.imaging import CameraBody, Pattern, View
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 from reseau_sims.serving.v4l2 import VideoCamera
 
@@ -65,8 +66,19 @@ class Rig:
     script: Script
     work: Callable[[int], None]
     recover: Callable[[], object]
-    server: Server | None = None
+    server: Server | GigeCamera | None = None
     extra: dict[str, Any] = field(default_factory=dict)
+
+
+def aravis_is_missing() -> str:
+    """What lacks for GigE Vision on this machine; empty when nothing does."""
+    try:
+        import gi  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+        gi.require_version("Aravis", "0.8")
+    except (ImportError, ValueError) as error:
+        return f"no Aravis ({error}): apt-get install gir1.2-aravis-0.8, pip install reseau[aravis]"
+    return ""
 
 
 def left_open() -> tuple[int, int, int]:
@@ -224,6 +236,31 @@ def v4l2_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, body, script, work, device.expose, extra={"camera": camera})
 
 
+def gige_camera(stack: ExitStack, body: CameraBody) -> GigeCamera:
+    """A simulated camera on GigE Vision, once no other test has one; without Aravis the test is skipped."""
+    missing = aravis_is_missing()
+    if missing:
+        pytest.skip(missing)
+    return stack.enter_context(GigeCamera(body, patience_s=240.0))
+
+
+def gige_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+    body = CameraBody(script=script)
+    camera = gige_camera(stack, body)
+    light = {"exposure_us": 2000.0, "gain": 3.0, "rate": 100.0}
+    device = aravis("camera", camera.address, settings=light | {"width": 96, "height": 64}, seconds=1.0)
+
+    def work(run: int) -> None:
+        for k in range(5):
+            pattern = Pattern(shift=5 * run + k)
+            body.look_at(pattern)
+            shot = device.expose()
+            assert shot.fresh
+            assert (shot.pixels == pattern(View(2000.0, 3.0, 0.0, 0, 0, 96, 64, 255.0))).all()
+
+    return Rig(device, body, script, work, device.expose, camera)
+
+
 Maker = Callable[[ExitStack, str, Script], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
@@ -236,6 +273,7 @@ RIGS: dict[tuple[str, str], Maker] = {
         for transport in ("tcp", "vxi-11", "hislip", "usbtmc", "in process")
     },
     ("v4l2", "in process"): v4l2_rig,
+    ("aravis", "gige"): gige_rig,
 }
 
 

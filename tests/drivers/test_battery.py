@@ -15,7 +15,7 @@ import pytest
 from reseau.errors import InstrumentError
 from reseau_sims.serving import KINDS, Fault, Kind, Script
 
-from .rigs import RIGS, Rig, left_open, rig
+from .rigs import RIGS, Rig, aravis_is_missing, left_open, rig
 
 CELLS = [
     (driver, transport, kind, at)

@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+from .aravis import Aravis, AravisSettings, aravis_cameras
 from .camera import Camera, CameraSettings, Shot, Source, Taken
 from .kernel import KernelNode, OpenNode, video_devices
 from .v4l2 import V4l2, V4l2Settings
 
 __all__ = [
+    "Aravis",
+    "AravisSettings",
     "Camera",
     "CameraSettings",
     "Shot",
@@ -18,6 +21,8 @@ __all__ = [
     "Taken",
     "V4l2",
     "V4l2Settings",
+    "aravis",
+    "aravis_cameras",
     "v4l2",
     "video_devices",
 ]
@@ -41,3 +46,22 @@ def v4l2(
     """
     open_node = partial(KernelNode, address) if isinstance(address, str) else address
     return Camera(name, V4l2(open_node), V4l2Settings().changed(settings or {}), **options)
+
+
+def aravis(
+    name: str, address: str, *, settings: Mapping[str, Any] | None = None, **options: Any
+) -> Camera[AravisSettings]:
+    """A camera of GigE Vision or USB3 Vision; found by its entry point.
+
+    Parameters
+    ----------
+    name : str
+        On the bench.
+    address : str
+        Its identifier as `reseau bench list` shows it, or its IP address.
+    settings : mapping, optional
+        Of :class:`AravisSettings`.
+    **options
+        Of :class:`Camera`.
+    """
+    return Camera(name, Aravis(address), AravisSettings().changed(settings or {}), **options)

@@ -47,7 +47,7 @@ class Wrapping:
     Parameters
     ----------
     period : int
-        After how many the numbers begin anew.
+        After how many the numbers begin anew; may be changed once that is known better.
 
     Examples
     --------
@@ -59,22 +59,25 @@ class Wrapping:
     """
 
     def __init__(self, period: int) -> None:
-        self._period, self._last = period, -1
+        self.period = period
+        self._number, self._counted = -1, -1
         self.lost = 0
         """Numbers that were left out."""
 
     def restart(self) -> None:
         """Numbers begin at any one; none is missing before it."""
-        self._last = -1
+        self._number = -1
 
     def next(self, number: int) -> int | None:
         """The number counted on without wrapping; None when it is not a newer one."""
-        if self._last < 0:
-            self._last = number
-            return number
-        step = (number - self._last) % self._period
-        if step == 0 or step > self._period // 2:
+        if self._number < 0:
+            self._number = number
+            self._counted = max(number, self._counted + 1)
+            return self._counted
+        step = (number - self._number) % self.period
+        if step == 0 or step > self.period // 2:
             return None
         self.lost += step - 1
-        self._last += step
-        return self._last
+        self._number = number
+        self._counted += step
+        return self._counted

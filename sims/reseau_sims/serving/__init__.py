@@ -9,7 +9,8 @@ from .bench import SimulatedBench
 from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .datagrams import UdpServer
-from .imaging import CameraBody, Pattern, Sight, View
+from .gige import GigeCamera, aravis_is_installed
+from .imaging import CameraBody, InLaboratory, Pattern, Sight, Still, View
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -32,7 +33,9 @@ __all__ = [
     "CompactPulser",
     "Family",
     "Fault",
+    "GigeCamera",
     "HislipInstrument",
+    "InLaboratory",
     "InProcess",
     "Kind",
     "Machine",
@@ -48,6 +51,7 @@ __all__ = [
     "Sight",
     "SimulatedBench",
     "Smc100Line",
+    "Still",
     "TcpServer",
     "UdpServer",
     "UsbInstrument",
@@ -56,5 +60,6 @@ __all__ = [
     "Vxi11Session",
     "Wire",
     "ZaberChain",
+    "aravis_is_installed",
     "plugged_in",
 ]

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reseau.data import Frame
+
+from ..laboratory import Laboratory
 from .script import Script
 
-__all__ = ["CameraBody", "Pattern", "Sight", "View"]
+__all__ = ["CameraBody", "InLaboratory", "Pattern", "Sight", "Still", "View"]
 
 NOMINAL_US = 10_000.0
 """Exposure at which a sight has its own brightness."""
+_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,52 @@ class Pattern:
         return view.seen(grey.astype(np.uint8 if view.full_scale <= 255 else np.uint16))
 
 
+@dataclass(frozen=True, eq=False)
+class Still:
+    """A picture that was taken at the nominal exposure; other settings scale it.
+
+    Parameters
+    ----------
+    frame : Frame
+        The picture.
+    """
+
+    frame: Frame
+
+    def __call__(self, view: View) -> NDArray[Any]:
+        """The picture of a view."""
+        return view.seen(_levelled(self.frame, view, view.light * view.gain))
+
+
+@dataclass(frozen=True, eq=False)
+class InLaboratory:
+    """What a camera of the laboratory sees now; no two pictures have the same noise.
+
+    Parameters
+    ----------
+    laboratory : Laboratory
+        Where it stands.
+    sight : {"screen", "testfield"}
+        What stands before it.
+    """
+
+    laboratory: Laboratory
+    sight: Literal["screen", "testfield"] = "screen"
+
+    def __call__(self, view: View) -> NDArray[Any]:
+        """The picture of a view."""
+        return view.seen(_levelled(self.laboratory.expose(self.sight, view.light, view.gain), view, 1.0))
+
+
+def _levelled(frame: Frame, view: View, factor: float) -> NDArray[Any]:
+    """Grey values of a frame on the scale of a view: of eight bits in sixteen, each step is 257."""
+    factor *= view.full_scale / frame.full_scale
+    dtype = np.uint8 if view.full_scale <= 255 else np.uint16
+    if factor == 1.0 and frame.pixels.dtype == dtype:
+        return frame.pixels
+    return np.clip(np.rint(frame.pixels * factor), 0, view.full_scale).astype(dtype)
+
+
 class CameraBody:
     """A sensor that looks at something; the doors in front of it are V4L2 or GigE Vision.
 
@@ -111,6 +161,8 @@ class CameraBody:
     ----------
     violations : list of str
         What its client did wrong.
+    drawn : deque of ndarray
+        The last pictures.
     before_change : list of callable
         Called before it looks at something else, so that what was exposed until then is what was seen then.
     """
@@ -122,6 +174,7 @@ class CameraBody:
         self.width, self.height = width, height
         self.script = script or Script()
         self.violations: list[str] = []
+        self.drawn: deque[NDArray[Any]] = deque(maxlen=_KEPT)
         self.before_change: list[Callable[[], None]] = []
         self._sight: Sight = sight or Pattern(width, height)
 
@@ -135,9 +188,6 @@ class CameraBody:
     def draw(self, view: View) -> NDArray[Any]:
         """The picture that it takes now."""
         with self.lock:
-            return self._sight(view)
-
-    def forget(self, hook: Callable[[], None]) -> None:
-        """Call it no more before changes."""
-        with self.lock, suppress(ValueError):
-            self.before_change.remove(hook)
+            picture = self._sight(view)
+            self.drawn.append(picture)
+            return picture

@@ -1,0 +1,400 @@
+"""Cameras of GigE Vision and USB3 Vision, by Aravis: all that knows its library.
+
+Aravis is used through its introspection (PyGObject and the typelib ``Aravis-0.8``); where they are missing
+the driver says so when it connects. A buffer that was taken is copied and always given back.
+"""
+
+from __future__ import annotations
+
+import time
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from threading import Event, Thread
+from typing import Any
+
+from reseau.errors import ConnectionLost, InstrumentError, ProtocolError, RefusedError, UsageError
+from reseau.instruments import Deadline, Identity, choice, quantity
+
+from ..codecs.pixels import GENICAM, decode
+from .camera import CameraSettings, Taken
+from .clocks import Span, Wrapping, realtime_offset
+from .gvcp import require_answer
+
+__all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
+
+_SHORT_IDS, _SHORT_IDS_WITH_ZERO, _LONG_IDS = 65535, 65536, 1 << 64
+"""Numbers of frames: GigE Vision 1 counts 1…65535 (some cameras use 0 too), version 2 in 64 bits."""
+_UNKNOWN_PERIOD_NS = 1_000_000_000
+_RELEASE_S = 0.5
+_LATCHES = (
+    ("TimestampLatch", "TimestampLatchValue"),
+    ("GevTimestampControlLatch", "GevTimestampValue"),
+)
+"""Features that read a camera's clock, of the Standard Features Naming Convention from 2.0 on, and before."""
+
+
+@dataclass(frozen=True)
+class AravisSettings(CameraSettings):
+    """Settings of a camera of GenICam; gains in dB, where it has that unit; packet size 0: negotiated."""
+
+    format: str = choice("Mono8", *GENICAM)
+    trigger: str = choice("off", "off", "software", "hardware")
+    trigger_line: str = choice("Line0", "Line0", "Line1", "Line2", "Line3")
+    stamp: str = choice("end", "end", "start")
+    chunks: str = choice("off", "off", "on")
+    packet_size: int = quantity(0, "B", 0, 65535)
+
+
+@cache
+def _library() -> tuple[Any, Any]:
+    """Aravis and GLib.
+
+    Raises
+    ------
+    UsageError
+        When they are not installed.
+    """
+    try:
+        import gi  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis as library  # type: ignore[import-untyped, unused-ignore]
+        from gi.repository import GLib  # type: ignore[import-untyped, unused-ignore]
+    except (ImportError, ValueError) as error:
+        raise UsageError(
+            f"Aravis is not installed ({error})",
+            do="install gir1.2-aravis-0.8, and pip install reseau[aravis]",
+        ) from None
+    return library, GLib
+
+
+def aravis_cameras() -> tuple[str, ...]:
+    """Identifiers of the cameras that answer; found by its entry point.
+
+    Raises
+    ------
+    UsageError
+        When Aravis is not installed.
+    """
+    library, _ = _library()
+    library.update_device_list()
+    return tuple(library.get_device_id(index) for index in range(library.get_n_devices()))
+
+
+class Aravis:
+    """A camera that Aravis opens.
+
+    Parameters
+    ----------
+    address : str
+        Its identifier, or its IP address.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._camera: Any = None
+        self._stream: Any = None
+        self._parser: Any = None
+        self._lost = Event()
+        self._running = False
+        self._settings = AravisSettings()
+        self._numbers, self._damaged = Wrapping(_SHORT_IDS), 0
+        self._size = (0, 0)
+        self._period_ns = _UNKNOWN_PERIOD_NS
+        self._exposure_ns: int | None = None
+        self._gain = float("nan")
+        self._triggered_ns: int | None = None
+        self._clock: tuple[int, int] | None = None
+        self._least_delay: int | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were lost or damaged."""
+        return self._numbers.lost + self._damaged
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of its frames."""
+        return self._size[1], self._size[0]
+
+    def open(self, deadline: Deadline) -> None:
+        """Open it anew, and take control of it."""
+        self.close()
+        library, _ = _library()
+        self._lost = lost = Event()
+        self._numbers, self._damaged = Wrapping(_SHORT_IDS), 0
+        require_answer(self._address, deadline)
+        with self._told("open"):
+            self._camera = library.Camera.new(self._address)
+            self._camera.get_device().connect("control-lost", lambda *_: lost.set())
+            self._clock = self._latched()
+
+    def close(self) -> None:
+        """Let go of it, if it is open; one that does not answer is not waited for."""
+        held = [self._camera] if self._camera is not None else []
+        running, self._running = self._running, False
+        # Only when nothing refers to it any more does the library give its control back, and it tries hard.
+        self._stream = self._parser = self._camera = None
+        if held:
+            releasing = Thread(target=_release, args=(held, running), name="Aravis", daemon=True)
+            releasing.start()
+            releasing.join(_RELEASE_S)
+
+    def identify(self, deadline: Deadline) -> Identity:
+        """What it says it is."""
+        with self._told("identify") as camera:
+            version = ""
+            if camera.is_feature_available("DeviceVersion"):
+                version = camera.get_string("DeviceVersion")
+            return Identity(
+                camera.get_vendor_name(), camera.get_model_name(), camera.get_device_serial_number(), version
+            )
+
+    def apply(self, settings: AravisSettings, deadline: Deadline) -> None:
+        """Stop, and have it set so."""
+        self.halt()
+        self._settings = settings
+        with self._told("set") as camera:
+            self._set_region(camera, settings)
+            self._set_light(camera, settings)
+            if settings.trigger == "off":
+                camera.clear_triggers()
+            else:
+                camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
+            self._parser = None
+            if settings.chunks == "on":
+                camera.set_chunks("Timestamp,ExposureTime,Gain")
+                self._parser = camera.create_chunk_parser()
+            if settings.packet_size and camera.is_gv_device():
+                camera.gv_set_packet_size(settings.packet_size)
+                camera.gv_set_packet_size_adjustment(_library()[0].GvPacketSizeAdjustment.NEVER)
+
+    def dark(self, settings: AravisSettings) -> AravisSettings:
+        """Settings with the shortest exposure."""
+        with self._told("limits") as camera:
+            if not camera.is_exposure_time_available():
+                return settings
+            return replace(settings, exposure_us=max(1.0, float(camera.get_exposure_time_bounds()[0])))
+
+    def start(self, deadline: Deadline) -> None:
+        """Have it deliver frames, if it does not yet."""
+        if self._running:
+            return
+        with self._told("start") as camera:
+            self._stream = camera.create_stream(None, None)
+            if self._stream is None:
+                raise RefusedError("opens no stream", do="is it open elsewhere?")
+            payload = camera.get_payload()
+            for _ in range(self._settings.buffers):
+                self._stream.push_buffer(_library()[0].Buffer.new_allocate(payload))
+            camera.start_acquisition()
+        self._running = True
+        self._numbers.restart()
+        self._least_delay = self._triggered_ns = None
+
+    def request(self, deadline: Deadline) -> None:
+        """Trigger it by software, where it is set so; what came before is let go."""
+        if self._settings.trigger == "off":
+            return
+        while (buffer := self._stream.try_pop_buffer()) is not None:
+            self._counted(buffer)
+            self._stream.push_buffer(buffer)
+        if self._settings.trigger == "software":
+            self._triggered_ns = time.monotonic_ns()
+            with self._told("trigger") as camera:
+                camera.software_trigger()
+
+    def take(self, deadline: Deadline) -> Taken | None:
+        """The next whole frame that is newer than the last."""
+        if self._lost.is_set() or self._stream is None:
+            raise ConnectionLost("control of the camera was lost", do="is it on, and the cable good?")
+        with self._told("fetch"):
+            stream = _held(self._stream)
+            buffer = stream.timeout_pop_buffer(max(1, int(deadline.left * 1e6)))
+            if buffer is None:
+                return None
+            try:
+                sequence = self._counted(buffer)
+                if sequence is None or not self._is_whole(buffer):
+                    return None
+                return self._read(buffer, sequence)
+            finally:
+                stream.push_buffer(buffer)
+
+    def halt(self) -> None:
+        """Have it stop, and let its stream go."""
+        self._stream = None
+        if not self._running:
+            return
+        self._running = False
+        with self._told("stop") as camera:
+            camera.stop_acquisition()
+
+    def clock(self, deadline: Deadline) -> str:
+        """How its clock stands to UTC."""
+        with self._told("clock"):
+            self._clock = self._latched()
+        if self._clock is not None:
+            offset, doubt = self._clock
+            return f"offset {(offset + realtime_offset()[0]) / 1e9:.6f} ± {doubt / 1e9:.6f} s"
+        if self._least_delay is None:
+            return "offset unknown: no way to read its clock, and no frame yet"
+        offset = self._least_delay + realtime_offset()[0]
+        return f"offset at most {offset / 1e9:+.6f} s, by the arrival of frames"
+
+    def _is_whole(self, buffer: Any) -> bool:
+        return bool(buffer.get_status() == _library()[0].BufferStatus.SUCCESS)
+
+    def _counted(self, buffer: Any) -> int | None:
+        """The number of a frame counted on; damaged ones are counted too."""
+        number = int(buffer.get_frame_id())
+        if number > _SHORT_IDS:
+            self._numbers.period = _LONG_IDS
+        elif number == 0 and self._numbers.period == _SHORT_IDS:
+            self._numbers.period = _SHORT_IDS_WITH_ZERO
+        sequence = self._numbers.next(number)
+        if sequence is not None and not self._is_whole(buffer):
+            self._damaged += 1
+        return sequence
+
+    def _read(self, buffer: Any, sequence: int) -> Taken | None:
+        width, height = buffer.get_image_width(), buffer.get_image_height()
+        layout = GENICAM[self._settings.format]
+        if buffer.get_image_pixel_format() != layout.code or (width, height) != self._size:
+            raise ProtocolError(
+                f"sent {width}×{height} pixels of format {buffer.get_image_pixel_format():#x}, not "
+                f"{self._size[0]}×{self._size[1]} {self._settings.format}"
+            )
+        stride = width * layout.stored + int(buffer.get_image_padding()[0])
+        exposure_ns, gain = self._exposure_ns, self._gain
+        if self._parser is not None and buffer.has_chunks():
+            with self._told("chunks"):
+                exposure_ns = int(self._parser.get_float_value(buffer, "ChunkExposureTime") * 1000)
+                gain = float(self._parser.get_float_value(buffer, "ChunkGain"))
+        began = self._began(buffer, exposure_ns or 0)
+        pixels = decode(layout, width, height, buffer.get_data(), stride)
+        exposure_us = float("nan") if exposure_ns is None else exposure_ns / 1000
+        return Taken(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
+
+    def _began(self, buffer: Any, exposure_ns: int) -> Span:
+        """When the exposure began: by the camera's clock where it can be read, or by when the frame came."""
+        arrived = int(buffer.get_system_timestamp()) - realtime_offset()[0]
+        stamped = int(buffer.get_timestamp())
+        before = exposure_ns if self._settings.stamp == "end" else 0
+        if self._clock is not None:
+            offset, doubt = self._clock
+            began = stamped + offset - before
+            span = Span(began - doubt, began + doubt)
+        else:
+            # A frame that came later after its stamp than another did has waited for as long somewhere.
+            delay = arrived - stamped
+            self._least_delay = delay if self._least_delay is None else min(delay, self._least_delay)
+            waited = delay - self._least_delay
+            span = Span(arrived - waited - exposure_ns - self._period_ns, arrived - exposure_ns)
+        if self._triggered_ns is None:
+            return span
+        # Everything of before was let go, so this one was exposed at the trigger, or after it.
+        return Span(max(span.earliest, self._triggered_ns), max(span.latest, arrived, self._triggered_ns))
+
+    def _latched(self) -> tuple[int, int] | None:
+        """What is added to the camera's clock to have ours, and its uncertainty; None: it cannot be read."""
+        camera, found = _held(self._camera), []
+        for latch, value in _LATCHES:
+            if not (camera.is_feature_available(latch) and camera.is_feature_available(value)):
+                continue
+            for _ in range(3):
+                before = time.monotonic_ns()
+                camera.execute_command(latch)
+                after = time.monotonic_ns()
+                found.append((after - before, (before + after) // 2 - int(camera.get_integer(value)), after))
+            readings = [middle - offset for _, offset, middle in found]
+            # A clock that stands still is none.
+            if readings[0] == readings[-1]:
+                return None
+            doubt, offset, _ = min(found)
+            return offset, (doubt + 1) // 2
+        return None
+
+    def _set_region(self, camera: Any, settings: AravisSettings) -> None:
+        camera.set_pixel_format_from_string(settings.format)
+        camera.set_region(0, 0, -1, -1)
+        _, _, width, height = camera.get_region()
+        sensor = camera.get_sensor_size()
+        width, height = settings.width or width, settings.height or height
+        if settings.left + width > sensor[0] or settings.top + height > sensor[1]:
+            raise RefusedError(
+                f"has {sensor[0]}×{sensor[1]} pixels, and none of {width}×{height} at "
+                f"({settings.left}, {settings.top})"
+            )
+        camera.set_region(settings.left, settings.top, width, height)
+        got = tuple(camera.get_region())
+        if got != (settings.left, settings.top, width, height):
+            raise RefusedError(f"reads the region {got}, not {(settings.left, settings.top, width, height)}")
+        self._size = width, height
+
+    def _set_light(self, camera: Any, settings: AravisSettings) -> None:
+        if settings.rate:
+            _within("rate", settings.rate, camera.get_frame_rate_bounds())
+            camera.set_frame_rate(settings.rate)
+        self._period_ns = _UNKNOWN_PERIOD_NS
+        if camera.is_frame_rate_available() and camera.get_frame_rate() > 0:
+            self._period_ns = int(1e9 / camera.get_frame_rate())
+        if settings.exposure_us:
+            _within("exposure_us", settings.exposure_us, camera.get_exposure_time_bounds())
+            camera.set_exposure_time(settings.exposure_us)
+        self._exposure_ns = None
+        if camera.is_exposure_time_available():
+            self._exposure_ns = int(camera.get_exposure_time() * 1000)
+        if settings.gain >= 0:
+            _within("gain", settings.gain, camera.get_gain_bounds())
+            camera.set_gain(settings.gain)
+        self._gain = float(camera.get_gain()) if camera.is_gain_available() else float("nan")
+
+    @contextmanager
+    def _told(self, what: str) -> Iterator[Any]:
+        """The camera; and what the library's errors mean."""
+        glib = _library()[1]
+        if self._camera is None and what != "open":
+            raise ConnectionLost("the camera is not open")
+        try:
+            # What an error's traceback refers to lives on: were it the camera, nobody could open it anew.
+            yield None if self._camera is None else _held(self._camera)
+        except glib.Error as error:
+            raise _meaning(error, what, self._lost.is_set()) from None
+        except ReferenceError:
+            raise ConnectionLost("was closed meanwhile") from None
+
+
+def _release(held: list[Any], running: bool) -> None:
+    """Stop the camera, and drop the only reference to it."""
+    with suppress(Exception):
+        if running:
+            held[0].stop_acquisition()
+    held.clear()
+
+
+def _held(thing: Any) -> Any:
+    """A reference that keeps nothing alive."""
+    if thing is None:
+        raise ConnectionLost("was closed meanwhile")
+    return weakref.proxy(thing)
+
+
+def _within(name: str, value: float, bounds: Any) -> None:
+    low, high = float(bounds[0]), float(bounds[1])
+    if not low <= value <= high:
+        raise RefusedError(f"{name} {value:g} is beyond its {low:g}…{high:g}")
+
+
+def _meaning(error: Any, what: str, lost: bool) -> InstrumentError:
+    """The project's error for one of the library."""
+    text, codes = f"{what}: {error.message}", _library()[0].DeviceError
+    if lost:
+        return ConnectionLost(f"control of the camera was lost ({text})", do="is it switched on?")
+    gone = (codes.TIMEOUT, codes.NOT_CONNECTED, codes.NOT_FOUND, codes.TRANSFER_ERROR, codes.UNKNOWN)
+    if error.domain == "arv-device-error-quark" and error.code in (int(code) for code in gone):
+        return ConnectionLost(f"does not answer ({text})", do="is it switched on, and the address right?")
+    return RefusedError(f"refused it ({text})", do="does it have that, and no other program control it?")

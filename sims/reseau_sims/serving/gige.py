@@ -1,0 +1,245 @@
+"""A simulated camera on GigE Vision, on the loopback interface: real packets, by Aravis's fake camera.
+
+The library speaks the protocol (in a process of its own, see :mod:`~reseau_sims.serving.gige_door`); what is
+seen, and what goes wrong, comes from here. Aravis (``libaravis-0.8-0``) has to be installed.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import fcntl
+import mmap
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reseau.errors import UsageError
+from reseau_drivers.codecs.pixels import GENICAM, encode
+
+from . import gige_door as door
+from .imaging import CameraBody, View
+from .script import Fault
+
+__all__ = ["GigeCamera", "aravis_is_installed"]
+
+_LARGEST = 2048
+"""Rows and columns of the library's fake camera."""
+_FORMATS = {layout.code: layout for layout in GENICAM.values()}
+_START_S = 10.0
+_AN_HOUR_NS = 3_600_000_000_000
+
+
+def aravis_is_installed() -> bool:
+    """Whether the library is there."""
+    return ctypes.util.find_library("aravis-0.8") is not None
+
+
+class GigeCamera:
+    """A camera on ``127.0.0.1``.
+
+    Parameters
+    ----------
+    body : CameraBody
+        What it looks with; frames are the upper left part of what it sees, as large as they are asked for.
+    serial : str
+        What it is called.
+    patience_s : float
+        How long one waits for another simulated camera of this machine to end: there is one port.
+
+    Raises
+    ------
+    UsageError
+        When the library is not installed, or the port is taken.
+    """
+
+    ADDRESS = "127.0.0.1"
+
+    def __init__(self, body: CameraBody, *, serial: str = "SIM1", patience_s: float = 0.0) -> None:
+        if not aravis_is_installed():
+            raise UsageError("Aravis is not installed", do="apt-get install libaravis-0.8-0")
+        self.body, self._serial = body, serial
+        self.frames = 0
+        """Frames that were asked for."""
+        self._turn = _one_at_a_time(patience_s)
+        self._size = _LARGEST * _LARGEST * 2
+        self._descriptor = os.memfd_create("reseau-gige")
+        os.ftruncate(self._descriptor, self._size)
+        self._memory = mmap.mmap(self._descriptor, self._size)
+        # A file, not a pipe: the library may warn of much, and nobody reads it.
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115
+        self._ended, self._lock = False, threading.Lock()
+        self._last: tuple[int, int, bytes] | None = None
+        self._start()
+
+    @property
+    def address(self) -> str:
+        """As a driver takes it."""
+        return self.ADDRESS
+
+    def _start(self) -> None:
+        program = Path(door.__file__)
+        self._process = subprocess.Popen(
+            [
+                sys.executable,
+                str(program),
+                self.ADDRESS,
+                self._serial,
+                str(self._descriptor),
+                str(self._size),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._said,
+            pass_fds=[self._descriptor],
+            env={**os.environ, "PYTHONPATH": ""},
+        )
+        assert self._process.stdout is not None
+        if len(self._process.stdout.read(door.REQUEST.size)) < door.REQUEST.size:
+            self._process.wait(5.0)
+            self._said.seek(0)
+            said = self._said.read().decode("utf-8", "replace").strip()
+            self.close()
+            raise UsageError(said or "ended at once", where="simulated GigE camera")
+        self._thread = threading.Thread(target=self._serve, name="GigeCamera", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        stdout = self._process.stdout
+        assert stdout is not None
+        while len(data := stdout.read(door.REQUEST.size)) == door.REQUEST.size:
+            number, stamp, exposure, gain, code, left, top, width, height, _ = door.REQUEST.unpack(data)
+            layout = _FORMATS.get(code, GENICAM["Mono8"])
+            view = View(float(exposure), float(gain), 0.0, left, top, width, height, layout.full_scale)
+            pixels = encode(layout, self._filled(view))
+            self._answer(number, stamp, pixels)
+            self.frames += 1
+
+    def _filled(self, view: View) -> NDArray[Any]:
+        """What is seen; black where a frame reaches beyond the sensor."""
+        seen = self.body.draw(view)
+        if seen.shape == (view.height, view.width):
+            return seen
+        whole = np.zeros((view.height, view.width), seen.dtype)
+        whole[: seen.shape[0], : seen.shape[1]] = seen
+        return whole
+
+    def _answer(self, number: int, stamp: int, pixels: bytes) -> None:
+        fault = self.body.script.draw()
+        kind = "" if fault is None else fault.kind
+        wait = fault.seconds if fault is not None and kind == "late" else 0.0
+        loss, number_, stamp_ = 0.0, -1, -1
+        if kind in ("dropped", "stuck"):
+            loss = 1.0
+        elif kind in ("truncated", "corrupted"):
+            # Each packet has a checksum: a damaged one never arrives.
+            loss = 0.5
+        elif kind == "repeated" and self._last is not None:
+            number_, stamp_, pixels = self._last
+        elif kind == "out of range":
+            stamp_ = stamp + _AN_HOUR_NS
+        self._memory[: len(pixels)] = pixels
+        self._order(door.FRAME, wait, loss, number_, stamp_, len(pixels))
+        self._last = number, stamp, pixels
+        if fault is not None:
+            self._befall(fault)
+
+    def _befall(self, fault: Fault) -> None:
+        """What befalls the camera itself, behind the frame."""
+        if fault.kind == "stuck":
+            self._order(door.STICK)
+        elif fault.kind in ("disconnected", "wrong state"):
+            self.hang_up()
+        elif fault.kind == "power-cycled":
+            self.power_cycle()
+
+    def hang_up(self) -> None:
+        """Take its control from whoever has it, and stop; it can be opened anew."""
+        self._order(door.HANG_UP)
+
+    def power_cycle(self) -> None:
+        """Switch it off and on: it forgets who had it, and how it was set."""
+        self._order(door.RESET)
+
+    def pull_plug(self) -> None:
+        """Nobody answers any more, until :meth:`plug_in`."""
+        self._process.kill()
+        self._process.wait()
+        self._thread.join(5.0)
+
+    def plug_in(self) -> None:
+        """There it is again, as switched on."""
+        self._close_pipes()
+        self._start()
+
+    def _order(
+        self,
+        kind: bytes,
+        wait: float = 0.0,
+        loss: float = 0.0,
+        number: int = -1,
+        stamp: int = -1,
+        size: int = 0,
+    ) -> None:
+        stdin = self._process.stdin
+        assert stdin is not None
+        with self._lock, suppress(OSError, ValueError):
+            stdin.write(door.ORDER.pack(kind, wait, loss, number, stamp, size))
+            stdin.flush()
+
+    def close(self) -> None:
+        """End it."""
+        if self._ended:
+            return
+        self._ended = True
+        self._order(door.END)
+        try:
+            self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if hasattr(self, "_thread"):
+            self._thread.join(5.0)
+        self._close_pipes()
+        self._memory.close()
+        self._said.close()
+        os.close(self._descriptor)
+        os.close(self._turn)
+
+    def _close_pipes(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _one_at_a_time(patience_s: float) -> int:
+    """A lock that goes with the process: the library binds one port of the machine."""
+    path = Path(tempfile.gettempdir()) / f"reseau-gige-{os.getuid()}.lock"
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    until = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return descriptor
+        except OSError:
+            if time.monotonic() >= until:
+                os.close(descriptor)
+                raise UsageError(
+                    "another simulated GigE camera runs on this machine", do="end that one first"
+                ) from None
+            time.sleep(0.05)

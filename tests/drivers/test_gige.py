@@ -1,0 +1,255 @@
+"""GigE Vision on the loopback interface: real packets, read by our driver and by Aravis's own programs."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, UsageError
+from reseau_drivers import camera as cameras
+from reseau_drivers.camera import AravisSettings, aravis
+from reseau_sims import World
+from reseau_sims.laboratory import Laboratory
+from reseau_sims.serving import CameraBody, Fault, GigeCamera, InLaboratory, Pattern, Still, View
+
+from .rigs import gige_camera
+
+Cam = cameras.Camera[AravisSettings]
+SIZE = {"width": 640, "height": 480}
+LIGHT = {"exposure_us": 2000.0, "gain": 0.0, "rate": 100.0}
+
+
+def pattern(shift: int = 0) -> Pattern:
+    return Pattern(640, 480, shift)
+
+
+def seen(shift: int, exposure_us: float = 2000.0, full_scale: float = 255.0) -> Any:
+    return pattern(shift)(View(exposure_us, 0.0, 0.0, 0, 0, 640, 480, full_scale))
+
+
+@pytest.fixture
+def simulated() -> Iterator[GigeCamera]:
+    with ExitStack() as stack:
+        yield gige_camera(stack, CameraBody(pattern(), 640, 480))
+
+
+@pytest.fixture
+def camera(simulated: GigeCamera) -> Iterator[Cam]:
+    with aravis("camera", simulated.address, settings=SIZE | LIGHT, seconds=2.0) as made:
+        yield made
+
+
+@pytest.mark.parametrize("name", ["Mono8", "Mono16"])
+def test_frames_are_to_the_bit_what_the_world_drew(simulated: GigeCamera, name: str) -> None:
+    frame = World.standard(seed=5).photo_i()
+    simulated.body.look_at(Still(frame))
+    size = {"width": frame.width, "height": frame.height, "format": name, "exposure_us": 10_000.0}
+    with aravis("camera", simulated.address, settings=size) as camera:
+        shot = camera.expose()
+        if name == "Mono8":
+            assert shot.frame.sha256 == frame.sha256
+        assert (shot.pixels == frame.pixels * np.uint16(257 if name == "Mono16" else 1)).all()
+        assert shot.full_scale == {"Mono8": 255, "Mono16": 65535}[name]
+
+
+def test_it_looks_into_the_laboratory(simulated: GigeCamera) -> None:
+    simulated.body.look_at(InLaboratory(Laboratory(World.standard(seed=5))))
+    with aravis("camera", simulated.address, settings={"width": 1600, "height": 1200}) as camera:
+        one = camera.expose(20.0)
+        assert any((one.pixels == drawn).all() for drawn in simulated.body.drawn)
+        camera.configure(exposure_us=5000.0)
+        assert camera.expose(20.0).pixels.mean() == pytest.approx(one.pixels.mean() / 2, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["BayerRG8", "BayerGR8"])
+def test_colour_stays_raw_and_names_its_pattern(simulated: GigeCamera, camera: Cam, name: str) -> None:
+    camera.configure(format=name)
+    shot = camera.expose()
+    assert shot.pattern == {"BayerRG8": "RGGB", "BayerGR8": "GRBG"}[name]
+    assert (shot.pixels == seen(0)).all()
+
+
+@pytest.mark.parametrize("trigger", ["off", "software"])
+def test_no_frame_began_before_it_was_asked_for(simulated: GigeCamera, camera: Cam, trigger: str) -> None:
+    camera.configure(trigger=trigger)
+    for shift in range(12):
+        simulated.body.look_at(pattern(shift))
+        shot = camera.expose()
+        assert shot.fresh
+        assert (shot.pixels == seen(shift)).all()
+    assert (camera.skipped > 0) == (trigger == "off")
+
+
+def test_a_frame_that_waited_somewhere_is_not_fresh(simulated: GigeCamera, camera: Cam) -> None:
+    camera.expose()
+    time.sleep(0.2)
+    simulated.body.look_at(pattern(5))
+    shots = list(camera.frames(4))
+    assert not shots[0].fresh
+    assert (shots[0].pixels == seen(0)).all()
+    assert (camera.expose().pixels == seen(5)).all()
+
+
+def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, camera: Cam) -> None:
+    before = camera.expose().pixels.astype(float)
+    camera.configure(exposure_us=4000.0)
+    assert (camera.expose().pixels == seen(0, 4000.0)).all()
+    camera.configure(exposure_us=2000.0, gain=6)
+    assert camera.expose().pixels.mean() == pytest.approx(10**0.3 * before.mean(), rel=0.03)
+    camera.configure(gain=0, left=8, top=16, width=128, height=64)
+    assert (camera.expose().pixels == before[16:80, 8:136]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"gain": 99.0}, "gain 99 is beyond its 0…10"),
+        ({"exposure_us": 1.0}, "exposure_us 1 is beyond its 10…"),
+        ({"rate": 5e4}, "rate 50000 is beyond"),
+        ({"width": 2048, "left": 8}, "has 2048×2048 pixels, and none of 2048×480 at"),
+        ({"format": "Mono12"}, "camera .configure.: refused it"),
+    ],
+)
+def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
+    camera: Cam, changes: dict[str, Any], said: str
+) -> None:
+    before = camera.settings
+    with pytest.raises(RefusedError, match=said):
+        camera.configure(**changes)
+    assert camera.settings == before
+    assert (camera.expose().pixels == seen(0)).all()
+    assert camera.reconnections == 1
+
+
+def test_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Cam) -> None:
+    # The library's camera begins at 65400, and counts 0 too.
+    camera.configure(rate=500.0)
+    shots = list(camera.frames(200))
+    numbers = [shot.sequence for shot in shots]
+    assert numbers[0] < 65536 <= numbers[-1]
+    gaps = sum(b - a - 1 for a, b in itertools.pairwise(numbers))
+    assert gaps == shots[-1].dropped - shots[0].dropped
+    assert simulated.frames >= 200
+
+
+@pytest.mark.parametrize("kind", ["dropped", "truncated", "corrupted"])
+def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
+    simulated: GigeCamera, camera: Cam, kind: Any
+) -> None:
+    camera.configure(rate=50.0)
+    before = next(camera.frames(1))
+    script = simulated.body.script
+    script.fault_at(script.count + 2, Fault(kind))
+    shots = list(camera.frames(8))
+    assert [fault.kind for fault in script.happened] == [kind]
+    assert all((shot.pixels == seen(0)).all() for shot in shots)
+    lost = shots[-1].dropped - before.dropped
+    assert lost >= 1
+    assert shots[-1].sequence - before.sequence == 8 + lost
+
+
+def test_a_repeated_frame_is_not_handed_out_twice(simulated: GigeCamera, camera: Cam) -> None:
+    camera.expose()
+    script = simulated.body.script
+    script.fault_at(script.count + 2, Fault("repeated"))
+    numbers = [shot.sequence for shot in camera.frames(8)]
+    assert len(script.happened) == 1
+    assert len(set(numbers)) == 8
+
+
+def test_control_that_was_lost_is_said_and_taken_back_with_the_settings(
+    simulated: GigeCamera, camera: Cam
+) -> None:
+    camera.configure(exposure_us=4000.0)
+    camera.expose()
+    simulated.power_cycle()
+    with pytest.raises(ConnectionLost, match="control of the camera was lost"):
+        camera.expose()
+    assert (camera.expose().pixels == seen(0, 4000.0)).all()
+    assert camera.reconnections == 2
+
+
+def test_the_plug_pulled_and_put_back(simulated: GigeCamera, camera: Cam) -> None:
+    camera.expose()
+    simulated.pull_plug()
+    began = time.monotonic()
+    with pytest.raises(DeadlineError):
+        camera.expose(0.5)
+    with pytest.raises(ConnectionLost):
+        camera.expose(0.5)
+    # The library alone would try for a quarter of a minute.
+    assert time.monotonic() - began < 8.0
+    simulated.plug_in()
+    assert (camera.expose(5.0).pixels == seen(0)).all()
+
+
+def test_a_camera_that_another_controls_is_refused(simulated: GigeCamera, camera: Cam) -> None:
+    camera.expose()
+    with pytest.raises(InstrumentError):
+        aravis("other", simulated.address, settings=SIZE).connect()
+    assert camera.expose().fresh
+
+
+def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> None:
+    camera.configure(rate=50.0)
+    before = camera.settings
+    found = camera.check(10.0)
+    assert found["identity"].startswith("Aravis Fake SIM1")
+    assert found["frames"].startswith("640 × 480, ")
+    assert found["dropped"] == "0 of 12"
+    assert "by the arrival of frames" in found["clock"]
+    assert "noise 0 at the shortest exposure" in found["dark"]
+    assert camera.settings == before
+
+
+def test_there_is_one_port_and_one_camera_on_it(simulated: GigeCamera) -> None:
+    with pytest.raises(UsageError, match="another simulated GigE camera"):
+        GigeCamera(CameraBody())
+
+
+def test_where_nobody_answers_it_is_said() -> None:
+    with ExitStack() as stack:
+        gige_camera(stack, CameraBody()).pull_plug()
+        with pytest.raises(InstrumentError, match="camera"):
+            aravis("camera", "127.0.0.1").connect(2.0)
+
+
+def _program(name: str) -> str:
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"no {name}: apt-get install aravis-tools aravis-tools-cli")
+    return found
+
+
+def test_aravis_s_own_tool_reads_and_sets_its_features(simulated: GigeCamera) -> None:
+    tool = [_program("arv-tool-0.8"), "-a", simulated.address]
+    names = ["DeviceID", "DeviceModelName", "Width", "PixelFormat", "ExposureTimeAbs"]
+    said = subprocess.run([*tool, "control", *names], capture_output=True, text=True, timeout=30).stdout
+    assert "DeviceID = SIM1" in said
+    assert "Fake" in said
+    subprocess.run([*tool, "control", "Width=320"], capture_output=True, text=True, timeout=30, check=True)
+    said = subprocess.run([*tool, "control", "Width"], capture_output=True, text=True, timeout=30).stdout
+    assert "Width = 320" in said
+
+
+def test_aravis_s_own_client_receives_whole_frames(simulated: GigeCamera) -> None:
+    client = _program("arv-camera-test-0.8")
+    options = ["-n", simulated.address, "-w", "640", "-h", "480", "-f", "25", "-d", "stream:0"]
+    running = subprocess.Popen(
+        [client, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    time.sleep(4.0)
+    running.send_signal(2)
+    said = running.communicate(timeout=30)[0]
+    whole = int(said.split("n_completed_buffers")[1].split()[1])
+    failed = int(said.split("n_failures")[1].split()[1])
+    assert whole >= 20
+    assert failed == 0
