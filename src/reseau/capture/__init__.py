@@ -7,7 +7,7 @@ from .goal import Goal
 from .lock import BenchLock
 from .rerun import Rerun, rerun
 from .run import Decision, carry_out
-from .step import Step, paper_steps, read_steps
+from .step import Step, paper_steps, read_steps, spread
 
 __all__ = [
     "Acquisition",
@@ -36,4 +36,5 @@ __all__ = [
     "readiness",
     "rerun",
     "shift_between",
+    "spread",
 ]

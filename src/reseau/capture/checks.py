@@ -142,9 +142,9 @@ def shift_between(first: Frame, second: Frame) -> tuple[Array, Array]:
     Notes
     -----
     Least-squares matching of whole frames (Förstner 1982): g₂ = a g₁ + b − ∇g·d, the gradient taken of the
-    mean of both, with which the linearisation is good to the second order. Both are smoothed first, since finite
-    differences see less than the slope of what is sharp; for that the covariance is N⁻¹ (SA)ᵀ(SA) N⁻¹ of the
-    noise before, which was the residuals' times 4πs².
+    mean of both, with which the linearisation is good to the second order. Both are smoothed first, since
+    finite differences see less than the slope of what is sharp; for that the covariance is N⁻¹ (SA)ᵀ(SA) N⁻¹
+    of the noise before, which was the residuals' times 4πs².
     """
     if first.pixels.shape != second.pixels.shape:
         raise UsageError("frames of different sizes are of no one scene", where=second.name)

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..errors import FormatError
 from ..formats import read_text
 
-__all__ = ["Step", "paper_steps", "read_steps"]
+__all__ = ["Step", "paper_steps", "read_steps", "spread"]
 
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
 """Axes of the testfield's mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
@@ -101,3 +101,31 @@ def read_steps(path: Path) -> tuple[Step, ...]:
             raise FormatError(f"line {number}: {step.name!r} stands twice", where=path, do="name poses apart")
         steps[step.name] = step
     return tuple(steps.values())
+
+
+def spread(steps: Sequence[Step], count: int) -> tuple[Step, ...]:
+    """Some of the poses, far from one another: each next one is that furthest from all before.
+
+    Parameters
+    ----------
+    steps : sequence of Step
+        The first is always taken. Of equally far ones the first is.
+    count : int
+        How many.
+    """
+    chosen: list[Step] = []
+    left = list(steps)
+    while left and len(chosen) < count:
+        next_ = max(left, key=lambda step: min((_apart(step, other) for other in chosen), default=0.0))
+        left.remove(next_)
+        chosen.append(next_)
+    return tuple(chosen)
+
+
+def _apart(one: Step, other: Step) -> float:
+    """Distance of two poses: axes turned by a degree count as much as those moved by a millimetre."""
+    total = 0.0
+    for axis in one.position.keys() | other.position.keys():
+        gap = abs(one.position.get(axis, 0.0) - other.position.get(axis, 0.0))
+        total += (gap if axis == HEIGHT else min(gap % 360, 360 - gap % 360)) ** 2
+    return math.sqrt(total)

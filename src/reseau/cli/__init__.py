@@ -14,7 +14,20 @@ import typer
 
 from .. import __version__
 from ..errors import ReseauError
-from . import apply, bench, bundle, bundle_compare, calibrate, demo, design, measure, orient, refine
+from . import (
+    apply,
+    archive,
+    bench,
+    bundle,
+    bundle_compare,
+    calibrate,
+    capture,
+    demo,
+    design,
+    measure,
+    orient,
+    refine,
+)
 
 __all__ = ["app", "main"]
 
@@ -30,6 +43,8 @@ app.command()(demo.demo)
 app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
 app.add_typer(measure.app, name="measure")
+app.add_typer(capture.app, name="capture")
+app.add_typer(archive.app, name="archive")
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)

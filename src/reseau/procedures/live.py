@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,9 @@ class Place(Protocol):
     @property
     def position(self) -> Mapping[str, float]:
         """Where the axes stand."""
+
+
+P = TypeVar("P", bound=Place)
 
 
 class LiveTestfield:
@@ -102,6 +105,11 @@ class LiveTestfield:
             self._current = (count, found)
         return self._current[1]
 
+    @property
+    def provenance(self) -> Provenance:
+        """What the calibration was made of."""
+        return Provenance(self._inputs, self._options)
+
     def progress(self) -> dict[str, float]:
         """Standard deviations of the camera's parameters, and sigma0; nothing before the third image."""
         if len(self._measured) < _LEAST_IMAGES:
@@ -114,7 +122,7 @@ class LiveTestfield:
         reached = {f"sigma_{name}": float(s) for name, s in zip(names, sigma, strict=True)}
         return reached | {"sigma0": float(found.result.sigma0)}
 
-    def next_pose(self, candidates: Sequence[Place], wanted: str) -> tuple[Place, float | None] | None:
+    def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
         """The pose that lowers the standard deviation of a parameter most, and to what.
 
         Each candidate's image is predicted, and joins the network as if it had been measured as the others
@@ -145,7 +153,7 @@ class LiveTestfield:
         if isinstance(mount, Failure):
             raise EstimationError(mount.reason, where="next pose")
         sigma0 = float(result.sigma0)
-        best: tuple[Place, float] | None = None
+        best: tuple[P, float] | None = None
         for candidate in candidates:
             joined = _joined(network, result, mount.pose(candidate.position))
             predicted = sigma0 * _sigma(network if joined is None else joined, column)
@@ -164,8 +172,8 @@ class LiveTestfield:
         found = self.calibrated()
         if isinstance(found, Failure):
             raise EstimationError(found.reason, where=self.name)
-        provenance = Provenance(self._inputs, self._options)
-        calibration = calibration_of(found.result, "camera", name=self.name, provenance=provenance.to_dict())
+        about = self.provenance.to_dict()
+        calibration = calibration_of(found.result, "camera", name=self.name, provenance=about)
         return {"calibration.json": calibration.to_json()}
 
 
@@ -268,7 +276,7 @@ class LiveOscilloscope:
         """Sigma of the refined image coordinates, where there is a correction."""
         return {}
 
-    def next_pose(self, candidates: Sequence[Place], wanted: str) -> tuple[Place, float | None] | None:
+    def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
         """None: its three photographs are taken from one place."""
         return None
 

@@ -1,0 +1,136 @@
+"""What `reseau capture` and `reseau archive` share: a session's procedure, made of its parameters alone.
+
+Live and offline it is made here, of what the archive holds, so that both do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import UsageError
+
+if TYPE_CHECKING:
+    from ..archive import Archive, Session, Verdict
+    from ..capture import Procedure, Step
+    from ..data import Frame
+    from ..formats import ReseauDesign, TestfieldDesign
+    from ..procedures.live import LiveTestfield
+
+__all__ = [
+    "INPUT",
+    "ArchivePlace",
+    "ObjectsPlace",
+    "SessionName",
+    "input_of",
+    "opened",
+    "parsed",
+    "procedure_of",
+    "steps_of",
+]
+
+INPUT = "input"
+"""Kind of the files that a session was given: designs."""
+
+ArchivePlace = Annotated[
+    str, typer.Option("--archive", "-a", envvar="RESEAU_ARCHIVE", help="Folder, or URL of a database.")
+]
+ObjectsPlace = Annotated[
+    str | None, typer.Option("--objects", help="Folder or URL of the files, where the archive is a database.")
+]
+SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
+
+
+def opened(place: str, objects: str | None, *, create: bool = False) -> Archive:
+    """The archive at a place."""
+    from ..archive import Archive
+
+    return Archive.open(place, objects, create=create)
+
+
+def input_of(kept: Session, name: str) -> str:
+    """The text of a file that a session was given.
+
+    Raises
+    ------
+    UsageError
+        When it was given none.
+    """
+    found = kept.find(name, INPUT)
+    if found is None:
+        raise UsageError(f"was given no {name}", where=kept.name)
+    return kept.objects.get(found.sha256, found.suffix).decode("utf-8")
+
+
+def steps_of(parameters: Mapping[str, Any]) -> tuple[Step, ...]:
+    """The poses of a session."""
+    from ..capture import Step
+
+    return tuple(Step(name, position) for name, position in parameters["steps"])
+
+
+def procedure_of(kept: Session) -> Procedure | None:
+    """What becomes of a session's frames; None where they are only kept."""
+    if kept.plan == "testfield":
+        return _testfield(kept)
+    if kept.plan == "oscilloscope":
+        from ..formats import ReseauDesign
+        from ..procedures.live import LiveOscilloscope
+
+        reseau, rods = (
+            ReseauDesign.parse(input_of(kept, name), where=name) for name in ("reseau.json", "object.json")
+        )
+        return LiveOscilloscope(reseau, rods, name=kept.name, options=kept.parameters)
+    return None
+
+
+def parsed(text: str, where: object) -> ReseauDesign | TestfieldDesign:
+    """A design, told apart by its schema."""
+    from ..formats import ReseauDesign, TestfieldDesign
+
+    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
+    return kind.parse(text, where=where)
+
+
+def _testfield(kept: Session) -> Procedure:
+    from ..procedures.calibration import CameraModel
+    from ..procedures.live import LiveTestfield
+    from ..procedures.measuring import measurer_of
+    from ..refine import TestfieldOptions
+
+    given = kept.parameters
+    design = parsed(input_of(kept, "design.json"), "design.json")
+    pitch, free = given["pitch"], tuple(given["free"])
+    model = CameraModel("opencv", free) if pitch is None else CameraModel("brown", free, (pitch, pitch))
+    options = {key: value for key, value in given.items() if key not in ("steps", "until")}
+    measure = measurer_of(design, TestfieldOptions(row_jitter_px=given["row_jitter"], fill=given["fill"]))
+    return _Reported(LiveTestfield(design, measure, model, name=kept.name, options=options), options)
+
+
+class _Reported:
+    """A testfield procedure whose results have a report beside them."""
+
+    def __init__(self, live: LiveTestfield, options: Mapping[str, Any]) -> None:
+        self._live, self._options = live, dict(options)
+
+    def on_frame(self, frame: Frame, step: Step) -> Verdict:
+        return self._live.on_frame(frame, step)
+
+    def progress(self) -> dict[str, float]:
+        return self._live.progress()
+
+    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        return self._live.next_pose(candidates, wanted)
+
+    def finish(self) -> dict[str, str]:
+        from ..procedures.calibration import Calibrated
+        from ..report.bundle import bundle_report
+
+        made = self._live.finish()
+        found = self._live.calibrated()
+        assert isinstance(found, Calibrated)
+        title = f"Calibration, session {self._live.name}"
+        report = bundle_report(found.searched, title=title, provenance=self._live.provenance)
+        return made | {"report.html": report}
