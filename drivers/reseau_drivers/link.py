@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 from collections import deque
@@ -75,8 +76,11 @@ class SerialLink:
             self._serial.reset_input_buffer()
         except (OSError, ValueError) as error:
             self.close()
+            # pyserial's text repeats the port and the number of the error.
+            number = error.errno if isinstance(error, OSError) else None
+            why = os.strerror(number) if number else str(error)
             raise ConnectionLost(
-                f"{self._port} cannot be opened ({error})", do="is it plugged in, and free?"
+                f"{self._port} cannot be opened ({why})", do="is it plugged in, and free?"
             ) from None
 
     def close(self) -> None:

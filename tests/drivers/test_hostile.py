@@ -7,15 +7,19 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
 
 from reseau.errors import InstrumentError
+from reseau.instruments import Deadline
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, ping360
 from reseau_drivers.turntable import smc100, zaber
+from reseau_sims import serving
+from reseau_sims.serving import InProcess, Machine, PtyServer, Script, Server, UdpServer, Wire
+from reseau_sims.serving.script import Output
 
 DRIVERS: dict[str, Callable[..., Any]] = {
     "zaber": lambda name, address, seconds: zaber(name, address, axes={"tilt": {}}, seconds=seconds),
@@ -68,6 +72,37 @@ def flood(noise: bytes) -> Iterator[str]:
     listener.close()
 
 
+class Talker:
+    """A session that never stops once it was spoken to."""
+
+    def __init__(self, noise: bytes) -> None:
+        self._noise = noise
+
+    def receive(self, data: bytes) -> list[Output]:
+        return [(0.0, self._noise)] * 100
+
+    def hung_up(self) -> None:
+        """It does not mind."""
+
+
+@pytest.mark.parametrize("noise", NOISE)
+@pytest.mark.parametrize(
+    ("driver", "door"),
+    [(driver, PtyServer) for driver in DRIVERS if driver not in ("bk", "oscilloscope")]
+    + [("ping360", UdpServer)],
+)
+def test_a_talker_on_a_serial_line_or_in_datagrams(driver: str, door: type[Server], noise: str) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with door(lambda: Talker(NOISE[noise])) as server:
+        device = DRIVERS[driver]("victim", server.address, seconds=0.2)
+        began = time.monotonic()
+        with pytest.raises(InstrumentError, match="victim"):
+            device.connect()
+        assert time.monotonic() - began < 1.5
+        device.close()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_an_endless_talker_costs_bounded_time_and_memory(driver: str, noise: str) -> None:
@@ -80,3 +115,49 @@ def test_an_endless_talker_costs_bounded_time_and_memory(driver: str, noise: str
         assert time.monotonic() - began < 1.5
         device.close()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+MACHINES: dict[str, Callable[[], Machine]] = {
+    "zaber": lambda: serving.ZaberChain([2, 1]),
+    "smc100": lambda: serving.Smc100Line(2),
+    "ping360": serving.Ping360,
+    "bk": serving.BkScanner,
+    "compactpulser": serving.CompactPulser,
+    "oscilloscope": lambda: serving.Oscilloscope("keysight"),
+}
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_a_simulator_survives_any_noise_and_says_that_it_was_none_of_its_protocol(machine: str) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    made = MACHINES[machine]()
+    link, deadline = InProcess(lambda: Wire(made, Script())), Deadline(60.0)
+    link.open(deadline)
+    for noise in NOISE.values():
+        for _ in range(2):
+            link.write(noise, deadline)
+        made.hung_up()
+    link.close()
+    assert made.violations
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_close_never_raises_whatever_the_connection_is_in(driver: str) -> None:
+    device = DRIVERS[driver]("victim", "tcp://127.0.0.1:1", seconds=0.2)
+    device.close()
+    device.close()
+    with flood(b"x") as address:
+        device = DRIVERS[driver]("victim", address, seconds=0.2)
+        caller = threading.Thread(target=lambda: _tried(device.connect))
+        caller.start()
+        time.sleep(0.05)
+        device.close()
+        caller.join(5.0)
+        assert not caller.is_alive()
+    device.close()
+
+
+def _tried(call: Callable[[], object]) -> None:
+    with suppress(InstrumentError):
+        call()

@@ -105,12 +105,11 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         self._take()
         return staged
 
-    def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Who it is, how it is spoken to, and its oldest error."""
-        found = {"identity": str(self.connect(seconds)), "dialect": self._spoken.name}
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        found = {"dialect": self._spoken.name}
         if self._spoken.errors:
-            with self._exchange("check", seconds) as deadline:
-                number, text = error_entry(self._ask(self._spoken.errors, deadline))
+            with self._exchange("check", deadline.rest) as time:
+                number, text = error_entry(self._ask(self._spoken.errors, time))
                 found["error"] = f"{number} {text}".strip() if number else "none"
         return found
 

@@ -102,6 +102,12 @@ class BkScanner(Device[BkSettings]):
             f"{self.name}_mm_per_px": {"dtype": "array", "shape": [2], "units": "mm"},
         }
 
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        scan = self.scan(deadline.rest)
+        height, width = scan.pixels.shape
+        mm = "of unknown size" if scan.mm_per_px is None else "of {:g} × {:g} mm".format(*scan.mm_per_px)
+        return {"frame": f"{width}×{height} px {mm}"}
+
     def scan(self, seconds: float | None = None) -> BScan:
         """One frame, with the millimetres of the moment.
 

@@ -161,12 +161,10 @@ class CompactPulser(Device[CompactPulserSettings]):
         with self._exchange("verify", seconds) as deadline:
             self._verify(_letters(self.settings), deadline)
 
-    def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Who it is, and whether its settings are those that were pushed."""
-        found = {"identity": str(self.connect(seconds))}
-        self.verify(seconds)
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        self.verify(deadline.rest)
         alone = len(self._told) == 1
-        return found | {"settings": "gain as pushed; it tells no other" if alone else "as pushed"}
+        return {"settings": "gain as pushed; it tells no other" if alone else "as pushed"}
 
     def _identify(self, deadline: Deadline) -> Identity:
         self._value("G", deadline)

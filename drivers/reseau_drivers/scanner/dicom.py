@@ -157,15 +157,13 @@ class DicomFiles(Device[DicomSettings]):
         self._next = 0
         return staged
 
-    def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Whose files they are, how many frames they hold, and what is known of their millimetres."""
-        found = {"identity": str(self.connect(seconds)) or "unknown", "frames": str(len(self._frames))}
-        with self._exchange("check", seconds):
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        with self._exchange("check", deadline.rest):
             path, index = self._frames[0]
             scale = self._scale(self._header(path))
             self._pixels(path, index)
         mm = f"{scale.mm[0]:g} × {scale.mm[1]:g} mm" if scale.mm else f"unknown: {scale.why}"
-        return found | {"pixels": mm}
+        return {"frames": str(len(self._frames)), "pixels": mm}
 
     def scan(self, seconds: float | None = None) -> BScan:
         """The next frame.

@@ -124,11 +124,9 @@ class Ping360(Device[Ping360Settings]):
             f"{self.name}_mm_per_px": {"dtype": "array", "shape": [2], "units": "mm"},
         }
 
-    def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Who it is, and whether one line comes."""
-        found = {"identity": str(self.connect(seconds))}
-        line = self.line(0, seconds)
-        return found | {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        line = self.line(0, deadline.rest)
+        return {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
 
     def line(self, angle: int, seconds: float | None = None) -> NDArray[np.uint8]:
         """Echoes of one pulse.

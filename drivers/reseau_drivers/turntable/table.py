@@ -11,7 +11,7 @@ from reseau.instruments import AxisState, Deadline, Device, Identity, Limits, Se
 
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
-_POLL_S = 0.02
+_POLL_S, _HALT_S = 0.02, 1.0
 _PATIENCE = 3
 """Bad answers in a row that are asked for again while an axis moves: it must not be left alone for one."""
 
@@ -232,11 +232,10 @@ class Table(Device[TableSettings]):
         self._take()
         return self.read()
 
-    def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Who it is, and how each axis stands."""
-        found = {"identity": str(self.connect(seconds))}
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        found = {}
         for key in self.plans:
-            state = self.state(key, seconds)
+            state = self.state(key, deadline.rest)
             found[key] = "; ".join(
                 (
                     f"{state.position:g} {self.plans[key].unit}" if state.homed else "not homed",
@@ -277,7 +276,7 @@ class Table(Device[TableSettings]):
         state = self._arrived(axis, plan, deadline, command)
         if not state.homed:
             raise StateError("did not find its reference", where=self.name, command=command)
-        with self._exchange(command) as time:
+        with self._exchange(command, max(_POLL_S, deadline.at_most(self._seconds))) as time:
             # Some controllers take a speed only then.
             self._controller.set_speed(plan, self.settings.speed, time)
         return state
@@ -325,7 +324,8 @@ class Table(Device[TableSettings]):
                 command,
             )
         except DeadlineError:
-            with self._exchange(command) as time:
+            # An axis that goes on is worth the time beyond.
+            with self._exchange(command, min(_HALT_S, self._seconds)) as time:
                 self._controller.halt(plan, time)
             raise
         if state.faults:

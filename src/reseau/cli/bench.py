@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +41,7 @@ def list_(as_json: AsJson = False) -> None:
 @app.command()
 def check(
     bench: BenchPath = Path("bench.toml"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline of each test.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline for each instrument.")] = 10.0,
     as_json: AsJson = False,
 ) -> None:
     """Connect all instruments at once and have them test themselves; every failure is told."""
@@ -91,7 +92,10 @@ def sim(
         else:
             say(bench.toml)
             typer.get_text_stream("stdout").flush()
-        threading.Event().wait(seconds or None)
+        leads = f"in another terminal: reseau bench check --bench {out}" if out else "a bench.toml is above"
+        typer.echo(f"serving until Ctrl-C; {leads}", err=True)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait(seconds or None)
         complaints = [f"{name}: {text}" for name, texts in bench.violations.items() for text in texts]
     for complaint in complaints:
         typer.echo(complaint, err=True)

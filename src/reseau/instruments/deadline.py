@@ -50,6 +50,11 @@ class Deadline:
         """These seconds, or what is left when that is less."""
         return min(seconds, self.left)
 
+    @property
+    def rest(self) -> float:
+        """What is left, as the deadline of a next call: never nothing, which no call takes."""
+        return max(1e-3, self.left)
+
     def part(self, seconds: float) -> Deadline:
         """An earlier deadline for a part of the call; never later than this one."""
         return Deadline(max(1e-3, self.at_most(seconds)))

@@ -85,6 +85,10 @@ class Device(ABC, Generic[S]):
     def _kinds(self) -> dict[str, dict[str, Any]]:
         """What a reading holds: dtype, shape and units by name."""
 
+    def _test(self, deadline: Deadline) -> dict[str, str]:
+        """The test that the instrument can do of itself: what was tested, and what came out."""
+        return {}
+
     @property
     def settings(self) -> S:
         """As they were pushed last, or will be with the next connection."""
@@ -151,8 +155,12 @@ class Device(ABC, Generic[S]):
             return self._identify(deadline)
 
     def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Test itself; the driver of an instrument that can do more says so."""
-        return {"identity": str(self.connect(seconds))}
+        """Test itself: who it is, its firmware, and what its driver adds; the deadline is of all together."""
+        deadline = Deadline(self._seconds if seconds is None else seconds)
+        found = self.connect(deadline.left)
+        said = " ".join(part for part in (found.maker, found.model, found.serial) if part)
+        told = {"identity": said or "unknown", "firmware": found.firmware or "not told"}
+        return told | self._test(deadline)
 
     def close(self) -> None:
         """Let go of it; never raises."""

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reseau.errors import ProtocolError
-from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, vxi11, zaber
+from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 
 Decoders = dict[str, Callable[[], Any]]
@@ -139,6 +139,7 @@ def test_decoding_one_message_gives_a_value_or_says_what_is_wrong(data: bytes) -
         ping.Information.parse,
         lambda content: bk.parse_frame(content, 8),
         lambda line: bk.numbers(line, "US_WIN_SIZE"),
+        usbtmc.decode,
         ieee488.missing_of,
         ieee488.parse_block,
         ieee488.picture,
