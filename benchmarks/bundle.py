@@ -1,16 +1,20 @@
-"""The bundle adjustment beside Ceres, its statistics, how its time grows, and whether its covariances cover.
+"""The bundle adjustment beside Ceres and COLMAP, its statistics, its growth, and how its covariances cover.
 
 Run from the checkout: ``python benchmarks/bundle.py [--part peers|statistics|growth|cover]``. Networks are
-looked for in $RESEAU_DATA/networks. The Ceres runs need g++ and libceres-dev (Debian); without them our times
-stand alone. Both have two threads; import, compilation and reading of files are not counted.
+looked for in $RESEAU_DATA/networks. The Ceres runs need g++ and libceres-dev (Debian), those of COLMAP need
+pycolmap (PyPI); without them our times stand alone. All have two threads, and end where the relative change
+of the sum is below 1e-6 (ours: corrections below 1e-6 standard deviations); import, compilation and reading
+of files are not counted.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -29,7 +33,7 @@ from reseau.optics.poses import rotation_matrix
 DATA = (
     Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "networks"
 )
-SOURCE = Path(__file__).parent / "ceres" / "bundle.cc"
+SOURCE, COLMAP = (Path(__file__).parent / "ceres" / name for name in ("bundle.cc", "colmap.py"))
 # ½Σr² to be reached: that of Ceres for ladybug, the published 185.94²/2 for roma.
 LADYBUG, ROMA = 1.334433e4, 0.5 * 185.940**2
 REPEATS = 5
@@ -59,6 +63,16 @@ def peer(program: Path, kind: str, network: Path, target: float) -> tuple[float,
         [program, kind, network, repr(target)], check=True, capture_output=True, text=True
     ).stdout.split()
     return float(words[0]), float(words[1]), float(words[2]), int(words[3])
+
+
+def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
+    """Nothing is known of the way: seconds in all are those to its end."""
+    if importlib.util.find_spec("pycolmap") is None:
+        return None
+    words = subprocess.run(
+        [sys.executable, COLMAP, kind, network], check=True, capture_output=True, text=True
+    ).stdout.split()
+    return float("nan"), float(words[0]), float(words[1]), int(words[2])
 
 
 def ours(problem: BundleProblem, target: float) -> tuple[float, float, float, int]:
@@ -104,28 +118,33 @@ def peers() -> None:
         )
         for title, kind, file, problem, target in cases:
             ours(replace(problem, max_iterations=2), target)
-            mine, theirs = [], []
+            mine, theirs, others = [], [], []
             for _ in range(REPEATS):
                 mine.append(ours(problem, target))
                 if program is not None:
                     theirs.append(peer(program, kind, file, target))
+                found = colmap(kind, file)
+                if found is not None:
+                    others.append(found)
             print(f"{title}: to ½Σr² ≤ {target:.8g}")
             said("reseau", mine)
             if theirs:
-                said("Ceres", theirs)
-                ratio = np.median([a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
-                print(f"  ratio  {ratio:.2f}")
+                said("Ceres", theirs, [a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
+            if others:
+                said("COLMAP", others, [a[1] / b[1] for a, b in zip(mine, others, strict=True)])
 
 
-def said(who: str, runs: list[tuple[float, float, float, int]]) -> None:
+def said(who: str, runs: list[tuple[float, float, float, int]], ratios: list[float] | None = None) -> None:
     reached, whole, cost, steps = np.median(np.array(runs), axis=0)
-    print(f"  {who:6s} {reached:7.3f} s to it, {whole:.3f} s in all, ½Σr² {cost:.6f}, {steps:.0f} steps")
+    to_it = "        –" if np.isnan(reached) else f"{reached:7.3f} s"
+    ratio = "" if ratios is None else f"; reseau takes {np.median(ratios):.2f} of it"
+    print(f"  {who:6s} {to_it} to it, {whole:.3f} s in all, ½Σr² {cost:.6f}, {steps:.0f} steps{ratio}")
 
 
 def statistics() -> None:
     fit = roma_problem().adjusted()
     assert isinstance(fit, BundleFit)
-    chosen = fit.problem.network.datum_points
+    chosen = fit.datum
     spent, numbers = [], []
     for _ in range(REPEATS):
         begun = time.perf_counter()
