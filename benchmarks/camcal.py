@@ -201,8 +201,8 @@ def command(paths: list[Path], camcal: ModuleType, folder: Path) -> None:
         rows = [",".join((words[0], *words[2:5])) for words in known if words[0].isdigit()]
         control.write_text("id,x,y,z\n" + "\n".join(rows) + "\n")
         words = [
-            sys.executable, "-m", "reseau", "calibrate", *paths, "-d", design, "--control", control,
-            "--pitch", "0.0031911032863849768", "--side", "image", "--free", "c,x0,y0,K1,K2,K3,P1,P2",
+            sys.executable, "-c", "from reseau.cli import main; main()", "calibrate", *paths,
+            "--design", design, "--control", control, "--pitch", "0.0031911032863849768", "--side", "image", "--free", "c,x0,y0,K1,K2,K3,P1,P2",
             "--sigma", "0.1", "--channel", "green", "-o", out, "--report", Path(name) / "report.html",
         ]  # fmt: skip
         for mark in EXTRA:

@@ -1,4 +1,4 @@
-"""The networks of the benchmark adjusted by COLMAP; ``benchmarks/bundle.py`` calls it as a program of its own.
+"""The networks of the benchmark adjusted by COLMAP; called by ``benchmarks/bundle.py`` as a program.
 
     colmap.py bal NETWORK        BAL file; each image has f, k1, k2 of its own
     colmap.py shared NETWORK     one camera for all, as benchmarks/bundle.py writes it
