@@ -197,6 +197,41 @@ class Laboratory:
             self.echoes = np.clip(gain * 255 * signal + noise, 0, 255).astype(np.uint8)
             return self.echoes
 
+    SECTION_MM = (0.2, 0.25)
+    """Size of a pixel of :meth:`section`, along and in depth."""
+
+    def section(self) -> NDArray[np.uint8]:
+        """A section as the scanner itself hands it over, no tube between; pixels of :attr:`SECTION_MM`."""
+        with self.lock:
+            scanner = self.world.scanner
+            along, down = self.SECTION_MM
+            columns, rows = round(2 * scanner.half_sweep_mm / along), round(scanner.depth_mm / down)
+            place: Array = (np.arange(columns, dtype=np.float64) - (columns - 1) / 2) * along
+            depth: Array = (np.arange(rows, dtype=np.float64) + 0.5) * down
+            x = scanner.middle_mm + scanner.scale[0] * place
+            y = scanner.top_mm - scanner.scale[1] * depth
+            self._lines += 1
+            video = scanner.sweep(self._tank, x, y, self.world.rng("section", self._lines))
+            return np.clip(np.rint(255 * video.signal), 0, 255).astype(np.uint8)
+
+    def pulse(self, place_mm: float) -> NDArray[np.uint8]:
+        """Echoes of a transducer that stands so far along the tank, from its left end, on an oscilloscope.
+
+        1000 samples of a microsecond, the pulse in their middle; 128 is nothing.
+        """
+        with self.lock:
+            scanner, tank = self.world.scanner, self._tank
+            half = scanner.speed / 2
+            range_mm = (np.arange(1000.0) - 500) * half
+            off = place_mm - scanner.half_sweep_mm - tank.xy[:, 0]
+            distance, width = np.hypot(off, tank.xy[:, 1]), scanner.beam_mm(-tank.xy[:, 1])
+            strength = scanner.brightness * tank.strength * np.exp(-0.5 * (off / width) ** 2)
+            late = (range_mm[:, None] - distance) / np.hypot(scanner.pulse_mm, half / 2)
+            self._lines += 1
+            noise = self.world.rng("pulse", self._lines).normal(0.0, _NOISE, len(range_mm))
+            signal = 120 * (np.exp(-0.5 * late**2) * strength).sum(axis=1) + noise
+            return np.asarray(np.clip(np.rint(128 + signal), 0, 255), np.uint8)
+
     def screen(self) -> Screen:
         """The tube as it glows now: of the section, what has been swept."""
         with self.lock:

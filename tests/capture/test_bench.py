@@ -7,12 +7,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from reseau.capture import Bench, BenchFile, found_instruments, plugin
 from reseau.cli import run
 from reseau.errors import BenchError, ConnectionLost, FormatError, InputError, UsageError
 from reseau.instruments import Oscilloscope, Turntable, UltrasonicScanner
+from reseau_sims import Reflectors
 from reseau_sims.serving import Fault, SimulatedBench
 
 HEAD = 'schema = "reseau-bench/1"\n'
@@ -88,7 +90,39 @@ def test_the_simulated_bench_works_over_its_real_protocols() -> None:
             shown = scope.screen(20.0).frame().pixels
             assert (shown == simulated.laboratory.picture(800, 480)).all()
             bench.stop()
-        assert simulated.violations == {"table": [], "scanner": [], "oscilloscope": []}
+        assert not any(simulated.violations.values())
+
+
+def test_every_scanner_of_the_simulated_bench_sees_the_same_rods_in_millimetres() -> None:
+    with (
+        SimulatedBench(seed=2, table="smc100") as simulated,
+        Bench(BenchFile.parse_toml(simulated.toml, where="simulated")) as bench,
+    ):
+        table, bmode, pulser = bench["table"], bench["bmode"], bench["pulser"]
+        assert isinstance(table, Turntable)
+        assert isinstance(bmode, UltrasonicScanner)
+        assert isinstance(pulser, UltrasonicScanner)
+        simulated.laboratory.tank = Reflectors(("a",), np.array([[-30.0, -60.0]]), np.ones(1))
+        table.configure(speed=1000.0)
+        table.home("z", 20.0)
+        pulser.configure(
+            repetition_hz=100.0, first_mm=20.0, step_mm=2.0, lines=15, full_scale_v=5.0, speed_m_s=1540.0
+        )
+        for scan, left in ((bmode.scan(10.0), -64.0), (pulser.scan(60.0), 20.0 - 64.0)):
+            assert scan.mm_per_px is not None
+            # The transducer's own face, and what the pulse left, are not looked at.
+            first = round(20 / scan.mm_per_px[1])
+            row, column = np.unravel_index(int(scan.pixels[first:].argmax()), scan.pixels[first:].shape)
+            along = left + (column + 0.5 * (left == -64.0)) * scan.mm_per_px[0]
+            depth = (row + first - scan.origin_px[1]) * scan.mm_per_px[1]
+            assert (along, depth) == (pytest.approx(-30.0, abs=2.0), pytest.approx(60.0, abs=1.0))
+        assert not any(simulated.violations.values())
+
+
+def test_a_table_or_a_family_that_nobody_simulates_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in (["--table", "acme"], ["--family", "acme"]):
+        assert run(["bench", "sim", "--seconds", "0.01", *wrong]) == 2
+        assert "acme" in capsys.readouterr().err
 
 
 def test_check_tells_every_failure_and_its_exit_status(
@@ -106,13 +140,13 @@ def test_check_tells_every_failure_and_its_exit_status(
         assert told["scanner"]["line"].startswith("200 samples")
         assert told["table"]["tilt"] == "not homed"
         assert told["oscilloscope"]["error"] == "none"
-        assert [each["name"] for each in document["instruments"]] == ["table", "scanner", "oscilloscope"]
+        assert [each["name"] for each in document["instruments"]] == list(simulated.machines)
         for script in simulated.scripts.values():
             for number in range(40):
                 script.fault_at(script.count + number, Fault("dropped"))
         assert run(["bench", "check", "--bench", str(path), "--seconds", "0.5"]) == 1
         said = capsys.readouterr().out
-    assert said.count("failed") == 3
+    assert said.count("failed") == len(simulated.machines)
     assert "did not answer" in said
     assert "└── oscilloscope" in said
     assert run(["bench", "check", "--bench", str(tmp_path / "none.toml")]) == 2
@@ -123,7 +157,8 @@ def test_check_tells_every_failure_and_its_exit_status(
 def test_sim_writes_a_bench_that_check_accepts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bench.toml"
     assert run(["bench", "sim", "--out", str(path), "--seconds", "0.01"]) == 0
-    assert set(BenchFile.read(path).instruments) == {"table", "scanner", "oscilloscope"}
+    wanted = {"table", "scanner", "bmode", "pulser", "oscilloscope"}
+    assert set(BenchFile.read(path).instruments) >= wanted
     assert run(["bench", "sim", "--seconds", "0.01"]) == 0
     assert "reseau-bench/1" in capsys.readouterr().out
 

@@ -4,22 +4,35 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
-from typing import Self
+from typing import Literal, Self, get_args
 
-from ..laboratory import Laboratory
+import numpy as np
+from numpy.typing import NDArray
+
+from reseau.errors import UsageError
+
+from ..laboratory import AXES, Laboratory
 from ..world import World
+from .bk import BkScanner
+from .compactpulser import CompactPulser
 from .machine import Machine, Wire
-from .oscilloscope import Oscilloscope
+from .oscilloscope import FAMILIES, Oscilloscope
 from .ping360 import Ping360
 from .scpi import Vxi11Session
 from .script import Script
 from .servers import PtyServer, TcpServer
+from .smc100 import Smc100Line
 from .zaber import ZaberChain
 
-__all__ = ["SimulatedBench", "serve"]
+__all__ = ["SimulatedBench", "TableKind", "serve"]
 
-_AXES = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
-_PER_UNIT = 1000.0
+TableKind = Literal["zaber", "smc100"]
+
+_CHAIN = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
+"""Device and axis on the chain of Zaber's; of Newport's each axis has a controller of its own."""
+_STEPS = 1000.0
+"""Of Zaber's for a degree or a millimetre."""
+_HIGH = {"tilt": 75.0, "roll": 360.0, "camera_roll": 360.0, "z": 300.0}
 _SCREEN = (800, 480)
 
 _BENCH = """\
@@ -27,20 +40,25 @@ schema = "reseau-bench/1"
 name = "simulated"
 
 [instruments.table]
-driver = "zaber"
+driver = "{kind}"
 address = "{table}"
 settings = {{speed = 50.0}}
 
 [instruments.table.options.axes]
-tilt = {{device = 1, axis = 1, per_unit = 1000.0, low = 0.0, high = 75.0, backlash = 0.2}}
-roll = {{device = 1, axis = 2, per_unit = 1000.0, low = 0.0, high = 360.0, backlash = 0.2}}
-camera_roll = {{device = 2, axis = 1, per_unit = 1000.0, low = 0.0, high = 360.0, backlash = 0.2}}
-z = {{device = 3, axis = 1, per_unit = 1000.0, unit = "mm", low = 0.0, high = 300.0}}
-
+{axes}
 [instruments.scanner]
 driver = "ping360"
 address = "{scanner}"
 settings = {{range_mm = 150.0}}
+
+[instruments.bmode]
+driver = "bk"
+address = "{bmode}"
+
+[instruments.pulser]
+driver = "compactpulser"
+address = "{pulser}"
+options = {{digitiser = "oscilloscope", carrier = "table", axis = "z"}}
 
 [instruments.oscilloscope]
 driver = "oscilloscope"
@@ -55,6 +73,10 @@ class SimulatedBench:
     ----------
     seed : int
         Of the world.
+    table : {"zaber", "smc100"}
+        Whose controllers move it.
+    family : str
+        Of the oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
 
     Attributes
     ----------
@@ -64,17 +86,28 @@ class SimulatedBench:
         What they share.
     scripts : dict
         What goes wrong, by instrument; nothing at first.
+
+    Raises
+    ------
+    UsageError
+        When nobody simulates such a table or oscilloscope.
     """
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, *, table: TableKind = "zaber", family: str = "keysight") -> None:
+        for what, known, asked in (
+            ("table", get_args(TableKind), table),
+            ("oscilloscope", tuple(FAMILIES), family),
+        ):
+            if asked not in known:
+                raise UsageError(f"is no simulated {what}", where=asked, do=f"there are {', '.join(known)}")
         self.laboratory = laboratory = Laboratory(World.standard(seed))
-        table = ZaberChain([2, 1, 1])
-        for name, (device, axis) in _AXES.items():
-            laboratory.attach(name, partial(_units, table, device, axis))
-        scope = Oscilloscope("keysight", lambda: laboratory.picture(*_SCREEN), lambda: laboratory.echoes)
+        self._pulser = CompactPulser()
+        scope = Oscilloscope(family, lambda: laboratory.picture(*_SCREEN), self._channel)
         self.machines: dict[str, Machine] = {
-            "table": table,
+            "table": self._table(table),
             "scanner": Ping360(laboratory.line),
+            "bmode": BkScanner(laboratory.section, laboratory.SECTION_MM),
+            "pulser": self._pulser,
             "oscilloscope": scope,
         }
         self.scripts = {name: Script() for name in self.machines}
@@ -82,16 +115,36 @@ class SimulatedBench:
         with ExitStack() as stack:
             addresses = {
                 name: stack.enter_context(
-                    PtyServer(partial(Wire, self.machines[name], self.scripts[name]))
+                    (TcpServer if name == "bmode" else PtyServer)(partial(Wire, machine, self.scripts[name]))
                 ).address
-                for name in ("table", "scanner")
+                for name, machine in self.machines.items()
+                if name != "oscilloscope"
             }
             core = stack.enter_context(
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
             addresses["oscilloscope"] = f"TCPIP::{core.HOST},{core.port}::inst0::INSTR"
             self._servers = stack.pop_all()
-        self.toml = _BENCH.format(**addresses)
+        axes = "".join(_axis_entry(table, name) for name in AXES)
+        self.toml = _BENCH.format(kind=table, axes=axes, **addresses)
+
+    def _table(self, kind: TableKind) -> Machine:
+        """The controllers of the table; the laboratory's axes stand where they are."""
+        if kind == "smc100":
+            line = Smc100Line(len(AXES), low=0.0, high=400.0, speed=20.0)
+            for address, name in enumerate(AXES, 1):
+                self.laboratory.attach(name, partial(line.position, address))
+            return line
+        chain = ZaberChain([2, 1, 1])
+        for name, key in _CHAIN.items():
+            self.laboratory.attach(name, partial(_units, chain, *key))
+        return chain
+
+    def _channel(self) -> NDArray[np.uint8]:
+        """Channel 1 of the oscilloscope: echoes of the pulser while it sends, else of the scanner."""
+        if not self._pulser.values["P"]:
+            return self.laboratory.echoes
+        return self.laboratory.pulse(self.laboratory.axes["z"])
 
     @property
     def violations(self) -> dict[str, list[str]]:
@@ -109,11 +162,21 @@ class SimulatedBench:
         self.close()
 
 
-def _units(table: ZaberChain, device: int, axis: int) -> float:
+def _units(chain: ZaberChain, device: int, axis: int) -> float:
     """Where an axis stands, in degrees or millimetres."""
-    return table.position(device, axis) / _PER_UNIT
+    return chain.position(device, axis) / _STEPS
 
 
-def serve(seed: int = 0) -> SimulatedBench:
+def _axis_entry(kind: TableKind, name: str) -> str:
+    """The line of ``bench.toml`` for an axis."""
+    device, axis = _CHAIN[name]
+    where = f"device = {device}, axis = {axis}, per_unit = {_STEPS}"
+    if kind == "smc100":
+        where = f"device = {AXES.index(name) + 1}"
+    unit = ', unit = "mm"' if name == "z" else ", backlash = 0.2"
+    return f"{name} = {{{where}, low = 0.0, high = {_HIGH[name]}{unit}}}\n"
+
+
+def serve(seed: int = 0, table: TableKind = "zaber", family: str = "keysight") -> SimulatedBench:
     """A simulated bench; found by its entry point."""
-    return SimulatedBench(seed)
+    return SimulatedBench(seed, table=table, family=family)

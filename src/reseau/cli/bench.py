@@ -76,6 +76,8 @@ def check(
 def sim(
     out: Out = None,
     seed: Annotated[int, typer.Option(help="Of the simulated world.")] = 0,
+    table: Annotated[str, typer.Option(help="Whose controllers move the table: zaber, smc100.")] = "zaber",
+    family: Annotated[str, typer.Option(help="Of the oscilloscope: keysight, rigol-1000z, …")] = "keysight",
     seconds: Annotated[float, typer.Option(min=0.0, help="Serve so long; 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print the bench.toml that leads to them."""
@@ -86,7 +88,7 @@ def sim(
 
     if out is not None:
         writable(out)
-    with plugin("reseau.simulators", "bench")(seed) as bench:
+    with plugin("reseau.simulators", "bench")(seed, table, family) as bench:
         if out is not None:
             write_whole(out, bench.toml)
         else:
