@@ -142,6 +142,43 @@ def test_a_simulator_survives_any_noise_and_says_that_it_was_none_of_its_protoco
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
+CALLS: dict[str, list[str]] = {
+    "zaber": ["check", "home", "move", "state"],
+    "smc100": ["check", "home", "move", "state"],
+    "ping360": ["check", "scan", "line"],
+    "bk": ["check", "scan"],
+    "compactpulser": ["check", "verify"],
+    "oscilloscope": ["check", "screen", "waveform", "errors"],
+}
+ARGUMENTS: dict[str, tuple[Any, ...]] = {
+    "home": ("tilt",),
+    "move": ("tilt", 5.0),
+    "state": ("tilt",),
+    "line": (0,),
+    "waveform": (1,),
+}
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_every_call_of_a_silent_instrument_ends_at_its_deadline(driver: str) -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+    try:
+        address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        device = DRIVERS[driver]("victim", address, seconds=0.3)
+        for call in (*CALLS[driver], "connect", "configure", "stop", "stage", "read"):
+            more = {"seconds": 0.3} if call not in ("configure", "stop", "stage", "read") else {}
+            began = time.monotonic()
+            with pytest.raises(InstrumentError, match="victim") as caught:
+                getattr(device, call)(*ARGUMENTS.get(call, ()), **more)
+            assert time.monotonic() - began < 0.3 + 1.0, call
+            assert caught.value.command, call
+        status = device.trigger()
+        assert isinstance(status.exception(5.0), InstrumentError)
+        device.close()
+    finally:
+        listener.close()
+
+
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_close_never_raises_whatever_the_connection_is_in(driver: str) -> None:
     device = DRIVERS[driver]("victim", "tcp://127.0.0.1:1", seconds=0.2)

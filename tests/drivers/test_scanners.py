@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from reseau.capture import Bench, BenchFile
-from reseau.errors import BenchError, DeadlineError, ProtocolError, SettingError, StateError
+from reseau.errors import BenchError, ConnectionLost, DeadlineError, ProtocolError, SettingError, StateError
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.codecs import bk
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import BkScanner, CompactPulser, bk_oem, compact_pulser
 from reseau_drivers.turntable import zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, Machine, Script, Wire, ZaberChain
+from reseau_sims.serving import Fault, InProcess, Machine, Script, Wire, ZaberChain
 
 
 def linked(machine: Machine) -> InProcess:
@@ -203,6 +203,26 @@ def test_what_works_together_is_named_on_the_bench() -> None:
     ):
         with pytest.raises(BenchError, match=said):
             Bench(BenchFile.parse_toml(wrong, where="bench.toml"))
+
+
+def test_a_pulser_that_was_off_gets_all_its_settings_back() -> None:
+    machine, script = serving.CompactPulser(), Script()
+    device = compact_pulser("pulser", InProcess(lambda: Wire(machine, script)), settings={"voltage": 250.0})
+    with device:
+        device.configure(repetition_hz=500.0, gain_db=12.5)
+        before = dict(machine.values)
+        machine.afflict("power-cycled")
+        script.fault_at(script.count, Fault("disconnected"))
+        with pytest.raises(ConnectionLost):
+            device.verify()
+        device.verify()
+        assert machine.values == before
+        assert device.reconnections == 2
+        # A run stops the pulses at its end; the next one has them again.
+        device.unstage()
+        assert machine.values["P"] == 0
+        device.stage()
+        assert machine.values == before
 
 
 def test_a_knob_that_was_turned_is_found() -> None:

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from reseau.errors import ConnectionLost, DeadlineError, SettingError, StateError, UsageError
-from reseau.instruments import Turntable
+from reseau.instruments import Movable, Turntable
 from reseau_drivers.link import link_to
 from reseau_drivers.turntable import AxisPlan, Table, Zaber, smc100, zaber
 from reseau_sims.serving import Fault, InProcess, Script, Smc100Line, Wire, ZaberChain
@@ -32,6 +32,8 @@ def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
 def test_a_table_is_homed_before_it_moves_and_keeps_to_its_limits(which: int) -> None:
     table, machine = tables()[which]
     assert isinstance(table, Turntable)
+    assert isinstance(table.axes["tilt"], Movable)
+    assert (table.axes["tilt"].unit, table.axes["tilt"].limits) == ("deg", (0.5, 100.0))
     with table:
         with pytest.raises(StateError, match="home tilt first"):
             table.move("tilt", 5.0)

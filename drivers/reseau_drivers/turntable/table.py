@@ -126,6 +126,17 @@ class Axis:
         self.name = f"{table.name}_{key}"
 
     @property
+    def unit(self) -> str:
+        """Of its positions: degrees or millimetres."""
+        return self._table.plans[self._key].unit
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest position that it may be moved to; the lowest leaves room for the backlash."""
+        plan = self._table.plans[self._key]
+        return plan.low + plan.backlash, plan.high
+
+    @property
     def position(self) -> float:
         """Where it stands."""
         return self._table.state(self._key).position

@@ -95,6 +95,18 @@ class Movable(Protocol):
     def name(self) -> str:
         """Its name."""
 
+    @property
+    def unit(self) -> str:
+        """Of its positions and limits: degrees or millimetres."""
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest position that it may be moved to."""
+
+    @property
+    def position(self) -> float:
+        """Where it stands."""
+
     def set(self, value: float) -> Status:
         """Begin to move there."""
 
