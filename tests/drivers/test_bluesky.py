@@ -120,7 +120,7 @@ def test_count_and_scan_with_every_detector_on_every_table(
 def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], engine: Any) -> None:
     table, controller = make_table()
     tilt, roll = table.axes["tilt"], table.axes["roll"]
-    for wanted in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable"):
+    for wanted in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable", "NamedMovable"):
         assert isinstance(tilt, getattr(protocols, wanted)), wanted
     for wanted in EVERY:
         assert isinstance(table, getattr(protocols, wanted)), wanted
@@ -137,11 +137,15 @@ def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], eng
         assert (tilt.position, roll.position) == pytest.approx((12.0, -5.0), abs=2e-3)
         table.configure(speed=500.0)
         engine(bp.grid_scan([], tilt, 5.0, 15.0, 2, roll, 0.0, 10.0, 2), kept)
+        engine(bps.mv(tilt, 20.0))
+        engine(bp.rel_scan([], tilt, -5.0, 5.0, 3), kept)
+        assert tilt.position == pytest.approx(20.0, abs=2e-3)
+        assert [event["table_tilt"] for event in events[4:]] == pytest.approx([15, 20, 25], abs=2e-3)
         with pytest.raises(SettingError, match=r"axis tilt of table.*beyond"):
             engine(bps.mv(tilt, 91.0))
         with pytest.raises(SettingError):
             tilt.check_value(-1.0)
-    assert [(e["table_tilt"], e["table_roll"]) for e in events] == [
+    assert [(e["table_tilt"], e["table_roll"]) for e in events[:4]] == [
         pytest.approx(where, abs=2e-3) for where in ((5, 0), (5, 10), (15, 0), (15, 10))
     ]
     assert controller is not None

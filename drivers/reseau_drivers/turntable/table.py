@@ -141,6 +141,11 @@ class Axis:
         """Where it stands."""
         return self._table.state(self._key).position
 
+    @property
+    def hints(self) -> dict[str, Any]:
+        """What bluesky plots of it."""
+        return {"fields": [self.name]}
+
     def set(self, value: float) -> Status:
         """Begin to move there; the status is done when it is there.
 
