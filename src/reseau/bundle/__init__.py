@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
+from .between import sigma_between_images
 from .calibrated import calibration_of
 from .components import Kind, estimate_components, reweighted
 from .document import searched_document, to_document
@@ -50,5 +51,6 @@ __all__ = [
     "reweighted",
     "search_model",
     "searched_document",
+    "sigma_between_images",
     "to_document",
 ]

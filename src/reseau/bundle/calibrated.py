@@ -9,6 +9,7 @@ import numpy as np
 
 from ..calibration import Calibration, Covariance, Quantity
 from ..errors import UsageError
+from .between import sigma_between_images
 from .network import Camera
 from .result import Result
 
@@ -63,6 +64,7 @@ def calibration_of(
         key: Quantity(value=float(value), sigma=float(s), unit=_UNITS.get(key, ""))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
+    between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     return Calibration(
@@ -75,6 +77,7 @@ def calibration_of(
         redundancy=result.redundancy,
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
+                  "sigma_between_images": {key: s for key, s in between if np.isfinite(s)},
                   "warnings": list(result.warnings)},
         provenance=dict(provenance or {}),
         times=dict(times or {}),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Array
+from .between import sigma_between_images
 from .model_search import Searched
 from .network import finite
 from .result import Result
@@ -99,6 +100,8 @@ def _camera(result: Result, c: int) -> dict[str, Any]:
     return {
         "id": camera.id,
         "parameters": held | found,
+        # By the scatter between images; null where these are too few.
+        "sigma_between_images": dict(zip(names, _column(sigma_between_images(result, c)), strict=True)),
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
         "tests": tests,
     }

@@ -95,6 +95,11 @@ class Camera:
         return CAMERA_PARAMETERS[self.model] if self.mapping is None else tuple(self.mapping.names)
 
     @property
+    def label(self) -> str:
+        """What it is called in a sentence."""
+        return self.id if self.id == "camera" else f"camera {self.id}"
+
+    @property
     def parameters(self) -> dict[str, float]:
         """Values by name."""
         return dict(zip(self.names, self.values.tolist(), strict=True))

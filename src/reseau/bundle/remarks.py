@@ -10,6 +10,7 @@ import scipy.special
 from ..adjust import critical_w
 from ..data import Rows
 from ..errors import UsageError
+from .between import sigma_between_images
 from .network import Network
 from .patterns import by_place, common_pattern
 from .problem import BundleFit
@@ -23,6 +24,8 @@ _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
 _NEAR = 1e-3
 # Redundancy from which on the scatter of an image is compared with that of the others.
 _LEAST = 5.0
+# Uncertainty between images over that of independent errors that is remarked; by noise alone it is 1.1 or so.
+_SCATTERED = 2.0
 # Images of a camera from which on they are asked for what they have in common.
 _IN_COMMON = 3
 # A corner is this part of width and height.
@@ -71,7 +74,7 @@ def gaps(network: Network, fit: BundleFit) -> list[str]:
         found.append(f"{len(images) - LISTED} more images are left out")
     used = np.bincount(network.camera_of[fit.usable.images], minlength=len(network.cameras))
     for c in np.flatnonzero(used == 0):
-        found.append(f"camera {network.cameras[c].id} has no image; its parameters stay as they are given")
+        found.append(f"{network.cameras[c].label} has no image; its parameters stay as they are given")
     return found
 
 
@@ -88,6 +91,7 @@ def remarks(result: Result) -> list[str]:
         *_datum(result),
         *_scatter(result),
         *_patterns(result),
+        *_between(result),
         *_behind(network, fit),
         *_corners(network, fit),
     ]
@@ -150,7 +154,7 @@ def _correlations(result: Result) -> list[str]:
         size = np.where(size > 0, size, 1.0)
         r = q / np.outer(size, size)
         for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
-            found.append(f"camera {camera.id}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}")
+            found.append(f"{camera.label}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}")
     if len(found) > LISTED:
         found = [
             *found[:LISTED],
@@ -238,11 +242,28 @@ def _patterns(result: Result) -> list[str]:
             continue
         if pattern.p < _ALPHA:
             found.append(
-                f"camera {network.cameras[c].id}: residuals of its images have a pattern in common by place "
+                f"{network.cameras[c].label}: residuals of its images have a pattern in common by place "
                 f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
                 "sigmas do not cover"
             )
     return found
+
+
+def _between(result: Result) -> list[str]:
+    """Parameters that differ between the images of a camera by more than their sigmas."""
+    found = []
+    for c, camera in enumerate(result.network.cameras):
+        names, _, _ = result.camera_columns(c)
+        sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+        ratio = np.nan_to_num(sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf))
+        rows = np.flatnonzero(ratio > _SCATTERED)
+        if len(rows):
+            said = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
+            found.append(
+                f"{camera.label}: by the scatter between its images parameters are less certain than their "
+                f"sigmas say, by the factor: {said}; the camera may not be the same in all of them"
+            )
+    return found[:LISTED]
 
 
 def _behind(network: Network, fit: BundleFit) -> list[str]:
@@ -274,5 +295,5 @@ def _corners(network: Network, fit: BundleFit) -> list[str]:
         }
         empty = [name for name, inside in corners.items() if not inside.any()]
         if empty:
-            found.append(f"camera {camera.id}: no points in the {', '.join(empty)} of its images")
+            found.append(f"{camera.label}: no points in the {', '.join(empty)} of its images")
     return found[:LISTED]

@@ -223,7 +223,7 @@ def _differences(done: Calibrated, others: dict[str, Lens]) -> dict[str, FieldDi
 def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
     import numpy as np
 
-    from ..bundle import Lens, projection_field
+    from ..bundle import Lens, projection_field, sigma_between_images
 
     result = done.result
     count = sum(len(points) for points in done.measured.values())
@@ -233,8 +233,10 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
     v = v[np.isfinite(v).all(axis=1)]
     say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
     names, _, values = result.camera_columns(0)
-    for name, value, s in zip(names, values, result.camera_covariance(0).diagonal() ** 0.5, strict=True):
-        say(f"  {name:<6} {value:14.7g} ± {s:.3g}\n")
+    sigmas, between = result.camera_covariance(0).diagonal() ** 0.5, sigma_between_images(result, 0)
+    for name, value, s, other in zip(names, values, sigmas, between, strict=True):
+        by_images = f" (by images {other:.3g})" if np.isfinite(other) else ""
+        say(f"  {name:<6} {value:14.7g} ± {s:.3g}{by_images}\n")
     sigma = projection_field(Lens.of_result(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")

@@ -49,6 +49,10 @@ class PlaneDesign(Protocol):
     def xy(self) -> Array:
         """Coordinates (p, 2), x right and y up."""
 
+    @property
+    def unit(self) -> str:
+        """Of the coordinates; a label."""
+
 
 @dataclass(frozen=True)
 class CameraModel:
@@ -335,7 +339,7 @@ def network_of(
         datum_points=np.ones(p, dtype=bool),
         groups=(None,) * m if groups is None else tuple(groups),
         files=tuple(measured),
-        unit="mm",
+        unit=design.unit,
     )
 
 

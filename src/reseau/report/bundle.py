@@ -11,7 +11,15 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import FieldDifference, Lens, Result, Searched, projection_field, projection_field_at
+from ..bundle import (
+    FieldDifference,
+    Lens,
+    Result,
+    Searched,
+    projection_field,
+    projection_field_at,
+    sigma_between_images,
+)
 from ..data import Rows
 from ..provenance import Provenance
 from .bundle_figures import distortion_figure, network_figure, residual_figure
@@ -21,7 +29,7 @@ from .patterns import patterns_of
 
 __all__ = ["bundle_report"]
 
-_IMAGES, _CAMERAS = 200, 20
+_IMAGES, _CAMERAS, _PLACES = 200, 20, 45
 _UNITS = {"c": "mm", "x0": "mm", "y0": "mm", "K1": "mm⁻²", "K2": "mm⁻⁴", "K3": "mm⁻⁶", "P1": "mm⁻¹",
           "P2": "mm⁻¹", "fx": "px", "fy": "px", "cx": "px", "cy": "px"}  # fmt: skip
 
@@ -137,16 +145,18 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
     sigma = np.sqrt(np.diag(result.camera_covariance(c)))
     tests = {test.name: test for test in result.camera_tests(c)}
     rows = []
-    for name, value, s in zip(names, values, sigma, strict=True):
+    between = sigma_between_images(result, c)
+    for name, value, s, other in zip(names, values, sigma, between, strict=True):
         test = tests.get(name)
         rows.append(
             {
                 "name": name,
                 "value": f"{value:.7g}",
                 "sigma": f"{s:.2g}",
+                "between": f"{other:.2g}" if np.isfinite(other) else "–",
                 "unit": _UNITS.get(name, ""),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
-                "p": "" if test is None else f"{test.p:.3f}",
+                "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
                 "verdict": "" if test is None or test.significant else "not significant",
             }
         )
@@ -154,7 +164,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
     lens = _lens(result, c)
     profile = None if lens is None else distortion_figure(lens)
     return {
-        "id": camera.id,
+        "title": camera.label[0].upper() + camera.label[1:],
         "rows": rows,
         "residuals": Markup(residual_figure(result, c, at)),
         "fields": [] if lens is None else _fields(result, c, lens, at, distances),
@@ -177,9 +187,9 @@ def _fields(
     network, values = result.network, result.fit.values
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))
-    fields = [("directions", projection_field(lens))]
+    fields = [("directions", projection_field(lens, _PLACES))]
     fields += [
-        (f"points at {distance:.3g} {network.unit}", projection_field_at(result, c, distance))
+        (f"points at {distance:.3g} {network.unit}", projection_field_at(result, c, distance, across=_PLACES))
         for distance in distances or [usual]
     ]
     return [

@@ -43,7 +43,7 @@ def network_figure(result: Result) -> str:
             axes.plot(x0[:, a], x0[:, b], "^", color=BLUE, markersize=4)
             enlarged = _ellipses(axes, result, points, (a, b), 0.4 * size)
             axes.set_aspect("equal", adjustable="datalim")
-            axes.set_title(f"{title}; ellipses × {enlarged:.3g}")
+            axes.set_title(f"{title}; ellipses × {enlarged:g}")
             axes.set_xlabel(f"{'XYZ'[a]} [{result.network.unit}]")
             axes.set_ylabel(f"{'XYZ'[b]} [{result.network.unit}]")
         return to_svg(figure)

@@ -83,7 +83,7 @@ def difference_figure(found: FieldDifference) -> str:
                 *xy[chosen].T, *(enlarged * d[chosen]).T, color=colour, angles="xy", scale_units="xy",
                 scale=1, width=0.003, zorder=4,
             )  # fmt: skip
-        axes.set_title(f"difference × {enlarged:.3g} over its σ [px]; longest {longest:.2g} px")
+        axes.set_title(f"difference × {enlarged:g} over its σ [px]; longest {longest:.2g} px")
         return to_svg(figure)
 
 

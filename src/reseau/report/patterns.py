@@ -28,7 +28,7 @@ def patterns_of(result: Result) -> list[dict[str, Any]]:
     """
     network = result.network
     patterns = [
-        (f"at one place of all images of camera {camera.id}", by_place(result, c), False)
+        (f"at one place of all images of {camera.label}", by_place(result, c), False)
         for c, camera in enumerate(network.cameras)
     ]
     if any(group is not None for group in network.groups):
@@ -86,5 +86,5 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_title(str(name), color=FAINT if not grouped else INK)
-        figure.suptitle(f"shifts × {enlarged:.3g}; the longest {size.max():.2g} px", fontsize=10.5)
+        figure.suptitle(f"shifts × {enlarged:g}; the longest {size.max():.2g} px", fontsize=10.5)
         return to_svg(figure)
