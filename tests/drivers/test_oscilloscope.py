@@ -210,6 +210,18 @@ def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> 
     assert machine.violations == []
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="the portmapper's port 111 may be opened by root alone")
+def test_our_driver_finds_the_core_channel_by_the_portmapper() -> None:
+    machine = serving.Oscilloscope("keysight")
+    with (
+        TcpServer(partial(Vxi11Session, machine, machine.execute, Script())) as core,
+        _portmapper(core.port),
+        oscilloscope("scope", "TCPIP::127.0.0.1::inst0::INSTR") as device,
+    ):
+        assert (device.screen().frame().pixels == machine.screen()).all()
+    assert machine.violations == []
+
+
 @pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
 @pytest.mark.parametrize("way", ["stop", "close"])
 def test_a_call_that_hangs_is_broken_off_from_another_thread(transport: str, way: str) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -175,6 +178,36 @@ def test_a_transducer_that_is_carried_along_makes_sections() -> None:
     along = (column - scan.origin_px[0]) * scan.mm_per_px[0] + 12.0
     assert (along, depth) == (pytest.approx(12.0), pytest.approx(300.0, abs=0.8))
     assert scan.pixels.max() == pytest.approx(255 * 4 / 5, abs=3)
+    assert machine.violations == chain.violations == shown.violations == []
+
+
+def test_stop_ends_a_section_and_the_carrier_stands() -> None:
+    chain, shown = ZaberChain([1]), serving.Oscilloscope("keysight")
+    axes = {"z": {"per_unit": 1000.0, "unit": "mm", "high": 300.0}}
+    table = zaber("table", linked(chain), axes=axes, settings={"speed": 20.0})
+    scope = oscilloscope("scope", linked(shown))
+    wanted = {"repetition_hz": 100.0, "step_mm": 100.0, "lines": 3}
+    device, machine = pulser(digitiser=scope, carrier=table, settings=wanted)
+    with scope, table, device:
+        table.home("z")
+        caught: list[Exception] = []
+
+        def scan() -> None:
+            try:
+                device.scan()
+            except StateError as error:
+                caught.append(error)
+
+        thread = threading.Thread(target=scan)
+        thread.start()
+        time.sleep(0.5)
+        device.stop()
+        thread.join(5.0)
+        assert "was stopped" in str(caught[0])
+        assert machine.values["P"] == 0
+        state = table.state("z")
+        assert not state.moving
+        assert state.position < 90.0
     assert machine.violations == chain.violations == shown.violations == []
 
 

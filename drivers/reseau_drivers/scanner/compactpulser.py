@@ -100,7 +100,7 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._talk: Conversation[bytes] = Conversation(link, LineDecoder(end=b"\r", limit=LIMIT))
         self._digitiser, self._carrier, self._axis = digitiser, carrier, axis
         self._answer_s = answer_s
-        self._told = "G"
+        self._told, self._scanning = "G", False
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
         """Find what was named among the instruments of the bench.
@@ -143,6 +143,13 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._set("G", wanted["G"], deadline)
         # It may have lost its power in between, and all that was set before.
         self._verify(wanted, deadline)
+
+    def stop(self, *, success: bool = False) -> None:
+        """Stop the pulses, and the carrier in the midst of a section."""
+        scanning = self._scanning
+        super().stop(success=success)
+        if scanning and isinstance(self._carrier, Turntable):
+            self._carrier.stop(success=success)
 
     def stage(self) -> list[Any]:
         """Connect, and send pulses again, which the end of the run before had stopped."""
@@ -223,19 +230,25 @@ class CompactPulser(Device[CompactPulserSettings]):
             raise StateError("is not carried along", where=self.name, command="scan", do="give it a carrier")
         deadline = Deadline(self._seconds * s.lines if seconds is None else seconds)
         self._stopping.clear()
-        lines: list[Waveform] = []
-        for k in range(s.lines):
-            if self._stopping.is_set():
-                raise StateError("was stopped", where=self.name, command="scan")
-            if deadline.over:
-                what = f"was not done within {deadline.seconds:g} s"
-                raise DeadlineError(what, where=self.name, command="scan")
-            self._carrier.move(self._axis, s.first_mm + k * s.step_mm, max(0.05, deadline.left))
-            lines.append(self.line(max(0.05, deadline.left)))
-        with self._exchange("scan", max(0.05, deadline.left)):
+        self._scanning = True
+        try:
+            lines = [self._carried(self._carrier, k, deadline) for k in range(s.lines)]
+        finally:
+            self._scanning = False
+        with self._exchange("scan", deadline.rest):
             pixels, row, step_s = section(lines, s.full_scale_v)
         mm = (s.step_mm, s.speed_m_s * 1e3 * step_s / 2)
         return BScan(pixels, mm, ((s.lines - 1) / 2, row), s.speed_m_s, float("nan"), s.gain_db, asked)
+
+    def _carried(self, carrier: Turntable, number: int, deadline: Deadline) -> Waveform:
+        """The line of this number of a section."""
+        if self._stopping.is_set():
+            raise StateError("was stopped", where=self.name, command="scan")
+        if deadline.over:
+            what = f"was not done within {deadline.seconds:g} s"
+            raise DeadlineError(what, where=self.name, command="scan")
+        carrier.move(self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.rest)
+        return self.line(deadline.rest)
 
     def depths_mm(self, line: Waveform) -> Array:
         """Where the samples of a line lie (n,)."""
