@@ -217,24 +217,32 @@ def counts(label: str, done: list[Recording]) -> bool:
     return worst <= 0.03 and wrong[1] == 0 and misnumbered == 0
 
 
+def timed(frame: Frame) -> tuple[float, float]:
+    """Seconds of processor and of wall for one image."""
+    cpu, clock = time.process_time(), time.perf_counter()
+    measure(frame)
+    return time.process_time() - cpu, time.perf_counter() - clock
+
+
 def speed(done: list[Recording], workers: int) -> None:
-    """Print the time for an image and for all."""
+    """Print the time for an image and for all, on one core and on several."""
     frames = [r.frame for r in done]
-    processor, wall = [], []
-    for frame in frames:
-        cpu, clock = time.process_time(), time.perf_counter()
+    for frame in frames[:3]:
         measure(frame)
-        processor.append(time.process_time() - cpu)
-        wall.append(time.perf_counter() - clock)
+    clock = time.perf_counter()
+    cpu, wall = np.array([timed(frame) for frame in frames]).T
+    total = time.perf_counter() - clock
     print(
-        f"\ntime for one image: processor median {np.median(processor) * 1e3:.0f} ms, least "
-        f"{min(processor) * 1e3:.0f} ms; wall median {np.median(wall) * 1e3:.0f} ms"
+        f"\none image: processor median {np.median(cpu) * 1e3:.0f} ms, least {cpu.min() * 1e3:.0f} ms; "
+        f"wall median {np.median(wall) * 1e3:.0f} ms, least {wall.min() * 1e3:.0f} ms"
     )
+    print(f"{len(frames)} images on one core: processor {cpu.sum():.2f} s, wall {total:.2f} s")
     with ProcessPoolExecutor(workers) as pool:
-        list(pool.map(measure, frames[: 2 * workers]))  # the workers have started
+        list(pool.map(timed, frames[: 4 * workers]))  # the workers have started
         clock = time.perf_counter()
-        list(pool.map(measure, frames))
-        print(f"all {len(frames)} images with {workers} processes: {time.perf_counter() - clock:.2f} s wall")
+        cpu, _ = np.array(list(pool.map(timed, frames))).T
+        total = time.perf_counter() - clock
+    print(f"{len(frames)} images on {workers} cores: processor {cpu.sum():.2f} s, wall {total:.2f} s")
 
 
 def main() -> int:

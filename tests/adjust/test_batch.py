@@ -178,3 +178,51 @@ def test_derivatives_of_the_wrong_sign_diverge_and_are_not_taken_for_convergence
 
     fit = adjust_batch(wrong, true + 0.2, y, options=BatchOptions(max_iterations=200, tolerance=1e-9))
     assert fit.reasons.tolist() == [BatchReason.DIVERGED, BatchReason.CONVERGED]
+
+
+def test_kept_jacobians_lead_to_nearly_the_same_estimates_with_fewer_of_them():
+    true, y = simulated(k=200, seed=4)
+    asked = 0
+
+    def counted(x, rows):
+        nonlocal asked
+        asked += len(rows)
+        return decay(x, rows)
+
+    start, options = true * [1.01, 0.99, 1.0], BatchOptions(share=0.01)
+    kept = adjust_batch(counted, start, y, values=lambda x, rows: decay(x, rows)[0], options=options)
+    few, asked = asked, 0
+    renewed = adjust_batch(counted, start, y, options=options)
+    assert kept.converged.all()
+    assert few < 0.7 * asked
+    # Jacobians a hundredth off cost about that of a standard deviation.
+    off = (kept.estimates - renewed.estimates) / renewed.sigma
+    assert np.sqrt((off**2).mean()) < 0.03
+    np.testing.assert_allclose(kept.sigma, renewed.sigma, rtol=0.1)
+
+
+def test_a_jacobian_that_does_not_serve_is_formed_anew():
+    true, y = simulated(k=50)
+    fit = adjust_batch(
+        decay,
+        true * [0.5, 2.0, 1.0],
+        y,
+        values=lambda x, rows: decay(x, rows)[0],
+        options=BatchOptions(share=0.01),
+    )
+    assert fit.converged.all()
+    t = (fit.estimates - true) / fit.sigma
+    # 50 standardised errors each: their rms is 1 ± 0.1 (1 σ).
+    np.testing.assert_allclose(np.sqrt((t**2).mean(axis=0)), 1.0, atol=0.35)
+
+
+def test_weights_are_not_renewed_where_jacobians_are_kept():
+    _, y = simulated(k=2)
+    with pytest.raises(UsageError, match="not renewed"):
+        adjust_batch(
+            decay,
+            np.ones((2, 3)),
+            y,
+            values=lambda x, rows: decay(x, rows)[0],
+            options=BatchOptions(reweight=lambda t: np.ones_like(t)),
+        )

@@ -25,7 +25,6 @@ from scipy.special import ndtr
 
 from ..data import Array
 from ..errors import UsageError
-from .normal import normal_single
 
 __all__ = [
     "Outline",
@@ -238,10 +237,7 @@ class PixelResponse:
 def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
     """The blurred step's integral, the step and its derivatives at offsets `t`."""
     z = t / sigma
-    if t.dtype == np.float32:
-        step, bell = normal_single(z)
-    else:
-        step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z
+    step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z
     found: list[Array] = [step]
     if integral:
         found.insert(0, t * found[0] + sigma * bell)

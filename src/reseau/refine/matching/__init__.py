@@ -2,6 +2,16 @@
 
 from .matcher import SIZE, Matches, MatchOptions, match
 from .noise import grey_variance
-from .shapes import Shape, Some, Window
+from .shapes import FormedShape, Shape, Some, Window
 
-__all__ = ["SIZE", "MatchOptions", "Matches", "Shape", "Some", "Window", "grey_variance", "match"]
+__all__ = [
+    "SIZE",
+    "FormedShape",
+    "MatchOptions",
+    "Matches",
+    "Shape",
+    "Some",
+    "Window",
+    "grey_variance",
+    "match",
+]

@@ -115,6 +115,7 @@ def match(
     claims: tuple[NDArray[Any], Rows] | None = None,
     others: Array | None = None,
     light: tuple[Array, Array] | None = None,
+    searching: bool = True,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
 
@@ -145,6 +146,8 @@ def match(
     light : tuple, optional
         Contrast (k,) and coefficients of the background (k, b) where these, the positions and the width are
         known to begin with: then nothing is searched for, but in patches where something is amiss.
+    searching : bool
+        Whether it is there; otherwise these count as not converged.
 
     Returns
     -------
@@ -162,7 +165,8 @@ def match(
     if light is None:
         return _searched(patch, free, noise)
     quick, amiss = _continued(patch, patch.begin(*light), free, noise)
-    if not len(amiss):
+    quick.converged[amiss] = False
+    if not len(amiss) or not searching:
         return quick
     few = Patches(
         pixels,
@@ -226,6 +230,7 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         patch.grey,
         weights=patch.weights * patch.course / noise**2,
         prior=(start, free),
+        values=patch.form_values,
         options=BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5),
     )
     used = patch.weights > 0

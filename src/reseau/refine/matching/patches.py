@@ -195,7 +195,8 @@ class Patches:
         share, d_share = self.form.derivatives(
             self.xy[at] + x[:, :2], width, x[:, self.form_at :], at, self.window.select(at)
         )
-        plane, contrast = self.background(x), x[:, CONTRAST, None, None]
+        plane = self.background(x).astype(share.dtype, copy=False)
+        contrast = x[:, CONTRAST, None, None].astype(share.dtype, copy=False)
         if self.options.polarity == "dark":
             rest = 1 - contrast * share
             grey, by_share, by_contrast = plane * rest, -plane * contrast, -plane * share
@@ -203,19 +204,36 @@ class Patches:
             rest = np.ones_like(share)
             grey, by_share, by_contrast = plane + contrast * share, contrast, share
         # A row for each parameter, one pixel beside the other; handed on with the parameters last.
-        rows = np.empty((len(x), x.shape[1], *share.shape[1:]))
+        rows = np.empty((len(x), x.shape[1], *share.shape[1:]), dtype=share.dtype)
         np.multiply(by_share, d_share[:, 0], out=rows[:, X])
         np.multiply(by_share, d_share[:, 1], out=rows[:, Y])
-        by_width = by_share * (np.exp(2 * x[:, WIDTH]) / width)[:, None, None]
+        by_width = by_share * (np.exp(2 * x[:, WIDTH]) / width)[:, None, None].astype(share.dtype)
         np.multiply(by_width, d_share[:, 2], out=rows[:, WIDTH])
         rows[:, CONTRAST] = by_contrast
         for k in range(self.forms):
             np.multiply(by_share, d_share[:, 3 + k], out=rows[:, self.form_at + k])
         flat = rows.reshape(len(x), x.shape[1], -1)
-        np.multiply(rest.reshape(len(x), 1, -1), self.monomials.T, out=flat[:, LEVEL : self.form_at])
+        ground = self.monomials.T.astype(share.dtype, copy=False)
+        np.multiply(rest.reshape(len(x), 1, -1), ground, out=flat[:, LEVEL : self.form_at])
         grey, jacobian = grey.reshape(len(x), -1), np.swapaxes(flat, 1, 2)
         self.shares[at], self._formed = share, (x.copy(), at.copy(), grey, jacobian)
         return grey, jacobian
+
+    def form_values(self, x: Array, at: Rows) -> Array:
+        """Grey values (m, n) alone, as those of :meth:`form_image`."""
+        share = self.form.image(
+            self.xy[at] + x[:, :2], self.width(x, at), x[:, self.form_at :], at, self.window.select(at)
+        )
+        self.shares[at] = share
+        plane, part = self.background(x), x[:, CONTRAST, None, None] * share
+        formed = plane * (1 - part) if self.options.polarity == "dark" else plane + part
+        grey: Array = formed.reshape(len(x), -1)
+        if self.whitener is None:
+            return grey
+        slope, weighted = (field[at] for field in self.whitener)
+        off = (grey - self.grey[at]).reshape(slope.shape)
+        whitened: Array = off - slope * (weighted * off).sum(axis=2, keepdims=True)
+        return np.asarray(self.grey[at] + whitened.reshape(grey.shape))
 
     def background(self, x: Array) -> Array:
         """Grey values of the background in the window, (k, rows, columns)."""
@@ -257,20 +275,20 @@ class Patches:
         independent, of the weights W.
         """
         _, jacobian = self._form(x, np.arange(len(self.xy)))
-        slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape)
+        slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape).astype(jacobian.dtype)
         length2 = (self.course.reshape(self.shape) * slope**2).sum(axis=2, keepdims=True)
         q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2
         factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
-        self.whitener = (slope, factor)
+        self.whitener = (slope, (slope * factor * self.course.reshape(self.shape)).astype(slope.dtype))
 
     def _whitened(self, grey: Array, jacobian: Array, at: Rows) -> tuple[Array, Array]:
         assert self.whitener is not None
-        slope, factor = self.whitener[0][at], self.whitener[1][at]
+        slope, weighted = (field[at] for field in self.whitener)
         m, rows, columns = slope.shape
-        v = (grey - self.grey[at]).reshape(m, rows, columns)
-        weighted = slope * factor * self.course[at].reshape(slope.shape)
+        v = (grey - self.grey[at]).reshape(slope.shape)
         v = v - slope * (weighted * v).sum(axis=2, keepdims=True)
-        j = jacobian.reshape(m, rows, columns, -1)
-        along = np.einsum("mrc,mrcu->mru", weighted, j)
-        j = j - slope[..., None] * along[:, :, None, :]
-        return self.grey[at] + v.reshape(m, -1), j.reshape(m, rows * columns, -1)
+        # As it was formed, each derivative in one piece.
+        j = np.swapaxes(jacobian, 1, 2).reshape(m, -1, rows, columns)
+        j -= slope[:, None] * np.einsum("mrc,murc->mur", weighted, j)[..., None]
+        self._formed = None  # it is not what was formed any more
+        return self.grey[at] + v.reshape(m, -1), np.swapaxes(j.reshape(m, -1, rows * columns), 1, 2)

@@ -13,7 +13,7 @@ import numpy as np
 from ...data import Array, Rows
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["GrownOutline", "Shape", "Some", "Window"]
+__all__ = ["FormedShape", "GrownOutline", "Shape", "Some", "Window"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +125,42 @@ class Some:
     ) -> tuple[Array, Array]:
         """See :class:`Shape`."""
         return self.whole.derivatives(xy, width, form, self.rows[at], window)
+
+
+@dataclass(frozen=True, eq=False)
+class FormedShape:
+    """A shape whose images have been formed at one place already, in the windows in which it is matched.
+
+    Parameters
+    ----------
+    shape : Shape
+        The k marks.
+    xy, width : ndarray (k, 2), (k,)
+        Where and how wide; the form was nought.
+    share, slopes : ndarray (k, r, c), (k, 3 + p, r, c)
+        The image and its derivatives.
+    """
+
+    shape: Shape
+    xy: Array
+    width: Array
+    share: Array
+    slopes: Array
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form."""
+        return self.shape.parameters
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`Shape`."""
+        return self.shape.image(xy, width, form, at, window)
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`Shape`."""
+        same = np.array_equal(xy, self.xy[at]) and not form.any()
+        if same and np.allclose(width, self.width[at], rtol=1e-9, atol=0):
+            return self.share[at], self.slopes[at]
+        return self.shape.derivatives(xy, width, form, at, window)

@@ -22,8 +22,9 @@ from ...adjust import Failure
 from ...data import Array, Mask, Rows
 from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...formats import TestfieldDesign
-from ...optics.formation import Outline, PixelResponse, coverage_derivatives
-from ...optics.targets import target_outline
+from ...optics.formation import Outline, PixelResponse
+from ..matching import Window
+from .images import TargetImages, flat_outline, stacked
 from .lattice import LatticeFit
 
 __all__ = ["Kinds", "Placement", "Reading", "locate", "read_clusters"]
@@ -81,19 +82,9 @@ class Kinds:
 
     def outline(self, spacing: float) -> Outline:
         """Outlines (k, j, 2) in millimetres; where one has fewer nodes, the rest weighs nothing."""
-        outlines = [
-            target_outline(*kind, spacing) for kind in zip(self.shape, self.size, self.angle, strict=True)
-        ]
-        return stacked(outlines)
-
-
-def stacked(outlines: list[Outline]) -> Outline:
-    """Single outlines as one of many (k, j, 2), the shorter ones filled up with nodes of no weight."""
-    most = max(len(outline.xy) for outline in outlines)
-    xy, dxy = np.zeros((2, len(outlines), most, 2))
-    for k, outline in enumerate(outlines):
-        xy[k, : len(outline.xy)], dxy[k, : len(outline.dxy)] = outline.xy, outline.dxy
-    return Outline(xy, dxy)
+        return stacked(
+            [flat_outline(*kind, spacing) for kind in zip(self.shape, self.size, self.angle, strict=True)]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,11 +200,15 @@ class _Clusters:
         design = self._design(psf_px)
         for group, own in enumerate(self.own):
             of = self.group == group
-            seen = self.seen[of][..., own]
-            a = design[group][:, own]
-            x[of] = np.einsum("kun,stn->stku", np.linalg.pinv(a), seen)
-            left = seen[:, :, None] - np.einsum("knu,stku->stkn", a, x[of])
-            rest[of] = (left**2).sum(axis=3) / pixels[group]
+            seen = self.seen[of][..., own].astype(np.float64)
+            # By what of the image lies in the space of each design: a = q r, x = r⁻¹ qᵀ l, v² = l² − (qᵀ l)².
+            q, r = np.linalg.qr(design[group][:, own])
+            part = (seen.reshape(-1, seen.shape[2]) @ np.swapaxes(q, 1, 2).reshape(-1, q.shape[1]).T).reshape(
+                *seen.shape[:2], *q.shape[::2]
+            )
+            x[of] = np.einsum("kuv,stkv->stku", np.linalg.inv(r), part)
+            left = (seen**2).sum(axis=2)[:, :, None] - (part**2).sum(axis=3)
+            rest[of] = np.maximum(left, 0) / pixels[group]
         best = rest.argmin(axis=2)[..., None]
         noise = np.median(np.take_along_axis(rest, best, 2)[self.visible])
         amplitude = self.sign * x[..., 1]
@@ -246,12 +241,17 @@ class _Clusters:
     def _design(self, psf_px: float) -> Array:
         """Design matrices (g, k, n, 5): level, contrast, shifts, width."""
         scale = float(np.linalg.norm(self.frames, ord=2, axis=(1, 2)).max())
-        outline = self.kinds.outline(psf_px / scale)
+        outline = self.kinds.outline(float(f"{psf_px / scale:.2g}"))
         turned = np.swapaxes(self.frames, 1, 2)[:, None]
-        image = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()
-        share, slopes = coverage_derivatives(image, self.columns, self.rows, psf_px, self.response)
-        every = np.concatenate([np.ones_like(share)[:, :, None], share[:, :, None], slopes], axis=2)
-        return np.moveaxis(every.reshape(*every.shape[:3], -1), 2, 3)
+        nodes = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()
+        images = TargetImages.of(Outline(*(v.reshape(-1, *v.shape[2:]) for v in (nodes.xy, nodes.dxy))))
+        every = np.arange(len(images.nodes.xy))
+        none = np.zeros((len(every), 2))
+        columns, rows = (np.tile(v, (len(every), 1)) for v in (self.columns, self.rows))
+        window = Window(columns, rows, self.response)
+        share, slopes = images.derivatives(none, np.full(len(every), psf_px), none[:, :1], every, window)
+        design = np.stack([np.ones_like(share), share, *np.moveaxis(slopes[:, :3], 1, 0)], axis=-1)
+        return design.reshape(*nodes.xy.shape[:2], -1, 5).astype(np.float64)
 
 
 def _grouped(frames: Array) -> tuple[Rows, Array]:

@@ -25,7 +25,7 @@ from ..field import trend_degree
 from .lines import Lattice, Ridges
 from .profiles import crossings, located
 
-__all__ = ["LatticeFit", "fit_lattice", "lattices", "refit", "second_order"]
+__all__ = ["LatticeFit", "fit_lattice", "lattices", "refit", "second_order", "slope_of"]
 
 _DEGREE = 3
 """Of the polynomial, where lines alone tell it."""
@@ -45,7 +45,9 @@ _BETWEEN = 0.85
 _BENT_PX = 0.13
 """Distances of ridge points, root mean square, from which on the lens distorts much."""
 _TIMES = 4
-_LEAST_POINTS = 40
+_LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
+"""Ridge points without which there is no lattice, about how many tell it well enough to begin with, and among
+how many of a frame, most of them no lines', these are looked for."""
 _MIDDLE = 0.5
 """Part of the half frame around its middle that tells the projectivity."""
 _SHORTEST = 20
@@ -128,7 +130,7 @@ def lattices(
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
             # Where the lens distorts much, a line is found on more of its length every time.
-            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 2):
+            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 1):
                 points, fit = fit.points, _sharpened(fit, grey, width, blur)
                 if fit.points < 1.02 * points:
                     break
@@ -157,9 +159,10 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         None where the lines found do not lie in one lattice, or bound no square.
     """
     mapping = _start(lattice, ridges.darkness.shape)
-    at = _coordinates(mapping, ridges.xy)
-    near = _assigned(mapping, ridges.normal, at, *_NEAR)[0]
-    xy, normal = ridges.xy[near], ridges.normal[near]
+    each = max(1, len(ridges.xy) // _SOME)
+    xy, normal = ridges.xy[::each], ridges.normal[::each]
+    near = _assigned(mapping, normal, _coordinates(mapping, xy), *_NEAR)[0]
+    xy, normal = xy[near], normal[near]
     for gate, degrees in _GATES:
         at = _coordinates(mapping, xy)
         row, axis = _assigned(mapping, normal, at, gate, degrees)
@@ -170,14 +173,16 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         # Between two lines nothing tells a bend, between three no change of it.
         lines = min(len(np.unique(at[axis == k, k])) for k in (0, 1))
         degree = min(max(lines - 1, 1), _DEGREE)
-        mapping, residuals = _adjusted(mapping, degree, xy[row], normal[row], at)
+        thin = slice(None, None, max(1, len(at) // _ENOUGH))
+        given = xy[row][thin], normal[row][thin], at[thin]
+        mapping, residuals = _adjusted(mapping, degree, *given)
         if _rms(residuals) > _BENT_PX:
-            other = _adjusted(_middled(mapping, at), degree, xy[row], normal[row], at)
+            other = _adjusted(_middled(mapping, at), degree, *given)
             if _rms(other[1]) < _rms(residuals):
                 mapping, residuals = other
     numbers = [lattice.across, lattice.along]
     for k in (0, 1):
-        numbers[k] = _lines(mapping, ridges, at[axis == k][:, k], k, numbers[1 - k])
+        numbers[k] = _lines(mapping, ridges, np.repeat(at[axis == k][:, k], each), k, numbers[1 - k])
         if len(numbers[k]) < 2:
             return None
     return LatticeFit(mapping, numbers[0], numbers[1], _rms(residuals), 0)
@@ -263,8 +268,8 @@ def _straight_slope(mapping: Chain, at: Array) -> Array:
     return slope
 
 
-def _slope(mapping: PlaneMapping, at: Array) -> Array:
-    """Derivatives (n, 2, 2) by differences: those by the parameters are not wanted here."""
+def slope_of(mapping: PlaneMapping, at: Array) -> Array:
+    """Derivatives (n, 2, 2) of a mapping at points (n, 2), by differences."""
     step = 1e-4
     return np.stack([(mapping(at + d) - mapping(at - d)) / (2 * step) for d in step * np.eye(2)], axis=-1)
 
@@ -288,7 +293,9 @@ def _adjusted(mapping: Chain, degree: int, xy: Array, normal: Array, at: Array) 
     mapping = _of_degree(mapping, degree)
     monomials = _monomials(mapping, at)
     design = np.concatenate([normal[:, :1] * monomials, normal[:, 1:] * monomials], axis=1)
-    return _solved(mapping, design, (normal * (xy - mapping.first(at))).sum(axis=1), _POINT_PX)
+    observed = (normal * (xy - mapping.first(at))).sum(axis=1)
+    mapping, residuals = _solved(mapping, design, observed[None], _POINT_PX)
+    return mapping, residuals[0]
 
 
 def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
@@ -305,10 +312,7 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     powers = _powers(mapping)
     before = max(i + j for i, j in powers) if len(at) > len(powers) else 1
     mapping = _of_degree(mapping, max(before, trend_degree(len(at))))
-    monomials = _monomials(mapping, at)
-    none = np.zeros_like(monomials)
-    design = np.block([[monomials, none], [none, monomials]])
-    return _solved(mapping, design, (xy - mapping.first(at)).T.ravel(), sigma_px)[0]
+    return _solved(mapping, _monomials(mapping, at), (xy - mapping.first(at)).T, sigma_px)[0]
 
 
 def _monomials(mapping: Chain, at: Array) -> Array:
@@ -331,22 +335,24 @@ def _of_degree(mapping: Chain, degree: int) -> Chain:
 
 
 def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> tuple[Chain, Array]:
-    """The mapping with its polynomial adjusted, robustly, and the residuals (n,).
+    """The mapping with its polynomial adjusted, robustly, and the residuals (b, n).
 
-    The projectivity is kept, and what it lacks is left to the polynomial, whose coefficients are linear.
+    The projectivity is kept, and what it lacks is left to the polynomial, whose coefficients are linear: all
+    of them in one problem, or those of x and those of y, which share a design (n, u), in two.
     """
+    none = np.zeros((len(observed), design.shape[1]))
     fit = adjust_batch(
-        lambda x, _: (x @ design.T, design[None]),
-        np.zeros((1, design.shape[1])),
-        observed[None],
-        prior=(np.zeros((1, design.shape[1])), np.full(design.shape[1], _MOST_PX / sigma_px)),
-        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=8, tolerance=0.03 * sigma_px),
+        lambda x, rows: (x @ design.T, np.broadcast_to(design, (len(rows), *design.shape))),
+        none,
+        observed,
+        prior=(none, np.full(design.shape[1], _MOST_PX / sigma_px)),
+        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=5, tolerance=0.1 * sigma_px),
     )
     names = mapping.second.names
     curved = mapping.second.with_values(
-        dict(zip(names, mapping.second.values + fit.estimates[0], strict=True))
+        dict(zip(names, mapping.second.values + fit.estimates.ravel(), strict=True))
     )
-    return Chain(mapping.first, curved), fit.residuals[0]
+    return Chain(mapping.first, curved), fit.residuals
 
 
 def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows) -> list[Array]:

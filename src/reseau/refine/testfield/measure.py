@@ -20,7 +20,7 @@ from ..matching import Matches
 from ..measured import Measured
 from ..screening import quiet_noise, screen
 from .clusters import Placement, Reading, locate, read_clusters
-from .lattice import LatticeFit, lattices, refit, second_order
+from .lattice import LatticeFit, lattices, refit, slope_of
 from .light import Light
 from .lines import find_lattice, ridge_points
 from .profiles import blur_of
@@ -28,7 +28,7 @@ from .targets import Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
-_LEAST_FIRST, _MOST_FIRST = 8, 48
+_LEAST_FIRST, _MOST_FIRST = 8, 36
 """How many large targets are matched first, to know the mapping and the sharpness better."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
@@ -36,7 +36,9 @@ _FAR = 4.5
 """Standard deviations that a target may be off where all targets together have it."""
 _WIDE = 0.1
 """Part of the frame around it in which targets are looked for that reach into it."""
-_SETTLED_PX = 0.02
+_BEYOND = 1.0
+"""How far beyond the lines found, in steps of the lattice, the mapping through them still serves."""
+_SETTLED_PX = 0.1
 """Changes of what the mapping predicts below which it need not be looked at farther out."""
 _UNMODELLED_PX = 0.03
 """What positions scatter about a mapping of third degree beyond their own sigmas."""
@@ -194,7 +196,7 @@ class _Measurement:
         wide = _WIDE * size.max()
         self.rows = np.flatnonzero(((self.predicted > -wide) & (self.predicted < size + wide)).all(axis=1))
         self.rows = self.rows[self._unfolded(self.at[self.rows])]
-        slope = second_order(scene.mapping, self.at[self.rows])[1] @ scene.frame
+        slope = slope_of(scene.mapping, self.at[self.rows]) @ scene.frame
         reach = np.abs(slope).sum(axis=2) * (np.array(scene.design.targets.size) * 0.6)[self.rows, None]
         xy = self.predicted[self.rows]
         near = ((xy > -reach - margin) & (xy < size - 1 + reach + margin)).all(axis=1)
@@ -208,7 +210,7 @@ class _Measurement:
         """
         way = at - self.middle
         parts = np.array([0.4, 0.7, 1.0])[:, None, None]
-        slope = second_order(self.scene.mapping, (self.middle + parts * way).reshape(-1, 2))[1]
+        slope = slope_of(self.scene.mapping, (self.middle + parts * way).reshape(-1, 2))
         unfolded: Mask = np.asarray((np.linalg.det(slope).reshape(3, -1) < 0).all(axis=0))
         return unfolded
 
@@ -253,30 +255,26 @@ class _Measurement:
 
         It begins between the lines, where the mapping is known, and goes on outwards from there.
         """
-        # The second time light and neighbours are known better; a third is for what lies far out.
-        for most, before, beyond in (
-            (_MOST_FIRST // 2, -np.inf, 0.0),
-            (_MOST_FIRST, -np.inf, 1.0),
-            (_MOST_FIRST, 1.0, np.inf),
-        ):
+        for beyond in (_BEYOND, np.inf):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
             out = np.abs(self.at[self.rows[candidates]] - self.middle) - self.half
             candidates = candidates[(out <= beyond).all(axis=1)]
-            if (out > before).any(axis=1).mean() < _FEW:
-                break
             if len(candidates) < _LEAST_FIRST:
                 continue
             some = np.zeros(len(self.rows), dtype=bool)
-            some[candidates[:: max(1, len(candidates) // most)]] = True
+            some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
             predicted = self.predicted
             self._learn(some)
             moved = (self.predicted - predicted)[self.rows[self.inside]]
-            if beyond and len(moved) and np.abs(moved).max() < _SETTLED_PX:
+            if len(moved) and np.abs(moved).max() < _SETTLED_PX:
                 break
 
     def _learn(self, some: Mask) -> None:
-        first = match_targets(self.scene, self.rows, some)
-        sure = first.converged & (first.t > self.options.least_t) & (first.rejected < 0.1)
+        for searching in (False, True):
+            first = match_targets(self.scene, self.rows, some, searching=searching)
+            sure = first.converged & (first.t > self.options.least_t) & (first.rejected < 0.1)
+            if sure.sum() >= max(_LEAST_FIRST, some.sum() // 2):
+                break
         if sure.sum() >= _LEAST_FIRST:
             self._learn_from(first, sure, self.rows[some])
 

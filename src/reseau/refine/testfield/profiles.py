@@ -54,6 +54,11 @@ class Crossings:
         pair = (self.step, self.place) if self.axis == 0 else (self.place, self.step)
         return np.stack(pair, axis=1).astype(np.float64) + shift[:, None] * self.normal
 
+    def within(self, reach: int, shape: tuple[int, ...]) -> Crossings:
+        """Those no farther than `reach` off a frame of this height and width."""
+        keep = (self.place > -reach) & (self.place < shape[self.axis] + reach)
+        return Crossings(self.axis, self.step[keep], self.place[keep], self.normal[keep], self.along[keep])
+
     def around(self, reach: int) -> tuple[NDArray[Any], NDArray[Any], Array]:
         """Rows and columns (n, 2·reach + 1) of the pixels around, in the frame or not; distances (n, …)."""
         beside = np.rint(self.place).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
