@@ -51,6 +51,9 @@ CASES = {
 PAPER = {"Ricoh, 600 dpi": (0.008, 0.014, 0.015, 0.010), "Hasselblad, 1200 dpi": (0.014, 0.018, 0.026, 0.028)}
 """Table 1, examples 1 and 2: affine σX, σY, conformal σX, σY in mm."""
 
+SEEDS = 400_000
+"""Of the first frame of every difficulty. Nothing was tuned to these: that was done on seeds below."""
+
 Row = tuple[str, Array, Array, Array]
 
 
@@ -89,7 +92,7 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str]) -> None:
     for name, frame in CASES.items():
         if only and not any(part in name for part in only):
             continue
-        rows = list(pool.map(one, [frame.with_seed(1000 + seed) for seed in range(count)], chunksize=4))
+        rows = list(pool.map(one, [frame.with_seed(SEEDS + seed) for seed in range(count)], chunksize=4))
         status = np.array([row[0] for row in rows])
         good = status == "oriented"
         error, sigma, theirs = (np.array([row[k] for row in rows]) for k in (1, 2, 3))

@@ -9,15 +9,80 @@ the film cost little, and so do dark parts of the picture.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.ndimage import median_filter
 
-from ...data import Array
+from ...data import Array, Mask
+from .band import Band
 
-__all__ = ["best_line", "first_departure", "likelihood"]
+__all__ = ["Border", "Film", "best_line", "binned", "border_of", "likelihood", "row_median"]
 
 _PICTURE, _FILM = 2.3, 0.65
 """Log-likelihood of a place that differs from film, and the loss by one that does not: half of a picture's
 edge may be as dark as film, one place in twenty of film may be dust."""
+_BINS = 72
+"""Places across at which the search for the border looks, at most."""
+_ALONG = 24
+"""Columns over which tones are smoothed before they are compared with film."""
+_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.12
+"""In noise, and of the contrast along the edge: what differs from film by less is film."""
+_STRIPE, _LIT, _DETACHED = 8, 0.06, 3
+"""Places within a line at which film may part it from the picture, the part of an edge that differs from film
+at least where there is a picture, and how often such a thing is passed."""
+_RUNNING = 101
+"""Profiles over which the tone of film along an edge is taken."""
+_NARROW = 0.4
+"""Part of the usual gap that film has at least where it is known by its tone."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Unexposed film as other edges of the frame show it, where there is little of it beyond an edge.
+
+    Parameters
+    ----------
+    tone, noise : float
+        Grey value, times the polarity, and the scatter of smoothed ones.
+    """
+
+    tone: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """Film and picture of one channel along an edge, before the steps are located.
+
+    Parameters
+    ----------
+    level : ndarray (n,)
+        Tone of film beside each profile.
+    noise, spread : float
+        Of a pixel of film; of film smoothed along the edge.
+    contrast : float
+        Of the picture against film.
+    start : ndarray (n,)
+        Approximate distance of the step.
+    outermost : ndarray (n,)
+        Distance to which film reaches outwards at least.
+    clean : float
+        Part of the places beyond the edge that are film.
+    """
+
+    level: Array
+    noise: float
+    spread: float
+    contrast: float
+    start: Array
+    outermost: Array
+    clean: float
+
+    @property
+    def film(self) -> Film:
+        """What lies beyond the edge."""
+        return Film(float(np.median(self.level)), self.spread)
 
 
 def likelihood(departure: Array, known: Array, start: int, gap: int) -> Array:
@@ -47,7 +112,7 @@ def likelihood(departure: Array, known: Array, start: int, gap: int) -> Array:
     return np.asarray(np.where(lit, found, 0.0))
 
 
-def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> tuple[float, float, float]:
+def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> tuple[float, float]:
     """Straight line of the greatest sum within it.
 
     Parameters
@@ -63,9 +128,8 @@ def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> t
 
     Returns
     -------
-    (float, float, float)
-        Columns before which the inside begins at the places −1 and 1 (the line is half a column before), and
-        the sum per profile, less that of the best line that is elsewhere.
+    (float, float)
+        Columns before which the inside begins at the places −1 and 1; the line is half a column before.
     """
     within = np.cumsum(found[:, ::-1], axis=1)[:, ::-1]
     within = np.concatenate([within, np.zeros((len(found), 1))], axis=1)
@@ -80,9 +144,22 @@ def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> t
     # Lines as good as the best are one with it: take their middle.
     alike = total > total[best] - 0.5
     alike &= (np.abs(start - start[best]) <= 1) & (np.abs(stop - stop[best]) <= 1)
-    other = (np.abs(start - start[best]) > 3) & (np.abs(stop - stop[best]) > 3)
-    margin = float(total[best] - total[other].max()) if other.any() else float(total[best])
-    return float(start[alike].mean()), float(stop[alike].mean()), margin / len(found)
+    return float(start[alike].mean()), float(stop[alike].mean())
+
+
+def _detached(found: Array, line: Array) -> bool:
+    """Whether film all along parts what a line begins with from the picture: then that counts as film, too.
+
+    It is a scratch beside the edge, or print: of a picture's edge some part is always brighter than film.
+    """
+    column = np.rint(line).astype(np.intp)[:, None] + np.arange(_STRIPE)
+    seen = np.take_along_axis(found, np.clip(column, 0, found.shape[1] - 1), axis=1) > 0
+    lit = seen.mean(axis=0)
+    dark = np.flatnonzero(lit < _LIT)
+    if not len(dark) or lit[: dark[0] + 1].max() < _LIT:
+        return False
+    found[np.arange(found.shape[1]) <= column[:, dark[-1]][:, None]] = -_FILM
+    return True
 
 
 def first_departure(found: Array, middle: Array, reach: int) -> Array:
@@ -92,3 +169,107 @@ def first_departure(found: Array, middle: Array, reach: int) -> Array:
     columns = np.clip(columns, 0, found.shape[1] - 1)
     value = np.take_along_axis(within, columns, axis=1)
     return np.asarray(np.take_along_axis(columns, value.argmax(axis=1)[:, None], axis=1)[:, 0], dtype=float)
+
+
+def binned(grey: Array, distance: Array, low: float, size: float, count: int) -> Array:
+    """Means of the pixels of each profile in bins of distance (n, count); NaN where there are none."""
+    column = np.floor((distance - low) / size).astype(np.intp)
+    used = (column >= 0) & (column < count) & np.isfinite(grey)
+    flat = (np.arange(len(grey))[:, None] * count + column)[used]
+    total = np.bincount(flat, grey[used], minlength=len(grey) * count)
+    number = np.bincount(flat, minlength=len(grey) * count)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((total / np.where(number > 0, number, np.nan)).reshape(len(grey), count))
+
+
+def row_median(values: Array) -> Array:
+    """Medians of rows, NaN left out; NaN for a row that has nothing else."""
+    empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
+    filled = np.where(empty[:, None], 0.0, values)
+    return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
+
+
+def _running(values: Array) -> Array:
+    """Median along the edge: dust, print and scratches do not move it."""
+    filled = np.where(np.isfinite(values), values, np.nanmedian(values))
+    return np.asarray(median_filter(filled, size=_RUNNING, mode="nearest"))
+
+
+def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | None = None) -> Border | None:
+    """Tone of film along an edge, and the line where film ends; None where nothing differs from film.
+
+    Parameters
+    ----------
+    grey : ndarray (n, s)
+        Pixels of one channel, times the polarity, so that film is darker.
+    band : Band
+        Where they are.
+    reach : float
+        How far the edge may be from the approximate one, pixels.
+    gap : float
+        Width of film, pixels, beyond which things have nothing to do with the edge.
+    film : Film, optional
+        Film as other edges show it; else it is what lies beyond the reach.
+    """
+    low, high = float(band.distance.min(axis=1).max()), float(band.distance.max(axis=1).min())
+    size = max(1.0, (high - low) / _BINS)
+    count = int((high - low) / size)
+    tones = binned(grey, band.distance, low, size, count)
+    known, beyond = np.isfinite(tones), low + (np.arange(count) + 0.5) * size
+    outer = known & (beyond < -0.4 * reach)
+    if known.mean() < 0.5 or (film is None and outer.sum() < 3 * len(tones)):
+        return None
+    if film is None:
+        level = _running(row_median(np.where(outer, tones, np.nan)))
+    else:
+        level = np.full(len(tones), film.tone)
+    over = max(1, round(_ALONG / band.columns))
+    # Medians: a scratch that crosses the edge is a few columns wide.
+    smooth = median_filter(np.where(known, tones - level[:, None], 0.0), size=(over | 1, 1), mode="nearest")
+    if film is None:
+        # Within each profile: perforations and the scanner's light change from profile to profile.
+        own = row_median(np.where(outer, smooth, np.nan))
+        spread = 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
+    else:
+        spread = film.noise
+    contrast = float(np.quantile(smooth[:, beyond > 0], 0.85))
+    least = max(_SIGNIFICANT * spread, _LEAST_CONTRAST * contrast, 1e-9)
+    if contrast < 1.5 * least:
+        return None
+    start = int(np.clip((0.3 * reach - low) / size, 1, count - 1))
+    parted = gap if film is None else _NARROW * gap
+    found = likelihood(smooth / least, known, start, max(2, round(parted / size)))
+    first, last = (int(np.clip((r - low) / size, 1, count - 2)) for r in (-reach, reach))
+    line, narrow = np.zeros(len(found)), film is not None
+    for _ in range(_DETACHED):
+        begin, end = best_line(found, band.place, first, last, max(2, (last - first) // 2))
+        line = begin * (1 - band.place) / 2 + end * (1 + band.place) / 2
+        if not _detached(found, line):
+            break
+        narrow = True
+    near = first_departure(found, line, max(2, round(0.1 * gap / size)))
+    away = np.arange(count) - line[:, None] + 2
+    outside = (away < 0) & (away > -gap / size) & known
+    differs = found > 0 if film is None else smooth > least
+    clean = 1.0 - float((differs & outside).sum()) / max(float(outside.sum()), 1.0)
+    at = low + size * near
+    outermost, beside = np.full(len(at), -np.inf), band.distance < -0.5 * reach
+    if narrow:
+        level, column = _strip(tones, line, _NARROW * gap / size)
+        outermost = low + size * column
+        beside = np.abs(band.distance - outermost[:, None]) < size
+    raw = 1.4826 * float(np.nanmedian(np.abs((grey - level[:, None])[beside])))
+    return Border(level, max(raw, 1e-6), spread, contrast, at, outermost, clean)
+
+
+def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
+    """Tone of a narrow strip of film beyond a line, and the column in its middle: the darkest one.
+
+    Blur fills the strip from both sides; only its middle is film.
+    """
+    away = np.arange(1, max(3, round(2.5 * width)) + 1)
+    column = np.clip(np.rint(line[:, None] - away).astype(np.intp), 0, tones.shape[1] - 1)
+    values = np.take_along_axis(tones, column, axis=1)
+    best = int(np.argmin(np.nanmedian(values, axis=0)))
+    around = values[:, max(best - 1, 0) : best + 2]
+    return _running(row_median(around)), np.asarray(line - away[best])

@@ -6,8 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from .edges import Band, EdgeProfiles, measure_profiles, merged
+from ...data import Array, Mask
+from .band import Band
+from .border import Film
+from .companion import Companion, edge_beside_line
+from .edges import NEIGHBOURS, EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
 
 __all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
@@ -18,6 +23,25 @@ _TONE = 0.15
 """Standard deviation of the tone of film along an edge, over that of the noise of a pixel."""
 _FEW_GOOD, FAR = 0.2, 2.5
 """Part of an edge's profiles that show a step, below which the edge is looked for so much further away."""
+_FOREIGN = 0.25
+"""Part of the picture's contrast by which what lies beyond an edge differs from film beyond the others."""
+_UNEVEN = 0.45
+"""Part of its own tone by which film may differ between edges: the scanner's light is uneven."""
+_SHARP, _EVEN = 0.3, 0.015
+"""Quantile of the widths of all profiles that is the width of a sharp step, and by how much they differ from
+place to place, logarithm."""
+_RATIO, _FEW_DRAWN = 4.0, 0.15
+"""Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
+show it by chance."""
+_CLEAR = 0.6
+"""Part of its profiles that show a step where nothing disturbs."""
+_ENDS = 2.0
+"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths."""
+_TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
+"""Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
+take, and that which is left out besides."""
+_CHORD = 30
+"""Points by which an edge is given that is known by its ends."""
 _MOST_GOOD = 0.85
 """Part of an edge's profiles that show a step, from which no wide ones are needed."""
 
@@ -59,11 +83,14 @@ def measure_channel(
 ) -> Channel:
     """Profiles of the four edges in one channel, each edge's own line, and what agrees with it."""
 
-    far = [False] * 4
+    far: list[bool] = [False] * 4
+    films: list[Film | None] = [None] * 4
 
     def measured(k: int, wide: bool, width: float | None = None) -> EdgeProfiles | None:
         pixels, reached = band(k, wide, far[k]), FAR * reach if far[k] else reach
-        return None if pixels is None else measure_profiles(pixels, channel, polarity, reached, gap, width)
+        if pixels is None:
+            return None
+        return measure_profiles(pixels, channel, polarity, reached, gap, width, films[k])
 
     profiles = [measured(k, False) for k in range(4)]
     for k, found in enumerate(profiles):
@@ -75,10 +102,14 @@ def measure_channel(
                 profiles[k] = again
             else:
                 far[k] = False
+    for k, film in enumerate(_foreign(profiles)):
+        if film is not None:
+            films[k] = film
+            profiles[k] = measured(k, False)
     widths = [p.width for p in profiles if p is not None and p.good.sum() > 20]
     if widths:
         # The spread of film and scanner is one for all edges.
-        width = float(np.median(widths))
+        width = float(np.sort(widths)[(len(widths) - 1) // 2])
         for k, found in enumerate(profiles):
             if found is not None and abs(np.log(found.width / width)) > 0.12:
                 found = measured(k, False, width) or found
@@ -86,18 +117,61 @@ def measure_channel(
                 more = measured(k, True, width)
                 found = found if more is None else merged(found, more)
             profiles[k] = found
-    edges = [_edge(band(k, False, far[k]), found) for k, found in enumerate(profiles)]
+    blur = _common_blur(profiles)
+    edges = [
+        _edge(band(k, False, far[k]), found, blur, channel, polarity) for k, found in enumerate(profiles)
+    ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     return Channel(name, data, rejected, why)
 
 
-def _edge(band: Band | None, found: EdgeProfiles | None) -> tuple[EdgeData | None, int, str]:
+def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
+    """The film of the other edges, for those beyond which there is something else."""
+    seen = [p for p in profiles if p is not None]
+    if len(seen) < 2:
+        return [None] * len(profiles)
+    # Film is darker than anything: the second darkest of the edges is not by chance.
+    film = sorted((p.border.film for p in seen), key=lambda f: f.tone)[1]
+    contrast = max(p.border.contrast for p in seen if p.border.film.tone <= film.tone)
+    most = _FOREIGN * contrast + _UNEVEN * abs(film.tone)
+    return [film if p is None or p.border.film.tone - film.tone > most else None for p in profiles]
+
+
+def _common_blur(profiles: Sequence[EdgeProfiles | None]) -> float:
+    """Logarithm of the width of a step that is sharp: what a picture has beside its edge only widens it."""
+    told = [p.blur[0][p.good] for p in profiles if p is not None]
+    every = np.concatenate(told) if told else np.zeros(0)
+    return float(np.quantile(every, _SHARP)) if len(every) else 0.0
+
+
+def _drawn(found: EdgeProfiles, blur: float) -> tuple[Array, float]:
+    """By how much lines of the picture beside an edge may draw its steps to them, pixels (n,); how many do.
+
+    A second step of a part r of the contrast, s behind the first, is seen as one that is moved by r·s and has
+    the variance w² + r(1 − r)·s². One that is too sharp is a line by itself.
+    """
+    other = np.abs(found.blur[0] - blur) - _EVEN
+    sure = other - 2 * np.sqrt(found.blur[1])
+    part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
+    if part > _FEW_DRAWN:
+        # There is such a line: what is no proof is a sign now, and neighbours are drawn alike.
+        moved = np.sqrt(_RATIO * NEIGHBOURS * np.expm1(2 * np.maximum(other, 0.0)))
+    else:
+        moved = np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0)))
+    return np.asarray(np.exp(blur) * moved), part
+
+
+def _edge(
+    band: Band | None, found: EdgeProfiles | None, blur: float, channel: int, polarity: int
+) -> tuple[EdgeData | None, int, str]:
     """The profiles of an edge that agree with its line; or why it is not found."""
     if band is None:
         return None, 0, "is not in the scan, or nothing parts it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    place, offset, sigma = (part[found.good] for part in (found.place, found.offset, found.sigma))
+    drawn, part = _drawn(found, blur)
+    place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
+    sigma = np.hypot(sigma, drawn[found.good])
     line = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
     rejected = int((~found.good).sum())
     if line is None:
@@ -105,13 +179,50 @@ def _edge(band: Band | None, found: EdgeProfiles | None) -> tuple[EdgeData | Non
     (start, stop, bow), agree = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < 0.45:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
-    if found.clean < 0.6:
+    border = found.border
+    if border.clean < 0.6:
         return None, rejected, "there is no unexposed film beyond it; do frames overlap?"
-    residuals = (offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2))[agree]
-    total = np.hypot(sigma[agree], _NEIGHBOURHOOD_PX)
-    scale = shared_error(place[agree], residuals, total)
-    along = (band.stop - band.start) * ((place[agree] + 1) / 2)[:, None]
-    xy = band.start + along + offset[agree][:, None] * band.normal
     # An error of the film's tone moves a step by √(2π) of its width for each part of the contrast.
-    common = np.sqrt(2 * np.pi) * found.width * _TONE / found.contrast
-    return EdgeData(xy, total * scale, float(common)), rejected + int((~agree).sum()), ""
+    common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
+    hidden = False
+    if part > (_FEW_DRAWN if found.good.mean() > _CLEAR else _FEW_DRAWN / 5):
+        grey = band.grey[:, :, channel].astype(np.float64) * polarity
+        chord = (start * (1 - band.place) + stop * (1 + band.place)) / 2
+        two, hidden = edge_beside_line(grey, band, chord, border.level, border.noise, float(np.exp(blur)))
+        if two is not None:
+            return _along_chord(band, two, common), rejected, ""
+    residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+    total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
+    agree &= _straight(place, residuals / total)
+    scale = shared_error(place[agree], residuals[agree], total[agree])
+    ends = _ENDS * float(np.exp(blur)) * max(part - _FEW_DRAWN, 0.0) if hidden else 0.0
+    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
+    return data, rejected + int((~agree).sum()), ""
+
+
+def _straight(place: Array, inward: Array) -> Mask:
+    """Which profiles are not where corners are rounded: there an edge turns inwards, by so many sigmas."""
+    turned = median_filter(inward, size=min(9, len(inward)), mode="nearest") > _TURNED
+    keep = np.ones(len(place), dtype=bool)
+    for order in (np.arange(len(place)), np.arange(len(place))[::-1]):
+        straight = np.flatnonzero(~turned[order])
+        begin = place[order[straight[0]]] if len(straight) else 0.0
+        if len(straight) and straight[0] > 0 and abs(begin) > 1 - _ROUNDED:
+            keep &= np.abs(place - place[order[0]]) > abs(begin - place[order[0]]) + _MARGIN
+    return keep
+
+
+def _points(band: Band, place: Array, offset: Array) -> Array:
+    along = (band.stop - band.start) * ((place + 1) / 2)[:, None]
+    return np.asarray(band.start + along + offset[:, None] * band.normal)
+
+
+def _along_chord(band: Band, found: Companion, common: float) -> EdgeData:
+    """An edge that is known by its two ends, as points of a line as precise in its middle and at the ends."""
+    middle = float(found.covariance.sum() / 4)
+    slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
+    place = np.linspace(-1, 1, _CHORD)
+    # The line through n points of sigma s has the variance s²/n in its middle, s²/Σt² of its slope.
+    place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
+    offset = found.ends[0] * (1 - place) / 2 + found.ends[1] * (1 + place) / 2
+    return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

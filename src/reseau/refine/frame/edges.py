@@ -2,9 +2,9 @@
 
 All four edges are one case (Cruz et al., sect. 2.2): places are distances from an approximate line, positive
 towards the picture. Nothing is rotated or resampled for it; pixels keep their exact distances. A profile is
-film, a step blurred by a Gaussian, and a picture whose tone may slope:
+film, a step blurred by a Gaussian, and a picture whose tone may change once more close behind it:
 
-.. math:: g(d) = b + A\\,\\Phi(u) + e\\,w\\,(u\\,\\Phi(u) + \\varphi(u)), \\qquad u = (d - p)/w .
+.. math:: g(d) = b + A\\,\\Phi(u) + c\\,\\Phi(u - 3), \\qquad u = (d - p)/w .
 """
 
 from __future__ import annotations
@@ -14,65 +14,24 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import ndtr
 
 from ...adjust import BatchOptions, adjust_batch, weight_function
 from ...data import Array, Mask, Rows
-from ...scans import Scan
-from .border import best_line, first_departure, likelihood
+from .band import Band
+from .border import Border, Film, binned, border_of, row_median
 
-__all__ = ["Band", "EdgeProfiles", "measure_profiles", "merged", "read_band"]
+__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged"]
 
-_PROFILES = 400
-"""Profiles of an edge, where it is long enough for as many."""
-_COLUMNS, _MANY = 4, 12
-"""Neighbouring columns of pixels that make a profile, at most; and where so few show no step."""
-_ENDS = 0.03
-"""Part of an edge at either end that is left out: corners are rounded."""
-_BINS = 72
-"""Places across at which the search for the border looks, at most."""
-_ALONG = 24
-"""Columns over which tones are smoothed before they are compared with film."""
 _SHIFTS, _CHANGE = (3.0,), 0.15
 """Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
 contrast, one sigma."""
+_INWARD = 2.0
+"""How far behind the edge, in widths of the step, its picture is looked at: no further than it takes."""
+NEIGHBOURS = 15
+"""Profiles that tell one another how well a step is determined."""
 _ROBUST = weight_function("danish", 2.5)
-_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.12
-"""In noise, and of the contrast along the edge: what differs from film by less is film."""
-
-
-@dataclass(frozen=True, eq=False)
-class Band:
-    """Pixels along an approximate edge.
-
-    Parameters
-    ----------
-    start, stop : ndarray (2,)
-        Ends of the approximate edge, pixels.
-    place : ndarray (n,)
-        Of the profiles along it, −1 at its start and 1 at its end.
-    distance : ndarray (n, s)
-        Of the pixels from it, positive inwards.
-    grey : ndarray (n, s, channels)
-        Their values; NaN outside the scan.
-    columns : int
-        Neighbouring columns of pixels in a profile.
-    """
-
-    start: Array
-    stop: Array
-    place: Array
-    distance: Array
-    grey: NDArray[np.float32]
-    columns: int
-
-    @property
-    def normal(self) -> Array:
-        """Unit vector inwards."""
-        along = self.stop - self.start
-        return np.asarray(np.array([-along[1], along[0]]) / np.hypot(*along))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,88 +46,31 @@ class EdgeProfiles:
         Of the step, inwards from the approximate edge, and its standard deviation, pixels.
     good : ndarray of bool (n,)
         Which show a step that can be located.
-    contrast : float
-        Of the picture against film, in standard deviations of the noise.
+    blur : ndarray (2, n)
+        Logarithm of the width that a profile and its neighbours show by themselves, and its variance.
     width : float
         Of the blurred step, one sigma, pixels.
-    margin : float
-        By how much the line of the border is better than any other, log-likelihood per profile.
-    lit : float
-        Part of the profiles that differ from film anywhere.
-    clean : float
-        Part of the places beyond the edge that are film.
+    border : Border
+        Film and picture along the edge.
     """
 
     place: Array
     offset: Array
     sigma: Array
     good: Mask
-    contrast: float
+    blur: Array
     width: float
-    margin: float
-    lit: float
-    clean: float
-
-
-def read_band(
-    scan: Scan, start: Array, stop: Array, outward: float, inward: float, *, wide: bool = False
-) -> Band:
-    """Read the pixels along an approximate edge, `outward` and `inward` pixels to its sides.
-
-    `wide` profiles are of more columns each, for weak contrast.
-    """
-    along = stop - start
-    length = float(np.hypot(*along))
-    tangent = along / length
-    axis = int(abs(tangent[1]) > abs(tangent[0]))  # 0: profiles are columns of the scan
-    across = 1 - axis
-    normal = np.array([-tangent[1], tangent[0]])
-    spans = abs(along[axis]) * (1 - 2 * _ENDS)
-    count = int(np.clip(spans / (_MANY if wide else 2), 8, _PROFILES))
-    each = int(np.clip(spans / count, 1, _MANY if wide else _COLUMNS))
-    centre = start[axis] + along[axis] * (_ENDS + (1 - 2 * _ENDS) * (np.arange(count) + 0.5) / count)
-    step = np.rint(centre - (each - 1) / 2).astype(np.intp)
-    sign = np.sign(normal[across])
-    low, high = sorted((-outward * sign / abs(normal[across]), inward * sign / abs(normal[across])))
-    size = int(np.ceil(high - low)) + 1
-    slope = along[across] / along[axis]
-    first = np.rint(start[across] + (step + (each - 1) / 2 - start[axis]) * slope + low).astype(np.intp)
-    grey = np.full((count, each, size, len(scan.channels)), np.nan, dtype=np.float32)
-    limits = (scan.width, scan.height)
-    for i in range(count):
-        a0, a1 = max(step[i], 0), min(step[i] + each, limits[axis])
-        b0, b1 = max(first[i], 0), min(first[i] + size, limits[across])
-        if a1 <= a0 or b1 <= b0:
-            continue
-        box = (b0, b1, a0, a1) if axis == 0 else (a0, a1, b0, b1)
-        part: NDArray[Any] = scan.window(*(int(v) for v in box))
-        turned = part.transpose(1, 0, 2) if axis == 0 else part
-        grey[i, a0 - step[i] : a1 - step[i], b0 - first[i] : b1 - first[i]] = turned
-    at = np.empty((count, each, size, 2))
-    at[..., axis] = step[:, None, None] + np.arange(each)[None, :, None]
-    at[..., across] = first[:, None, None] + np.arange(size)
-    distance = (at - start) @ normal
-    middle = step + (each - 1) / 2
-    place = 2 * (middle - start[axis]) / along[axis] - 1
-    flat = distance.reshape(count, -1), grey.reshape(count, each * size, -1)
-    return Band(start, stop, place, *flat, each)
-
-
-@dataclass(frozen=True, eq=False)
-class _Border:
-    """Film and picture of one channel along an edge, before the steps are located."""
-
-    level: Array
-    noise: float
-    contrast: float
-    start: Array
-    margin: float
-    lit: float
-    clean: float
+    border: Border
 
 
 def measure_profiles(
-    band: Band, channel: int, polarity: int, reach: float, gap: float, width: float | None = None
+    band: Band,
+    channel: int,
+    polarity: int,
+    reach: float,
+    gap: float,
+    width: float | None = None,
+    film: Film | None = None,
 ) -> EdgeProfiles | None:
     """Locate the step from film to picture in every profile of one channel.
 
@@ -187,6 +89,8 @@ def measure_profiles(
     width : float, optional
         Of the blurred step, one sigma, where it is known from other edges; then the picture may have a step
         of its own near the edge.
+    film : Film, optional
+        Film as other edges show it, where little of it lies beyond this one.
 
     Returns
     -------
@@ -194,91 +98,31 @@ def measure_profiles(
         None where nothing differs from film.
     """
     grey = band.grey[:, :, channel].astype(np.float64) * polarity
-    border = _border(grey, band, reach, gap)
+    border = border_of(grey, band, reach, gap, film)
     if border is None:
         return None
     fits = _fitted(grey, band, border, width)
     if fits is None:
         return None
-    offset, sigma, good, width = fits
+    offset, sigma, good, width, blur = fits
     return EdgeProfiles(
         band.place,
         offset,
         sigma,
         good,
-        border.contrast / border.noise,
+        blur,
         width,
-        border.margin,
-        border.lit,
-        border.clean,
+        border,
     )
 
 
-def _binned(grey: Array, distance: Array, low: float, size: float, count: int) -> Array:
-    """Means of the pixels of each profile in bins of distance (n, count); NaN where there are none."""
-    column = np.floor((distance - low) / size).astype(np.intp)
-    used = (column >= 0) & (column < count) & np.isfinite(grey)
-    flat = (np.arange(len(grey))[:, None] * count + column)[used]
-    total = np.bincount(flat, grey[used], minlength=len(grey) * count)
-    number = np.bincount(flat, minlength=len(grey) * count)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((total / np.where(number > 0, number, np.nan)).reshape(len(grey), count))
-
-
-def _border(grey: Array, band: Band, reach: float, gap: float) -> _Border | None:
-    """Tone of film along the edge, and the line where film ends."""
-    low, high = float(band.distance.min(axis=1).max()), float(band.distance.max(axis=1).min())
-    size = max(1.0, (high - low) / _BINS)
-    count = int((high - low) / size)
-    tones = _binned(grey, band.distance, low, size, count)
-    known = np.isfinite(tones)
-    beyond = low + (np.arange(count) + 0.5) * size
-    outer = known & (beyond < -0.4 * reach)
-    if outer.sum() < 3 * len(tones) or known.mean() < 0.5:
-        return None
-    # A median of a profile, and along the edge of these: dust, print and scratches do not move it.
-    own = _row_median(np.where(outer, tones, np.nan))
-    level = median_filter(np.where(np.isfinite(own), own, np.nanmedian(own)), size=101, mode="nearest")
-    rest = np.where(known, tones - level[:, None], 0.0)
-    over = max(1, round(_ALONG / band.columns))
-    # Medians: a scratch that crosses the edge is a few columns wide.
-    smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
-    # Within each profile: perforations and the scanner's light change from profile to profile.
-    own = _row_median(np.where(outer, smooth, np.nan))
-    noise = 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
-    inner = smooth[:, beyond > 0]
-    contrast = float(np.quantile(inner, 0.85))
-    least = max(_SIGNIFICANT * noise, _LEAST_CONTRAST * contrast, 1e-9)
-    if contrast < 1.5 * least:
-        return None
-    start = int(np.clip((0.3 * reach - low) / size, 1, count - 1))
-    found = likelihood(smooth / least, known, start, max(2, round(gap / size)))
-    first, last = (int(np.clip((r - low) / size, 1, count - 2)) for r in (-reach, reach))
-    begin, end, margin = best_line(found, band.place, first, last, max(2, (last - first) // 2))
-    line = begin * (1 - band.place) / 2 + end * (1 + band.place) / 2
-    near = first_departure(found, line, max(2, round(0.1 * gap / size)))
-    outside = (np.arange(count) < line[:, None] - 2) & (np.arange(count) > line[:, None] - 2 - gap / size)
-    clean = 1.0 - float(((found > 0) & outside & known).sum()) / max(float((outside & known).sum()), 1.0)
-    inside = (np.arange(count) >= line[:, None]) & (np.arange(count) < line[:, None] + 6)
-    lit = float((((found > 0) & inside).any(axis=1)).mean())
-    raw = 1.4826 * float(np.nanmedian(np.abs((grey - level[:, None])[band.distance < -0.5 * reach])))
-    return _Border(level, max(raw, 1e-6), contrast, low + size * near, margin, lit, clean)
-
-
-def _row_median(values: Array) -> Array:
-    """Medians of rows, NaN left out; NaN for a row that has nothing else."""
-    empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
-    filled = np.where(empty[:, None], 0.0, values)
-    return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
-
-
-def _width(grey: Array, band: Band, border: _Border) -> float:
+def _width(grey: Array, band: Band, border: Border) -> float:
     """Width of the blurred step from the mean of all profiles, each over its own contrast."""
     at = band.distance - border.start[:, None]
     rest = grey - border.level[:, None]
     place = np.arange(-12.0, 12.0, 0.5)
-    tones = _binned(rest, at, -12.0, 0.5, len(place))
-    inside = _row_median(np.where((place > 1) & (place < 6), tones, np.nan))
+    tones = binned(rest, at, -12.0, 0.5, len(place))
+    inside = row_median(np.where((place > 1) & (place < 6), tones, np.nan))
     half = 0.5 * float(np.nanmedian(np.where(inside > 0, inside, np.nan)))
     strong = np.asarray(inside > half)
     if not strong.any():
@@ -295,13 +139,15 @@ def _width(grey: Array, band: Band, border: _Border) -> float:
 
 
 def _fitted(
-    grey: Array, band: Band, border: _Border, known: float | None
-) -> tuple[Array, Array, Mask, float] | None:
-    """Step of every profile: offset, sigma, which are good, and the common width."""
+    grey: Array, band: Band, border: Border, known: float | None
+) -> tuple[Array, Array, Mask, float, Array] | None:
+    """Step of every profile: offset, sigma, which are good, the common width, and each one's own."""
     start = border.start
     width = _width(grey, band, border) if known is None else known
     for spread in (0.5, 0.12, 0.12) if known is None else (0.02,):
-        window = _window(grey, band.distance, start, -4.0 * width - 2.0, 4.0 * width + 2.0)
+        far = 4.0 * width + 2.0
+        near = far if spread > 0.2 else _INWARD * width
+        window = _window(grey, band.distance, start, np.maximum(-far, border.outermost - start), near)
         if window is None:
             return None
         value, distance, weight = window
@@ -331,16 +177,28 @@ def _fitted(
         if not good.any():
             return None
         settled = float(np.clip(np.median(w[good]), 0.4, 6.0)) if known is None else known
+        blur = _own_width(fit.estimates[:, 2], fit.cofactor[:, 2, 2], np.log(width), spread, good)
         done = spread < 0.5 and abs(np.log(settled / width)) < 0.05
         start, width = np.where(good, p, start), settled
         if done:
             break
-    return np.where(good, p, 0.0), np.where(good, sigma, 1.0), good, width
+    return np.where(good, p, 0.0), np.where(good, sigma, 1.0), good, width, blur
+
+
+def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
+    """Logarithm of the width without the prior that held it, mean over neighbours, and variance (2, n)."""
+    share = np.clip(1 - cofactor / spread**2, 1e-3, 1.0)
+    weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
+    alone = np.clip((found - known) / share, -1.0, 1.0)
+    size = min(NEIGHBOURS, len(found))
+    total = uniform_filter1d(weight, size, mode="nearest")
+    mean = uniform_filter1d(weight * alone, size, mode="nearest") / total
+    return np.stack([known + mean, 1 / (size * total)])
 
 
 def _along(values: Array) -> Array:
     """Running median over neighbouring profiles."""
-    return np.asarray(median_filter(values, size=min(15, len(values)), mode="nearest"))
+    return np.asarray(median_filter(values, size=min(NEIGHBOURS, len(values)), mode="nearest"))
 
 
 def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
@@ -361,15 +219,16 @@ def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
         np.concatenate([a, b[lone]])[order]
         for a, b in ((fine.offset, wide.offset), (fine.sigma, wide.sigma), (fine.good, wide.good))
     )
-    return replace(fine, place=place[order], offset=offset, sigma=sigma, good=good)
+    blur = np.concatenate([fine.blur, wide.blur[:, lone]], axis=1)[:, order]
+    return replace(fine, place=place[order], offset=offset, sigma=sigma, good=good, blur=blur)
 
 
 def _window(
-    grey: Array, distance: Array, start: Array, low: float, high: float
+    grey: Array, distance: Array, start: Array, low: Array, high: float
 ) -> tuple[Array, Array, Array] | None:
     """Pixels of each profile between two distances from its start: values, distances, weights (n, s)."""
     at = distance - start[:, None]
-    used = (at > low) & (at < high) & np.isfinite(grey)
+    used = (at > low[:, None]) & (at < high) & np.isfinite(grey)
     size = int(used.sum(axis=1).max(initial=0))
     if size < 8:
         return None

@@ -46,11 +46,14 @@ class EdgeData:
         Standard deviations across the edge.
     common : float
         Standard deviation of an error that all of them share, pixels.
+    ends : float
+        Standard deviation of an error that the edge may have at either end by itself, pixels.
     """
 
     xy: Array
     sigma: Array
     common: float = 0.0
+    ends: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -286,7 +289,8 @@ def _lines(
     )
     cofactor = fit.covariance.copy()
     for k, edge in enumerate(edges):
-        cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += 0.0 if edge is None else edge.common**2
+        if edge is not None:
+            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2 + edge.ends**2 * np.eye(2)
     covariance = slope @ cofactor @ slope.T
     used, out, rms, coverage = (np.zeros(4) for _ in range(4))
     a, b, _ = _frame_axes(corners)

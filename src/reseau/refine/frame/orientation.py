@@ -12,8 +12,8 @@ from ...adjust import Failure
 from ...data import Array
 from ...formats import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...scans import Scan
+from .band import Band, read_band
 from .channel import FAR, Channel, channels_by_contrast, measure_channel
-from .edges import Band, read_band
 from .lines import FrameShape, Lines, adjust_lines, derived
 from .outline import FrameGuess
 from .search import search_frames

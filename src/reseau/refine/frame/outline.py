@@ -19,8 +19,11 @@ Plane = NDArray[np.float32]
 
 _OUTWARD_MM = 0.8
 """How far beyond a line that voted the edge is looked for; perforations are hardly nearer to it."""
-_OUTSIDE, _INSIDE = (-3.0, -2.0), (2.0, 3.0)
-"""Distances inwards at which film and picture are looked at, pixels of the overview."""
+_OUTSIDE, _INSIDE = (-3.5, -2.5, -1.5), (2.0, 3.0)
+"""Distances inwards at which film, wherever there is some, and picture are looked at, pixels of the overview.
+"""
+_GAP_MM = 0.15
+"""Width of film beyond which something else begins, as perforations do."""
 _ALONG = np.linspace(-0.92, 0.92, 80)
 """Where along an edge its surroundings are looked at, −1 to 1."""
 
@@ -52,7 +55,7 @@ class FrameGuess:
 
 def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
     """The guess with its score by what is on both sides of its edges; None where that is no frame."""
-    outside, inside = (_beside(guess.corners, grey, offset) for offset in (_OUTSIDE, _INSIDE))
+    outside, inside = _sides(guess, grey)
     known, seen = np.isfinite(outside) & np.isfinite(inside), np.array(guess.supported)
     if (known.mean(axis=1)[seen] < 0.5).any() or (seen.all() and not _within(guess.corners, grey.shape)):
         return None
@@ -97,7 +100,7 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
     """Each edge moved to where unexposed film ends; the lines that voted may run within the picture."""
     scale = float(np.mean(size_of(guess.corners) / guess.format_mm))
     seen = np.array(guess.supported)
-    outside, inside = (_beside(guess.corners, grey, offset) for offset in (_OUTSIDE, _INSIDE))
+    outside, inside = _sides(guess, grey)
     level, spread, strong = _film(guess, outside[seen], inside[seen])
     out, reach = int(np.clip(_OUTWARD_MM * scale, 4, 20)), 6
     offsets = np.arange(-out - 2, 3 * reach + 1)
@@ -109,11 +112,12 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
         near = _running(outside[k], level)
         far = _running(np.nanmean(np.where(known[k], profiles[k], level)[:, : out // 2], axis=1), level)
         # Where the line that voted has other tones before it than film, film is looked for further out.
-        raised = guess.polarity * (np.nanmedian(near) - level) > 0.1 * strong
-        film = (far if raised else near)[:, None]
+        raised = guess.polarity * (np.median(near) - level) > 0.1 * strong
+        darker = guess.polarity * (np.median(near) - np.median(far)) > 0
+        film = (far if raised and darker else near)[:, None]
         departure = guess.polarity * (np.where(known[k], profiles[k], film) - film) / least
-        found = likelihood(departure, known[k], out + 2, max(2, round(0.2 * scale)))
-        start, stop, _ = best_line(found, _ALONG, 2, len(offsets) - 2 * reach, 4)
+        found = likelihood(departure, known[k], out + 2, max(2, round(_GAP_MM * scale)))
+        start, stop = best_line(found, _ALONG, 2, len(offsets) - 2 * reach, 4)
         moved[k] = offsets[0] - 0.5 + np.array([start, stop])
     return FrameGuess(
         _moved(guess.corners, moved), guess.polarity, guess.format_mm, guess.supported, guess.score
@@ -140,6 +144,12 @@ def crossings_of(a: Array, b: Array) -> Array:
     line = np.cross(np.column_stack([a, np.ones(4)]), np.column_stack([b, np.ones(4)]))
     corner = np.cross(np.roll(line, 1, axis=0), line)
     return np.asarray(corner[:, :2] / corner[:, 2:])
+
+
+def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
+    """Grey values (4, 80) along the edges outside, where they are most like film, and inside."""
+    outside = [guess.polarity * _beside(guess.corners, grey, (offset,)) for offset in _OUTSIDE]
+    return guess.polarity * np.fmin.reduce(outside), _beside(guess.corners, grey, _INSIDE)
 
 
 def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
