@@ -97,6 +97,9 @@ class Laboratory:
         By default drawn from the world's seed.
     clock : callable
         Seconds.
+    repeatable : bool
+        Whether the same state gives the same picture to the bit: nothing drifts, and noise is that of the
+        state, not of the exposure.
 
     Examples
     --------
@@ -116,10 +119,11 @@ class Laboratory:
         *,
         room: Room | None = None,
         clock: Callable[[], float] = time.monotonic,
+        repeatable: bool = False,
     ) -> None:
-        self.world = world
+        self.world, self.repeatable = world, repeatable
         self.field = field or FieldBench(seed=world.seed)
-        self.room = room or Room.drawn(world.rng("room"))
+        self.room = room or (Room() if repeatable else Room.drawn(world.rng("room")))
         self.lock = threading.RLock()
         self.swept = np.zeros(GRADIANS, dtype=bool)
         """Head angles of which echoes have been drawn."""
@@ -191,7 +195,8 @@ class Laboratory:
             late = (ranges[:, None] - distance[None, :]) / pulse
             signal = (np.exp(-0.5 * late**2) * strength).sum(axis=1)
             self._lines += 1
-            noise = self.world.rng("line", self._lines).normal(0.0, _NOISE, samples)
+            purpose = ("line", angle, self._state()) if self.repeatable else ("line", self._lines)
+            noise = self.world.rng(*purpose).normal(0.0, _NOISE, samples)
             self.swept[angle % GRADIANS] = True
             self._drawn = None
             self.echoes = np.clip(gain * 255 * signal + noise, 0, 255).astype(np.uint8)
@@ -272,7 +277,7 @@ class Laboratory:
         """
         with self.lock:
             self._exposures += 1
-            name = f"exposure {self._exposures}"
+            name = f"exposure {self._state() if self.repeatable else self._exposures}"
             level = light * gain * max(0.0, 1 + self.room.light_per_hour * self.hours)
             if sight == "screen":
                 screen = copy.copy(self.screen())
@@ -285,12 +290,20 @@ class Laboratory:
             pixels = sensor.expose(level * bench.light(station, shifts), rng)
             return Frame(pixels, sensor.full_scale, name, sha256(pixels.tobytes()).hexdigest())
 
+    def _state(self) -> str:
+        """All that a picture shows, as a name."""
+        axes = " ".join(f"{name} {value:.6f}" for name, value in self.axes.items())
+        tank = sha256(self._tank.xy.tobytes() + np.packbits(self.swept).tobytes()).hexdigest()
+        return f"{axes} {tank}"
+
     def _drift(self) -> Array:
         """How far the cameras have crept (mm)."""
         return self.hours * np.array(self.room.drift_mm_per_hour)
 
     def _standing(self) -> World:
         """The world with the camera where it stands now."""
+        if not self._drift().any():
+            return self.world  # what it has computed of this camera holds
         return replace(self.world, camera=self.world.camera.moved(self._drift(), 0.0))
 
     def _moved(self) -> tuple[Station, FieldBench]:

@@ -16,16 +16,17 @@ POSITIONS = [step.position | {"z": 10.0 * (k % 3)} for k, step in enumerate(pape
 @given(
     about=st.sampled_from([0, 1]),
     signs=st.tuples(*[st.sampled_from([1.0, -1.0])] * 3),
+    lifts=st.sampled_from([1.0, -1.0]),
     seed=st.integers(0, 99),
     count=st.integers(12, 36),
 )
 @settings(deadline=None, max_examples=30)
 def test_poses_of_any_mount_are_predicted(
-    about: int, signs: tuple[float, float, float], seed: int, count: int
+    about: int, signs: tuple[float, float, float], lifts: float, seed: int, count: int
 ) -> None:
     rng = np.random.default_rng(seed)
     looks = rotation_matrix(np.array([np.pi, 0, 0]) + rng.normal(0, 0.02, 3))
-    true = Mount(about, signs, looks, np.array([*rng.normal(0, 5, 2), 5000.0]), 0.0)
+    true = Mount(about, signs, lifts, looks, np.array([*rng.normal(0, 5, 2), 5000.0]), 0.0)
     rows = rng.permutation(len(POSITIONS))[:count]
     poses = [true.pose(POSITIONS[k]) for k in rows]
     noise = [rotation_matrix(rng.normal(0, 1e-3, 3)) for _ in rows]
@@ -49,7 +50,7 @@ def test_axes_that_turn_something_else_are_told() -> None:
 
 @pytest.mark.parametrize("missing", ["tilt", "roll"])
 def test_an_axis_that_did_not_move_does_no_harm(missing: str) -> None:
-    true = Mount(1, (1.0, 1.0, -1.0), np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 900.0]), 0.0)
+    true = Mount(1, (1.0, 1.0, -1.0), 1.0, np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 900.0]), 0.0)
     positions = [{axis: v for axis, v in p.items() if axis != missing} for p in POSITIONS]
     poses = [true.pose(position) for position in positions]
     found = Mount.of(positions, np.array([p.matrix for p in poses]), np.array([p.x0 for p in poses]))

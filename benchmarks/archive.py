@@ -1,0 +1,111 @@
+"""What an archive of many frames costs: keeping one beside merely writing it, opening, listing, finding one.
+
+    python benchmarks/archive.py [--frames 10000] [--pixels 1024] [--objects 400] [--folder FOLDER]
+
+Frames are 8-bit, of noise: nothing of them can be left out. Plain writing is the same TIFF brought to the
+disk with fsync and a rename, as anyone must who does not want to lose it. To spare the disk, only so many
+frames are stored as files of their own (`--objects`); all others have rows in the index, and share a file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from reseau.archive import Archive, Verdict, tiff_of
+from reseau.data import Frame
+
+
+def milliseconds(work: Callable[[], object], times: int = 15) -> tuple[float, float]:
+    """Median and worst."""
+    taken = []
+    for _ in range(times):
+        began = time.perf_counter()
+        work()
+        taken.append(1e3 * (time.perf_counter() - began))
+    return statistics.median(taken), max(taken)
+
+
+def plain(path: Path, data: bytes) -> None:
+    """Write a file that outlasts a power cut."""
+    draft = path.with_suffix(".draft")
+    with draft.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+    draft.replace(path)
+    handle = os.open(path.parent, os.O_RDONLY)
+    os.fsync(handle)
+    os.close(handle)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--pixels", type=int, default=1024, help="width and height")
+    parser.add_argument("--objects", type=int, default=400, help="frames with a file of their own")
+    parser.add_argument("--folder", type=Path, help="where; by default a temporary folder")
+    given = parser.parse_args()
+    rng = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory(dir=given.folder) as name:
+        folder = Path(name)
+        (folder / "plain").mkdir()
+        kept_ms, written_ms = [], []
+        with Archive.open(folder / "archive", create=True) as archive:
+            for k in range(10):
+                archive.begin(f"session {k}", "frames", {})
+            sessions = [archive.session(f"session {k}") for k in range(10)]
+            shared = b"the same for all"
+            every = max(1, given.frames // given.objects)
+            for k in range(given.frames):
+                session, step = sessions[k % 10], f"{k:06d}"
+                if k % every:
+                    session.judge(session.store(step, shared, suffix=".bin"), Verdict(True))
+                    continue
+                pixels = rng.integers(0, 256, (given.pixels, given.pixels), dtype=np.uint8)
+                frame = Frame(pixels, 255.0, step)
+                began = time.perf_counter()
+                session.store(step, frame, facts={"gain": 1.0}, clock={"taken": "2026-01-01"})
+                between = time.perf_counter()
+                plain(folder / "plain" / f"{k}.tif", tiff_of(frame, {}))
+                kept_ms.append(1e3 * (between - began))
+                written_ms.append(1e3 * (time.perf_counter() - between))
+        overhead = [one - other for one, other in zip(kept_ms, written_ms, strict=True)]
+        size = sum(path.stat().st_size for path in (folder / "archive").glob("index*")) / 1e6
+        print(f"{given.frames} frames, index {size:.1f} MB; median and worst, ms")
+        written = statistics.median(written_ms), max(written_ms)
+        print(f"  writing one of {given.pixels}² px    {written[0]:7.1f} {written[1]:7.1f}")
+        print(f"  keeping one              {statistics.median(kept_ms):7.1f} {max(kept_ms):7.1f}")
+        print(
+            f"  overhead                 {statistics.median(overhead):7.1f} {max(overhead):7.1f}   asked < 15"
+        )
+        row = "  {:<24} {:7.1f} {:7.1f}   asked < 50"
+        print(row.format("opening", *milliseconds(lambda: Archive.open(folder / "archive").close())))
+        with Archive.open(folder / "archive") as archive:
+            print(row.format("listing all sessions", *milliseconds(archive.sessions)))
+            session = archive.session("session 3")
+            of_one = f"listing {len(session.frames())} frames"
+            print(row.format(of_one, *milliseconds(session.frames)))
+            step = f"{given.frames // 2 // every * every:06d}"
+            found = archive.session(f"session {int(step) % 10}")
+
+            def one() -> Frame:
+                frame = found.find(step)
+                assert frame is not None
+                return found.picture(frame)
+
+            print(row.format("finding and reading one", *milliseconds(one)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""How many poses the closed loop needs for what the paper's 36 recordings give.
+
+    python benchmarks/closed_loop.py [--seeds 2] [--parameter c]
+
+For every seed the paper's recordings are taken first, all 36; their standard deviation of the parameter is
+the goal. Then poses are chosen until it is reached: the next one always lowers it most, predicted from the
+design matrix; among the paper's tilts with eight turns of the board, and among tilts up to 60°. The testfield
+is flat here, so that sigma0 is one and counts for nothing; noise, jitter and camera are the paper's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from reseau.adjust.threads import one_thread
+from reseau.capture import Step, paper_steps, spread
+from reseau.data import Frame
+from reseau.designs import coded_testfield
+from reseau.procedures.calibration import CameraModel
+from reseau.procedures.live import LiveTestfield
+from reseau.procedures.measuring import measurer_of
+from reseau.refine import TestfieldOptions
+from reseau_sims import FieldBench, Station
+
+AXES = ("tilt", "roll", "camera_roll")
+DESIGN = coded_testfield()
+
+
+def grid(tilts: Sequence[float], rolls: int) -> list[Step]:
+    """All poses of a raster; the board that is not tilted is not turned either."""
+    steps = []
+    for tilt in tilts:
+        for roll in range(0, 360, 360 // rolls) if tilt else (0,):
+            for camera in (0, 90, 180, 270):
+                position = dict(zip(AXES, (tilt, float(roll), float(camera)), strict=True))
+                steps.append(Step(f"{tilt:g} {roll} {camera}", position))
+    return steps
+
+
+class Session:
+    """A testfield procedure on the simulated bench, without instruments between."""
+
+    def __init__(self, seed: int) -> None:
+        self.bench = FieldBench(seed=seed, bend_mm=0.0)
+        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
+        measure = measurer_of(DESIGN, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
+        self.procedure = LiveTestfield(DESIGN, measure, model, name="closed loop")
+        self.poses = 0
+
+    def take(self, step: Step) -> None:
+        """Record and measure."""
+        frame = self.bench.record(Station(*(step.position[axis] for axis in AXES)))
+        self.procedure.on_frame(Frame(frame.pixels, 255.0, step.name), step)
+        self.poses += 1
+
+    def sigma(self, parameter: str) -> float:
+        """Reached so far; infinite before there is a calibration."""
+        return self.procedure.progress().get(f"sigma_{parameter}", float("inf"))
+
+
+def closed(seed: int, candidates: Sequence[Step], parameter: str, goal: float) -> list[float]:
+    """Standard deviations after each pose, from the first calibration to the goal."""
+    session, left = Session(seed), list(candidates)
+    reached = []
+    for step in spread(candidates, 4):
+        session.take(step)
+        left.remove(step)
+    while left:
+        reached.append(session.sigma(parameter))
+        if reached[-1] <= goal:
+            break
+        chosen = session.procedure.next_pose(left, parameter)
+        assert chosen is not None
+        left.remove(chosen[0])
+        session.take(chosen[0])
+    return reached
+
+
+def main() -> None:
+    """Print a line for every seed and set of candidates."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--parameter", default="c")
+    given = parser.parse_args()
+    sets = {
+        "tilts 0, 30, 45": grid((0.0, 30.0, 45.0), 8),
+        "tilts 0, 30, 45, 60": grid((0.0, 30.0, 45.0, 60.0), 8),
+    }
+    with one_thread():
+        for seed in range(given.seeds):
+            paper = Session(seed)
+            for step in paper_steps():
+                paper.take(step)
+            goal = paper.sigma(given.parameter)
+            print(
+                f"seed {seed}: sigma_{given.parameter} {goal:.3g} of the paper's {paper.poses} poses",
+                flush=True,
+            )
+            for name, candidates in sets.items():
+                reached = closed(seed, candidates, given.parameter, goal)
+                count = len(reached) + 3
+                course = " ".join(f"{sigma:.3g}" for sigma in reached)
+                print(f"  {name:<20} {count:3d} poses; after 4, 5, …: {course}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
