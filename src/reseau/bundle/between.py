@@ -2,8 +2,8 @@
 
 Each image i moves the estimates by dxᵢ = Q Aᵢᵀ Pᵢ vᵢ, and these sum to zero. Where errors are independent
 from one image to another, whatever they are within an image, Σ dxᵢ dxᵢᵀ estimates the covariance of the
-estimates (Huber 1967; Liang & Zeger 1986, *Biometrika* 73). It tells a camera that changes from image to image,
-or marks that are off in common, from noise.
+estimates (Huber 1967; Liang & Zeger 1986, *Biometrika* 73). It tells a camera that changes, or marks that are
+off in common, from noise.
 """
 
 from __future__ import annotations

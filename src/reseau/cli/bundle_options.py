@@ -92,6 +92,8 @@ def say_model(searched: Searched) -> None:
     for step in searched.eliminated or ():
         said = f"|t| {step.test.statistic:.2f}, p = {step.test.p:.2g}, sigma0 without it {step.sigma0:.5g}"
         say(f"dropped: {step.test.name} of camera {step.camera}: {said}\n")
+    if searched.eliminated == ():
+        say("all distortion parameters are significant: none was dropped\n")
     if searched.validation is not None:
         before, after = searched.validation
         say(

@@ -90,24 +90,26 @@ def difference_figure(found: FieldDifference) -> str:
 def _contours(axes: Axes, xy: Array, sigma: Array) -> None:
     """Contours over the image, y down."""
     x, y = xy[0, :, 0], xy[:, 0, 1]
-    levels = _levels(sigma)
+    levels, digits = _levels(sigma)
     shown = np.ma.masked_invalid(sigma)
     axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, extend="both")
     lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)
-    axes.clabel(lines, fontsize=7.5, fmt="%.3g")
+    axes.clabel(lines, fontsize=7.5, fmt=f"%.{digits}g")
     axes.set_aspect("equal")
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[-1], y[0])
 
 
-def _levels(sigma: Array) -> list[float]:
-    """Round levels in geometric steps between the least and the largest."""
+def _levels(sigma: Array) -> tuple[list[float], int]:
+    """Round levels in geometric steps between the least and the largest, and their significant digits."""
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(known):
-        return [0.0, 1.0]
+        return [0.0, 1.0], 1
     high = float(np.quantile(known, 0.995))
     low = max(float(known.min()), high / _SPAN)
     steps = np.geomspace(1.1 * low, max(high, 1.2 * low), _LEVELS)
-    digits = 1 - int(np.floor(np.log10(low)))
-    rounded = sorted({round(float(step), digits) for step in steps})
-    return rounded if len(rounded) > 1 else [low, 1.05 * low]
+    for digits in (2, 3, 4):
+        rounded = sorted({float(f"{step:.{digits}g}") for step in steps})
+        if len(rounded) == _LEVELS:
+            break
+    return rounded, digits
