@@ -6,7 +6,7 @@ OUT    ?= out
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test lint slow clean
+.PHONY: demo test lint rig slow clean
 
 demo: $(VENV)/.core
 	$(BIN)/reseau demo --out $(OUT)
@@ -19,6 +19,9 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+rig: $(VENV)/.test
+	$(BIN)/python -m tests.rig.machine
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow

@@ -208,9 +208,11 @@ class V4l2:
         if buffer.flags & uapi.Buffer.CLOCKS != uapi.Buffer.MONOTONIC:
             raise ProtocolError("stamps its frames by an unknown clock")
         stamp = buffer.stamp_ns
-        if stamp > now + _TICK_NS or stamp < self._stamp_ns:
+        if stamp > now + self._period_ns + _TICK_NS or stamp < self._stamp_ns:
             raise ProtocolError(f"stamped a frame {(stamp - now) / 1e9:+.3g} s from now, or out of order")
         self._stamp_ns = stamp
+        # Drivers that stamp where a frame is to end may be ahead of that by a part of the period.
+        stamp = min(stamp, now)
         self._stamped_at_start = buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
         if self._stamped_at_start:
             return Span(stamp, stamp + 1000)

@@ -1,0 +1,191 @@
+"""The driver of V4L2 at a real node of the kernel, whose frames are ours."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.errors import InstrumentError, ProtocolError, RefusedError
+from reseau_drivers.camera import v4l2, video_devices
+from reseau_sims.serving import Pattern
+
+from .lab import steer, value
+
+FORMATS = {"GREY": "GREY", "Y16": "Y16 "}
+PATIENCE_S = 20.0
+"""After a change until it is seen: frames go through the loop's buffers, slowly in emulation."""
+
+
+@pytest.fixture(params=list(FORMATS))
+def looped(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
+    yield steer("start_camera", FORMATS[request.param]), request.param
+    assert not value("camera.failed")
+    steer("stop_camera")
+
+
+@pytest.fixture
+def grey() -> Iterator[str]:
+    yield steer("start_camera", "GREY")
+    steer("stop_camera")
+
+
+def _seen(camera: Any, shift: int) -> None:
+    """Wait until the stripes of this shift are seen, to the bit."""
+    wanted = Pattern(640, 480, shift)(value("camera.view"))
+    until = time.monotonic() + PATIENCE_S
+    while not np.array_equal(pixels := camera.expose().pixels, wanted):
+        assert time.monotonic() < until, f"{np.count_nonzero(pixels != wanted)} pixels differ"
+
+
+def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
+    node, name = looped
+    with v4l2("camera", node, settings={"format": name}) as camera:
+        for shift in (0, 9, 25):
+            steer("look_at", shift)
+            _seen(camera, shift)
+        shot = camera.expose()
+        assert shot.full_scale == {"GREY": 255, "Y16": 65535}[name]
+
+
+def test_brightness_and_gain_act_on_the_picture(grey: str) -> None:
+    with v4l2("camera", grey) as camera:
+        steer("look_at", 3)
+        for changes in ({"brightness": 138}, {"brightness": 128, "gain": 60.0}, {"gain": 0.0}):
+            camera.configure(**changes)
+            _seen(camera, 3)
+
+
+@pytest.mark.parametrize("source", ["End of Frame", "Start of Exposure"])
+def test_frames_are_fresh_and_their_time_is_told(grey: str, source: str) -> None:
+    with v4l2("camera", grey) as camera:
+        steer("camera._choose", "Timestamp Source", source)
+        for _ in range(5):
+            asked = datetime.now(UTC)
+            shot = camera.expose()
+            assert shot.fresh
+            assert (shot.taken - asked).total_seconds() + shot.taken_within_s >= 0
+            assert shot.taken <= datetime.now(UTC)
+        assert (shot.taken_within_s < 1e-3) == (source == "Start of Exposure")
+        steer("camera._choose", "Timestamp Source", "End of Frame")
+
+
+def test_lost_frames_are_counted(grey: str) -> None:
+    with v4l2("camera", grey) as camera:
+        camera.expose()
+        steer("camera._set", "Percentage of Dropped Buffers", 50)
+        try:
+            shots = list(camera.frames(20))
+        finally:
+            steer("camera._set", "Percentage of Dropped Buffers", 0)
+    gaps = sum(b.sequence - a.sequence - 1 for a, b in pairwise(shots))
+    assert shots[-1].dropped - shots[0].dropped == gaps > 0
+
+
+def test_numbers_wrap_without_a_gap_of_billions(grey: str) -> None:
+    with v4l2("camera", grey) as camera:
+        camera.stop()
+        steer("camera._set", "Wrap Sequence Number", 1)
+        try:
+            shots = list(camera.frames(40))
+        finally:
+            steer("camera._set", "Wrap Sequence Number", 0)
+    assert shots[-1].sequence - shots[0].sequence < 400
+
+
+@pytest.mark.parametrize("button", ["Inject VIDIOC_STREAMON Error", "Inject Fatal Streaming Error"])
+def test_faults_of_the_driver_are_said_and_survived(grey: str, button: str) -> None:
+    with v4l2("camera", grey) as camera:
+        camera.expose()
+        if "STREAMON" in button:
+            camera.stop()
+        steer("camera._set", button, 1)
+        with pytest.raises(InstrumentError) as caught:
+            camera.expose(2.0)
+        assert caught.value.instrument == "camera"
+        if "Fatal" in button:
+            assert isinstance(caught.value, ProtocolError)
+        assert camera.expose().fresh
+
+
+def test_a_second_process_is_refused_and_disturbs_nothing(grey: str) -> None:
+    program = (
+        "from reseau_drivers.camera import v4l2\n"
+        "from reseau.errors import RefusedError\n"
+        f"try: v4l2('other', {grey!r}).connect()\n"
+        "except RefusedError as error: print(error)\n"
+    )
+    with v4l2("camera", grey) as camera:
+        before = camera.expose()
+        other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=50)
+        assert "another process" in other.stdout, other.stderr
+        assert camera.expose().sequence > before.sequence
+
+
+def test_the_self_test_passes(grey: str) -> None:
+    with v4l2("camera", grey) as camera:
+        found = camera.check(10.0)
+    assert found["identity"].startswith("vivid vivid")
+    assert found["frames"].startswith("640 × 480, ")
+
+
+def test_what_the_camera_cannot_do_is_refused(grey: str) -> None:
+    with v4l2("camera", grey) as camera:
+        with pytest.raises(RefusedError, match="no control of the exposure time"):
+            camera.configure(exposure_us=1000.0)
+        with pytest.raises(RefusedError, match="brightness 999 is beyond its 0…255"):
+            camera.configure(brightness=999)
+        assert camera.expose().fresh
+
+
+def test_the_nodes_are_found(grey: str) -> None:
+    assert grey in {os.path.realpath(path) for path in video_devices()}
+
+
+def test_v4l2_ctl_agrees_with_what_our_driver_set(grey: str) -> None:
+    if shutil.which("v4l2-ctl") is None:
+        pytest.skip("no v4l2-ctl on the host: apt-get install v4l-utils")
+    with v4l2("camera", grey, settings={"brightness": 77}) as camera:
+        camera.expose()
+        said = subprocess.run(
+            ["v4l2-ctl", "-d", grey, "--get-fmt-video", "--get-ctrl=brightness"],
+            capture_output=True,
+            text=True,
+        ).stdout
+    assert "640/480" in said
+    assert "'GREY'" in said
+    assert "brightness: 77" in said
+
+
+def test_v4l2_ctl_captures_the_same_frame(grey: str, tmp_path: Any) -> None:
+    if shutil.which("v4l2-ctl") is None:
+        pytest.skip("no v4l2-ctl on the host: apt-get install v4l-utils")
+    steer("look_at", 17)
+    with v4l2("camera", grey, settings={"brightness": 128, "gain": 0.0}) as camera:
+        _seen(camera, 17)
+        camera.stop()
+    file = tmp_path / "frame"
+    options = ["--stream-mmap=4", "--stream-skip=20", "--stream-count=1", f"--stream-to={file}"]
+    subprocess.run(["v4l2-ctl", "-d", grey, *options], check=True, capture_output=True, timeout=50)
+    wanted = Pattern(640, 480, 17)(value("camera.view"))
+    assert file.read_bytes() == wanted.tobytes()
+
+
+def test_a_disconnected_camera_is_said(grey: str) -> None:
+    # The last one: the virtual driver stays disconnected.
+    with v4l2("camera", grey) as camera:
+        camera.expose()
+        steer("camera._set", "Disconnect", 1)
+        for _ in range(2):
+            with pytest.raises(InstrumentError) as caught:
+                camera.expose(3.0)
+            assert caught.value.instrument == "camera"
