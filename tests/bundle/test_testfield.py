@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust import compare
-from reseau.bundle import Additional, Camera, Network, Result, adjust_network
+from reseau.bundle import Additional, Camera, Network, Result, adjust_network, by_place, common_pattern
 from reseau.data import Array
 from reseau.optics.poses import matrix_to_vector
 
@@ -33,9 +33,16 @@ def about(axis: int, angle: float) -> Array:
     return turn
 
 
-def paper(all_images: bool = False, noise: float = 0.04, bend_mm: float = 0.0, seed: int = 0) -> Network:
+def paper(
+    all_images: bool = False,
+    noise: float = 0.04,
+    bend_mm: float = 0.0,
+    seed: int = 0,
+    shape: Array | None = None,
+) -> Network:
     """32 or 36 images: the board tilted by 30° and 45° (and 0°), turned in its plane, the camera rolled."""
     rng, xyz = np.random.default_rng(seed), board()
+    body = xyz if shape is None else np.column_stack([xyz[:, :2], shape])
     extra = Additional(BASE, True, "group")
     values = np.array([C] + 9 * [0.0])
     camera = Camera("ccd", 512, 512, (PITCH, PITCH), "brown", values, (), "object", additional=extra)
@@ -49,7 +56,7 @@ def paper(all_images: bool = False, noise: float = 0.04, bend_mm: float = 0.0, s
         turn = view @ board_to_mount
         where = board_to_mount.T @ np.array([0.0, 0.0, 1900.0])
         # A bend that turns with the mount, whatever way the board is turned in it.
-        turned, tilt = xyz @ about(2, np.pi / 2 * t).T, about(1, np.radians(phi))
+        turned, tilt = body @ about(2, np.pi / 2 * t).T, about(1, np.radians(phi))
         turned[:, 2] += bend_mm * ((turned[:, 0] / 437.5) ** 2 - 0.5)
         bent = turned @ tilt.T
         seen.append(networks.image_points(camera, view, np.array([0.0, 0.0, 1900.0]), bent))
@@ -67,7 +74,7 @@ def paper(all_images: bool = False, noise: float = 0.04, bend_mm: float = 0.0, s
         x0=np.array(x0),
         rotation=np.array(rotation),
         points=tuple(f"t{k}" for k in range(32)),
-        xyz=xyz,
+        xyz=body,
         sigma=sigma,
         role=tuple("control" if k in control else "tie" for k in range(32)),
         image_of=np.repeat(np.arange(m), 32),
@@ -113,3 +120,36 @@ def test_a_bend_that_turns_with_the_mount_is_removed_by_groups() -> None:
     assert 0.94 < groups.sigma0 < 1.06 < one.sigma0
     assert compare(one.fit, groups.fit).p < 1e-12
     assert any(test.significant for test in groups.camera_tests(0, alpha=0.001))
+
+
+def test_the_bend_of_the_mount_is_seen_in_residuals_that_images_have_in_common() -> None:
+    network = paper(bend_mm=0.8)
+    camera = network.cameras[0]
+    one = adjusted(replace(network, cameras=(replace(camera, additional=Additional(BASE, True, "camera")),)))
+    # The same place of the mount is the same place of the frame, in all images of a group.
+    names = list(dict.fromkeys(network.groups))
+    group = np.array([names.index(name) for name in network.groups])[network.image_of]
+    key = 1000 * group + by_place(one, 0, 16)
+    assert common_pattern(one, key).p < 1e-12
+    assert common_pattern(adjusted(network), key).p > 1e-4
+
+
+def test_a_bend_of_the_board_itself_is_in_the_heights_within_their_sigma() -> None:
+    """Half a millimetre: nothing in the residuals, all in the object, beside the plane of the control."""
+    flat, bend = board(), 0.5
+    height = bend * ((flat[:, 0] / 437.5) ** 2 + 0.6 * (flat[:, 1] / 437.5) - (flat[:, 1] / 437.5) ** 2)
+    result = adjusted(paper(noise=0.005, shape=height))
+    assert 0.94 < result.sigma0 < 1.06
+    control = [0, 3, 31]
+    plane = np.column_stack([np.ones(32), flat[:, :2]])
+    true = height - plane @ np.linalg.solve(plane[control], height[control])
+    found = result.fit.values.xyz[:, 2]
+    found = found - plane @ np.linalg.solve(plane[control], found[control])
+    off = found - true
+    names = [f"Z of point t{k}" for k in range(32)]
+    turn = np.eye(32) - plane @ np.linalg.solve(plane[control], np.eye(32)[control])
+    sigma = np.sqrt(np.diag(turn @ result.covariance_of(*names) @ turn.T))
+    free = sigma > 1e-9
+    assert np.median(sigma[free]) < 0.1
+    assert np.abs(off[free] / sigma[free]).max() < 4.5
+    assert np.abs(true[free] / sigma[free]).max() > 8

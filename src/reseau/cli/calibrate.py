@@ -72,6 +72,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
+    workers = _processes(images, jobs)
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..provenance import Provenance, sha256_of
     from ..refine import TestfieldOptions
@@ -82,7 +83,7 @@ def calibrate(
     model, target = _model(pitch, side, free), _design(design)
     others = {path.name: read_lens(path) for path in against or []}
     options = _options(sigma, control, leave_out or [], reject, component_kind(components),
-                       level_of(eliminate, "--eliminate"), _processes(images, jobs))  # fmt: skip
+                       level_of(eliminate, "--eliminate"), workers)  # fmt: skip
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     with progress("measuring", len(images)) as step:
         frames = _frames(images, channel, step)
@@ -133,10 +134,13 @@ def _options(
 
 
 def _processes(images: list[Path], jobs: int | None) -> int:
-    """Processes for the photographs; none for what was measured before."""
-    from ..procedures.measuring import cores
+    """Processes for the photographs, none for what was measured before; their imports begin at once."""
+    from ..processes import cores, start_early
 
-    return max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
+    count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
+    if count > 1:
+        start_early(["reseau.procedures.measuring"])
+    return count
 
 
 def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -17,10 +15,11 @@ from ..adjust.threads import always_one_thread
 from ..data import Frame, ImagePoints
 from ..errors import EstimationError
 from ..formats import ReseauDesign, TestfieldDesign
+from ..processes import process_context
 from ..refine import TestfieldOptions, measure_reseau, measure_testfield
 from ..refine.measured import Measured
 
-__all__ = ["Measurer", "cores", "measured_in_order", "measurer_of"]
+__all__ = ["Measurer", "measured_in_order", "measurer_of"]
 
 Measurer = Callable[[Frame], Measured | Failure]
 """What measures a target in a frame; all that a procedure knows of how that is done."""
@@ -43,11 +42,6 @@ def measurer_of(
     if isinstance(design, TestfieldDesign):
         return partial(measure_testfield, design=design, options=testfield)
     return partial(measure_reseau, design=design)
-
-
-def cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def measured_in_order(
@@ -74,7 +68,7 @@ def measured_in_order(
         for frame in frames:
             yield (frame.name, work(frame)) if isinstance(frame, Frame) else frame
         return
-    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_one_thread)
+    pool = ProcessPoolExecutor(workers, mp_context=process_context([__name__]), initializer=_one_thread)
     waiting: deque[tuple[str, ImagePoints | Future[ImagePoints | Failure]]] = deque()
     try:
         for frame in frames:
@@ -104,15 +98,6 @@ def _next(
         raise EstimationError(
             "a process that measured has died", where=name, do="use fewer processes: memory may be short"
         ) from None
-
-
-def _context() -> multiprocessing.context.BaseContext:
-    """Processes that share no threads with this one; what they need is imported once for all."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    return context
 
 
 def _one_thread() -> None:

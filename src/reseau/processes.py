@@ -1,0 +1,37 @@
+"""Processes that work side by side; light, so that they can be started before anything heavy is imported."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from multiprocessing import forkserver
+from multiprocessing.context import BaseContext
+
+__all__ = ["cores", "process_context", "start_early"]
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def process_context(modules: Sequence[str]) -> BaseContext:
+    """How to start processes that share no threads with this one.
+
+    Parameters
+    ----------
+    modules : sequence of str
+        What they need, imported once for all of them.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(modules))
+    return context
+
+
+def start_early(modules: Sequence[str]) -> None:
+    """Let the modules be imported for later processes while this one goes on with its own work."""
+    if process_context(modules).get_start_method() == "forkserver":
+        forkserver.ensure_running()
