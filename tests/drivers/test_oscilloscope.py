@@ -20,6 +20,7 @@ import pytest
 from reseau.errors import InstrumentError, ProtocolError, RefusedError, SettingError, UsageError
 from reseau.instruments import Oscilloscope
 from reseau_drivers.oscilloscope import DIALECTS, dialect_of, oscilloscope
+from reseau_drivers.oscilloscope.dialects import fields_of
 from reseau_sims import World, serving
 from reseau_sims.laboratory import Laboratory
 from reseau_sims.serving import (
@@ -85,6 +86,36 @@ def test_families_over_their_real_protocols(family: str, transport: str) -> None
             assert (device.screen().frame().pixels == shown).all()
             assert len(device.waveform(1).volts) == 1000
     assert machine.violations == []
+
+
+def test_a_wave_descriptor_of_siglent_is_read_where_its_guide_puts_the_numbers() -> None:
+    # As public drivers of SDS1000X HD and 2000X Plus unpack it (EN11): offsets in bytes, little endian.
+    head = bytearray(346)
+    head[116:120] = bytes.fromhex("88 13 00 00")  # 5000 points
+    head[156:160] = bytes.fromhex("00 00 80 3f")  # 1 V a division
+    head[160:164] = bytes.fromhex("00 00 00 bf")  # −0.5 V
+    head[164:168] = bytes.fromhex("00 00 f0 41")  # 30 codes a division
+    head[172:174] = bytes.fromhex("08 00")
+    head[176:180] = bytes.fromhex("77 cc 2b 32")  # 1e−8 s
+    head[328:332] = bytes.fromhex("00 00 20 41")  # a probe of ten
+    dialect = dialect_of("Siglent Technologies,SDS2104X Plus,S,1").waveform
+    assert dialect is not None
+    numbers = fields_of(bytes(head), dialect)
+    assert numbers["dx"] == pytest.approx(1e-8, rel=1e-6)
+    del numbers["dx"]
+    assert numbers == {
+        "points": 5000,
+        "vdiv": 1.0,
+        "ofst": -0.5,
+        "codes": 30.0,
+        "bits": 8,
+        "delay": 0.0,
+        "probe": 10.0,
+    }
+    assert dialect.volts(np.array([60.0]), numbers) == pytest.approx([25.0])
+    for wrong in (bytes(100), bytes(346)):
+        with pytest.raises(ProtocolError):
+            fields_of(wrong, dialect)
 
 
 def test_dialects_are_chosen_by_identity() -> None:

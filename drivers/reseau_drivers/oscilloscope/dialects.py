@@ -6,9 +6,11 @@ matches.
 
 from __future__ import annotations
 
+import math
 import re
+import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
@@ -17,7 +19,7 @@ import numpy as np
 from reseau.data import Array
 from reseau.errors import ProtocolError
 
-__all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of"]
+__all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of", "fields_of", "samples_of"]
 
 Numbers = dict[str, float]
 Step = tuple[Literal["tell", "ask", "fetch"], str]
@@ -43,6 +45,14 @@ class WaveformDialect:
         From samples and the numbers to volts.
     start, step : callable
         From the numbers to the seconds of the first sample, and of a step.
+    preamble : str
+        Question for a block that holds more numbers.
+    fields : mapping
+        Where in it they stand, and how (of :mod:`struct`), by name.
+    wide : tuple (str, str), optional
+        What is said for samples of more than eight bits (the number ``bits``), and their type.
+    piece : str
+        Said before each block, where all samples need not come in one; ``{at}`` is the first of it.
     """
 
     setup: tuple[str, ...]
@@ -52,6 +62,14 @@ class WaveformDialect:
     volts: Callable[[Array, Numbers], Array]
     start: Callable[[Numbers], float] = lambda f: f["x0"]
     step: Callable[[Numbers], float] = lambda f: f["dx"]
+    preamble: str = ""
+    fields: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    wide: tuple[str, str] | None = None
+    piece: str = ""
+
+    def sampled(self, numbers: Numbers) -> tuple[str, str]:
+        """What has to be said for these samples, and their type."""
+        return self.wide if self.wide and numbers.get("bits", 8) > 8 else ("", self.dtype)
 
 
 @dataclass(frozen=True)
@@ -112,6 +130,32 @@ _SIGLENT = WaveformDialect(
     start=lambda f: -7 * f["tdiv"],
     step=lambda f: 1 / f["rate"],
 )
+_SIGLENT_BLOCK = WaveformDialect(
+    (":WAVeform:SOURce C{n}", ":WAVeform:WIDTh BYTE", ":WAVeform:INTerval 1", ":WAVeform:POINt 0"),
+    MappingProxyType({"tdiv": ":TIMebase:SCALe?"}),
+    ":WAVeform:DATA?",
+    "i1",
+    lambda codes, f: f["probe"] * (codes / f["codes"] * f["vdiv"] - f["ofst"]),
+    # Ten divisions; the delay is that of their middle.
+    start=lambda f: f["delay"] - 5 * f["tdiv"],
+    step=lambda f: f["dx"],
+    preamble=":WAVeform:PREamble?",
+    # The wave descriptor of the programming guide EN11.
+    fields=MappingProxyType(
+        {
+            "points": (116, "<i"),
+            "vdiv": (156, "<f"),
+            "ofst": (160, "<f"),
+            "codes": (164, "<f"),
+            "bits": (172, "<H"),
+            "dx": (176, "<f"),
+            "delay": (180, "<d"),
+            "probe": (328, "<f"),
+        }
+    ),
+    wide=(":WAVeform:WIDTh WORD", "<i2"),
+    piece=":WAVeform:STARt {at}",
+)
 _TEKTRONIX = WaveformDialect(
     ("HEADer OFF", "DATa:SOUrce CH{n}", "DATa:ENCdg RIBinary", "DATa:WIDth 1"),
     MappingProxyType(
@@ -154,7 +198,7 @@ DIALECTS: tuple[Dialect, ...] = (
         "Siglent with PRINt",
         r"SIGLENT.*,SDS(2\d{3}X (Plus|HD)|1\d{3}X HD|[567]\d{3}).*",
         (("fetch", "PRINt? PNG"),),
-        _SIGLENT,
+        _SIGLENT_BLOCK,
         setup=("CHDR OFF",),
         halt="STOP",
         errors="",
@@ -241,17 +285,38 @@ def dialect_of(identity: str) -> Dialect:
     raise ProtocolError(f"how to speak to {identity!r} is not known", do="name a dialect")
 
 
+def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:
+    """The numbers that a preamble holds.
+
+    Raises
+    ------
+    ProtocolError
+        When it is too short for them, or holds what cannot be meant.
+    """
+    try:
+        found = {
+            name: float(struct.unpack_from(how, block, at)[0]) for name, (at, how) in dialect.fields.items()
+        }
+    except struct.error:
+        raise ProtocolError(f"a preamble of {len(block)} bytes is too short") from None
+    divisors = (found.get("codes", 1.0), found.get("dx", 1.0))
+    if not all(math.isfinite(value) for value in found.values()) or min(divisors) <= 0:
+        raise ProtocolError(f"a preamble that holds {found}")
+    return found
+
+
 def samples_of(data: bytes, dialect: WaveformDialect, numbers: Numbers) -> Array:
-    """Volts of a block of samples.
+    """Volts of the samples of all blocks.
 
     Raises
     ------
     ProtocolError
         When their number is not the one that was announced.
     """
-    if len(data) % np.dtype(dialect.dtype).itemsize:
+    dtype = np.dtype(dialect.sampled(numbers)[1])
+    if len(data) % dtype.itemsize:
         raise ProtocolError(f"{len(data)} bytes are no whole number of samples")
-    codes = np.frombuffer(data, dialect.dtype).astype(np.float64)
+    codes = np.frombuffer(data, dtype).astype(np.float64)
     if "points" in numbers and len(codes) != int(numbers["points"]):
         raise ProtocolError(f"{len(codes)} samples came; {numbers['points']:g} were announced")
     return dialect.volts(codes, numbers)

@@ -15,7 +15,7 @@ from reseau.instruments.values import now
 from ..codecs.ieee488 import LARGEST, error_entry, missing_of, parse_block, picture
 from ..codecs.stream import shown
 from ..link import Link
-from .dialects import Dialect, dialect_of, samples_of
+from .dialects import Dialect, WaveformDialect, dialect_of, fields_of, samples_of
 
 __all__ = ["Oscilloscope", "OscilloscopeSettings"]
 
@@ -154,13 +154,37 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             numbers: dict[str, float] = {}
             for names, question in dialect.scale.items():
                 numbers |= _numbers(names, self._ask(question.format(n=channel), deadline))
-            block = parse_block(self._fetch(dialect.data.format(n=channel), deadline))
-            volts = samples_of(block, dialect, numbers)
+            if dialect.preamble:
+                numbers |= fields_of(parse_block(self._fetch(dialect.preamble, deadline)), dialect)
+            data = self._samples(dialect, numbers, channel, deadline)
             try:
+                volts = samples_of(data, dialect, numbers)
                 start, step = dialect.start(numbers), dialect.step(numbers)
             except ZeroDivisionError:
                 raise ProtocolError("its waveform has no extent in time") from None
             return Waveform(volts, start, step, channel, asked)
+
+    def _samples(
+        self, dialect: WaveformDialect, numbers: dict[str, float], channel: int, deadline: Deadline
+    ) -> bytes:
+        """The samples of a waveform, in as many blocks as they come in."""
+        said, dtype = dialect.sampled(numbers)
+        if said:
+            self._tell(said, deadline)
+        question = dialect.data.format(n=channel)
+        if not dialect.piece:
+            return parse_block(self._fetch(question, deadline))
+        data, size = b"", np.dtype(dtype).itemsize
+        wanted = size * int(numbers["points"])
+        if not 0 < wanted <= LARGEST:
+            raise ProtocolError(f"announces {numbers['points']:g} samples")
+        while len(data) < wanted:
+            self._tell(dialect.piece.format(at=len(data) // size), deadline)
+            piece = parse_block(self._fetch(question, deadline))
+            if not piece:
+                break
+            data += piece
+        return data
 
     def errors(self, seconds: float | None = None) -> list[str]:
         """What its error queue holds; taken out of it."""
