@@ -70,6 +70,7 @@ def adjust_batch(
     --------
     Two straight lines, the second with a missing observation:
 
+    >>> import numpy as np
     >>> t = np.arange(4.0)
     >>> def line(x, rows):
     ...     return x[:, :1] + x[:, 1:] * t, np.broadcast_to(np.column_stack([t**0, t]), (len(rows), 4, 2))
