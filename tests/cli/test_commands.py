@@ -160,11 +160,12 @@ def test_a_design_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> N
         files["svg"],
         "--pdf",
         files["pdf"],
-        "-o",
-        files["json"],
         "--json",
+        files["json"],
     )
     assert status == 0
+    assert out.split() == [str(path) for path in files.values()]
+    status, out, _ = reseau("design", "reseau", *options, "--json", "-")
     assert ReseauDesign.parse(out, where="stdout") == ReseauDesign.read(files["json"])
     assert files["svg"].read_text().startswith("<svg")
     assert files["pdf"].read_bytes().startswith(b"%PDF")

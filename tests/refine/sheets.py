@@ -87,15 +87,25 @@ def exposed(share: Array, seed: int = 0) -> Frame:
     return Frame(grey.round().clip(0, 254).astype(np.uint8), 255.0, "formed")
 
 
-def form(camera: Camera, *, rings: bool = True, seed: int = 0) -> Formed:
-    """A photograph of the sheet."""
-    circle, xy = Outline.circle(_SIZE / 2, 0.05), DESIGN.xy
+def form(
+    camera: Camera,
+    design: ReseauDesign = DESIGN,
+    *,
+    rings: bool = True,
+    glare: Array | None = None,
+    seed: int = 0,
+) -> Formed:
+    """A photograph of the sheet; of the light that a disk takes, `glare` (h, w) gives back a share."""
+    assert design.mark.size is not None
+    circle, xy = Outline.circle(design.mark.size / 2, 0.05), design.xy
     tangents = np.broadcast_to(circle.dxy, (len(xy), *circle.dxy.shape))
     share = camera.share(Outline(xy[:, None] + circle.xy, tangents))
-    assert DESIGN.rings is not None
-    for name, sectors in DESIGN.rings.sectors.items():
+    assert design.rings is not None
+    for name, sectors in design.rings.sectors.items():
         for start, end in sectors if rings else ():
-            share += camera.share(_sector(DESIGN.rings, start, end, xy[DESIGN.ids.index(name)]))
+            share += camera.share(_sector(design.rings, start, end, xy[design.ids.index(name)]))
+    if glare is not None:
+        share *= 1 - glare
     return Formed(exposed(share, seed), camera.image(xy)[0])
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from reseau.cli import run
 from reseau.data import Frame
+from reseau.designs import coded_sheet
 from reseau.errors import FormatError
 from reseau.formats import ReseauDesign, ReseauMeasurement
 from reseau.images import read_frame, write_image
@@ -121,3 +122,25 @@ def test_in_photographs_every_disk_that_another_program_found_is_measured_and_nu
     difference = result.xy[rows] - np.array(list(theirs.values())) + 0.5
     # A wrong number would be 60 px off at least; theirs are centres of ellipses, in all colours.
     assert np.abs(difference).max() < 0.6
+
+
+def test_a_sheet_that_is_designed_is_numbered_from_every_side() -> None:
+    design = coded_sheet(8, 7, 10.0)
+    for roll in (15.0, 105.0, 195.0, 285.0):
+        formed = sheets.form(sheets.Camera(roll, 35.0), design)
+        result = measured(formed, design)
+        assert result.ok.all(), result.why
+        assert np.abs(result.xy - formed.truth).max() < 0.1
+
+
+def test_light_reflected_in_disks_does_not_move_them() -> None:
+    camera = sheets.Camera(20.0, 30.0)
+    x, y = np.meshgrid(np.arange(800.0), np.arange(600.0))
+    # Its contrast changes by a fifth from the middle of a disk to its edge, where it changes most.
+    glare = 0.5 * np.exp(-0.5 * ((x - 400) ** 2 + (y - 300) ** 2) / 25.0**2)
+    formed = sheets.form(camera, glare=glare)
+    result = measured(formed)
+    near = np.hypot(*(formed.truth - [400, 300]).T) < 75
+    error = (result.xy - formed.truth)[result.ok & near]
+    assert (result.ok & near).sum() >= 3
+    assert np.abs(error).max() < 0.06

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, say, suffix_of, writable
+from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..formats import ReseauDesign, TestfieldDesign
@@ -36,6 +36,14 @@ class Polarity(StrEnum):
     BRIGHT = "bright"
 
 
+Svg = Annotated[Path | None, typer.Option("--svg", help="Drawing to write, SVG.")]
+Pdf = Annotated[Path | None, typer.Option("--pdf", help="Drawing to write, PDF.")]
+Design = Annotated[
+    Path | None,
+    typer.Option("--json", "--out", "-o", help="Design to write, JSON; - for standard output."),
+]
+
+
 @app.callback()
 def _targets() -> None:
     """Draw a target to print in true size, and write its coordinates."""
@@ -53,10 +61,9 @@ def reseau(
     origin: Annotated[str | None, typer.Option(help="Mark O of the common system.")] = None,
     axis: Annotated[str | None, typer.Option(help="Mark S on its x-axis.")] = None,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "reseau",
-    svg: Annotated[Path | None, typer.Option("--svg", help="Drawing to write, SVG.")] = None,
-    pdf: Annotated[Path | None, typer.Option("--pdf", help="Drawing to write, PDF.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Design to write, JSON.")] = None,
-    as_json: AsJson = False,
+    svg: Svg = None,
+    pdf: Pdf = None,
+    out: Design = None,
 ) -> None:
     """Design a reseau: a regular grid of marks."""
     from ..designs import regular_reseau
@@ -74,13 +81,28 @@ def reseau(
         origin=origin,
         axis=axis,
     )
-    written = _write(design, svg, pdf, out)
-    if as_json:
-        say(design.to_json())
-    elif written:
-        say("".join(f"{path}\n" for path in written))
-    else:
-        say(f"{name}: {columns} × {rows} marks, pitch {pitch:g} mm; give --svg, --pdf, --out or --json\n")
+    _write(design, svg, pdf, out, f"{columns} × {rows} marks, pitch {pitch:g} mm")
+
+
+@app.command()
+def sheet(
+    columns: Annotated[int, typer.Option(help="Disks in a row.")] = 10,
+    rows: Annotated[int, typer.Option(help="Disks in a column.")] = 10,
+    pitch: Annotated[float, typer.Option(help="Distance of neighbouring disks, mm.")] = 25.0,
+    size: Annotated[
+        float | None, typer.Option(help="Diameter of a disk, mm; by default 0.22 pitches.")
+    ] = None,
+    polarity: Annotated[Polarity, typer.Option(help="Dark or bright disks.")] = Polarity.DARK,
+    name: Annotated[str, typer.Option(help="Name of the design.")] = "sheet",
+    svg: Svg = None,
+    pdf: Pdf = None,
+    out: Design = None,
+) -> None:
+    """Design a sheet of disks, four of them in coded rings that number all of them from any side."""
+    from ..designs import coded_sheet
+
+    design = coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
+    _write(design, svg, pdf, out, f"{columns} × {rows} disks, pitch {pitch:g} mm")
 
 
 @app.command("testfield")
@@ -105,17 +127,13 @@ def coded_field(
     ] = None,
     polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "testfield",
-    svg: Annotated[Path | None, typer.Option("--svg", help="Drawing to write, SVG.")] = None,
-    pdf: Annotated[Path | None, typer.Option("--pdf", help="Drawing to write, PDF.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--json", "--out", "-o", help="Design to write, JSON; - for standard output."),
-    ] = None,
+    svg: Svg = None,
+    pdf: Pdf = None,
+    out: Design = None,
 ) -> None:
     """Design a coded testfield: squares of sixteen targets, told apart by what lies where."""
     from ..designs import coded_testfield
 
-    to_stdout = out is not None and str(out) == "-"
     design = coded_testfield(
         columns,
         rows,
@@ -128,22 +146,18 @@ def coded_field(
         polarity=polarity.value,
         name=name,
     )
-    written = _write(design, svg, pdf, None if to_stdout else out)
-    if to_stdout:
-        say(design.to_json())
-    elif written:
-        say("".join(f"{path}\n" for path in written))
-    else:
-        say(f"{name}: {columns} × {rows} squares, pitch {pitch:g} mm; give --svg, --pdf or --json\n")
+    _write(design, svg, pdf, out, f"{columns} × {rows} squares, pitch {pitch:g} mm")
 
 
 def _write(
-    design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None
-) -> list[Path]:
-    """Write drawings and design where they are wanted; either all of them or none."""
+    design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
+) -> None:
+    """Write drawings and design where they are wanted, either all of them or none, and say so."""
     from ..formats import write_whole
     from ..report.drawing import design_pdf, design_svg
 
+    to_stdout = out is not None and str(out) == "-"
+    out = None if to_stdout else out
     for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
         if path is not None:
             suffix_of(writable(path), (suffix,))
@@ -154,4 +168,9 @@ def _write(
     }
     for path, content in files.items():
         write_whole(path, content)
-    return list(files)
+    if to_stdout:
+        say(design.to_json())
+    elif files:
+        say("".join(f"{path}\n" for path in files))
+    else:
+        say(f"{design.name}: {what}; give --svg, --pdf or --json\n")

@@ -1,6 +1,6 @@
 """Designs made from a few numbers: reseaus, an ultrasonic test object, the coded testfield and its code."""
 
-from .reseaus import regular_reseau, standard_reseau, test_object
+from .reseaus import coded_sheet, regular_reseau, standard_reseau, test_object
 from .testfield import coded_testfield
 from .topology import HIDDEN, Decoded, TopologicalCode
 
@@ -8,6 +8,7 @@ __all__ = [
     "HIDDEN",
     "Decoded",
     "TopologicalCode",
+    "coded_sheet",
     "coded_testfield",
     "regular_reseau",
     "standard_reseau",

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from ..errors import UsageError
-from ..formats import DesignPoint, Mark, ReseauDesign
+from ..formats import DesignPoint, Mark, ReseauDesign, Rings
 
-__all__ = ["regular_reseau", "standard_reseau", "test_object"]
+__all__ = ["coded_sheet", "regular_reseau", "standard_reseau", "test_object"]
 
 
 def regular_reseau(
@@ -90,6 +90,74 @@ def _letters(row: int) -> str:
         row, letter = divmod(row - 1, 26)
         letters = chr(ord("A") + letter) + letters
     return letters
+
+
+_CODES: tuple[tuple[tuple[float, float], ...], ...] = (
+    ((112.5, 337.5),),
+    ((22.5, 112.5), (202.5, 292.5)),
+    ((67.5, 112.5), (157.5, 202.5), (292.5, 337.5)),
+    ((-22.5, 22.5), (67.5, 112.5), (157.5, 202.5), (247.5, 292.5)),
+)
+"""Sectors of four rings, degrees: none is another one turned or reflected."""
+_DISK, _RING = 0.22, (0.54, 0.96)
+"""Diameters of the disks, and of the rings, in pitches: a ring leaves a gap to the disks beside it."""
+
+
+def coded_sheet(
+    columns: int,
+    rows: int,
+    pitch: float,
+    *,
+    size: float | None = None,
+    name: str = "sheet",
+    polarity: Literal["dark", "bright"] = "dark",
+) -> ReseauDesign:
+    """A sheet of disks, four of them in coded rings: one ring in sight numbers all disks from any side.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Number of disks in a row and in a column, at least 4 each.
+    pitch : float
+        Distance of neighbouring disks in millimetres.
+    size : float, optional
+        Diameter of a disk in millimetres, by default 0.22 pitches.
+
+    Raises
+    ------
+    UsageError
+        When a number is impossible, or disks do not fit into the rings.
+
+    Examples
+    --------
+    >>> sheet = coded_sheet(10, 10, 25.0)
+    >>> sheet.mark.size, sheet.rings.inner, sheet.rings.outer
+    (5.5, 13.5, 24.0)
+    >>> tuple(sheet.rings.sectors)
+    ('B2', 'B9', 'I2', 'I9')
+    """
+    if min(columns, rows) < 4:
+        raise UsageError(f"{columns} × {rows} disks have no room for four rings", where=f"design {name}")
+    inner, outer = (round(part * pitch, 6) for part in _RING)
+    size = round(_DISK * pitch, 6) if size is None else size
+    if pitch > 0 and not 0 < size < 0.9 * inner:
+        raise UsageError(f"disks of {size:g} mm do not fit rings of {inner:g} mm", where=f"design {name}")
+    grid = regular_reseau(columns, rows, pitch, Mark(shape="disk", size=size), name=name, polarity=polarity)
+    across, down = max(1, columns // 6), max(1, rows // 6)
+    places = [(row, column) for row in (down, rows - 1 - down) for column in (across, columns - 1 - across)]
+    sectors = {
+        f"{_letters(row)}{column + 1}": code for (row, column), code in zip(places, _CODES, strict=True)
+    }
+    return ReseauDesign(
+        name=name,
+        unit=grid.unit,
+        mark=grid.mark,
+        polarity=polarity,
+        origin=grid.origin,
+        axis=grid.axis,
+        points=grid.points,
+        rings=Rings(inner=inner, outer=outer, sectors=sectors),
+    )
 
 
 def standard_reseau() -> ReseauDesign:

@@ -133,6 +133,7 @@ def _reseau(design: ReseauDesign) -> _Content:
         polygons += [_box(low[0], y - w, high[0], y + w) for y in np.unique(xy[:, 1])]
     elif mark.shape in ("disk", "rod"):
         circles = [(float(x), float(y), size / 2) for x, y in xy]
+        polygons = list(_ring_sectors(design))
     else:
         corners = target_corners(mark.shape, size, arm=mark.line_width)
         polygons = [point + corners for point in xy]
@@ -144,6 +145,19 @@ def _reseau(design: ReseauDesign) -> _Content:
     }
     title = f"{design.name}: {len(xy)} marks, {_describe(design)}"
     return _Content(low, high, polygons, circles, title, letters)
+
+
+def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
+    """Sectors of the coded rings as polygons, a corner every degree: 4e-5 of the radius off the arc."""
+    if design.rings is None:
+        return
+    for name, sectors in design.rings.sectors.items():
+        centre = design.xy[design.ids.index(name)]
+        for start, end in sectors:
+            angle = np.deg2rad(np.linspace(start, end, int(end - start) + 2))
+            arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            edges = design.rings.outer / 2 * arc, design.rings.inner / 2 * arc[::-1]
+            yield centre + np.concatenate(edges)
 
 
 def _testfield(design: TestfieldDesign) -> _Content:

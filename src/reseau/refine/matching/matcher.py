@@ -160,6 +160,7 @@ def match(
     free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = np.array(options.half) / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
+    free[patch.ground.stop : patch.form_at] = options.contrast_slope or np.inf
     if form_sigma is not None:
         free[patch.form_at :] = form_sigma
     if light is None:

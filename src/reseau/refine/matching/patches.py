@@ -1,7 +1,7 @@
 """Windows of a frame around its marks, and the images formed in them.
 
 A patch has the parameters position (two), logarithm of the width of the point-spread function, contrast,
-coefficients of the background, and those of the form, in this order.
+coefficients of the background, slopes of the contrast if wanted, and those of the form, in this order.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ class MatchOptions:
         Expected contrast; by default half the light of a dark mark, the brightest pixel of a bright one.
     contrast_sigma : float
         Standard deviation of that; infinite where nothing is known.
+    contrast_slope : float, optional
+        Standard deviation of the contrast's change from the middle of the window to its edge, along x and y:
+        light reflected in the mark, which else would move it. By default there is none.
     response : PixelResponse
         The pixel.
     polarity : {"dark", "bright"}
@@ -72,6 +75,7 @@ class MatchOptions:
     psf_log_sigma: float = 0.5
     contrast: float | None = None
     contrast_sigma: float = np.inf
+    contrast_slope: float | None = None
     response: PixelResponse = field(default_factory=PixelResponse)
     polarity: Literal["dark", "bright"] = "dark"
     rejection: float = 4.5
@@ -108,7 +112,11 @@ class Patches:
         powers = [(i, j) for i in range(options.background + 1) for j in range(options.background + 1 - i)]
         # Monomials (n, b) of the background over the window.
         self.monomials = np.stack([(u**i * v**j).ravel() for i, j in powers], axis=1)
-        self.form_at = LEVEL + len(powers)
+        self.ground = slice(LEVEL, LEVEL + len(powers))
+        # Monomials (2, rows, columns) of the contrast, where it is not the same all over a mark.
+        uneven = options.contrast_slope is not None
+        self.across = np.stack(np.broadcast_arrays(u, v)) if uneven else np.zeros((0, len(down), len(right)))
+        self.form_at = self.ground.stop + len(self.across)
         self.centre = np.rint(xy).astype(np.intp)
         columns, rows = self.centre[:, :1] + right, self.centre[:, 1:] + down
         self.window = Window(columns.astype(float), rows.astype(float), options.response)
@@ -135,7 +143,7 @@ class Patches:
         x = np.zeros((len(self.xy), self.form_at + self.forms))
         # As wide as expected; see `width`.
         x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - _SHARPEST**2))
-        x[:, CONTRAST], x[:, LEVEL : self.form_at] = contrast, ground
+        x[:, CONTRAST], x[:, self.ground] = contrast, ground
         return x
 
     def start(self, noise: float) -> Array:
@@ -162,7 +170,7 @@ class Patches:
             normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(design.shape[1])
             fitted = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * fitted)[..., None])[..., 0]
         self.weights = np.where(far > 1.5, 0.0, self.weights)
-        x[:, LEVEL : self.form_at] = fitted
+        x[:, self.ground] = fitted
         if self.options.contrast is not None:
             x[:, CONTRAST] = self.options.contrast
         elif self.options.polarity == "dark":
@@ -195,8 +203,9 @@ class Patches:
         share, d_share = self.form.derivatives(
             self.xy[at] + x[:, :2], width, x[:, self.form_at :], at, self.window.select(at)
         )
-        plane = self.background(x).astype(share.dtype, copy=False)
-        contrast = x[:, CONTRAST, None, None].astype(share.dtype, copy=False)
+        plane, contrast = (
+            field.astype(share.dtype, copy=False) for field in (self.background(x), self.contrast(x))
+        )
         if self.options.polarity == "dark":
             rest = 1 - contrast * share
             grey, by_share, by_contrast = plane * rest, -plane * contrast, -plane * share
@@ -210,11 +219,13 @@ class Patches:
         by_width = by_share * (np.exp(2 * x[:, WIDTH]) / width)[:, None, None].astype(share.dtype)
         np.multiply(by_width, d_share[:, 2], out=rows[:, WIDTH])
         rows[:, CONTRAST] = by_contrast
+        for k, slope in enumerate(self.across.astype(share.dtype)):
+            np.multiply(by_contrast, slope, out=rows[:, self.ground.stop + k])
         for k in range(self.forms):
             np.multiply(by_share, d_share[:, 3 + k], out=rows[:, self.form_at + k])
         flat = rows.reshape(len(x), x.shape[1], -1)
         ground = self.monomials.T.astype(share.dtype, copy=False)
-        np.multiply(rest.reshape(len(x), 1, -1), ground, out=flat[:, LEVEL : self.form_at])
+        np.multiply(rest.reshape(len(x), 1, -1), ground, out=flat[:, self.ground])
         grey, jacobian = grey.reshape(len(x), -1), np.swapaxes(flat, 1, 2)
         self.shares[at], self._formed = share, (x.copy(), at.copy(), grey, jacobian)
         return grey, jacobian
@@ -225,7 +236,7 @@ class Patches:
             self.xy[at] + x[:, :2], self.width(x, at), x[:, self.form_at :], at, self.window.select(at)
         )
         self.shares[at] = share
-        plane, part = self.background(x), x[:, CONTRAST, None, None] * share
+        plane, part = self.background(x), self.contrast(x) * share
         formed = plane * (1 - part) if self.options.polarity == "dark" else plane + part
         grey: Array = formed.reshape(len(x), -1)
         if self.whitener is None:
@@ -237,8 +248,17 @@ class Patches:
 
     def background(self, x: Array) -> Array:
         """Grey values of the background in the window, (k, rows, columns)."""
-        grey: Array = (x[:, LEVEL : self.form_at] @ self.monomials.T).reshape(len(x), *self.shape[1:])
+        grey: Array = (x[:, self.ground] @ self.monomials.T).reshape(len(x), *self.shape[1:])
         return grey
+
+    def contrast(self, x: Array) -> Array:
+        """Contrast (k, 1, 1), or (k, rows, columns) where it has slopes."""
+        even = x[:, CONTRAST, None, None]
+        return (
+            even + np.tensordot(x[:, self.ground.stop : self.form_at], self.across, 1)
+            if len(self.across)
+            else even
+        )
 
     def share(self, x: Array) -> Array:
         """Share of each pixel that the marks take, all patches, (k, rows, columns)."""
@@ -258,7 +278,7 @@ class Patches:
         residuals, tolerated : ndarray (k, n)
         """
         share = self.share(x).reshape(len(x), -1)
-        plane, contrast = self.background(x).reshape(len(x), -1), x[:, CONTRAST, None]
+        plane, contrast = self.background(x).reshape(len(x), -1), self.contrast(x).reshape(len(x), -1)
         amplitude = np.abs(contrast)
         if self.options.polarity == "dark":
             formed = plane * (1 - contrast * share)

@@ -39,6 +39,8 @@ _EDGE_PX = 3
 """Pixels next to a ring that its blur may reach."""
 _OWN_PX = 2
 """Pixels next to a disk that its own blur reaches."""
+_SLOPE = 0.3
+"""How the contrast of a disk may change from its middle to the edge of its window by reflected light."""
 _SEEN = 0.95
 _UNEASY = 1.4
 """Times the ordinary residuals from which on the ground is tried curved."""
@@ -180,6 +182,7 @@ class _Sheet:
                 polarity=self.design.polarity,
                 row_jitter_px=self.options.row_jitter_px,
                 settled=0.05,
+                contrast_slope=_SLOPE,
                 background=background,
                 variance=self.look.variance,
             )
