@@ -15,10 +15,11 @@ from .bundle_options import (
     Reject,
     component_kind,
     level_of,
+    outputs,
     say_left_out,
     say_model,
 )
-from .common import AsJson, Out, progress, required, say, suffix_of, writable
+from .common import AsJson, Out, progress, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network, Searched
@@ -46,9 +47,7 @@ def bundle(
     from ..provenance import Provenance, canonical_json, sha256_of
 
     level_of(alpha, "--alpha")
-    for path, suffixes in ((out, (".json",)), (report, (".html",))):
-        if path is not None:
-            suffix_of(writable(path), suffixes)
+    outputs(out, report)
     content = read_network(network)
     with progress("adjusting", 30) as step:
         options = Options(

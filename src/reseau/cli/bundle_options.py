@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import say
+from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..bundle import FieldDifference, Kind, Result, Searched
@@ -20,6 +21,7 @@ __all__ = [
     "Reject",
     "component_kind",
     "level_of",
+    "outputs",
     "say_difference",
     "say_left_out",
     "say_model",
@@ -72,6 +74,21 @@ def level_of(value: float | None, name: str) -> float | None:
     if value is not None and not 0 < value < 1:
         raise UsageError(f"{value:g} is not between 0 and 1", where=name)
     return value
+
+
+def outputs(out: Path | None, report: Path | None) -> None:
+    """Ask before the work begins whether result and report can be written.
+
+    Raises
+    ------
+    InputError
+        When a folder does not exist.
+    UsageError
+        When one has another suffix than it should.
+    """
+    for path, suffixes in ((out, (".json",)), (report, (".html",))):
+        if path is not None:
+            suffix_of(writable(path), suffixes)
 
 
 def say_left_out(result: Result) -> None:

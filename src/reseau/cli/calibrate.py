@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,11 +16,12 @@ from .bundle_options import (
     Reject,
     component_kind,
     level_of,
+    outputs,
     say_difference,
     say_left_out,
     say_model,
 )
-from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
+from .common import AsJson, Out, is_points, progress, read_measurement, required, say
 from .measure import Channel
 
 if TYPE_CHECKING:
@@ -32,6 +33,18 @@ if TYPE_CHECKING:
     from ..provenance import Provenance
 
 __all__ = ["calibrate"]
+
+Sigma = Annotated[
+    float | None,
+    typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
+]
+Control = Annotated[
+    Path | None,
+    typer.Option(help="Known points of the target, CSV id,x,y,z[,sx,sy,sz]; without, a free network."),
+]
+LeaveOut = Annotated[
+    list[str] | None, typer.Option(help="Image point to leave out, as photo.jpg:A1; repeatable.")
+]
 
 
 def calibrate(
@@ -48,17 +61,9 @@ def calibrate(
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
     channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
-    sigma: Annotated[
-        float | None,
-        typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
-    ] = None,
-    control: Annotated[
-        Path | None,
-        typer.Option(help="Known points of the target, CSV id,x,y,z[,sx,sy,sz]; without, a free network."),
-    ] = None,
-    leave_out: Annotated[
-        list[str] | None, typer.Option(help="Image point to leave out, as photo.jpg:A1; repeatable.")
-    ] = None,
+    sigma: Sigma = None,
+    control: Control = None,
+    leave_out: LeaveOut = None,
     reject: Reject = False,
     components: ComponentsOf = None,
     eliminate: Eliminate = None,
@@ -74,26 +79,22 @@ def calibrate(
     """Calibrate a camera from photographs of a target, in one command."""
     workers = _processes(images, jobs)
     from ..procedures.calibration import calibrate_camera, measurer_of
-    from ..provenance import Provenance, sha256_of
     from ..refine import TestfieldOptions
 
-    for path, suffixes in ((out, (".json",)), (report, (".html",))):
-        if path is not None:
-            suffix_of(writable(path), suffixes)
-    model, target = _model(pitch, side, free), _design(design)
+    outputs(out, report)
+    target, kind = _design(design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
-    options = _options(sigma, control, leave_out or [], reject, component_kind(components),
-                       level_of(eliminate, "--eliminate"), workers)  # fmt: skip
+    level = level_of(eliminate, "--eliminate")
+    options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     with progress("measuring", len(images)) as step:
-        frames = _frames(images, channel, step)
+        frames, model = _frames(images, channel, step), _model(pitch, side, free)
         done = required(calibrate_camera(frames, target, measure, _size(size), model, options), design)
-    inputs = {path.name: sha256_of(path) for path in (design, *images, *([control] if control else []))}
-    settings = {"pitch": pitch, "side": side, "free": free, "sigma": sigma, "reject": reject,
-                "row_jitter": row_jitter, "fill": fill, "channel": channel.value,
-                "leave_out": list(leave_out or []), "eliminate": eliminate,
-                "components": component_kind(components)}  # fmt: skip
-    provenance = Provenance(inputs, settings)
+    provenance = _provenance(
+        [design, *images, *([control] if control else [])], pitch=pitch, side=side, free=free, sigma=sigma,
+        reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
+        leave_out=list(leave_out or []), components=kind,
+    )  # fmt: skip
     differences = _differences(done, others)
     calibration = _calibration(done, target.name, provenance)
     if report is not None:
@@ -104,6 +105,12 @@ def calibrate(
         say(calibration.to_json())
     else:
         _say(done, differences)
+
+
+def _provenance(inputs: list[Path], **settings: Any) -> Provenance:
+    from ..provenance import Provenance, sha256_of
+
+    return Provenance({path.name: sha256_of(path) for path in inputs}, settings)
 
 
 def _options(
