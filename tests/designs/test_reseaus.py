@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.designs import regular_reseau, standard_reseau
+from reseau.designs import coded_sheet, regular_reseau, standard_reseau
 from reseau.errors import UsageError
 from reseau.formats import Mark, ReseauDesign
 
@@ -45,3 +45,29 @@ def test_impossible_reseaus_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=complaint):
         regular_reseau(columns, rows, pitch, mark, **options)  # type: ignore[arg-type]
+
+
+def test_the_rings_of_a_sheet_differ_however_it_is_turned_or_reflected() -> None:
+    rings = coded_sheet(10, 10, 25.0).rings
+    assert rings is not None
+    degrees = np.arange(720) / 2 + 0.25
+    dark = [
+        np.any([np.mod(degrees - start, 360) < end - start for start, end in sectors], axis=0)
+        for sectors in rings.sectors.values()
+    ]
+    for k, code in enumerate(dark):
+        seen = [np.roll(way, 180 * quarter) for way in (code, code[::-1]) for quarter in range(4)]
+        # Four of twelve sectors, from itself turned or reflected and from the others anyhow.
+        for other in [*seen[1:], *(np.asarray(each) for each in dark[:k] + dark[k + 1 :])]:
+            assert (code != other).mean() >= 4 / 12 - 1e-9
+        for other in dark[:k] + dark[k + 1 :]:
+            assert min((way != other).mean() for way in seen) >= 4 / 12 - 1e-9
+
+
+def test_a_sheet_that_cannot_be_is_refused() -> None:
+    with pytest.raises(UsageError, match="no room for four rings"):
+        coded_sheet(3, 9, 25.0)
+    with pytest.raises(UsageError, match="do not fit rings"):
+        coded_sheet(9, 9, 25.0, size=13.0)
+    with pytest.raises(UsageError, match="cannot have"):
+        coded_sheet(9, 9, 0.0)

@@ -144,3 +144,16 @@ def test_light_reflected_in_disks_does_not_move_them() -> None:
     error = (result.xy - formed.truth)[result.ok & near]
     assert (result.ok & near).sum() >= 3
     assert np.abs(error).max() < 0.06
+
+
+@pytest.mark.parametrize("kept", [(0,), (1,), (2,), (3,)])
+def test_one_ring_in_sight_numbers_a_sheet(kept: tuple[int]) -> None:
+    design = coded_sheet(8, 7, 10.0)
+    assert design.rings is not None
+    names = list(design.rings.sectors)
+    only = {names[kept[0]]: design.rings.sectors[names[kept[0]]]}
+    shown = design.model_copy(update={"rings": design.rings.model_copy(update={"sectors": only})})
+    formed = sheets.form(sheets.Camera(50.0 + 90 * kept[0], 25.0), shown)
+    result = measured(formed, design)
+    assert result.ok.sum() >= 52
+    assert np.abs(result.xy - formed.truth)[result.ok].max() < 0.2

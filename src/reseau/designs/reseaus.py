@@ -92,13 +92,9 @@ def _letters(row: int) -> str:
     return letters
 
 
-_CODES: tuple[tuple[tuple[float, float], ...], ...] = (
-    ((112.5, 337.5),),
-    ((22.5, 112.5), (202.5, 292.5)),
-    ((67.5, 112.5), (157.5, 202.5), (292.5, 337.5)),
-    ((-22.5, 22.5), (67.5, 112.5), (157.5, 202.5), (247.5, 292.5)),
-)
-"""Sectors of four rings, degrees: none is another one turned or reflected."""
+_CODES = ("000001011111", "001001101110", "000011110011", "001100001111")
+"""Sectors of four rings, counterclockwise from x. Each differs from the others, and from itself turned by
+quarters or reflected, in four of its twelve at least."""
 _DISK, _RING = 0.22, (0.54, 0.96)
 """Diameters of the disks, and of the rings, in pitches: a ring leaves a gap to the disks beside it."""
 
@@ -136,17 +132,20 @@ def coded_sheet(
     >>> tuple(sheet.rings.sectors)
     ('B2', 'B9', 'I2', 'I9')
     """
+    if not pitch > 0:
+        raise UsageError(f"cannot have disks at {pitch:g} mm", where=f"design {name}")
     if min(columns, rows) < 4:
         raise UsageError(f"{columns} × {rows} disks have no room for four rings", where=f"design {name}")
     inner, outer = (round(part * pitch, 6) for part in _RING)
     size = round(_DISK * pitch, 6) if size is None else size
-    if pitch > 0 and not 0 < size < 0.9 * inner:
+    if not 0 < size < 0.9 * inner:
         raise UsageError(f"disks of {size:g} mm do not fit rings of {inner:g} mm", where=f"design {name}")
     grid = regular_reseau(columns, rows, pitch, Mark(shape="disk", size=size), name=name, polarity=polarity)
     across, down = max(1, columns // 6), max(1, rows // 6)
     places = [(row, column) for row in (down, rows - 1 - down) for column in (across, columns - 1 - across)]
     sectors = {
-        f"{_letters(row)}{column + 1}": code for (row, column), code in zip(places, _CODES, strict=True)
+        f"{_letters(row)}{column + 1}": _sectors(code)
+        for (row, column), code in zip(places, _CODES, strict=True)
     }
     return ReseauDesign(
         name=name,
@@ -158,6 +157,14 @@ def coded_sheet(
         points=grid.points,
         rings=Rings(inner=inner, outer=outer, sectors=sectors),
     )
+
+
+def _sectors(code: str) -> tuple[tuple[float, float], ...]:
+    """From where to where, degrees, a ring is dark: one sector for each run of ones around it."""
+    n = len(code)
+    starts = [k for k in range(n) if code[k] == "1" and code[k - 1] == "0"]
+    runs = [(k, next(m for m in range(1, n) if code[(k + m) % n] == "0")) for k in starts]
+    return tuple((360.0 / n * k, 360.0 / n * (k + length)) for k, length in runs)
 
 
 def standard_reseau() -> ReseauDesign:
