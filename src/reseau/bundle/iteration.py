@@ -47,6 +47,8 @@ class Iterated:
         Relative offset: corrections still to come, in standard deviations.
     away : ndarray of int
         Points that ran off to infinity.
+    converged : bool
+        Whether this is the minimum; otherwise the iteration was at the end of its patience.
     """
 
     linear: Linear
@@ -54,6 +56,7 @@ class Iterated:
     iterations: int
     offset: float
     away: Rows
+    converged: bool = True
 
     @property
     def values(self) -> Values:
@@ -93,7 +96,7 @@ def iterate(
     Returns
     -------
     Iterated or Failure
-        A failure says at which cost the iteration stood.
+        A failure when there is no way to go on.
     """
     linear = system.linearise(start)
     cost, growth, tried = linear.cost, 2.0, 0
@@ -137,8 +140,8 @@ def iterate(
         damping, growth = max(damping, _LEAST_DAMPING) * growth, growth * 2.0
         if damping > _MOST_DAMPING:
             break
-    reason = f"has not converged in {tried} iterations"
-    return Failure(reason, iterations=tried, costs=tuple(costs))
+    away = linear.values.beyond(_NEARLY * radius)
+    return Iterated(linear, tuple(costs), tried, float("nan"), away, converged=False)
 
 
 def _extent(system: System, values: Values) -> float:

@@ -22,7 +22,7 @@ from .further import Further
 from .iteration import Iterated, iterate
 from .network import Network, finite
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import steady_points, undetermined, weak_points
+from .rank import creeping_points, steady_points, undetermined, weak_points
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .usable import Usable, usable
@@ -261,9 +261,13 @@ class _Run:
         )  # fmt: skip
         if isinstance(found, Failure):
             return found
-        away = found.away
+        # What hardly any angle determines creeps on for ever, and what it creeps on is noise.
+        away = found.away if found.converged else creeping_points(found.linear)
         if len(away) and problem.rounds < _ROUNDS:
             return self._without(away, found.values).adjusted()
+        if not found.converged:
+            reason = f"has not converged in {found.iterations} iterations"
+            return Failure(reason, iterations=found.iterations, costs=found.costs)
         values, inner = found.values, network.datum == "free" and freedom.defect > 0
         chosen = network.datum_points & self.usable.points
         if inner:

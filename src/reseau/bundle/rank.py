@@ -9,13 +9,15 @@ from ..data import Array, Mask, Rows
 from .datum import Freedom, held_for
 from .system import Linear
 
-__all__ = ["PARALLEL", "steady_points", "undetermined", "weak_points"]
+__all__ = ["PARALLEL", "creeping_points", "steady_points", "undetermined", "weak_points"]
 
 # Eigenvalues of the scaled normal equations that count as zero.
 _ZERO = 1e-11
 # Of the scaled normal equations of a point whose rays are parallel: they cut at less than 3e-5 rad.
 PARALLEL = 1e-9
 _LISTED = 8
+# A point this many times as uncertain as the median is hardly determined.
+_CREEPING = 50.0
 # A point of a datum may be this many times as uncertain, by its own rays, as the median of all.
 _UNSTEADY = 5.0
 
@@ -67,13 +69,23 @@ def steady_points(linear: Linear, chosen: Mask) -> Mask:
     chosen : ndarray of bool (p,)
         Points that are determined.
     """
+    return chosen & ~_unsteady(linear, chosen, _UNSTEADY)
+
+
+def creeping_points(linear: Linear) -> Rows:
+    """Points that their rays, all but parallel, hardly determine: too little to come to an end with."""
+    every = np.ones(len(linear.prior), dtype=bool)
+    return np.asarray(np.flatnonzero(_unsteady(linear, every, _CREEPING)), dtype=np.intp)
+
+
+def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
+    """Which points (p,), images held, are so many times as uncertain as the median of the chosen ones."""
     v = _own_normals(linear)
     rows = np.flatnonzero(chosen & (linear.system.pattern.eliminated == 1))
-    spread = np.linalg.eigvalsh(v[rows])[:, 0]
-    size = np.full(len(chosen), 0.0)
-    size[rows] = 1.0 / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
+    size = np.zeros(len(chosen))
+    size[rows] = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(v[rows])[:, 0], np.finfo(float).tiny))
     median = float(np.median(size[rows])) if len(rows) else 0.0
-    return np.asarray(chosen & (size <= _UNSTEADY * median)) if median > 0 else chosen
+    return np.asarray(size > times * median) if median > 0 else np.zeros(len(chosen), dtype=bool)
 
 
 def _own_normals(linear: Linear) -> Array:
