@@ -84,6 +84,13 @@ class _Mounted(FieldBench):
         return Pose(matrix_to_vector(matrix), board.T @ (first.x0 + np.array(self.shift_mm)))
 
 
+def _same_camera(one: World, two: World) -> bool:
+    a, b = one.camera, two.camera
+    same = a.lens is b.lens and a.film is b.film and a.scan is b.scan
+    same = same and (a.sensor, a.psf_px, a.response) == (b.sensor, b.psf_px, b.response)
+    return same and bool((a.pose.x0 == b.pose.x0).all() and (a.pose.matrix == b.pose.matrix).all())
+
+
 class Laboratory:
     """A world, and what its instruments have done to it so far.
 
@@ -133,6 +140,7 @@ class Laboratory:
         self._clock, self._began = clock, clock()
         self._tank = world.rods
         self._drawn: tuple[bytes, Screen] | None = None
+        self._stood: World | None = None
         self._lines, self._exposures = 0, 0
 
     @property
@@ -297,14 +305,20 @@ class Laboratory:
         return f"{axes} {tank}"
 
     def _drift(self) -> Array:
-        """How far the cameras have crept (mm)."""
-        return self.hours * np.array(self.room.drift_mm_per_hour)
+        """How far the cameras have crept (mm), to a micrometre: no frame shows less."""
+        crept: Array = np.round(self.hours * np.array(self.room.drift_mm_per_hour), 3)
+        return crept
 
     def _standing(self) -> World:
         """The world with the camera where it stands now."""
-        if not self._drift().any():
-            return self.world  # what it has computed of this camera holds
-        return replace(self.world, camera=self.world.camera.moved(self._drift(), 0.0))
+        drift = self._drift()
+        if not drift.any():
+            return self.world
+        crept = replace(self.world, camera=self.world.camera.moved(drift, 0.0))
+        # What was computed of a camera holds as long as it stands there.
+        if self._stood is None or not _same_camera(self._stood, crept):
+            self._stood = crept
+        return replace(crept, camera=self._stood.camera)
 
     def _moved(self) -> tuple[Station, FieldBench]:
         """How the table stands, and the testfield on it."""
