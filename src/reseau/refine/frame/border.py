@@ -33,7 +33,7 @@ _STRIPE, _LIT, _DETACHED = 8, 0.06, 3
 at least where there is a picture, and how often such a thing is passed."""
 _RUNNING = 101
 """Profiles over which the tone of film along an edge is taken."""
-_NARROW = 0.4
+_NARROW = 0.25
 """Part of the usual gap that film has at least where it is known by its tone."""
 
 
@@ -190,7 +190,9 @@ def row_median(values: Array) -> Array:
 
 
 def _running(values: Array) -> Array:
-    """Median along the edge: dust, print and scratches do not move it."""
+    """Median along the edge: dust, print and scratches do not move it. NaN where there is nothing at all."""
+    if not np.isfinite(values).any():
+        return values
     filled = np.where(np.isfinite(values), values, np.nanmedian(values))
     return np.asarray(median_filter(filled, size=_RUNNING, mode="nearest"))
 
@@ -249,7 +251,7 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
         narrow = True
     near = first_departure(found, line, max(2, round(0.1 * gap / size)))
     away = np.arange(count) - line[:, None] + 2
-    outside = (away < 0) & (away > -gap / size) & known
+    outside = (away < 0) & (away > -parted / size) & known
     differs = found > 0 if film is None else smooth > least
     clean = 1.0 - float((differs & outside).sum()) / max(float(outside.sum()), 1.0)
     at = low + size * near
@@ -258,7 +260,10 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
         level, column = _strip(tones, line, _NARROW * gap / size)
         outermost = low + size * column
         beside = np.abs(band.distance - outermost[:, None]) < size
-    raw = 1.4826 * float(np.nanmedian(np.abs((grey - level[:, None])[beside])))
+    rest = np.abs((grey - level[:, None])[beside])
+    if not np.isfinite(rest).any():
+        return None
+    raw = 1.4826 * float(np.nanmedian(rest))
     return Border(level, max(raw, 1e-6), spread, contrast, at, outermost, clean)
 
 
@@ -270,6 +275,7 @@ def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
     away = np.arange(1, max(3, round(2.5 * width)) + 1)
     column = np.clip(np.rint(line[:, None] - away).astype(np.intp), 0, tones.shape[1] - 1)
     values = np.take_along_axis(tones, column, axis=1)
-    best = int(np.argmin(np.nanmedian(values, axis=0)))
+    middle = row_median(values.T)
+    best = int(np.argmin(np.where(np.isfinite(middle), middle, np.inf)))
     around = values[:, max(best - 1, 0) : best + 2]
     return _running(row_median(around)), np.asarray(line - away[best])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -27,9 +28,11 @@ _FOREIGN = 0.25
 """Part of the picture's contrast by which what lies beyond an edge differs from film beyond the others."""
 _UNEVEN = 0.45
 """Part of its own tone by which film may differ between edges: the scanner's light is uneven."""
-_SHARP, _EVEN = 0.3, 0.015
-"""Quantile of the widths of all profiles that is the width of a sharp step, and by how much they differ from
-place to place, logarithm."""
+_SHARP, _EVEN = (0.1, 0.3), 0.015
+"""Quantiles of the widths of profiles: the greater is that of a sharp step, their difference tells how they
+differ from place to place, logarithm, at least so much."""
+_FARTHEST = 1.5
+"""Widths by which a line may draw a step at most; one that is farther away is seen by itself."""
 _RATIO, _FEW_DRAWN = 4.0, 0.15
 """Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
 show it by chance."""
@@ -42,6 +45,9 @@ _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 take, and that which is left out besides."""
 _CHORD = 30
 """Points by which an edge is given that is known by its ends."""
+_OTHER_WIDTH, _UNEVEN_WIDTH = 0.12, 0.2
+"""Logarithms by which an edge's width of the step differs from that of all for it to be measured with theirs,
+and by which three edges differ if the scan is sharper at one side than at another."""
 _MOST_GOOD = 0.85
 """Part of an edge's profiles that show a step, from which no wide ones are needed."""
 
@@ -106,23 +112,62 @@ def measure_channel(
         if film is not None:
             films[k] = film
             profiles[k] = measured(k, False)
-    widths = [p.width for p in profiles if p is not None and p.good.sum() > 20]
-    if widths:
-        # The spread of film and scanner is one for all edges.
-        width = float(np.sort(widths)[(len(widths) - 1) // 2])
-        for k, found in enumerate(profiles):
-            if found is not None and abs(np.log(found.width / width)) > 0.12:
-                found = measured(k, False, width) or found
-            if found is not None and found.good.mean() < _MOST_GOOD:
-                more = measured(k, True, width)
-                found = found if more is None else merged(found, more)
-            profiles[k] = found
-    blur = _common_blur(profiles)
+    for k, (found, width) in enumerate(zip(profiles, _widths(profiles), strict=True)):
+        if found is None or width is None:
+            continue
+        if abs(np.log(found.width / width)) > _OTHER_WIDTH:
+            found = measured(k, False, width) or found
+        if found.good.mean() < _MOST_GOOD:
+            more = measured(k, True, width)
+            found = found if more is None else merged(found, more)
+        profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, blur, channel, polarity) for k, found in enumerate(profiles)
+        _edge(band(k, False, far[k]), found, blur, channel, polarity)
+        for k, (found, blur) in enumerate(zip(profiles, _blurs(profiles), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     return Channel(name, data, rejected, why)
+
+
+def _widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
+    """Width of the blurred step for each edge: one for all, unless they are focused differently."""
+    told = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
+    if not told:
+        return [None] * len(profiles)
+    if _uneven(told):
+        return [None if p is None else p.width for p in profiles]
+    return [told[(len(told) - 1) // 2]] * len(profiles)
+
+
+def _uneven(widths: Sequence[float]) -> bool:
+    """Whether sorted widths differ by more than what a picture beside one of the edges does to it."""
+    return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN_WIDTH)
+
+
+def _blurs(profiles: Sequence[EdgeProfiles | None]) -> list[_Blur]:
+    """Widths of sharp steps: what a picture has beside its edge only widens them."""
+    own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
+    sharp = [_blur(blur) for blur in own]
+    if _uneven(sorted(float(np.exp(b.width)) for b, blur in zip(sharp, own, strict=True) if len(blur))):
+        return sharp
+    # A line beside one of the edges scatters its widths, not those of the others.
+    scatter = sorted(b.scatter for b, blur in zip(sharp, own, strict=True) if len(blur))
+    typical = scatter[min(1, len(scatter) - 1)] if scatter else _EVEN
+    return [_Blur(_blur(np.concatenate(own)).width, typical)] * len(profiles)
+
+
+class _Blur(NamedTuple):
+    """Logarithm of the width of a sharp step, and by how much it differs from place to place."""
+
+    width: float
+    scatter: float
+
+
+def _blur(every: Array) -> _Blur:
+    if not len(every):
+        return _Blur(0.0, _EVEN)
+    low, sharp = np.quantile(every, _SHARP)
+    return _Blur(float(sharp), max(float(sharp - low), _EVEN))
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
@@ -137,32 +182,26 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
     return [film if p is None or p.border.film.tone - film.tone > most else None for p in profiles]
 
 
-def _common_blur(profiles: Sequence[EdgeProfiles | None]) -> float:
-    """Logarithm of the width of a step that is sharp: what a picture has beside its edge only widens it."""
-    told = [p.blur[0][p.good] for p in profiles if p is not None]
-    every = np.concatenate(told) if told else np.zeros(0)
-    return float(np.quantile(every, _SHARP)) if len(every) else 0.0
-
-
-def _drawn(found: EdgeProfiles, blur: float) -> tuple[Array, float]:
+def _drawn(found: EdgeProfiles, blur: _Blur) -> tuple[Array, float]:
     """By how much lines of the picture beside an edge may draw its steps to them, pixels (n,); how many do.
 
     A second step of a part r of the contrast, s behind the first, is seen as one that is moved by r·s and has
     the variance w² + r(1 − r)·s². One that is too sharp is a line by itself.
     """
-    other = np.abs(found.blur[0] - blur) - _EVEN
+    other = np.minimum(np.abs(found.blur[0] - blur.width) - blur.scatter, 1.0)
     sure = other - 2 * np.sqrt(found.blur[1])
     part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
     if part > _FEW_DRAWN:
-        # There is such a line: what is no proof is a sign now, and neighbours are drawn alike.
-        moved = np.sqrt(_RATIO * NEIGHBOURS * np.expm1(2 * np.maximum(other, 0.0)))
-    else:
-        moved = np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0)))
-    return np.asarray(np.exp(blur) * moved), part
+        # There is such a line: what is no proof is a sign now.
+        sure = other - np.sqrt(found.blur[1])
+    moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _FARTHEST)
+    if part > _FEW_DRAWN:
+        moved = moved * np.sqrt(NEIGHBOURS)  # which are drawn alike
+    return np.asarray(np.exp(blur.width) * moved), part
 
 
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, blur: float, channel: int, polarity: int
+    band: Band | None, found: EdgeProfiles | None, blur: _Blur, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
     """The profiles of an edge that agree with its line; or why it is not found."""
     if band is None:
@@ -175,7 +214,7 @@ def _edge(
     line = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
     rejected = int((~found.good).sum())
     if line is None:
-        return None, rejected, f"only {len(place)} of {len(found.place)} profiles show a step"
+        return None, rejected, f"no line through {len(place)} of {len(found.place)} profiles show a step"
     (start, stop, bow), agree = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < 0.45:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
@@ -187,15 +226,19 @@ def _edge(
     hidden = False
     if part > (_FEW_DRAWN if found.good.mean() > _CLEAR else _FEW_DRAWN / 5):
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
-        chord = (start * (1 - band.place) + stop * (1 + band.place)) / 2
-        two, hidden = edge_beside_line(grey, band, chord, border.level, border.noise, float(np.exp(blur)))
+        # A line draws an edge by its width at most: a greater bow is the edge's own.
+        own = bow if abs(bow) > 2 * found.width else 0.0
+        fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
+        two, hidden = edge_beside_line(
+            grey, band, fitted, border.level, border.noise, float(np.exp(blur.width))
+        )
         if two is not None:
-            return _along_chord(band, two, common), rejected, ""
+            return _along_chord(band, two, own, common), rejected, ""
     residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
-    ends = _ENDS * float(np.exp(blur)) * max(part - _FEW_DRAWN, 0.0) if hidden else 0.0
+    ends = _ENDS * float(np.exp(blur.width)) * max(part - _FEW_DRAWN, 0.0) if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
 
@@ -217,12 +260,12 @@ def _points(band: Band, place: Array, offset: Array) -> Array:
     return np.asarray(band.start + along + offset[:, None] * band.normal)
 
 
-def _along_chord(band: Band, found: Companion, common: float) -> EdgeData:
+def _along_chord(band: Band, found: Companion, bow: float, common: float) -> EdgeData:
     """An edge that is known by its two ends, as points of a line as precise in its middle and at the ends."""
     middle = float(found.covariance.sum() / 4)
     slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
     place = np.linspace(-1, 1, _CHORD)
     # The line through n points of sigma s has the variance s²/n in its middle, s²/Σt² of its slope.
     place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
-    offset = found.ends[0] * (1 - place) / 2 + found.ends[1] * (1 + place) / 2
+    offset = (found.ends[0] * (1 - place) + found.ends[1] * (1 + place)) / 2 - bow * (1 - place**2)
     return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

@@ -94,6 +94,8 @@ def edge_beside_line(
     behind = x[2] + x[3] * place + x[4] * place**2 - x[0] - x[1] * place
     there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
     there &= (behind > -0.3 * width).mean() > 0.9
+    # What lies behind the edge at one distance all along may be the scanner's own glare.
+    there &= np.ptp(behind) > width
     if chi[best] > _MOST_MISFIT or without < _LEAST_GAIN * chi[best] or not there:
         return None, without < _MOST_MISFIT
     ends = np.array([[1.0, -1.0], [1.0, 1.0]])

@@ -123,10 +123,10 @@ def _width(grey: Array, band: Band, border: Border) -> float:
     place = np.arange(-12.0, 12.0, 0.5)
     tones = binned(rest, at, -12.0, 0.5, len(place))
     inside = row_median(np.where((place > 1) & (place < 6), tones, np.nan))
-    half = 0.5 * float(np.nanmedian(np.where(inside > 0, inside, np.nan)))
-    strong = np.asarray(inside > half)
-    if not strong.any():
+    lit = inside[np.isfinite(inside) & (inside > 0)]
+    if not len(lit):
         return 1.0
+    strong = np.asarray(inside > 0.5 * float(np.median(lit)))
     with warnings.catch_warnings():  # where no profile has a pixel there is no mean, and none is needed
         warnings.simplefilter("ignore", RuntimeWarning)
         mean = np.nanmedian(tones[strong] / inside[strong][:, None], axis=0)

@@ -112,11 +112,15 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
         near = _running(outside[k], level)
         far = _running(np.nanmean(np.where(known[k], profiles[k], level)[:, : out // 2], axis=1), level)
         # Where the line that voted has other tones before it than film, film is looked for further out.
+        further = guess.polarity * (np.median(far) - np.median(near)) / strong
         raised = guess.polarity * (np.median(near) - level) > 0.1 * strong
-        darker = guess.polarity * (np.median(near) - np.median(far)) > 0
-        film = (far if raised and darker else near)[:, None]
-        departure = guess.polarity * (np.where(known[k], profiles[k], film) - film) / least
-        found = likelihood(departure, known[k], out + 2, max(2, round(_GAP_MM * scale)))
+        film = (far if raised and further < 0 else near)[:, None]
+        # Where film is a narrow strip, blurred with something else beyond it, one place of it must do.
+        narrow = further > 0.1
+        gap = 1 if narrow else max(2, round(_GAP_MM * scale))
+        significant = max(least, 0.4 * further * strong) if narrow else least
+        departure = guess.polarity * (np.where(known[k], profiles[k], film) - film) / significant
+        found = likelihood(departure, known[k], out + 2, gap)
         start, stop = best_line(found, _ALONG, 2, len(offsets) - 2 * reach, 4)
         moved[k] = offsets[0] - 0.5 + np.array([start, stop])
     return FrameGuess(

@@ -89,11 +89,18 @@ def search_frames(
         with warnings.catch_warnings():  # an edge beyond the scan has no tones; it is left out later
             warnings.simplefilter("ignore", RuntimeWarning)
             scored = [judged(guess, grey) for guess in _distinct(found, tried)]
-            good = sorted((g for g in scored if g is not None), key=lambda g: -g.score)
+            good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
             found = [settled(guess, grey) for guess in _apart(good)]
         if found:
             return found
     return []
+
+
+def _far(guess: FrameGuess, near: Array | None) -> float:
+    """What the distance from where a frame was said to be counts against it, at most one edge."""
+    if near is None:
+        return 0.0
+    return float(np.abs(guess.corners - near).max() / (0.1 * size_of(near).max()))
 
 
 def _gradients(overview: NDArray[np.float32]) -> tuple[Plane, tuple[Array, Array, Array, Array]]:
