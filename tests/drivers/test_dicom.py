@@ -226,6 +226,38 @@ def test_what_is_not_readable_is_named(tmp_path: Path, syntax: Any) -> None:
         scanner.scan()
 
 
+@pytest.mark.parametrize(
+    ("name", "maker", "frames", "why"),
+    [
+        # Files of real scanners, as pydicom brings them; someone made them smaller, and left their regions.
+        (
+            "examples_ybr_color.dcm",
+            "SonoSite, Inc. Turbo",
+            30,
+            "beyond the frame of 320×240 px lies (84, 31, 595, 414)",
+        ),
+        ("examples_palette.dcm", "", 1, "beyond the frame of 800×350 px lies (120, 60, 800, 518)"),
+        ("examples_rgb_color.dcm", "G.E. Medical Systems LOGIQ 700 4121885", 1, "no regions"),
+    ],
+)
+def test_real_files_give_pixels_and_never_wrong_millimetres(
+    name: str, maker: str, frames: int, why: str
+) -> None:
+    path = Path(pydicom.__file__).parent / "data" / "test_files" / name
+    if not path.exists():
+        pytest.skip(f"pydicom came without {name}")
+    with DicomFiles("files", path) as scanner:
+        told = scanner.check()
+        assert maker in told["identity"]
+        assert (told["frames"], told["pixels"]) == (str(frames), f"unknown: {why}")
+        scan = scanner.scan()
+        assert (scan.mm_per_px, scan.region_px) == (None, None)
+        header = pydicom.dcmread(path, stop_before_pixels=True)
+        assert scan.pixels.shape == (header.Rows, header.Columns)
+        # An echo is bright, and most of a frame is dark.
+        assert np.median(scan.pixels) < 60 < scan.pixels.max()
+
+
 def test_what_is_no_image_costs_one_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     whole = file(tmp_path / "whole", region()).read_bytes()

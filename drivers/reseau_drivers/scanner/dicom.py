@@ -223,6 +223,8 @@ class DicomFiles(Device[DicomSettings]):
             ) from None
         try:
             values = self._pydicom.pixels.pixel_array(path, index=index)
+            if header.PhotometricInterpretation == "PALETTE COLOR":
+                values = self._pydicom.pixels.apply_color_lut(values, header)
         except OSError as error:
             raise ConnectionLost(f"{path} cannot be read ({error.strerror or error})") from None
         except InstrumentError:
@@ -307,10 +309,10 @@ def _united(known: list[_Scale]) -> _Scale:
 def _grey(values: NDArray[Any], header: Any, name: str) -> NDArray[np.uint8]:
     """Grey values 0 to 255, bright is an echo."""
     kind = str(header.get("PhotometricInterpretation", ""))
-    bits = int(header.get("BitsStored", 8))
+    bits = 8 * values.itemsize if kind == "PALETTE COLOR" else int(header.get("BitsStored", 8))
     if values.ndim == 3 and values.shape[2] == 3:
         values = cv2.cvtColor(np.ascontiguousarray(values), cv2.COLOR_RGB2GRAY)
-    if values.ndim != 2 or not kind.startswith(("MONOCHROME", "RGB", "YBR")):
+    if values.ndim != 2 or not kind.startswith(("MONOCHROME", "PALETTE", "RGB", "YBR")):
         raise ProtocolError(f"{name} has pixels of the kind {kind or 'unknown'}", do="convert them to grey")
     if not 1 <= bits <= 16 or values.dtype.kind != "u":
         raise ProtocolError(f"{name} has pixels of {bits} bits of the type {values.dtype}")
