@@ -10,7 +10,7 @@ from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .datagrams import UdpServer
 from .gige import GigeCamera, aravis_is_installed
-from .imaging import CameraBody, InLaboratory, Pattern, Sight, Still, View
+from .imaging import CameraBody, InLaboratory, Lamp, Pattern, Sight, Still, View
 from .machine import Machine, Session, Wire
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -38,6 +38,7 @@ __all__ = [
     "InLaboratory",
     "InProcess",
     "Kind",
+    "Lamp",
     "Machine",
     "Motor",
     "Oscilloscope",

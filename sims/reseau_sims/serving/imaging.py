@@ -5,18 +5,20 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Frame
+from reseau.data import Array, Frame
 
 from ..laboratory import Laboratory
+from ..pixels import PixelSensor
+from ..streams import stream
 from .script import Script
 
-__all__ = ["CameraBody", "InLaboratory", "Pattern", "Sight", "Still", "View"]
+__all__ = ["CameraBody", "InLaboratory", "Lamp", "Pattern", "Sight", "Still", "View"]
 
 NOMINAL_US = 10_000.0
 """Exposure at which a sight has its own brightness."""
@@ -134,6 +136,32 @@ class InLaboratory:
     def __call__(self, view: View) -> NDArray[Any]:
         """The picture of a view."""
         return view.seen(_levelled(self.laboratory.expose(self.sight, view.light, view.gain), view, 1.0))
+
+
+@dataclass(eq=False)
+class Lamp:
+    """A sensor of uneven pixels before a lamp, without a lens; no two pictures have the same noise.
+
+    Parameters
+    ----------
+    sensor : PixelSensor
+        What is seen is what it makes of the light; gain and scale of a view are the sensor's own.
+    light : ndarray or float
+        Grey values per microsecond; 0 when it is covered.
+    seed : int
+        Of the noise.
+    """
+
+    sensor: PixelSensor
+    light: Array | float = 0.25
+    seed: int = 0
+    _taken: int = field(default=0, init=False)
+
+    def __call__(self, view: View) -> NDArray[Any]:
+        """The picture of a view."""
+        self._taken += 1
+        rng = stream(self.seed, "lamp", self._taken)
+        return view.seen(self.sensor.expose(self.light, view.exposure_us, rng))
 
 
 def _levelled(frame: Frame, view: View, factor: float) -> NDArray[Any]:

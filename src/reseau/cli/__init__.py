@@ -22,6 +22,7 @@ from . import (
     bundle_compare,
     calibrate,
     capture,
+    capture_sensor,
     demo,
     design,
     measure,
@@ -43,6 +44,7 @@ app.command()(demo.demo)
 app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
 app.add_typer(measure.app, name="measure")
+capture.app.command()(capture_sensor.sensor)
 app.add_typer(capture.app, name="capture")
 app.add_typer(archive.app, name="archive")
 app.command()(orient.orient)

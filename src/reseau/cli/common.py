@@ -23,6 +23,30 @@ AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON t
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 
 
+SensorFile = Annotated[
+    Path | None,
+    typer.Option("--sensor", help="Calibration of the sensor, applied before anything is measured."),
+]
+
+
+def corrected(frame: Frame, sensor: Path | None) -> Frame:
+    """The frame freed of what its sensor did to it, by a calibration of `reseau capture sensor`.
+
+    Raises
+    ------
+    FormatError
+        When the file is none of a sensor.
+    UsageError
+        When it is one of another sensor.
+    """
+    if sensor is None:
+        return frame
+    from ..calibration import Calibration
+    from ..refine.sensor import SensorCorrection
+
+    return SensorCorrection.from_calibration(Calibration.read(sensor)).apply(frame)
+
+
 def is_points(path: Path) -> bool:
     """Whether a file holds image coordinates and not an image, by its name."""
     return path.suffix.lower() in (".json", ".csv")

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, Out, is_points, progress, read_measurement, required, say, suffix_of, writable
+from .common import (
+    AsJson,
+    Out,
+    SensorFile,
+    corrected,
+    is_points,
+    progress,
+    read_measurement,
+    required,
+    say,
+    suffix_of,
+    writable,
+)
 
 if TYPE_CHECKING:
     from ..data import Array
@@ -44,6 +56,7 @@ def reseau(
     ] = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
     channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
+    sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
@@ -57,7 +70,7 @@ def reseau(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = read_frame(image, channel.value)
+        frame = corrected(read_frame(image, channel.value), sensor)
         options = ReseauOptions(mark_px=mark_px, row_jitter_px=row_jitter)
         with progress(f"measuring {image.name}", 1):
             result = required(measure_reseau(frame, target, options), image)
@@ -77,6 +90,7 @@ def pins(
         float | None, typer.Option(min=1, help="Greatest length of an echo, pixels.")
     ] = None,
     max_rotation: Annotated[float, typer.Option(help="Largest rotation of the test object, degrees.")] = 12.0,
+    sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the rods of an ultrasonic test object."""
@@ -91,7 +105,8 @@ def pins(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame, others = read_frame(image), [read_frame(path) for path in also or []]
+        frame = corrected(read_frame(image), sensor)
+        others = [corrected(read_frame(path), sensor) for path in also or []]
         options = PinOptions(most_length_px=max_length_px, max_rotation_deg=max_rotation)
         with progress(f"measuring {image.name}", 1):
             result = required(measure_pins(frame, target, options, others), image)
@@ -108,6 +123,7 @@ def coded_field(
     fill: Annotated[
         float, typer.Option(min=0, max=1, help="Light-sensitive part of the pitch of the pixels.")
     ] = 1.0,
+    sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the targets of a coded testfield."""
@@ -121,7 +137,7 @@ def coded_field(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = read_frame(image)
+        frame = corrected(read_frame(image), sensor)
         with progress(f"measuring {image.name}", 1):
             options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
             result = required(measure_testfield(frame, target, options), image)

@@ -1,0 +1,24 @@
+"""A sensor calibrated: what it adds in the dark, how it answers to light, its scatter, which pixels fail."""
+
+from .correction import SensorCorrection
+from .edge import EdgeSpread, measure_edge
+from .fields import Fields, estimate_fields
+from .sensor import SensorResult, calibrate_sensor
+from .series import Level, SensorSeries
+from .transfer import Linearity, PhotonTransfer, fit_linearity, fit_transfer
+
+__all__ = [
+    "EdgeSpread",
+    "Fields",
+    "Level",
+    "Linearity",
+    "PhotonTransfer",
+    "SensorCorrection",
+    "SensorResult",
+    "SensorSeries",
+    "calibrate_sensor",
+    "estimate_fields",
+    "fit_linearity",
+    "fit_transfer",
+    "measure_edge",
+]
