@@ -92,6 +92,82 @@ def test_calibrated_corners_give_a_transformation_with_residuals_or_honestly_non
             assert np.abs(left).max() < 0.05
 
 
+def one_bad(name: str, path: Path) -> None:
+    """Write a scan of a kind that cannot be oriented."""
+    frame = FilmFrame(0, dpi=300)
+    if name == "without borders":
+        tifffile.imwrite(path, FilmFrame(1, dpi=300, margin_mm=-1.0).scan())
+    elif name == "overlapping":
+        first, second = frame.scan(), FilmFrame(1, dpi=300).scan()
+        h, w = min(len(first), len(second)), first.shape[1]
+        both = np.zeros((h, 2 * w - 100), np.uint8)
+        both[:, :w] = first[:h]
+        both[:, w - 100 :] = np.maximum(both[:, w - 100 :], second[:h, :w])
+        tifffile.imwrite(path, both)
+    elif name == "blank":
+        tifffile.imwrite(path, np.full((300, 400), 9, np.uint8))
+    elif name == "truncated":
+        tifffile.imwrite(path, frame.scan())
+        path.write_bytes(path.read_bytes()[:9000])
+    elif name == "CMYK":
+        tifffile.imwrite(path, np.zeros((30, 30, 4), np.uint8), photometric="separated")
+    elif name == "palette":
+        tifffile.imwrite(path, frame.scan(), photometric="palette", colormap=np.zeros((3, 256), np.uint16))
+    elif name == "1 bit":
+        tifffile.imwrite(path, frame.scan() > 80)
+    else:
+        tifffile.imwrite(path, frame.scan().astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "wrong", "helps"),
+    [
+        ("without borders", 1, "no frame of the format", "scan it with a margin of film around"),
+        ("overlapping", 1, "no frame of the format", "frames that overlap cannot be told apart"),
+        ("blank", 1, "of one tone", "scan it with more exposure"),
+        ("truncated", 2, "is a truncated TIFF", "copy or scan it anew"),
+        ("CMYK", 2, "colour CMYK", "convert it to grey or RGB of 8 or 16 bit"),
+        ("palette", 2, "a palette", "convert it to grey or RGB of 8 or 16 bit"),
+        ("1 bit", 2, "1 bit", "convert it to grey or RGB of 8 or 16 bit"),
+        ("32 bit floating point", 2, "32 bit floating point", "convert it to grey or RGB of 8 or 16 bit"),
+    ],
+)
+def test_bad_input_says_what_is_wrong_and_what_would_help(
+    name: str, status: int, wrong: str, helps: str, tmp_path: Path, reseau: Run
+) -> None:
+    one_bad(name, tmp_path / "bad.tif")
+    out_folder = tmp_path / "out"
+    got, out, err = reseau("orient", tmp_path / "bad.tif", "--frame", "36x24", "--out", out_folder)
+    told = out + err
+    assert got == status
+    assert wrong in told
+    assert helps in told
+    assert told.count("\n") == 1
+    assert not list(out_folder.glob("*-marked.tif"))
+
+
+def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path, reseau: Run) -> None:
+    tifffile.imwrite(tmp_path / "untagged.tif", FilmFrame(0, dpi=300).scan())
+    status, out, _ = reseau("orient", tmp_path / "untagged.tif", "--frame", "36x24", "--json")
+    assert status == 0
+    # The gate differs from its format by some hundredths of a millimetre.
+    assert json.loads(out)["px_per_mm"] == pytest.approx([300 / 25.4] * 2, rel=0.005)
+
+
+def test_every_frame_of_a_strip_is_oriented(tmp_path: Path, reseau: Run) -> None:
+    frames = [FilmFrame(seed, dpi=300) for seed in range(3)]
+    height = min(frame.shape[0] for frame in frames)
+    tifffile.imwrite(tmp_path / "strip.tif", np.hstack([frame.scan()[:height] for frame in frames]))
+    status, out, _ = reseau("orient", tmp_path / "strip.tif", "--frame", "36x24", "--json")
+    assert status == 0
+    found = json.loads(out)
+    assert [one["status"] for one in found] == ["oriented"] * 3
+    left = np.cumsum([0, *(frame.shape[1] for frame in frames)])
+    for one, frame, start in zip(found, frames, left, strict=False):
+        xy = np.array([[one["corners"][k]["x"], one["corners"][k]["y"]] for k in ("ul", "ur", "lr", "ll")])
+        np.testing.assert_allclose(xy - [start, 0], frame.truth.corners, rtol=0, atol=0.3)
+
+
 def test_what_cannot_be_oriented_is_told_in_one_line(tmp_path: Path, reseau: Run, roll: Path) -> None:
     tifffile.imwrite(tmp_path / "blank.tif", np.full((300, 400), 9, np.uint8))
     status, out, err = reseau("orient", tmp_path / "blank.tif")

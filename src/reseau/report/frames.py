@@ -20,8 +20,9 @@ __all__ = ["contact_sheet", "frame_tile", "write_marked"]
 
 _STRIPE = 512
 """Rows copied at a time."""
-_SIDE, _ZOOM = 420, 104
-"""Sides of a frame's picture and of that of a corner, pixels."""
+_SIDE, _ZOOM, _PART = 420, 208, 0.02
+"""Sides of a frame's picture and of that of a corner, pixels, and the part of an edge that it shows at least
+to both sides."""
 _COLOURS = {"oriented": (60, 170, 60), "three-edges": (230, 150, 30), "declined": (200, 50, 50)}
 
 
@@ -111,18 +112,21 @@ def _shown(grey: NDArray[Any], step: Array) -> NDArray[np.uint8]:
 def _corner(
     scan: Scan, points: Array, k: int, step: Array, colour: tuple[int, int, int]
 ) -> NDArray[np.uint8]:
-    """The surroundings of a corner, each pixel as four by four, with the two edges that meet there."""
-    half, zoom = _ZOOM // 8, 4
+    """The surroundings of a corner, enlarged, with the two edges that meet there."""
+    side = float(np.hypot(*(points[(k + 1) % 4] - points[k])))
+    half = max(_ZOOM // 8, round(_PART * side))
+    zoom = _ZOOM / (2 * half)
     column, row = (int(v) for v in np.rint(points[k]))
     top, left = max(row - half, 0), max(column - half, 0)
     bottom, right = min(row + half, scan.height), min(column + half, scan.width)
     canvas = np.full((_ZOOM, _ZOOM, 3), 255, dtype=np.uint8)
     if bottom <= top or right <= left:
         return canvas
-    part = _shown(scan.window(top, bottom, left, right), step)
-    y, x = (top - row + half) * zoom, (left - column + half) * zoom
-    large = np.repeat(np.repeat(part, zoom, axis=0), zoom, axis=1)
-    canvas[y : y + large.shape[0], x : x + large.shape[1]] = large
+    part = np.full((2 * half, 2 * half, len(scan.channels)), scan.full_scale, dtype=np.float32)
+    seen = scan.window(top, bottom, left, right)
+    part[top - row + half : bottom - row + half, left - column + half : right - column + half] = seen
+    how = cv2.INTER_NEAREST if zoom >= 1 else cv2.INTER_AREA
+    canvas = cv2.resize(_shown(part, step), (_ZOOM, _ZOOM), interpolation=how).astype(np.uint8)
     for other in (points[k - 1], points[(k + 1) % 4]):
         ends = (np.array([points[k], other]) - [column - half, row - half] + 0.5) * zoom - 0.5
         way = ends[1] - ends[0]

@@ -215,8 +215,9 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
         return Failure("shows nothing: it is of one tone; scan it with more exposure"), reduction
     formats = ", ".join(f"{w:g}x{h:g}" for w, h in options.formats)
     return Failure(
-        f"no frame of the format {formats} stands out from unexposed film on at least three sides; "
-        "scan it with a margin of film around, or say its --frame, --dpi or where it is"
+        f"no frame of the format {formats} stands out from unexposed film on at least three sides; scan it "
+        "with a margin of film around, or say its --frame, --dpi or where it is (frames that overlap cannot "
+        "be told apart)"
     ), reduction
 
 

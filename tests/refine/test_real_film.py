@@ -1,0 +1,47 @@
+"""Real film: still frames are oriented, cine frames beside a soundtrack are never wrong silently."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.refine.frame import FrameOptions, orient_frames
+from reseau.scans import open_scan
+
+STILLS = {
+    "fac_neg.jpg": ((24.0, 36.0), [[110, 93], [2791, 89], [2791, 4170], [110, 4170]]),
+    "strw_in1.jpg": ((36.0, 24.0), [[611, 348], [2482, 261], [2534, 1526], [663, 1578]]),
+    "strw_in3.jpg": ((36.0, 24.0), [[291, 401], [2168, 304], [2255, 1545], [376, 1665]]),
+}
+"""Formats and corners as read off a reduced picture by eye, good to a dozen pixels."""
+CINE = {
+    "kino_1264.jpg": [[893, 1676], [2874, 1676], [2874, 3145], [893, 3145]],
+    "kino_1265.jpg": [[885, 1615], [2870, 1615], [2870, 3085], [885, 3085]],
+}
+
+
+def options(size, **known):
+    """Copied by tilted cameras: shapes are known to 2 % and 1° only."""
+    return FrameOptions((size,), aspect_sigma=0.02, angle_sigma_deg=1.0, **known)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STILLS)
+def test_a_still_frame_is_oriented_at_its_edges(name, reference_data):
+    size, corners = STILLS[name]
+    (result,) = orient_frames(open_scan(reference_data("film_frames") / name), options(size))
+    assert result.status == "oriented", result.why
+    np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CINE)
+def test_a_cine_frame_whose_film_is_a_few_pixels_wide_is_not_wrong_silently(name, reference_data):
+    near = np.array(CINE[name], dtype=float)
+    scan = open_scan(reference_data("film_frames") / name)
+    (result,) = orient_frames(scan, options((22.0, 16.0), near=near))
+    if not result:
+        assert "edge" in result.why
+        return
+    sigma = np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
+    assert (np.abs(result.lines.corners - near) < 3 * np.hypot(sigma, 8)).all()
