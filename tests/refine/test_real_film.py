@@ -9,11 +9,12 @@ from reseau.refine.frame import FrameOptions, orient_frames
 from reseau.scans import open_scan
 
 STILLS = {
-    "fac_neg.jpg": ((24.0, 36.0), [[110, 93], [2791, 89], [2791, 4170], [110, 4170]]),
+    "fac_neg.jpg": ((24.0, 36.0), [[106, 80], [2795, 88], [2800, 4185], [108, 4180]]),
     "strw_in1.jpg": ((36.0, 24.0), [[611, 348], [2482, 261], [2534, 1526], [663, 1578]]),
-    "strw_in3.jpg": ((36.0, 24.0), [[291, 401], [2168, 304], [2255, 1545], [376, 1665]]),
+    "strw_in3.jpg": ((36.0, 24.0), [[291, 401], [2168, 304], [2255, 1545], [350, 1662]]),
 }
-"""Formats and corners as read off a reduced picture by eye, good to a dozen pixels."""
+"""Formats and corners as read off by eye where half of the contrast is reached, good to some pixels: these
+edges are blurred over ten."""
 CINE = {
     "kino_1264.jpg": [[893, 1676], [2874, 1676], [2874, 3145], [893, 3145]],
     "kino_1265.jpg": [[885, 1615], [2870, 1615], [2870, 3085], [885, 3085]],
