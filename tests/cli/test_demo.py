@@ -5,16 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from reseau.archive import Archive, verify
 from reseau.calibration import Calibration
-from reseau.cli import demo, run
+from reseau.cli import run
 from reseau.formats import ReseauDesign, ReseauMeasurement
 from reseau.refine.correction import InstrumentCorrection
+from reseau_sims import World
 
 FILES = {
+    "archive",
+    "camera.json",
+    "testfield.html",
     "report.html",
     "overview.png",
     "photo_i.png",
@@ -65,6 +71,25 @@ def test_all_files_are_there_and_fit_together(out: Path) -> None:
     assert np.abs(again.xy - np.array(list(written.values()))[:, :2]).max() < 0.01  # millimetres
 
 
+def test_every_frame_is_in_the_archive_and_can_be_computed_with_again(out: Path) -> None:
+    with Archive.open(out / "archive") as archive:
+        assert [(s.name, s.status) for s in archive.sessions()] == [
+            ("oscilloscope", "done"),
+            ("testfield", "done"),
+        ]
+        assert verify(archive)
+        kinds = [frame.kind for frame in archive.session("oscilloscope").frames()]
+        assert kinds == ["frame", "screen", "scan", "frame", "screen", "scan", "frame", "screen"]
+        results = archive.session("testfield").results()
+    camera, kept = Calibration.read(out / "camera.json"), results[0]
+    assert kept.name == "calibration.json"
+    assert len(kept.inputs) == 12
+    truth = json.loads((out / "comparison.json").read_text())["testfield"]["parameters"]
+    for name, row in truth.items():
+        assert camera.parameters[name].value == row["value"]
+        assert abs(row["value"] - row["true"]) < 4 * row["sigma"]
+
+
 def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> None:
     truth = json.loads((out / "comparison.json").read_text())
     check = {stage["name"]: max(stage["check"]) for stage in truth["camera"]["stages"]}
@@ -85,7 +110,7 @@ def test_same_seed_same_bytes_but_for_the_clock(out: Path, reseau: Run, tmp_path
     status, text, err = reseau("demo", "--out", tmp_path / "again", "--seed", 2, "--json")
     assert (status, err) == (0, "")
     assert text == (out / "comparison.json").read_text()
-    for name in FILES - {"calibration.json"}:
+    for name in FILES - {"calibration.json", "archive"}:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
     one, other = (
         json.loads((folder / "calibration.json").read_text()) for folder in (out, tmp_path / "again")
@@ -101,23 +126,13 @@ def test_an_error_leaves_what_was_there_before(
     folder.mkdir()
     (folder / "mine.txt").write_text("keep")
 
-    class Dark:
-        """A bench whose shutter stays shut."""
+    def dark(seed: int) -> World:
+        """A world whose shutter stays shut."""
+        world = World.standard(seed)
+        world.screen.light *= 0
+        return world
 
-        def __init__(self) -> None:
-            from reseau_sims import World
-
-            self.world = World.standard(1)
-            self.design = self.world.design
-            self.world.screen.light *= 0
-
-        def photo_i(self) -> object:
-            return self.world.photo_i()
-
-        def check_marks(self) -> tuple[str, ...]:
-            return ()
-
-    monkeypatch.setattr(demo, "_bench", lambda seed: Dark())
+    monkeypatch.setattr("reseau_sims.serving.bench.World", SimpleNamespace(standard=dark))
     status, text, err = reseau("demo", "--out", folder)
     assert status in (1, 2)
     assert text == ""

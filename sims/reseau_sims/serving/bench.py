@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from reseau.errors import UsageError
 
 from ..laboratory import AXES, Laboratory
+from ..testfield import FieldBench
 from ..world import World
 from .bk import BkScanner
 from .compactpulser import CompactPulser
+from .gige import GigeCamera, aravis_is_installed
+from .imaging import CameraBody, InLaboratory
 from .machine import Machine, Wire
 from .oscilloscope import FAMILIES, Oscilloscope
 from .ping360 import Ping360
@@ -22,17 +25,25 @@ from .scpi import Vxi11Session
 from .script import Script
 from .servers import PtyServer, TcpServer
 from .smc100 import Smc100Line
+from .v4l2 import VideoCamera
 from .zaber import ZaberChain
 
 __all__ = ["SimulatedBench", "TableKind", "serve"]
 
 TableKind = Literal["zaber", "smc100"]
+Sight = Literal["screen", "testfield"]
+_PATIENCE_S = 120.0
+"""For the port of another simulated camera of this machine."""
+_DISTORTION_PX = 1.5
+"""At the edge of a frame of the flat testfield."""
 
 _CHAIN = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
 """Device and axis on the chain of Zaber's; of Newport's each axis has a controller of its own."""
 _STEPS = 1000.0
 """Of Zaber's for a degree or a millimetre."""
 _HIGH = {"tilt": 75.0, "roll": 360.0, "camera_roll": 360.0, "z": 300.0}
+_LOW = -5.0
+"""Below zero: also that is come to from below."""
 _SCREEN = (800, 480)
 
 _BENCH = """\
@@ -66,6 +77,15 @@ address = "{oscilloscope}"
 """
 
 
+_CAMERA = """
+[instruments.camera]
+driver = "aravis"
+address = "{address}"
+settings = {{trigger = "software", width = {width}, height = {height}, exposure_us = 10000.0, gain = 0.0}}
+options = {{seconds = 30.0}}
+"""
+
+
 class SimulatedBench:
     """Servers on pseudo-terminals and the loopback interface; see :attr:`toml`.
 
@@ -77,6 +97,13 @@ class SimulatedBench:
         Whose controllers move it.
     family : str
         Of the oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
+    camera : {"screen", "testfield"}, optional
+        What a camera looks at, over GigE Vision where Aravis is installed; elsewhere it has a node of
+        Video4Linux within this process, `video`, and does not stand in the ``bench.toml``.
+    repeatable : bool
+        See :class:`~reseau_sims.laboratory.Laboratory`.
+    flat : bool
+        Whether the testfield is a plane, before a lens that distorts.
 
     Attributes
     ----------
@@ -86,6 +113,8 @@ class SimulatedBench:
         What they share.
     scripts : dict
         What goes wrong, by instrument; nothing at first.
+    video : VideoCamera or None
+        The camera, where it is in this process.
 
     Raises
     ------
@@ -93,14 +122,25 @@ class SimulatedBench:
         When nobody simulates such a table or oscilloscope.
     """
 
-    def __init__(self, seed: int = 0, *, table: TableKind = "zaber", family: str = "keysight") -> None:
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        table: TableKind = "zaber",
+        family: str = "keysight",
+        camera: Sight | None = None,
+        repeatable: bool = False,
+        flat: bool = False,
+    ) -> None:
         for what, known, asked in (
             ("table", get_args(TableKind), table),
             ("oscilloscope", tuple(FAMILIES), family),
+            ("sight of a camera", get_args(Sight), camera),
         ):
-            if asked not in known:
+            if asked is not None and asked not in known:
                 raise UsageError(f"is no simulated {what}", where=asked, do=f"there are {', '.join(known)}")
-        self.laboratory = laboratory = Laboratory(World.standard(seed))
+        field = FieldBench(seed=seed, bend_mm=0.0).distorted(_DISTORTION_PX) if flat else None
+        self.laboratory = laboratory = Laboratory(World.standard(seed), field, repeatable=repeatable)
         self._pulser = CompactPulser()
         scope = Oscilloscope(family, lambda: laboratory.picture(*_SCREEN), self._channel)
         self.machines: dict[str, Machine] = {
@@ -112,6 +152,7 @@ class SimulatedBench:
         }
         self.scripts = {name: Script() for name in self.machines}
         self._servers = ExitStack()
+        self.video: VideoCamera | None = None
         with ExitStack() as stack:
             addresses = {
                 name: stack.enter_context(
@@ -124,18 +165,31 @@ class SimulatedBench:
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
             addresses["oscilloscope"] = f"TCPIP::{core.HOST},{core.port}::inst0::INSTR"
+            door = "" if camera is None else self._camera(camera, stack)
             self._servers = stack.pop_all()
         axes = "".join(_axis_entry(table, name) for name in AXES)
-        self.toml = _BENCH.format(kind=table, axes=axes, **addresses)
+        self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + door
+
+    def _camera(self, sight: Sight, stack: ExitStack) -> str:
+        """The camera; its part of the ``bench.toml``, where it can be reached from outside."""
+        first = self.laboratory.expose(sight)  # what takes long is computed now
+        body = CameraBody(InLaboratory(self.laboratory, sight), first.width, first.height)
+        self.scripts["camera"] = body.script
+        if not aravis_is_installed():
+            self.video = VideoCamera(body)
+            return ""
+        served = GigeCamera(body, patience_s=_PATIENCE_S)
+        stack.callback(served.close)
+        return _CAMERA.format(address=served.address, width=first.width, height=first.height)
 
     def _table(self, kind: TableKind) -> Machine:
         """The controllers of the table; the laboratory's axes stand where they are."""
         if kind == "smc100":
-            line = Smc100Line(len(AXES), low=0.0, high=400.0, speed=20.0)
+            line = Smc100Line(len(AXES), low=_LOW, high=400.0, speed=20.0)
             for address, name in enumerate(AXES, 1):
                 self.laboratory.attach(name, partial(line.position, address))
             return line
-        chain = ZaberChain([2, 1, 1])
+        chain = ZaberChain([2, 1, 1], low=_LOW * _STEPS)
         for name, key in _CHAIN.items():
             self.laboratory.attach(name, partial(_units, chain, *key))
         return chain
@@ -174,9 +228,17 @@ def _axis_entry(kind: TableKind, name: str) -> str:
     if kind == "smc100":
         where = f"device = {AXES.index(name) + 1}"
     unit = ', unit = "mm"' if name == "z" else ", backlash = 0.2"
-    return f"{name} = {{{where}, low = 0.0, high = {_HIGH[name]}{unit}}}\n"
+    return f"{name} = {{{where}, low = {_LOW}, high = {_HIGH[name]}{unit}}}\n"
 
 
-def serve(seed: int = 0, table: TableKind = "zaber", family: str = "keysight") -> SimulatedBench:
-    """A simulated bench; found by its entry point."""
-    return SimulatedBench(seed, table=table, family=family)
+def serve(seed: int = 0, **options: Any) -> SimulatedBench:
+    """A simulated bench; found by its entry point.
+
+    Parameters
+    ----------
+    seed : int
+        Of the world.
+    **options
+        Of :class:`SimulatedBench`.
+    """
+    return SimulatedBench(seed, **options)

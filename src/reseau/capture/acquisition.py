@@ -12,7 +12,7 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from bluesky import Msg
@@ -20,7 +20,15 @@ from bluesky import plan_stubs as bps
 
 from ..archive import ArchivedFrame, Session, Verdict
 from ..data import Frame
-from ..errors import ImageError, InstrumentError, StateError, UsageError
+from ..errors import (
+    ConnectionLost,
+    DeadlineError,
+    ImageError,
+    InstrumentError,
+    ProtocolError,
+    StateError,
+    UsageError,
+)
 from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
 from .bench import Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
@@ -32,6 +40,9 @@ Plan = Generator[Msg, Any, Any]
 Watch = Callable[[str, dict[str, Any]], None]
 """Told what happens: the kind of an event, and what there is to say about it."""
 
+T = TypeVar("T")
+_TRIES = 4
+"""How often an instrument is asked before its failure ends the session."""
 _STILL = 0.02
 """By how much an axis may move while a frame is exposed, in its unit."""
 
@@ -161,7 +172,11 @@ class Acquisition:
             unknown = [axis for axis in position if axis not in axes]
             if unknown:
                 raise UsageError(f"has no axis {unknown[0]}", where="table", do=f"it has {', '.join(axes)}")
-            yield from bps.mv(*(part for axis, value in position.items() for part in (axes[axis], value)))
+            yield message("move", self, dict(position))
+
+    def home(self) -> Plan:
+        """Have the axes of the table that have no reference find it; where they drive to is theirs."""
+        yield message("home", self)
 
     def pictures(self, step: Step, kind: str) -> Plan:
         """Sweep with the scanner (`scan`), or keep what the oscilloscope's own screen shows (`screen`).
@@ -205,6 +220,8 @@ class Acquisition:
         """The messages above, for ``RunEngine.register_command``."""
         work: dict[str, Callable[..., Any]] = {
             "expose": self._expose,
+            "move": self._move,
+            "home": self._home,
             "picture": self._picture,
             "ask": self._ask,
             "check": self._check,
@@ -267,6 +284,11 @@ class Acquisition:
         except InstrumentError as error:
             self.watch("rest", {"failed": str(error)})
 
+    def settle(self) -> None:
+        """Wait for what an interrupted message still does: what it brings is stored, and judged."""
+        with self._busy:
+            pass
+
     def ready(self) -> None:
         """Connect all instruments, and let them move and send again.
 
@@ -278,6 +300,10 @@ class Acquisition:
         self._resting = False
         for instrument in self.bench.instruments.values():
             instrument.stage()
+
+    def verdict(self, found: ArchivedFrame) -> Verdict:
+        """What was found of a frame that was taken or looked at in this process."""
+        return self._known[found.id]
 
     def done(self, step: Step) -> bool:
         """Whether a step has its frame: a good one, or as many bad ones as are tried."""
@@ -298,12 +324,42 @@ class Acquisition:
                     break
             return found
 
+    def _move(self, position: Mapping[str, float]) -> None:
+        axes = self.one(Turntable).axes
+
+        def there() -> None:
+            statuses = [axes[axis].set(value) for axis, value in position.items()]
+            failures = [status.exception(None) for status in statuses]
+            for failure in failures:
+                if failure is not None:
+                    raise failure
+
+        self._persist(there)
+
+    def _home(self) -> None:
+        table: Turntable = self.one(Turntable)
+        for axis in table.axes:
+            if not self._persist(lambda axis=axis: table.state(axis)).homed:  # type: ignore[misc]
+                self.watch("home", {"axis": axis})
+                self._persist(lambda axis=axis: table.home(axis))  # type: ignore[misc]
+
+    def _persist(self, work: Callable[[], T]) -> T:
+        """The outcome of a work that may be begun anew; what passes is tried again, and told."""
+        for tried in range(_TRIES):
+            try:
+                return work()
+            except (ConnectionLost, DeadlineError, ProtocolError) as error:
+                if tried == _TRIES - 1 or self._resting:
+                    raise
+                self.watch("again", {"why": str(error)})
+        raise AssertionError
+
     def _taken(self, step: Step, take: int, average: int) -> ArchivedFrame:
         if self._resting:
             raise StateError("the bench was brought to rest", where=step.name)
         camera: Camera = self.one(Camera)
         before = self._position()
-        exposures = [camera.expose() for _ in range(average)]
+        exposures = [self._persist(camera.expose) for _ in range(average)]
         moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
         frame = _mean([each.frame for each in exposures], step.name)
         first = exposures[0]
@@ -324,7 +380,7 @@ class Acquisition:
         if not self.has(Turntable):
             return {}
         table: Turntable = self.one(Turntable)
-        return {axis: round(table.state(axis).position, 6) for axis in table.axes}
+        return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
 
     def _judged(self, found: ArchivedFrame, step: Step) -> Verdict:
         """The verdict on a frame; the procedure sees each once, also those of before a resumption."""
@@ -365,11 +421,11 @@ class Acquisition:
             if there is not None:
                 return there
             if kind == "screen":
-                screen = self.one(Oscilloscope).screen()
+                screen = self._persist(self.one(Oscilloscope).screen)
                 clock = {"taken": screen.taken.isoformat()}
                 return self.kept.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
             if kind == "scan":
-                scan = self.one(UltrasonicScanner).scan()
+                scan = self._persist(self.one(UltrasonicScanner).scan)
                 facts = {
                     "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
                     "origin_px": list(scan.origin_px),
@@ -405,7 +461,7 @@ class Acquisition:
             begun = len(self.kept.frames(kind="check"))
             frames = []
             for k in range(begun, begun + count):
-                exposure = camera.expose()
+                exposure = self._persist(camera.expose)
                 frame = _mean([exposure.frame], f"check {k}")
                 self.kept.store(f"check {k}", frame, kind="check", clock=_clock([exposure]))
                 frames.append(frame)

@@ -173,7 +173,7 @@ class Bench:
         made, failures = {}, []
         for name, entry in file.instruments.items():
             try:
-                made[name] = (build or _built)(name, entry)
+                made[name] = (build or built)(name, entry)
             except ReseauError as error:
                 failures.append(error)
         for each in made.values():
@@ -263,8 +263,14 @@ class Bench:
             return dict(zip(self.instruments, pool.map(outcome, self.instruments.values()), strict=True))
 
 
-def _built(name: str, entry: InstrumentEntry) -> Instrument:
-    """The driver of an entry, not connected yet."""
+def built(name: str, entry: InstrumentEntry) -> Instrument:
+    """The driver of an entry, not connected yet.
+
+    Raises
+    ------
+    ReseauError
+        When there is no such driver, or the entry does not fit it.
+    """
     make = plugin(INSTRUMENTS, entry.driver)
     try:
         made = make(name, entry.address, settings=entry.settings, limits=entry.limits, **entry.options)

@@ -7,15 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ..errors import StateError
+from ..errors import EstimationError, StateError
 from .acquisition import Acquisition, Plan
 from .goal import Goal
 from .step import Step
 
-__all__ = ["frames", "oscilloscope", "poses", "scan", "until"]
+__all__ = ["frames", "homed", "oscilloscope", "poses", "scan", "until"]
 
 _WORTH = 0.01
 """By what share a standard deviation must be lowered for a pose to help."""
+
+
+def homed(run: Acquisition, plan: Plan) -> Plan:
+    """A plan before which axes without a reference find it."""
+    yield from run.home()
+    return (yield from plan)
 
 
 def _ready(run: Acquisition, checks: int) -> Plan:
@@ -91,5 +97,8 @@ def oscilloscope(run: Acquisition, body: bool = True, average: int = 1, checks: 
             yield from _ready(run, checks)
         else:
             yield from run.pictures(step, "scan")
-        yield from run.at(step, average)
+        found = yield from run.at(step, average)
+        verdict = run.verdict(found)
+        if not verdict.ok:
+            raise EstimationError(verdict.why, where=name)
         yield from run.pictures(step, "screen")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import signal
 import sys
 import threading
@@ -20,6 +21,9 @@ from ..errors import InstrumentError, ReseauError
 from .acquisition import Acquisition, Plan
 
 __all__ = ["Decision", "carry_out"]
+
+# What goes wrong is told once, by the error that is raised; the engine would print it as well.
+logging.getLogger("bluesky").addHandler(logging.NullHandler())
 
 Decision = Literal["resume", "stop", "abort"]
 """What is to become of a paused acquisition; stopping keeps it for `--resume`, and so does aborting."""
@@ -77,6 +81,7 @@ def carry_out(
         run.ready()
         with contextlib.redirect_stdout(sys.stderr), _terminated(engine, ended, in_main):
             outcome = _engaged(engine, _whole(run, plan, park or {}), about or {}, paused, ended)
+        run.settle()
         status = "stopped" if outcome is None else "done"
         if outcome is not None:
             _keep_results(run)
@@ -92,6 +97,7 @@ def carry_out(
         raise
     finally:
         run.rest()
+        run.settle()
 
 
 def _whole(run: Acquisition, plan: Plan, park: Mapping[str, float]) -> Plan:

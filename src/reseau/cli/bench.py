@@ -78,6 +78,12 @@ def sim(
     seed: Annotated[int, typer.Option(help="Of the simulated world.")] = 0,
     table: Annotated[str, typer.Option(help="Whose controllers move the table: zaber, smc100.")] = "zaber",
     family: Annotated[str, typer.Option(help="Of the oscilloscope: keysight, rigol-1000z, …")] = "keysight",
+    camera: Annotated[
+        str, typer.Option(help="What a camera looks at: screen, testfield; by default there is none.")
+    ] = "",
+    repeatable: Annotated[
+        bool, typer.Option("--repeatable", help="The same state gives the same picture; nothing drifts.")
+    ] = False,
     seconds: Annotated[float, typer.Option(min=0.0, help="Serve so long; 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print the bench.toml that leads to them."""
@@ -88,7 +94,10 @@ def sim(
 
     if out is not None:
         writable(out)
-    with plugin("reseau.simulators", "bench")(seed, table, family) as bench:
+    options = {"table": table, "family": family, "camera": camera or None, "repeatable": repeatable}
+    with plugin("reseau.simulators", "bench")(seed, **options) as bench:
+        if camera and "[instruments.camera]" not in bench.toml:
+            typer.echo("no camera: Aravis is not installed", err=True)
         if out is not None:
             write_whole(out, bench.toml)
         else:

@@ -101,6 +101,9 @@ def coded_field(
     average: Average = 1,
     checks: Checks = 3,
     retakes: Retakes = 2,
+    home: Annotated[
+        bool, typer.Option("--home", help="Have axes without a reference find it first: they will move.")
+    ] = False,
     park: Annotated[str, typer.Option(help="Where the table ends, as tilt=0,roll=0; else it stays.")] = "",
     camera: CameraName = None,
     objects: ObjectsPlace = None,
@@ -128,15 +131,18 @@ def coded_field(
             "average": average,
             "checks": checks,
             "retakes": retakes,
+            "home": home,
             "park": _position(park),
         }
 
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
-        every = steps_of(given)
-        if not given["until"]:
-            return plans.poses(run, every, given["average"], given["checks"])
-        goal, begin = Goal.parse(given["until"]), spread(every, given["first"])
-        return plans.until(run, goal, begin, every, given["average"], given["checks"])
+        every, how = steps_of(given), (given["average"], given["checks"])
+        if given["until"]:
+            goal, begin = Goal.parse(given["until"]), spread(every, given["first"])
+            plan = plans.until(run, goal, begin, every, *how)
+        else:
+            plan = plans.poses(run, every, *how)
+        return plans.homed(run, plan) if given["home"] else plan
 
     where = _Where(archive, objects, bench, name, camera, resume, as_json)
     _conduct(where, "testfield", planned, parameters, {"design.json": design})

@@ -1,73 +1,31 @@
-"""`reseau demo`: the whole oscilloscope procedure on a simulated bench, and what it is worth."""
+"""`reseau demo`: a simulated bench over its real protocols: capture, refine, bundle, report."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import AsJson, points_csv, progress, required, say
+from .common import AsJson, points_csv, progress, say
 
 if TYPE_CHECKING:
     from ..data import Frame
-    from ..formats import ReseauDesign, ReseauMeasurement
-    from ..optics import PlaneMapping
-    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+    from ..formats import ReseauMeasurement
     from ..provenance import Provenance
-    from ..report.truth import Comparison, KnownPoints
+    from ..report.truth import Comparison
+    from .simulated import OscilloscopeSession, TestfieldSession
 
 __all__ = ["demo"]
 
-_BENCH = "simulated-bench"
-
-
-class Bench(Protocol):
-    """What the demo needs of a simulated bench; see the entry point ``simulated-bench``."""
-
-    @property
-    def design(self) -> ReseauDesign:
-        """The reseau in front of the screen."""
-
-    @property
-    def test_object(self) -> ReseauDesign:
-        """The rods of the test object, as designed."""
-
-    def photo_i(self) -> Frame:
-        """PHOTO I."""
-
-    def photo_ii(self) -> Frame:
-        """PHOTO II."""
-
-    def photo_iii(self) -> Frame:
-        """PHOTO III, of a body that nobody has measured."""
-
-    def check_marks(self) -> tuple[str, ...]:
-        """Marks to hold out."""
-
-    def view(self) -> PlaneMapping:
-        """The truth: from the plane of the reseau to the image."""
-
-    def truth_ii(self) -> KnownPoints:
-        """The truth: the rods as they were made, and where PHOTO II shows them."""
-
-    def truth_iii(self) -> KnownPoints:
-        """The truth: the points of the body."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Done:
-    """The three photographs and what came out."""
-
-    frames: tuple[Frame, Frame, Frame]
-    first: PhotoI
-    second: PhotoII
-    third: PhotoIII
+_STEPS = 18
+"""Fifteen frames, comparison, report, and the end."""
 
 
 def demo(
@@ -75,79 +33,93 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="Of all that is random; same seed, same bytes.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Refine the photographs of a simulated bench factor by factor, and compare with the truth."""
+    """Capture, refine and adjust on a simulated bench over its real protocols, and compare with the truth."""
     from ..adjust.threads import one_thread
     from ..errors import InputError
     from ..provenance import canonical_json
-    from ..report.comparison import compare_with_truth
     from ..report.summary import comparison_table
-    from ..report.truth import Known
 
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=out, do="name a folder")
     if not out.absolute().parent.is_dir():
         raise InputError("has no such folder", where=out.parent, do="create it first")
     # Small matrices throughout, from drawing the wires on: several threads only wait for one another.
-    with one_thread(), progress("photographing", 6) as step:
-        bench = _bench(seed)
-        done = _refined(bench, step)
+    with one_thread(), progress("photographing", _STEPS) as step, _draft_of(out) as draft:
+        done, field = _captured(draft, seed, step)
         step("comparing with the truth")
-        known = Known(bench.view(), bench.truth_ii(), (bench.truth_iii(),))
-        truth = compare_with_truth(
-            known, done.first, bench.design, done.second, bench.test_object, (done.third,)
-        )
+        truth = _compared(done)
         step("writing the report")
-        _write_folder(out, done.frames, _documents(bench, done, truth, seed))
+        _write_draft(draft, done.frames, _documents(done, field, truth, seed))
         step()
+        _put(draft, out)
     if as_json:
-        say(canonical_json(truth.to_dict()))
+        say(canonical_json(truth.to_dict() | {"testfield": _testfield(field)}))
     else:
         say(comparison_table(truth))
-        say(f"\nopen {out / 'report.html'}\n")
+        say(_camera_table(field))
+        say(f"\n{done.way}; every frame is in {out / 'archive'}\nopen {out / 'report.html'}\n")
 
 
-def _bench(seed: int) -> Bench:
-    """The simulated bench, found by its entry point.
+def _captured(
+    draft: Path, seed: int, step: Callable[[str | None], None]
+) -> tuple[OscilloscopeSession, TestfieldSession]:
+    """Both sessions, into an archive in the folder."""
+    from ..archive import Archive
+    from .simulated import captured_oscilloscope, captured_testfield
 
-    Raises
-    ------
-    UsageError
-        When no installed package offers one.
-    """
-    from importlib.metadata import entry_points
+    def watch(kind: str, facts: dict[str, Any]) -> None:
+        if kind == "frame":
+            step(f"{facts['step']}: {facts.get('points', 0)} points")
 
-    from ..errors import UsageError
-
-    found = list(entry_points(group="reseau.instruments", name=_BENCH))
-    if not found:
-        raise UsageError(f"no installed package offers {_BENCH!r}", do="install reseau anew")
-    bench: Bench = found[0].load()(seed)
-    return bench
+    with Archive.open(draft / "archive", create=True) as archive:
+        return captured_oscilloscope(archive, seed, watch), captured_testfield(archive, seed, watch)
 
 
-def _refined(bench: Bench, step: Any) -> _Done:
-    """PHOTO I, II and III, one after the other."""
-    from ..procedures.oscilloscope import photo_i, photo_ii, photo_iii
+def _compared(done: OscilloscopeSession) -> Comparison:
+    from ..report.comparison import compare_with_truth
+    from ..report.truth import Known
 
-    one = bench.photo_i()
-    step("PHOTO I: the camera")
-    first = required(photo_i(one, bench.design, check=bench.check_marks()), one.name)
-    two = bench.photo_ii()
-    step("PHOTO II: the ultrasonic instrument")
-    second = required(photo_ii(two, bench.design, bench.test_object, first.camera), two.name)
-    three = bench.photo_iii()
-    step("PHOTO III: the body")
-    third = required(photo_iii(three, second.instrument, bench.design), three.name)
-    return _Done((one, two, three), first, second, third)
+    world = done.world
+    known = Known(world.view(), world.truth_ii(), (world.truth_iii(),))
+    return compare_with_truth(known, done.first, world.design, done.second, world.test_object, (done.third,))
 
 
-def _documents(bench: Bench, done: _Done, truth: Comparison, seed: int) -> dict[str, str | bytes]:
+def _testfield(field: TestfieldSession) -> dict[str, Any]:
+    """The camera's parameters beside their true values."""
+    import numpy as np
+
+    result = field.calibrated.result
+    names, _, values = result.camera_columns(0)
+    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    rows = zip(names, values.tolist(), sigma.tolist(), strict=True)
+    return {
+        "poses": field.poses,
+        "sigma0": result.sigma0,
+        "parameters": {n: {"value": v, "sigma": s, "true": field.true[n]} for n, v, s in rows},
+    }
+
+
+def _camera_table(field: TestfieldSession) -> str:
+    facts = _testfield(field)
+    lines = [f"\ntestfield, {facts['poses']} poses: sigma0 {facts['sigma0']:.3f}"]
+    for name, row in facts["parameters"].items():
+        off = (row["value"] - row["true"]) / row["sigma"]
+        known = f"{row['value']:13.6g} ± {row['sigma']:<9.2g} true {row['true']:<13.6g}"
+        lines.append(f"  {name:<4} {known} {off:+.1f} sigma")
+    return "\n".join(lines) + "\n"
+
+
+def _documents(
+    done: OscilloscopeSession, field: TestfieldSession, truth: Comparison, seed: int
+) -> dict[str, str | bytes]:
     """All that is written beside the photographs, by the names of the files."""
     from ..provenance import canonical_json
     from ..report import oscilloscope_report
+    from ..report.bundle import bundle_report
+    from ..report.camera import camera_section
     from ..report.overview import overview_png
 
-    provenance = _provenance(bench, done, seed)
+    bench, provenance = done.world, _provenance(done, seed)
     calibration = done.second.instrument.calibration(
         bench.design,
         bench.test_object,
@@ -165,21 +137,24 @@ def _documents(bench: Bench, done: _Done, truth: Comparison, seed: int) -> dict[
         title=f"The simulated bench, seed {seed}",
         provenance=provenance,
         truth=truth,
+        camera=camera_section(field.calibrated.result, field.poses, field.true),
     )
     overview = overview_png(done.first, done.second, bench.test_object, done.third, done.frames, truth)
     return {
         "report.html": page,
         "overview.png": overview,
+        "testfield.html": bundle_report(field.calibrated.searched, title=f"The testfield, seed {seed}"),
         "calibration.json": calibration.to_json(),
+        "camera.json": field.calibration,
         "reseau.json": bench.design.to_json(),
         "rods.json": bench.test_object.to_json(),
         "true.csv": points_csv(done.third.true),
-        "comparison.json": canonical_json(truth.to_dict()),
+        "comparison.json": canonical_json(truth.to_dict() | {"testfield": _testfield(field)}),
         **{f"{name}.json": document.to_json() for name, document in _measurements(done).items()},
     }
 
 
-def _measurements(done: _Done) -> dict[str, ReseauMeasurement]:
+def _measurements(done: OscilloscopeSession) -> dict[str, ReseauMeasurement]:
     """Image coordinates of the marks in PHOTO I, the rods in PHOTO II and the points in PHOTO III."""
     import numpy as np
 
@@ -198,9 +173,10 @@ def _measurements(done: _Done) -> dict[str, ReseauMeasurement]:
     return {"marks_i": marks.measurement(), "rods_ii": rods.measurement(), "points_iii": seen}
 
 
-def _provenance(bench: Bench, done: _Done, seed: int) -> Provenance:
+def _provenance(done: OscilloscopeSession, seed: int) -> Provenance:
     from ..provenance import Provenance, sha256_of
 
+    bench = done.world
     inputs = {frame.name: frame.sha256 for frame in done.frames}
     inputs |= {
         design.name: sha256_of(design.to_json().encode()) for design in (bench.design, bench.test_object)
@@ -208,8 +184,9 @@ def _provenance(bench: Bench, done: _Done, seed: int) -> Provenance:
     return Provenance(inputs, {"seed": seed, "check": list(bench.check_marks()), "alpha": 0.05})
 
 
-def _write_folder(out: Path, frames: tuple[Frame, ...], documents: dict[str, str | bytes]) -> None:
-    """Write all files beside their place first, then move them there: an error leaves what was before.
+@contextmanager
+def _draft_of(out: Path) -> Iterator[Path]:
+    """A folder beside the place, gone in the end: an error leaves what was before.
 
     Raises
     ------
@@ -217,25 +194,46 @@ def _write_folder(out: Path, frames: tuple[Frame, ...], documents: dict[str, str
         When the place cannot be written to.
     """
     from ..errors import InputError
-    from ..formats import write_whole
-    from ..images import write_image
 
     try:
         draft = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.absolute().parent))
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", where=out) from None
     try:
-        for number, frame in zip(("i", "ii", "iii"), frames, strict=True):
-            write_image(draft / f"photo_{number}.png", frame.pixels)
-        for name, content in documents.items():
-            write_whole(draft / name, content)
-        draft.chmod(0o755)
+        yield draft
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _write_draft(draft: Path, frames: tuple[Frame, ...], documents: dict[str, str | bytes]) -> None:
+    """Write all files."""
+    from ..formats import write_whole
+    from ..images import write_image
+
+    for number, frame in zip(("i", "ii", "iii"), frames, strict=True):
+        write_image(draft / f"photo_{number}.png", frame.pixels)
+    for name, content in documents.items():
+        write_whole(draft / name, content)
+    draft.chmod(0o755)
+
+
+def _put(draft: Path, out: Path) -> None:
+    """Move all that is in the draft to its place.
+
+    Raises
+    ------
+    InputError
+        When the place cannot be written to.
+    """
+    from ..errors import InputError
+
+    try:
         if not out.exists():
             draft.replace(out)
             return
         for path in sorted(draft.iterdir()):
+            if path.is_dir():
+                shutil.rmtree(out / path.name, ignore_errors=True)
             os.replace(path, out / path.name)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", where=out) from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)

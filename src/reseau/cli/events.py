@@ -81,6 +81,8 @@ class Display:
             self._say(f"next: {facts['step']}" if facts["step"] else "no pose is left")
         elif kind == "check":
             self._say("checks: " + ("; ".join(facts["faults"]) or "good"))
+        elif kind == "again":
+            self._say(f"once more: {facts['why']}")
         elif kind == "rest" and "failed" in facts:
             self._say(f"at rest, but: {facts['failed']}")
 

@@ -6,7 +6,7 @@ to the byte.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
@@ -228,6 +228,8 @@ class LiveOscilloscope:
         Of the calibration.
     options : mapping
         For its provenance.
+    check : iterable of str
+        Marks to be held out of PHOTO I.
     """
 
     def __init__(
@@ -237,8 +239,10 @@ class LiveOscilloscope:
         *,
         name: str,
         options: Mapping[str, Any] | None = None,
+        check: Iterable[str] = (),
     ) -> None:
         self.reseau, self.test_object, self.name = reseau, test_object, name
+        self._check = tuple(check)
         self._options, self._inputs = dict(options or {}), dict[str, str]()
         self.first: PhotoI | None = None
         self.second: PhotoII | None = None
@@ -255,7 +259,7 @@ class LiveOscilloscope:
 
     def _refined(self, frame: Frame, photo: str) -> PhotoI | PhotoII | PhotoIII | Failure:
         if photo == "PHOTO I":
-            one = photo_i(frame, self.reseau)
+            one = photo_i(frame, self.reseau, check=self._check)
             self.first = None if isinstance(one, Failure) else one
             return one
         if photo == "PHOTO II":

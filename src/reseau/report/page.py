@@ -36,6 +36,7 @@ def oscilloscope_report(
     title: str = "Oscilloscope images refined",
     provenance: Provenance | None = None,
     truth: Comparison | None = None,
+    camera: Row | None = None,
 ) -> str:
     """Render the report of as much of the procedure as was done.
 
@@ -59,6 +60,8 @@ def oscilloscope_report(
         Inputs, options, version.
     truth : Comparison, optional
         What a simulator knows.
+    camera : dict, optional
+        A camera calibrated in another session; see :func:`~reseau.report.camera.camera_section`.
 
     Returns
     -------
@@ -80,7 +83,9 @@ def oscilloscope_report(
     if second is not None and test_object is not None:
         more = _of_the_instrument(second, test_object, third, pictures[1:], truth)
     facts = (provenance or Provenance()).to_dict()
-    return _render(title=title, reseau=reseau, unit=reseau.unit, one=one, provenance=facts, **more)
+    return _render(
+        title=title, reseau=reseau, unit=reseau.unit, one=one, provenance=facts, camera=camera, **more
+    )
 
 
 def _of_the_instrument(

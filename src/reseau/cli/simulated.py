@@ -1,0 +1,192 @@
+"""Sessions on the simulated bench, over its real protocols: what `reseau demo` captures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ..errors import EstimationError
+
+if TYPE_CHECKING:
+    from ..archive import Archive, Session
+    from ..capture import InstrumentEntry, Plan, Procedure
+    from ..data import Frame
+    from ..formats import ReseauDesign
+    from ..instruments import Instrument
+    from ..optics import PlaneMapping
+    from ..procedures.calibration import Calibrated
+    from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+    from ..report.truth import KnownPoints
+
+__all__ = ["OscilloscopeSession", "TestfieldSession", "World", "captured_oscilloscope", "captured_testfield"]
+
+_POSES = 12
+_HALF_SECTOR = 100
+"""That the scanner's head sweeps over, gradians: what stands beside it is seen as well."""
+_PITCH_MM, _JITTER_PX, _FILL = 0.027, 0.0086, 0.8
+"""Of the camera before the testfield: the paper's."""
+
+
+class World(Protocol):
+    """What a simulated world knows; see the entry point ``bench`` of ``reseau.simulators``."""
+
+    @property
+    def design(self) -> ReseauDesign:
+        """The reseau in front of the screen."""
+
+    @property
+    def test_object(self) -> ReseauDesign:
+        """The rods of the test object, as designed."""
+
+    def check_marks(self) -> tuple[str, ...]:
+        """Marks to hold out."""
+
+    def view(self) -> PlaneMapping:
+        """The truth: from the plane of the reseau to the image."""
+
+    def truth_ii(self) -> KnownPoints:
+        """The truth: the rods as they were made, and where PHOTO II shows them."""
+
+    def truth_iii(self) -> KnownPoints:
+        """The truth: the points of the body."""
+
+
+@dataclass(frozen=True, eq=False)
+class OscilloscopeSession:
+    """The three photographs, and what came out."""
+
+    world: World
+    frames: tuple[Frame, ...]
+    first: PhotoI
+    second: PhotoII
+    third: PhotoIII
+    way: str
+
+
+@dataclass(frozen=True, eq=False)
+class TestfieldSession:
+    """The calibration of the camera before the testfield, and what its parameters truly are."""
+
+    calibrated: Calibrated
+    true: dict[str, float]
+    calibration: str
+    poses: int
+
+
+def _carried_out(
+    simulated: Any,
+    kept: Session,
+    procedure: Procedure,
+    planned: Callable[[Any], Plan],
+    watch: Callable[[str, dict[str, Any]], None],
+) -> None:
+    """Carry a plan out on a simulated bench; its tank is filled as the operator is asked to."""
+    from ..capture import Acquisition, Bench, BenchFile, BenchLock, carry_out
+
+    laboratory = simulated.laboratory
+    tanks = {"test object": lambda: laboratory.world.rods, "body": laboratory.world.body}
+
+    def operator(what: str) -> None:
+        for word, filled in tanks.items():
+            if word in what:
+                laboratory.tank = filled()
+
+    file = BenchFile.parse_toml(simulated.toml + _in_process(simulated), where="simulated bench")
+    addresses = [entry.address for entry in file.instruments.values()]
+    with BenchLock(addresses, "the demo"), Bench(file, _builder(simulated)) as bench:
+        bench["scanner"].configure(half_sector=_HALF_SECTOR)
+        run = Acquisition(bench, kept, procedure, scanner="scanner", watch=watch, operator=operator)
+        carry_out(run, planned(run))
+
+
+def _in_process(simulated: Any) -> str:
+    """The camera's entry where it cannot be reached from outside this process."""
+    if simulated.video is None:
+        return ""
+    return '\n[instruments.camera]\ndriver = "v4l2"\naddress = "in this process"\n'
+
+
+def _builder(simulated: Any) -> Callable[[str, InstrumentEntry], Instrument] | None:
+    """What makes the instruments: drivers by their entry points, the camera at its node in this process."""
+    from ..capture import plugin
+    from ..capture.bench import INSTRUMENTS, built
+
+    if simulated.video is None:
+        return None
+
+    def build(name: str, entry: InstrumentEntry) -> Instrument:
+        if name != "camera":
+            return built(name, entry)
+        made: Instrument = plugin(INSTRUMENTS, "v4l2")(name, simulated.video.open, seconds=30.0)
+        return made
+
+    return build
+
+
+def captured_oscilloscope(
+    archive: Archive, seed: int, watch: Callable[[str, dict[str, Any]], None]
+) -> OscilloscopeSession:
+    """PHOTO I, II and III of the simulated bench, taken over its protocols and refined as they came.
+
+    Raises
+    ------
+    EstimationError
+        When a photograph could not be refined.
+    """
+    from ..capture import plans, plugin
+    from ..procedures.live import LiveOscilloscope
+
+    with plugin("reseau.simulators", "bench")(seed, camera="screen", repeatable=True) as simulated:
+        world: World = simulated.laboratory.world
+        kept = archive.begin("oscilloscope", "oscilloscope", {"seed": seed}, simulated.toml)
+        live = LiveOscilloscope(
+            world.design, world.test_object, name="oscilloscope", check=world.check_marks()
+        )
+        _carried_out(simulated, kept, live, plans.oscilloscope, watch)
+        way = _way(simulated)
+    frames = tuple(kept.picture(f) for f in kept.frames(kind="frame") if f.verdict and f.verdict.ok)
+    if live.first is None or live.second is None or live.third is None:
+        raise EstimationError("the photographs could not all be refined", where="demo")
+    return OscilloscopeSession(world, frames, live.first, live.second, live.third, way)
+
+
+def captured_testfield(
+    archive: Archive, seed: int, watch: Callable[[str, dict[str, Any]], None]
+) -> TestfieldSession:
+    """A camera calibrated by recordings of the simulated testfield, taken over the bench's protocols.
+
+    Raises
+    ------
+    EstimationError
+        When the calibration fails.
+    """
+    from ..adjust import Failure
+    from ..capture import paper_steps, plans, plugin, spread
+    from ..procedures.calibration import CameraModel
+    from ..procedures.live import LiveTestfield
+    from ..procedures.measuring import measurer_of
+    from ..refine import TestfieldOptions
+
+    with plugin("reseau.simulators", "bench")(
+        seed, camera="testfield", repeatable=True, flat=True
+    ) as simulated:
+        field = simulated.laboratory.field
+        measure = measurer_of(field.design, TestfieldOptions(row_jitter_px=_JITTER_PX, fill=_FILL))
+        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (_PITCH_MM, _PITCH_MM))
+        kept = archive.begin("testfield", "testfield", {"seed": seed, "poses": _POSES}, simulated.toml)
+        live = LiveTestfield(field.design, measure, model, name="testfield")
+        steps = spread(paper_steps(), _POSES)
+        _carried_out(simulated, kept, live, lambda run: plans.homed(run, plans.poses(run, steps)), watch)
+        true = dict(zip(field.camera.names, field.camera.values.tolist(), strict=True))
+    found = live.calibrated()
+    if isinstance(found, Failure):
+        raise EstimationError(found.reason, where="testfield")
+    return TestfieldSession(found, true, live.finish()["calibration.json"], len(kept.frames(kind="frame")))
+
+
+def _way(simulated: Any) -> str:
+    """How frames came."""
+    if simulated.video is None:
+        return "GigE Vision"
+    return "Video4Linux, simulated in process (Aravis is not installed)"

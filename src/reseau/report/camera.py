@@ -1,0 +1,49 @@
+"""The section of a camera that was calibrated by a testfield, beside what its parameters truly are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from markupsafe import Markup
+
+from ..bundle import Lens, Result
+from .bundle_figures import distortion_figure, network_figure
+from .tables import Row
+
+__all__ = ["camera_section"]
+
+
+def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Row:
+    """What the template of the section shows.
+
+    Parameters
+    ----------
+    result : Result
+        Of the bundle adjustment; its network has one camera.
+    images : int
+        Frames that were taken.
+    true : mapping of str to float
+        Parameters as a simulator knows them.
+    """
+    names, _, values = result.camera_columns(0)
+    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    rows = [
+        (name, f"{value:.6g}", f"{s:.2g}", f"{true[name]:.6g}", f"{(value - true[name]) / s:+.2f}")
+        for name, value, s in zip(names, values, sigma, strict=True)
+    ]
+    errors = np.array([float(row[-1]) for row in rows])
+    return {
+        "images": images,
+        "points": len(result.network.xy),
+        "sigma0": f"{result.sigma0:.3f}",
+        "redundancy": result.redundancy,
+        "rows": rows,
+        "rms": f"{np.sqrt(np.mean(errors**2)):.2f}",
+        "network": Markup(network_figure(result)),
+        "distortion": _markup(distortion_figure(Lens.of_result(result, 0))),
+    }
+
+
+def _markup(figure: str | None) -> Markup | None:
+    return None if figure is None else Markup(figure)
