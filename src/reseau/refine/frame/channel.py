@@ -238,7 +238,7 @@ def _edge(
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
-    ends = _ENDS * float(np.exp(blur.width)) * max(part - _FEW_DRAWN, 0.0) if hidden else 0.0
+    ends = _ENDS * float(np.exp(blur.width)) * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
 

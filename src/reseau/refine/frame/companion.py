@@ -74,7 +74,7 @@ def edge_beside_line(
     -------
     (Companion or None, bool)
         The second tells whether a line could run so close to the edge all along that nothing parts the two:
-        all sections are described by a step at one place. With other things beside the edge they are not.
+        all sections are described by straight steps. With other things beside the edge they are not.
     """
     sections = _sections(grey - level[:, None], band, line, noise, width)
     if sections is None:
@@ -97,7 +97,7 @@ def edge_beside_line(
     # What lies behind the edge at one distance all along may be the scanner's own glare.
     there &= np.ptp(behind) > width
     if chi[best] > _MOST_MISFIT or without < _LEAST_GAIN * chi[best] or not there:
-        return None, without < _MOST_MISFIT
+        return None, min(without, float(chi[best])) < _MOST_MISFIT
     ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     covariance = ends @ cofactor[best, :2, :2] @ ends.T * _TOGETHER**2
     fitted = np.interp([-1.0, 1.0], band.place, line)
