@@ -9,6 +9,8 @@ import pytest
 
 from reseau.adjust import compare
 from reseau.bundle import Additional, Camera, Network, Result, adjust_network, by_place, common_pattern
+from reseau.bundle.selection import Selection, eliminate_parameters
+from reseau.bundle.system import residuals
 from reseau.data import Array
 from reseau.optics.poses import matrix_to_vector
 
@@ -153,3 +155,34 @@ def test_a_bend_of_the_board_itself_is_in_the_heights_within_their_sigma() -> No
     assert np.median(sigma[free]) < 0.1
     assert np.abs(off[free] / sigma[free]).max() < 4.5
     assert np.abs(true[free] / sigma[free]).max() > 8
+
+
+def test_additional_parameters_that_are_not_needed_are_dropped_one_by_one() -> None:
+    """Of a lens with b3 and b7 alone these stay, and nothing else changes but the redundancy."""
+    network = paper(noise=0.04)
+    camera = network.cameras[0]
+    free = replace(network, cameras=(replace(camera, additional=Additional(BASE, True, "camera")),))
+    true = np.zeros((1, 12))
+    true[0, 2], true[0, 6] = 2e-4, -1.5e-4
+    plain = adjusted(free)
+    system = plain.fit.linear.system
+    values = replace(plain.fit.values, extra=true)
+    rows = np.arange(len(network.xy))
+    bent = residuals(network=free, unknowns=system.unknowns, rows=rows, values=values) - residuals(
+        network=free, unknowns=system.unknowns, rows=rows, values=replace(values, extra=0 * true)
+    )
+    found = eliminate_parameters(replace(free, xy=free.xy + bent), alpha=1e-4)
+    assert isinstance(found, Selection)
+    extra = found.network.cameras[0].additional
+    assert extra is not None
+    assert {f"b{k + 1}" for k in range(12)} - extra.dropped == {"b3", "b7"}
+    result = found.result
+    assert result.redundancy == plain.redundancy + 10
+    assert result.fit.redundancy_numbers.sum() == pytest.approx(result.redundancy, abs=1e-6)
+    names, _, values_found = result.camera_columns(0)
+    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    kept = np.array([name in ("b3", "b7") for name in names])
+    assert (values_found[~kept] == 0).all()
+    assert (sigma[~kept] == 0).all()
+    assert (np.abs(values_found - true[0])[kept] < 4 * sigma[kept]).all()
+    assert 0.94 < result.sigma0 < 1.06

@@ -180,6 +180,7 @@ def test_the_model_is_searched(reseau: Run, measured: tuple[Path, ...], tmp_path
     assert (status, err) == (0, "")
     assert "sigmas of x times " in out
     assert "cross-validation" in out
+    assert "of points at 1500 mm to " in out
     content = json.loads((tmp_path / "K.json").read_text())["validity"]
     assert {step["name"] for step in content["eliminated"]} == {"K2", "P1", "P2"}
     assert content["cross_validation"]["kept"] < content["cross_validation"]["all"]
@@ -249,6 +250,7 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
         (("--pitch", 0.027, "--free", "c,fx"), "fx: is none of c, x0"),
         (("--side", "inner", "--pitch", 0.027), "write `object` or `image`"),
         (("--size", "large"), "write 640x480"),
+        (("--distance", -3), "-3 is not above zero"),
     ],
 )
 def test_wrong_options_are_named(

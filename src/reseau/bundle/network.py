@@ -31,11 +31,18 @@ class Additional:
         Whether they are estimated; otherwise they are zero.
     per : {"camera", "group", "image"}
         What has a set of its own.
+    dropped : frozenset of str
+        Those that stay zero, as a result names them: ``b3``, or ``b3 of group G`` of a set per group.
     """
 
     base_mm: float
     free: bool = True
     per: Literal["camera", "group", "image"] = "camera"
+    dropped: frozenset[str] = frozenset()
+
+    def name(self, k: int, label: str) -> str:
+        """What the k-th parameter of a set is called, k from 0, of what the label says."""
+        return f"b{k + 1}" if self.per == "camera" else f"b{k + 1} of {label}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,8 @@ __all__ = ["BundleFit", "BundleProblem"]
 
 # Points that run off to infinity are left out so many times.
 _ROUNDS = 12
+# Corrections tried after which an adjustment that has not converged is asked for points that creep.
+_ENOUGH = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +238,7 @@ class _Run:
             [self.network.cov], self.weights[: 2 * n].reshape(n, 2)[self.usable.observations].ravel()
         )
         factors = self.weights[2 * n :][self.in_further]
-        self.system = System(self.unknowns, further, mine, factors, np.zeros(self.unknowns.size, dtype=bool))
+        self.system = System(self.unknowns, further, mine, factors, self.unknowns.dropped.copy())
 
     def adjust(self) -> BundleFit | Failure:
         problem, network = self.problem, self.network
@@ -262,9 +264,11 @@ class _Run:
         if isinstance(found, Failure):
             return found
         # What hardly any angle determines creeps on for ever, and what it creeps on is noise.
-        away = found.away if found.converged else creeping_points(found.linear)
+        away = found.away if found.converged else self._creeping(found)
         if len(away) and problem.rounds < _ROUNDS:
-            return self._without(away, found.values).adjusted()
+            again = self._without(away, found.values).adjusted()
+            if found.converged or again:
+                return again
         if not found.converged:
             reason = f"has not converged in {found.iterations} iterations"
             return Failure(reason, iterations=found.iterations, costs=found.costs)
@@ -286,6 +290,11 @@ class _Run:
                 return self._without(weak, values).adjusted()
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def _creeping(self, found: Iterated) -> Rows:
+        """Points without which an iteration that was given time enough may come to its end."""
+        none = np.zeros(0, dtype=np.intp)
+        return creeping_points(found.linear) if found.iterations >= _ENOUGH else none
 
     def _without(self, points: Rows, values: Values) -> BundleProblem:
         """The problem begun at the estimates, without points whose rays turn out to be parallel."""
@@ -314,7 +323,9 @@ class _Run:
         observations = int((self.weights > 0).sum())
         free = ~network.held & part[:, None]
         kept = self.unknowns.kept >= 0
-        unknowns = self.unknowns.size - 3 * int(kept.sum()) + int(free.sum())
+        unknowns = (
+            self.unknowns.size - int(self.unknowns.dropped.sum()) - 3 * int(kept.sum()) + int(free.sum())
+        )
         return observations, unknowns, freedom.defect if network.datum != "control" else 0
 
     def _aligned(self, values: Values, freedom: Freedom, chosen: Mask) -> Values:

@@ -80,8 +80,12 @@ def creeping_points(linear: Linear) -> Rows:
 
 def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
     """Which points (p,), images held, are so many times as uncertain as the median of the chosen ones."""
-    v = _own_normals(linear)
-    rows = np.flatnonzero(chosen & (linear.system.pattern.eliminated == 1))
+    v, movable = _own_normals(linear), linear.system.movable > 0
+    # Held coordinates are as certain as can be: they must not count as what no ray determines.
+    largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
+    j, axis = np.nonzero(~movable)
+    v[j, axis, axis] = largest[j]
+    rows = np.flatnonzero(chosen & movable.any(axis=1) & (linear.system.pattern.eliminated == 1))
     size = np.zeros(len(chosen))
     size[rows] = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(v[rows])[:, 0], np.finfo(float).tiny))
     median = float(np.median(size[rows])) if len(rows) else 0.0

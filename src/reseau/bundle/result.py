@@ -87,10 +87,9 @@ class Result:
             names += list(camera.free)
             columns += list(unknowns.camera[c] + np.arange(count))
             found += values.cameras[c, unknowns.free[c, :count]].tolist()
-        own = camera.additional is not None and camera.additional.per == "camera"
         for e, (owner, label) in enumerate(unknowns.extra_names):
-            if owner == c and unknowns.extra[e] >= 0:
-                names += [f"b{i + 1}" + ("" if own else f" of {label}") for i in range(EBNER)]
+            if owner == c and unknowns.extra[e] >= 0 and camera.additional is not None:
+                names += [camera.additional.name(i, label) for i in range(EBNER)]
                 columns += list(unknowns.extra[e] + np.arange(EBNER))
                 found += values.extra[e].tolist()
         return tuple(names), np.array(columns, dtype=np.intp), np.array(found)

@@ -63,7 +63,7 @@ def eliminate_parameters(
 ) -> Selection | Failure:
     """Drop the least significant distortion, adjust again, and so on until all that remain are significant.
 
-    Sets of additional parameters stay whole; their single tests are in :meth:`Result.camera_tests`.
+    Additional parameters are dropped one by one too, of each set by itself.
 
     Parameters
     ----------
@@ -98,14 +98,17 @@ def eliminate_parameters(
 def _weakest(network: Network, result: Result, alpha: float) -> tuple[int, CoefficientTest] | None:
     tests = [
         (c, test)
-        for c, camera in enumerate(network.cameras)
+        for c in range(len(network.cameras))
         for test in result.camera_tests(c, alpha)
-        if test.name in camera.free and not test.significant
+        if not test.significant
     ]
     return max(tests, key=lambda found: found[1].p, default=None)
 
 
 def _without(camera: Camera, name: str) -> Camera:
+    extra = camera.additional
+    if name not in camera.free and extra is not None:
+        return replace(camera, additional=replace(extra, dropped=extra.dropped | {name}))
     values = camera.values.copy()
     values[camera.names.index(name)] = 0.0
     sigma = {key: s for key, s in camera.sigma.items() if key != name}

@@ -126,6 +126,16 @@ class Unknowns:
         """Number of the free parameters of each camera (c,)."""
         return np.array([len(camera.free) for camera in self.network.cameras], dtype=np.intp)
 
+    @cached_property
+    def dropped(self) -> Mask:
+        """Columns (u,) of additional parameters that stay zero."""
+        held = np.zeros(self.size, dtype=bool)
+        for (c, label), at in zip(self.extra_names, self.extra, strict=True):
+            extra = self.network.cameras[c].additional
+            if at >= 0 and extra is not None and extra.dropped:
+                held[at : at + EBNER] = [extra.name(k, label) in extra.dropped for k in range(EBNER)]
+        return held
+
     @property
     def width(self) -> int:
         """Entries in a ray's row of derivatives."""

@@ -16,6 +16,7 @@ from .bundle_options import (
     component_kind,
     level_of,
     outputs,
+    positive,
     say_left_out,
     say_model,
 )
@@ -48,6 +49,7 @@ def bundle(
 
     level_of(alpha, "--alpha")
     outputs(out, report)
+    distance = positive(distance)
     content = read_network(network)
     with progress("adjusting", 30) as step:
         options = Options(

@@ -22,6 +22,7 @@ __all__ = [
     "component_kind",
     "level_of",
     "outputs",
+    "positive",
     "say_difference",
     "say_left_out",
     "say_model",
@@ -89,6 +90,22 @@ def outputs(out: Path | None, report: Path | None) -> None:
     for path, suffixes in ((out, (".json",)), (report, (".html",))):
         if path is not None:
             suffix_of(writable(path), suffixes)
+
+
+def positive(distances: list[float] | None) -> list[float]:
+    """Distances, asked before the work begins.
+
+    Raises
+    ------
+    UsageError
+        When one is not above zero.
+    """
+    from ..errors import UsageError
+
+    for distance in distances or []:
+        if not distance > 0:
+            raise UsageError(f"{distance:g} is not above zero", where="--distance")
+    return distances or []
 
 
 def say_left_out(result: Result) -> None:

@@ -17,6 +17,7 @@ from .bundle_options import (
     component_kind,
     level_of,
     outputs,
+    positive,
     say_difference,
     say_left_out,
     say_model,
@@ -82,6 +83,7 @@ def calibrate(
     from ..refine import TestfieldOptions
 
     outputs(out, report)
+    distance = positive(distance)
     target, kind = _design(design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
     level = level_of(eliminate, "--eliminate")
@@ -104,7 +106,7 @@ def calibrate(
     if as_json:
         say(calibration.to_json())
     else:
-        _say(done, differences)
+        _say(done, differences, distance or [])
 
 
 def _provenance(inputs: list[Path], **settings: Any) -> Provenance:
@@ -231,10 +233,10 @@ def _differences(done: Calibrated, others: dict[str, Lens]) -> dict[str, FieldDi
     }
 
 
-def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
+def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
     import numpy as np
 
-    from ..bundle import Lens, projection_field, sigma_between_images
+    from ..bundle import Lens, projection_field, projection_field_at, sigma_between_images
 
     result = done.result
     count = sum(len(points) for points in done.measured.values())
@@ -251,6 +253,10 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference]) -> None:
     sigma = projection_field(Lens.of_result(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
+    for away in distances:
+        sigma = projection_field_at(result, 0, away).sigma
+        middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
+        say(f"  of points at {away:g} {result.network.unit} to {middle:.2g} px, {worst:.2g} px at worst\n")
     say_model(done.searched)
     for name, found in differences.items():
         say_difference(name, found)
