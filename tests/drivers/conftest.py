@@ -11,7 +11,7 @@ from reseau_sims.serving import KINDS
 HEAD = """\
 # Faults: what happens
 
-Written by `python benchmarks/faults.py --exchanges 10000`; every cell is one or more tests of `test_battery.py`.
+By `python benchmarks/faults.py --exchanges 10000`; each cell is one or more tests of `test_battery.py`.
 A fault befalls an answer in the middle of the driver's work: in process the 1st, 2nd, 3rd and 5th after the
 work began, elsewhere the 3rd. In a cell stands what came of it, and the longest time until it was known:
 *right*, the work was done as if nothing had happened, or the error of the tree, which names instrument and
