@@ -394,3 +394,17 @@ def test_a_block_without_datum_is_refused_with_what_is_missing(published: Callab
     assert not fit
     for word in ("rank defect 7", "position in X", "rotation about Z", "scale"):
         assert word in fit.reason
+
+
+def test_held_coordinates_are_no_weakness_of_their_points() -> None:
+    """A free network some of whose coordinates are held all the same: none of its points leaves the datum."""
+    world = networks.world(datum="free", control=0)
+    sigma = world.network.sigma.copy()
+    sigma[[0, 3, 7], 2] = 0.0
+    xyz = np.where(sigma == 0, world.xyz, world.network.xyz)
+    network = replace(world.network, sigma=sigma, xyz=xyz)
+    fit = required(replace(world, network=network).problem())
+    assert fit.datum is not None
+    assert fit.datum.all()
+    assert fit.counts[2] == 3 + 1
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
