@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 import subprocess
 import time
@@ -11,8 +12,10 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
+from reseau.data import Frame
 from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, UsageError
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import AravisSettings, aravis
@@ -220,6 +223,27 @@ def test_where_nobody_answers_it_is_said() -> None:
         gige_camera(stack, CameraBody()).pull_plug()
         with pytest.raises(InstrumentError, match="camera"):
             aravis("camera", "127.0.0.1").connect(2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_thousands_of_large_frames_leave_memory_flat_and_none_is_damaged() -> None:
+    """`benchmarks/gige.py` compares rates and CPU; here is what must hold."""
+    count = int(os.environ.get("RESEAU_FRAMES", "5000"))
+    noise = np.random.default_rng(1).integers(0, 256, (2048, 2048), np.uint8)
+    settings = {"width": 2048, "height": 2048, "rate": 60.0, "packet_size": 8192, "exposure_us": 10_000.0}
+    memory = []
+    with ExitStack() as stack:
+        address = gige_camera(stack, CameraBody(Still(Frame(noise, 255.0)), 2048, 2048)).address
+        camera = stack.enter_context(aravis("camera", address, settings=settings, seconds=20.0))
+        first = last = camera.expose()
+        for number, shot in enumerate(camera.frames(count)):
+            assert (shot.pixels == noise).all()
+            last = shot
+            if number % (count // 10) == 0:
+                memory.append(psutil.Process().memory_info().rss / 1e6)
+    assert last.sequence - first.sequence == count + last.dropped - first.dropped
+    assert memory[-1] - memory[2] < 20.0
 
 
 def _program(name: str) -> str:

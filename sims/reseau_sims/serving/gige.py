@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes.util
 import fcntl
+import importlib.util
 import mmap
 import os
 import subprocess
@@ -39,7 +40,12 @@ _AN_HOUR_NS = 3_600_000_000_000
 
 
 def aravis_is_installed() -> bool:
-    """Whether the library is there."""
+    """Whether the library is there, and what programs in Python use it with."""
+    typelibs = any(Path("/usr/lib").glob("*/girepository-1.0/Aravis-0.8.typelib"))
+    return _library_is_there() and typelibs and importlib.util.find_spec("gi") is not None
+
+
+def _library_is_there() -> bool:
     return ctypes.util.find_library("aravis-0.8") is not None
 
 
@@ -64,7 +70,7 @@ class GigeCamera:
     ADDRESS = "127.0.0.1"
 
     def __init__(self, body: CameraBody, *, serial: str = "SIM1", patience_s: float = 0.0) -> None:
-        if not aravis_is_installed():
+        if not _library_is_there():
             raise UsageError("Aravis is not installed", do="apt-get install libaravis-0.8-0")
         self.body, self._serial = body, serial
         self.frames = 0

@@ -206,6 +206,11 @@ class CameraBody:
         self.before_change: list[Callable[[], None]] = []
         self._sight: Sight = sight or Pattern(width, height)
 
+    @property
+    def sight(self) -> Sight:
+        """What it looks at."""
+        return self._sight
+
     def look_at(self, sight: Sight) -> None:
         """Turn it to something else."""
         with self.lock:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,11 @@ from reseau.errors import InstrumentError, ProtocolError, RefusedError
 from reseau_drivers.camera import v4l2, video_devices
 from reseau_sims.serving import Pattern
 
+from .gadget import settle
 from .lab import steer, value
 
 FORMATS = {"GREY": "GREY", "Y16": "Y16 "}
-PATIENCE_S = 20.0
+PATIENCE_S = 40.0
 """After a change until it is seen: frames go through the loop's buffers, slowly in emulation."""
 
 
@@ -180,12 +182,23 @@ def test_v4l2_ctl_captures_the_same_frame(grey: str, tmp_path: Any) -> None:
     assert file.read_bytes() == wanted.tobytes()
 
 
-def test_a_disconnected_camera_is_said(grey: str) -> None:
-    # The last one: the virtual driver stays disconnected.
-    with v4l2("camera", grey) as camera:
+def test_unplugged_and_plugged_in_again_it_is_set_as_before(grey: str) -> None:
+    with v4l2("camera", grey, settings={"brightness": 140}) as camera:
         camera.expose()
         steer("camera._set", "Disconnect", 1)
         for _ in range(2):
             with pytest.raises(InstrumentError) as caught:
                 camera.expose(3.0)
             assert caught.value.instrument == "camera"
+        # The virtual driver stays disconnected until it is loaded anew.
+        steer("stop_camera")
+        busybox, line = "/run/busybox", Path("/proc/cmdline").read_text().split()
+        options = next(word for word in line if word.startswith("rig.mod.vivid=")).split("=", 1)[1].split(",")
+        subprocess.run([busybox, "rmmod", "vivid"], check=True)
+        subprocess.run([busybox, "insmod", "/run/modules/vivid.ko", *options], check=True)
+        settle()
+        assert steer("start_camera", "GREY") == grey
+        steer("look_at", 31)
+        _seen(camera, 31)
+        assert value("camera.view").offset == 12.0
+        assert camera.reconnections >= 2

@@ -135,9 +135,13 @@ class LoopCamera:
         try:
             # Not by write(): the driver in Linux 6.1 answers EINVAL.
             maps = list(self._maps())
-            free, on = list(range(len(maps))), False
+            free, on, drawn, picture = list(range(len(maps))), False, None, b""
             while not self._stop.is_set():
-                picture = np.ascontiguousarray(self._body.draw(self.view), self._type).tobytes()
+                # Drawn anew only when something changed: the emulated processor has others to serve.
+                wanted = self._body.sight, self.view
+                if wanted != drawn:
+                    drawn = wanted
+                    picture = np.ascontiguousarray(self._body.draw(wanted[1]), self._type).tobytes()
                 if not free:
                     done = _buffer()
                     fcntl.ioctl(self._out, DQBUF, done)  # when the driver has shown it

@@ -1,0 +1,170 @@
+"""Frames of 2048 × 2048 pixels over GigE Vision: our driver beside Aravis's own client, on the same loopback.
+
+    python benchmarks/gige.py [--frames 300] [--rounds 3]
+
+In each round both receive from the same simulated camera, which sends as fast as it can; the rates of whole
+frames are compared, and CPU seconds of a frame. Afterwards a long series by our driver, in blocks: CPU and
+memory must not grow, every frame must be to the bit what was sent or be counted as lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import numpy as np
+import psutil
+
+from reseau_drivers.camera import Camera, aravis
+from reseau_sims.serving import CameraBody, GigeCamera, View
+
+SIZE = 2048
+SECONDS = 8.0
+RATE = 120.0
+PACKET = 8192
+BLOCKS = 10
+
+
+class Numbered:
+    """A noisy picture whose first pixels are its number."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.noise = np.random.default_rng(1).integers(0, 256, (SIZE, SIZE), np.uint8)
+
+    def __call__(self, view: View) -> np.ndarray:
+        """The picture."""
+        self.number += 1
+        picture = self.noise[: view.height, : view.width]
+        picture[0, :4] = np.frombuffer(self.number.to_bytes(4, "little"), np.uint8)
+        return picture
+
+
+def serve(ready: Connection) -> None:
+    """The simulated camera, in a process of its own: it is not to take our client's time."""
+    with GigeCamera(CameraBody(Numbered(), SIZE, SIZE), patience_s=120.0) as simulated:
+        ready.send(simulated.address)
+        ready.recv()
+
+
+@contextmanager
+def simulated_camera() -> Iterator[str]:
+    """Its address."""
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs,))
+    process.start()
+    try:
+        yield ours.recv()
+    finally:
+        ours.send("end")
+        process.join(20.0)
+
+
+@dataclass(frozen=True)
+class Received:
+    """What a client received."""
+
+    rate: float
+    cpu_ms: float
+    whole: int
+    lost: int
+
+
+def peer(address: str) -> Received:
+    """Aravis's own client."""
+    client = shutil.which("arv-camera-test-0.8")
+    if client is None:
+        sys.exit("no arv-camera-test-0.8: apt-get install aravis-tools")
+    options = ["-n", address, "-w", str(SIZE), "-h", str(SIZE), "-f", str(RATE), "-i", str(PACKET)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    began = time.monotonic()
+    running = subprocess.Popen(
+        [client, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    time.sleep(SECONDS + 1.0)
+    running.send_signal(signal.SIGINT)
+    said = running.communicate(timeout=60)[0]
+    elapsed = time.monotonic() - began
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    # It tells its rate every second; the first and the last of them are not of whole seconds.
+    rates = [float(found) for found in re.findall(r"([\d.]+) frames/s", said)][1:-1]
+    whole = int(re.findall(r"n_completed_buffers\s*=\s*(\d+)", said)[0])
+    failed = int(re.findall(r"n_failures\s*=\s*(\d+)", said)[0])
+    rate = float(np.mean(rates)) if rates else whole / elapsed
+    return Received(rate, 1000 * cpu / max(1, whole), whole, failed)
+
+
+def ours(camera: Camera) -> Received:
+    """Our driver, for the same time."""
+    first = camera.expose(20.0)
+    began, cpu, whole = time.monotonic(), time.process_time(), 0
+    last = first
+    while time.monotonic() - began < SECONDS:
+        for shot in camera.frames(10, 20.0):
+            last, whole = shot, whole + 1
+    elapsed, used = time.monotonic() - began, time.process_time() - cpu
+    camera.stop()
+    return Received(whole / elapsed, 1000 * used / whole, whole, last.dropped - first.dropped)
+
+
+def long_series(camera: Camera, sight: Numbered, frames: int) -> tuple[list[float], list[float], int]:
+    """CPU milliseconds of a frame and megabytes of this process, block by block; and frames lost."""
+    me = psutil.Process()
+    cpu, memory, dropped = [], [], 0
+    for _ in range(BLOCKS):
+        began = time.process_time()
+        for shot in camera.frames(frames // BLOCKS, 20.0):
+            # What was sent is the noise, but for the number.
+            if not (shot.pixels[1:] == sight.noise[1:]).all():
+                sys.exit(f"frame {shot.sequence} is damaged")
+            dropped = shot.dropped
+        cpu.append(1000 * (time.process_time() - began) / (frames // BLOCKS))
+        memory.append(me.memory_info().rss / 1e6)
+    return cpu, memory, dropped
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare, and look whether anything grows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=int(os.environ.get("RESEAU_FRAMES", "300")))
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args(arguments)
+    sight = Numbered()
+    settings = {"width": SIZE, "height": SIZE, "rate": RATE, "packet_size": PACKET, "buffers": 10}
+    with simulated_camera() as address:
+        ratios = []
+        for number in range(options.rounds):
+            theirs = peer(address)
+            with aravis("camera", address, settings=settings, seconds=20.0) as camera:
+                own = ours(camera)
+            ratios.append(own.rate / theirs.rate)
+            print(
+                f"round {number + 1}: Aravis {theirs.rate:6.1f} 1/s ({theirs.lost} failed), "
+                f"ours {own.rate:6.1f} 1/s ({own.lost} lost), ratio {ratios[-1]:.2f}; "
+                f"CPU {theirs.cpu_ms:.1f} and {own.cpu_ms:.1f} ms a frame"
+            )
+        with aravis("camera", address, settings=settings, seconds=20.0) as camera:
+            cpu, memory, dropped = long_series(camera, sight, options.frames)
+    print(f"{options.frames} frames, {dropped} lost, none damaged")
+    print("CPU, ms a frame: " + " ".join(f"{value:.1f}" for value in cpu))
+    print("memory, MB:      " + " ".join(f"{value:.0f}" for value in memory))
+    grown, slower = memory[-1] - memory[1], np.median(cpu[-3:]) / np.median(cpu[:3])
+    print(f"median ratio {np.median(ratios):.2f}; memory grew by {grown:+.1f} MB, CPU by × {slower:.2f}")
+    return 0 if np.median(ratios) >= 0.9 and grown < 10 and slower < 1.3 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
