@@ -61,6 +61,8 @@ CASES: dict[str, tuple[FieldBench, Station, int]] = {
     "pincushion distortion of 10 px": (FieldBench().distorted(10), Station(30), 250),
     "barrel distortion of 10 px": (FieldBench().distorted(-10), Station(30), 350),
     "blurred by 1.5 px": (FieldBench(psf_px=1.5), Station(0), 250),
+    "blurred by 2 px": (FieldBench(psf_px=2.0), Station(0), 250),
+    "blurred by 1.7 px, and tilted": (FieldBench(psf_px=1.7), Station(45, 90, 180), 200),
     "a tenth of the contrast": (FieldBench(contrast=0.1), Station(30), 340),
     "uneven light": (FieldBench(gradient=(0.4, -0.3), level=140.0), Station(30), 340),
     "bright on dark": (FieldBench(design=coded_testfield(polarity="bright")), Station(30), 340),
@@ -123,10 +125,27 @@ FRAME = PLAIN.record(STATION).pixels
         ),
         (FRAME[:, ::-1], DESIGN, "in a mirror"),
         (np.hstack([FRAME, FRAME]), DESIGN, "of the design|read like it do not|no common lattice"),
+        (np.hstack([PLAIN.record(Station(0)).pixels] * 2), DESIGN, "shows two testfields"),
+        (
+            np.hstack([PLAIN.record(s).pixels for s in (Station(30, 0, 37), Station(30, 90))]),
+            DESIGN,
+            "shows two",
+        ),
         (FRAME, coded_testfield(4, 4), "none is one of the design"),
         (FRAME, coded_testfield(12, 14), "read like it do not"),
     ],
-    ids=["noise", "ramp", "tiny", "chessboard", "mirrored", "two of them", "another", "a larger one"],
+    ids=[
+        "noise",
+        "ramp",
+        "tiny",
+        "chessboard",
+        "mirrored",
+        "two of them",
+        "two at right angles",
+        "two from other sides",
+        "another",
+        "a larger one",
+    ],
 )
 def test_what_is_not_the_testfield_gets_a_clear_answer(pixels: Array, design: Any, reason: str) -> None:
     found = answer(np.ascontiguousarray(pixels).astype(np.uint8), design)

@@ -38,6 +38,8 @@ _UNLIKE, _UNEXPLAINED = 4.0, 0.3
 part of what is seen."""
 _WIDTH_PX = 0.2
 """How well the width of the point-spread function must be known for targets to be told apart."""
+_LEAST_VARIANCE = 1e-6
+"""Square of the grey values that are left where an image of a few pixels fits exactly."""
 _FAINT = 0.3
 """Part of the ordinary contrast below which there is no target."""
 _ANGLE = 7.5
@@ -210,7 +212,7 @@ class _Clusters:
             left = (seen**2).sum(axis=2)[:, :, None] - (part**2).sum(axis=3)
             rest[of] = np.maximum(left, 0) / pixels[group]
         best = rest.argmin(axis=2)[..., None]
-        noise = np.median(np.take_along_axis(rest, best, 2)[self.visible])
+        noise = max(float(np.median(np.take_along_axis(rest, best, 2)[self.visible])), _LEAST_VARIANCE)
         amplitude = self.sign * x[..., 1]
         level, contrast, _, _, wider = np.moveaxis(np.take_along_axis(x, best[..., None], 2)[:, :, 0], 2, 0)
         ordinary = np.median(np.abs(contrast[self.visible]))
@@ -296,11 +298,12 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
         return Failure(f"{in_sight} squares are in sight, but none is one of the design {design.name!r}")
     (mirrored, quarters, *doubled), most = votes.most_common(1)[0]
     others = sum(votes.values()) - most
-    if mirrored:
+    # In a mirror every square says something else about the place of the board.
+    if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, 0.3 * in_sight):
         return Failure("shows the testfield in a mirror", iterations=0)
     if others > max(1, 0.2 * most):
         return Failure(f"{most} squares lie as in the design {design.name!r}, {others} read like it do not")
-    if most < 0.3 * in_sight:
+    if mirrored or most < 0.3 * in_sight:
         return Failure(f"of {in_sight} squares in sight only {most} are of the design {design.name!r}")
     return Placement(_quarter(quarters) / design.pitch, np.array(doubled) / 2, most)
 

@@ -25,7 +25,7 @@ from ..field import trend_degree
 from .lines import Lattice, Ridges
 from .profiles import crossings, located
 
-__all__ = ["LatticeFit", "fit_lattice", "lattices", "refit", "second_order", "slope_of"]
+__all__ = ["LatticeFit", "fit_lattice", "lattices", "refit", "second_order", "slope_of", "straightened"]
 
 _DEGREE = 3
 """Of the polynomial, where lines alone tell it."""
@@ -246,11 +246,17 @@ def _middled(mapping: Chain, at: Array) -> Chain:
     return Chain(straight, mapping.second)
 
 
-def _coordinates(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points; a few steps of Newton, which is near enough here."""
+def straightened(mapping: Chain, xy: Array) -> Array:
+    """Lattice coordinates (n, 2) of image points by the projectivity alone."""
     h = np.append(mapping.first.values, 1.0).reshape(3, 3)
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
     at: Array = back[:, :2] / back[:, 2:]
+    return at
+
+
+def _coordinates(mapping: Chain, xy: Array) -> Array:
+    """Lattice coordinates (n, 2) of image points; a few steps of Newton, which is near enough here."""
+    at = straightened(mapping, xy)
     if np.array_equal(mapping(at[:1]), mapping.first(at[:1])):
         return at  # there is no polynomial yet
     slope = _straight_slope(mapping, at)

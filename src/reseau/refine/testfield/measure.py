@@ -19,11 +19,10 @@ from ...optics.formation import PixelResponse
 from ..matching import Matches
 from ..measured import Measured
 from ..screening import quiet_noise, screen
-from .clusters import Placement, Reading, locate, read_clusters
-from .lattice import LatticeFit, lattices, refit, slope_of
+from .clusters import Reading
+from .lattice import LatticeFit, refit, slope_of
 from .light import Light
-from .lines import find_lattice, ridge_points
-from .profiles import blur_of
+from .sight import Sight
 from .targets import Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
@@ -134,21 +133,20 @@ def measure_testfield(
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     noise = quiet_noise(grey)
-    ridges = ridge_points(grey, noise)
-    found = find_lattice(ridges)
-    if isinstance(found, Failure):
-        return Failure(f"{frame.name}: {found.reason}")
-    response = PixelResponse(options.fill)
-    why = ""
-    width, blur = design.lines.width / design.pitch, blur_of(options.psf_px, response)
-    for lattice in lattices(grey, ridges, found, width, blur):
-        reading = read_clusters(screened.grey, lattice, design, options.psf_px, response)
-        placed = reading if isinstance(reading, Failure) else locate(reading, design)
-        if isinstance(placed, Placement) and isinstance(reading, Reading):
-            break
-        why = why or (placed.reason if isinstance(placed, Failure) else "")
-    else:
-        return Failure(f"{frame.name}: {why or 'the straight lines found lie in no common lattice'}")
+    seen = Sight(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
+    read = seen.read()
+    if isinstance(read, Failure):
+        # Lines a pixel wide are lost in blur, but not for good.
+        reason, sharp = read.reason, seen.sharpened(noise)
+        read = sharp.read()
+        if isinstance(read, Failure):
+            return Failure(f"{frame.name}: {reason}")
+        seen = sharp
+    if seen.another(read):
+        return Failure(
+            f"{frame.name}: shows two testfields {design.name!r}; cut the picture so that it shows one"
+        )
+    lattice, reading, placed = read.lattice, read.reading, read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)
     size = (float(frame.width), float(frame.height))
     light = Light.through(reading.xy.reshape(-1, 2), reading.level.ravel(), reading.contrast.ravel(), size)
@@ -161,8 +159,8 @@ def measure_testfield(
         placed.frame,
         placed.origin,
         light,
-        reading.psf_px,
-        response,
+        seen.blurred(reading.psf_px),
+        PixelResponse(options.fill),
         options.row_jitter_px,
     )
     return TestfieldResult(
