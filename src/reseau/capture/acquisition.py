@@ -299,7 +299,7 @@ class Acquisition:
         """
         self._resting = False
         for instrument in self.bench.instruments.values():
-            instrument.stage()
+            self._persist(instrument.stage)
 
     def verdict(self, found: ArchivedFrame) -> Verdict:
         """What was found of a frame that was taken or looked at in this process."""

@@ -79,9 +79,10 @@ def _carried_out(
     kept: Session,
     procedure: Procedure,
     planned: Callable[[Any], Plan],
+    names: tuple[str, ...],
     watch: Callable[[str, dict[str, Any]], None],
 ) -> None:
-    """Carry a plan out on a simulated bench; its tank is filled as the operator is asked to."""
+    """Carry a plan out with some instruments of a simulated bench; its tank is filled as the plan asks."""
     from ..capture import Acquisition, Bench, BenchFile, BenchLock, carry_out
 
     laboratory = simulated.laboratory
@@ -93,11 +94,16 @@ def _carried_out(
                 laboratory.tank = filled()
 
     file = BenchFile.parse_toml(simulated.toml + _in_process(simulated), where="simulated bench")
-    addresses = [entry.address for entry in file.instruments.values()]
-    with BenchLock(addresses, "the demo"), Bench(file, _builder(simulated)) as bench:
-        bench["scanner"].configure(half_sector=_HALF_SECTOR)
-        run = Acquisition(bench, kept, procedure, scanner="scanner", watch=watch, operator=operator)
-        carry_out(run, planned(run))
+    entries = {name: file.instruments[name] for name in names}
+    with BenchLock([entry.address for entry in entries.values()], "the demo"):
+        bench = Bench(file.model_copy(update={"instruments": entries}), _builder(simulated))
+        try:
+            if "scanner" in names:
+                bench["scanner"].configure(half_sector=_HALF_SECTOR)
+            run = Acquisition(bench, kept, procedure, watch=watch, operator=operator)
+            carry_out(run, planned(run))
+        finally:
+            bench.close()
 
 
 def _in_process(simulated: Any) -> str:
@@ -143,7 +149,8 @@ def captured_oscilloscope(
         live = LiveOscilloscope(
             world.design, world.test_object, name="oscilloscope", check=world.check_marks()
         )
-        _carried_out(simulated, kept, live, plans.oscilloscope, watch)
+        names = ("scanner", "oscilloscope", "camera")
+        _carried_out(simulated, kept, live, plans.oscilloscope, names, watch)
         way = _way(simulated)
     frames = tuple(kept.picture(f) for f in kept.frames(kind="frame") if f.verdict and f.verdict.ok)
     if live.first is None or live.second is None or live.third is None:
@@ -177,7 +184,11 @@ def captured_testfield(
         kept = archive.begin("testfield", "testfield", {"seed": seed, "poses": _POSES}, simulated.toml)
         live = LiveTestfield(field.design, measure, model, name="testfield")
         steps = spread(paper_steps(), _POSES)
-        _carried_out(simulated, kept, live, lambda run: plans.homed(run, plans.poses(run, steps)), watch)
+
+        def planned(run: Any) -> Plan:
+            return plans.homed(run, plans.poses(run, steps))
+
+        _carried_out(simulated, kept, live, planned, ("table", "camera"), watch)
         true = dict(zip(field.camera.names, field.camera.values.tolist(), strict=True))
     found = live.calibrated()
     if isinstance(found, Failure):
