@@ -44,7 +44,8 @@ _BETWEEN = 0.85
 """Share of their length on which lines between those found must be dark."""
 _BENT_PX = 0.13
 """Distances of ridge points, root mean square, from which on the lens distorts much."""
-_TIMES = 4
+_TIMES, _STILL_PX = 4, 0.1
+"""How often lines are adjusted to their profiles, unless they move by less."""
 _LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
 """Ridge points without which there is no lattice, about how many tell it well enough to begin with, and among
 how many of a frame, most of them no lines', these are looked for."""
@@ -130,11 +131,17 @@ def lattices(
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
             # Where the lens distorts much, a line is found on more of its length every time.
-            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 1):
-                points, fit = fit.points, _sharpened(fit, grey, width, blur)
-                if fit.points < 1.02 * points:
+            for _ in range(_TIMES if fit.rms_px > _BENT_PX else 2):
+                before, fit = fit, _sharpened(fit, grey, width, blur)
+                if fit.points < 1.02 * before.points or _moved(before, fit) < _STILL_PX:
                     break
             yield fit
+
+
+def _moved(before: LatticeFit, after: LatticeFit) -> float:
+    """How far the crossings of the lines have moved at most, in pixels."""
+    at = np.stack(np.meshgrid(before.across, before.along), axis=-1).reshape(-1, 2).astype(np.float64)
+    return float(np.abs(after.mapping(at) - before.mapping(at)).max())
 
 
 def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
