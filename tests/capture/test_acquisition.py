@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 from reseau.archive import Archive, Session
 from reseau.capture import Goal, Plan, Step, carry_out, paper_steps, plans, rerun
-from reseau.errors import EstimationError, StateError, UsageError
+from reseau.errors import ArchiveError, EstimationError, StateError, UsageError
 
 from .fieldrig import FieldRig
 
@@ -64,6 +65,57 @@ def test_a_plan_leaves_frames_verdicts_documents_and_results(rig: FieldRig, kept
     assert calibration["provenance"]["inputs"] == {f.step: f.sha256 for f in frames}
     assert kept.status == "done"
     assert rig.table.stops > 0
+
+
+def test_it_is_told_what_the_next_pose_would_bring(rig: FieldRig, kept: Session) -> None:
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    (foretold,) = [facts for kind, facts in rig.events if kind == "outlook"]
+    (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == foretold["step"]]
+    assert abs(foretold["sigma_c"] / came["sigma_c"] - 1) < 0.1
+
+
+def test_a_disk_that_is_full_ends_the_session_and_with_room_it_goes_on(
+    rig: FieldRig, kept: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, count = kept.objects.put, []
+
+    def full(data: bytes, suffix: str) -> str:
+        count.append(suffix)
+        if len(count) == 3:
+            raise ArchiveError("cannot be kept (No space left on device)", where="archive", do="make room")
+        return put(data, suffix)
+
+    monkeypatch.setattr(kept.objects, "put", full)
+    run = rig.acquisition(kept)
+    with pytest.raises(ArchiveError, match="No space left on device"):
+        carry_out(run, plans.poses(run, FEW))
+    assert kept.status == "failed"
+    assert rig.table.stops > 0
+    again = rig.acquisition(kept)
+    carry_out(again, plans.poses(again, FEW))
+    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
+
+
+def test_a_clock_that_jumps_changes_neither_order_nor_result(
+    rig: FieldRig, kept: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Jumping(datetime):
+        """An hour back with every question."""
+
+        asked = 0
+
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            cls.asked += 1
+            return datetime(2026, 3, 29, 12, tzinfo=UTC) - timedelta(hours=cls.asked)
+
+    monkeypatch.setattr("reseau.archive.session.datetime", Jumping)
+    run = rig.acquisition(kept, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    assert [f.step for f in kept.frames(kind="frame")] == [step.name for step in FEW]
+    assert kept.status == "done"
+    assert rerun(kept, rig.procedure())[0].same
 
 
 def test_offline_equals_live_to_the_byte(rig: FieldRig, kept: Session) -> None:

@@ -23,6 +23,7 @@ from ..data import Frame
 from ..errors import (
     ConnectionLost,
     DeadlineError,
+    EstimationError,
     ImageError,
     InstrumentError,
     ProtocolError,
@@ -215,6 +216,11 @@ class Acquisition:
         """
         return (yield message("choose", self, candidates, wanted))
 
+    def outlook(self, step: Step) -> Plan:
+        """Have it told what the next pose would bring, where that can be predicted."""
+        if self.procedure is not None and not self.done(step):
+            yield message("outlook", self, step)
+
     @property
     def commands(self) -> dict[str, Callable[[Msg], Any]]:
         """The messages above, for ``RunEngine.register_command``."""
@@ -226,6 +232,7 @@ class Acquisition:
             "ask": self._ask,
             "check": self._check,
             "choose": self._choose,
+            "outlook": self._outlook,
         }
 
         def registered(do: Callable[..., Any]) -> Callable[[Msg], Any]:
@@ -454,6 +461,21 @@ class Acquisition:
             self.kept.note(key, "choice", {"key": key, "step": step, "predicted": predicted})
             self.watch("next", {"step": step, f"sigma_{wanted}": predicted})
             return found
+
+    def _outlook(self, step: Step) -> None:
+        assert self.procedure is not None
+        with self._busy:
+            reached = next(iter(self.procedure.progress()), "")
+            parameter = reached.removeprefix("sigma_")
+            if not reached or reached == "sigma0":
+                return
+            try:
+                found = self.procedure.next_pose([step], parameter)
+            except EstimationError as error:
+                self.watch("outlook", {"step": step.name, "why": error.what})
+                return
+            if found is not None and found[1] is not None:
+                self.watch("outlook", {"step": step.name, f"sigma_{parameter}": found[1]})
 
     def _check(self, count: int) -> Readiness:
         with self._busy:

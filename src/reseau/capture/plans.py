@@ -5,7 +5,8 @@ Each takes the :class:`~reseau.capture.Acquisition` that carries it out, and yie
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
 
 from ..errors import EstimationError, StateError
 from .acquisition import Acquisition, Plan
@@ -39,11 +40,13 @@ def frames(run: Acquisition, count: int, average: int = 1, checks: int = 0) -> P
         yield from run.at(Step(f"{k:05d}"), average)
 
 
-def poses(run: Acquisition, steps: Iterable[Step], average: int = 1, checks: int = 0) -> Plan:
+def poses(run: Acquisition, steps: Sequence[Step], average: int = 1, checks: int = 0) -> Plan:
     """A frame from each of some poses: a testfield recorded for a calibration."""
     yield from _ready(run, checks)
-    for step in steps:
+    for step, after in itertools.zip_longest(steps, steps[1:]):
         yield from run.at(step, average)
+        if after is not None:
+            yield from run.outlook(after)
 
 
 def until(

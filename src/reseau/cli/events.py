@@ -77,6 +77,10 @@ class Display:
             self._say(f"{self._poses}{of} {facts['step']}{take}: {outcome}{left}")
         elif kind == "precision":
             self._say(f"    {self._reached}")
+        elif kind == "outlook":
+            self._say(
+                f"    {facts['step']} would bring {_told(facts)}" if "why" not in facts else facts["why"]
+            )
         elif kind == "next":
             self._say(f"next: {facts['step']}" if facts["step"] else "no pose is left")
         elif kind == "check":
