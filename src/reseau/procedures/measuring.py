@@ -11,7 +11,7 @@ from functools import partial
 import cv2
 
 from ..adjust import Failure
-from ..adjust.threads import always_one_thread
+from ..adjust.threads import always_one_thread, one_thread
 from ..data import Frame, ImagePoints
 from ..errors import EstimationError
 from ..formats import ReseauDesign, TestfieldDesign
@@ -82,7 +82,9 @@ def measured_in_order(
 
 
 def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
-    found = measure(frame)
+    # Sums of one thread and of several differ in their last digits: the same bytes, however many processes.
+    with one_thread():
+        found = measure(frame)
     return found if isinstance(found, Failure) else found.points
 
 
