@@ -75,9 +75,12 @@ class LoopCamera:
         self._controls = {name: identifier for identifier, name in _controls(self._cap)}
         self._loop()
         self.failed = ""
-        self._stop = threading.Event()
+        self._stop, self._begun = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._feed, daemon=True)
         self._thread.start()
+        # Injected faults are for whoever begins to stream next: not for this one.
+        if not self._begun.wait(30.0):
+            raise TimeoutError(f"the loop did not begin: {self.failed}")
 
     @property
     def view(self) -> View:
@@ -152,6 +155,7 @@ class LoopCamera:
                 if not on and not free:
                     fcntl.ioctl(self._out, STREAMON, struct.pack("<i", OUTPUT))
                     on = True
+                    self._begun.set()
         except Exception as error:
             # A thread that ends says nothing: the tests ask for this.
             self.failed = repr(error)
