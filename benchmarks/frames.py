@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -145,49 +147,69 @@ def _results(frame: FilmFrame) -> FrameResult:
     return orient_frames(scan_of(frame.scan(), dpi=frame.dpi), FrameOptions(formats=(frame.format[:2],)))[0]
 
 
-def _by_file(path: Path) -> str:
-    return orient_frames(open_scan(path), FrameOptions(formats=((36.0, 24.0),)))[0].status
+def _commanded(*arguments: object) -> tuple[str, float, float, float]:
+    """What `reseau orient` said of scans, its wall time and processor time in s, its peak memory in MB."""
+    start = time.perf_counter()
+    command = [str(Path(sys.executable).with_name("reseau")), "orient", *map(str, arguments)]
+    command += ["--frame", "36x24"]
+    with tempfile.TemporaryFile() as said:
+        child = subprocess.Popen(command, stdout=said)
+        _, _, used = os.wait4(child.pid, 0)
+        took = time.perf_counter() - start
+        said.seek(0)
+        text = said.read().decode()
+    return text, took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
-def print_times(pool: ProcessPoolExecutor) -> None:
-    """A roll of 36 and a frame of 40 megapixels."""
-    import resource
+def print_times() -> None:
+    """A roll of 36, a frame of 40 megapixels, and a scan of 600 MB by the command, for its memory."""
+    print("\nTimes and memory of `reseau orient` (with its start), by the clock and of the processor")
+    with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(2) as pool:
+        # Other processes make the scans: a child begins with the memory of its parent.
+        folder = Path(name)
+        paths = list(pool.map(_roll_frame, [folder] * 36, range(36)))
+        said, took, used, _ = _commanded(*paths, "--out", folder / "out", "--jobs", 2)
+        done = said.count(": oriented")
+        print(f"  roll of 36 at 1200 dpi, with marked copies: {took:.1f} s, {used:.1f} s, {done} oriented")
+        plain, wide = pool.submit(_large, folder).result()
+        runs = [pool.submit(_oriented_within, plain).result() for _ in range(3)]
+        took, used = (min(run[k] for run in runs) for k in (1, 2))
+        print(f"  40 megapixels, uncompressed, without the start: {took:.2f} s, {used:.2f} s, {runs[0][0]}")
+        said, took, used, peak = _commanded(wide, "--no-marked", "--jobs", 1)
+        done, size = said.count(": oriented"), wide.stat().st_size / 1e6
+        print(
+            f"  RGB of 16 bit, {size:.0f} MB: {took:.1f} s, {used:.1f} s, {peak:.0f} MB at most, "
+            f"{done} oriented"
+        )
 
+
+def _roll_frame(folder: Path, seed: int) -> Path:
     import tifffile
 
-    print("\nTimes and memory")
-    with tempfile.TemporaryDirectory() as folder:
-        paths = []
-        for seed in range(36):
-            paths.append(Path(folder) / f"{seed:02d}.tif")
-            pixels = FilmFrame(seed, dpi=1200, beside=Beside(**_FILM)).scan()
-            tifffile.imwrite(paths[-1], pixels, photometric="minisblack", resolution=(1200, 1200))
-        start = time.perf_counter()
-        status = list(pool.map(_by_file, paths))
-        took = time.perf_counter() - start
-        print(f"  roll of 36 frames, 1200 dpi: {took:.1f} s, {status.count('oriented')} oriented")
-        large = Path(folder) / "large.tif"
-        pixels = FilmFrame(1, dpi=4800, blur_px=2.0, colour=False, margin_mm=2.0).scan()
-        tifffile.imwrite(large, np.repeat(pixels[:, :, None], 3, axis=2), photometric="rgb")
-        size = large.stat().st_size / 1e6
-        times = []
-        for _ in range(3):
-            start = time.perf_counter()
-            state = _by_file(large)
-            times.append(time.perf_counter() - start)
-        print(f"  {pixels.size / 1e6:.0f} megapixels RGB ({size:.0f} MB): {min(times):.2f} s, {state}")
-        del pixels
-    peak = pool.submit(_peak).result()
-    print(
-        f"  peak memory of a worker: {peak:.0f} MB; of this process: "
-        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB (it simulates, too)"
-    )
+    path = folder / f"{seed:02d}.tif"
+    pixels = FilmFrame(seed, dpi=1200, beside=Beside(**_FILM)).scan()
+    tifffile.imwrite(path, pixels, photometric="minisblack", resolution=(1200, 1200))
+    return path
 
 
-def _peak() -> float:
-    import resource
+def _large(folder: Path) -> tuple[Path, Path]:
+    """A scan of 40 megapixels, and the same at 7700 dpi in colour."""
+    import cv2
+    import tifffile
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    pixels = FilmFrame(1, dpi=4800, blur_px=2.0, margin_mm=2.0).scan()
+    plain, wide = folder / "plain.tif", folder / "wide.tif"
+    tifffile.imwrite(plain, pixels, photometric="minisblack", resolution=(4800, 4800))
+    finer = cv2.resize(pixels, None, fx=1.6, fy=1.6, interpolation=cv2.INTER_LINEAR).astype(np.uint16) * 257
+    tifffile.imwrite(wide, np.repeat(finer[:, :, None], 3, axis=2), photometric="rgb")
+    return plain, wide
+
+
+def _oriented_within(path: Path) -> tuple[str, float, float]:
+    """Status, time by the clock and processor time of opening and orienting in this process."""
+    start, used = time.perf_counter(), time.process_time()
+    result = orient_frames(open_scan(path), FrameOptions(formats=((36.0, 24.0),)))[0]
+    return result.status, time.perf_counter() - start, time.process_time() - used
 
 
 def main() -> None:
@@ -210,7 +232,7 @@ def main() -> None:
         if not given.only or "table" in given.only:
             print_table_1(pool, max(6, given.frames // 10))
         if not given.only or "times" in given.only:
-            print_times(pool)
+            print_times()
     if not given.only or "real" in given.only:
         print_real(given.real, given.pictures)
 

@@ -6,6 +6,7 @@ are decoded. Channels stay apart.
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,9 @@ _STRIPE = 256
 """Rows that are decoded at a time for an overview."""
 _WHOLE = 60_000_000
 """Samples up to which an image is averaged whole; of a larger one some rows and columns are enough."""
+
+_HELD, _AROUND = 50_000_000, 65_536
+"""Bytes of a mapped file that are held in memory, and those that a system maps around one that is read."""
 
 Window = Callable[[int, int, int, int], NDArray[Any]]
 
@@ -190,8 +194,15 @@ def _mapped(page: Any, path: Path) -> Window:
     kind = np.dtype(page.dtype).newbyteorder(order)
     whole = np.memmap(path, dtype=kind, mode="r", offset=page.dataoffsets[0], shape=page.shape)
     pixels = _channels_last(whole, page)
+    row, touched = whole.nbytes // page.imagelength, 0
 
     def window(top: int, bottom: int, left: int, right: int) -> NDArray[Any]:
+        nonlocal touched
+        touched += (bottom - top) * min(row, pixels.itemsize * pixels.shape[2] * (right - left) + 2 * _AROUND)
+        if touched > _HELD and hasattr(mmap, "MADV_DONTNEED"):
+            # What was read stays in the system's cache, but no longer counts as ours; views of it stay valid.
+            whole._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+            touched = 0
         return np.asarray(pixels[top:bottom, left:right]).astype(page.dtype, copy=False)
 
     return window
