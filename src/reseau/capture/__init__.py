@@ -1,6 +1,6 @@
 """From instruments to frames: the bench, plans, and what carries them out into an archive."""
 
-from .acquisition import Acquisition, Plan, Procedure, Watch
+from .acquisition import Acquisition, Plan
 from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
 from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
 from .goal import Goal
@@ -8,6 +8,7 @@ from .lock import BenchLock
 from .rerun import Rerun, rerun
 from .run import Decision, carry_out
 from .step import Step, paper_steps, read_steps, spread
+from .work import Procedure, Watch
 
 __all__ = [
     "Acquisition",

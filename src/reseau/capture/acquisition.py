@@ -9,43 +9,20 @@ there.
 from __future__ import annotations
 
 import asyncio
-import math
-import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
-import numpy as np
 from bluesky import Msg
 from bluesky import plan_stubs as bps
 
-from ..archive import ArchivedFrame, Session, Verdict
-from ..data import Frame
-from ..errors import (
-    ConnectionLost,
-    DeadlineError,
-    EstimationError,
-    ImageError,
-    InstrumentError,
-    ProtocolError,
-    StateError,
-    UsageError,
-)
-from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
-from .bench import Bench
-from .checks import Limits, Readiness, exposure_fault, readiness
+from ..errors import StateError, UsageError
+from ..instruments import Oscilloscope, Turntable
 from .step import Step
+from .work import Work
 
-__all__ = ["Acquisition", "Plan", "Procedure", "Watch"]
+__all__ = ["Acquisition", "Plan"]
 
 Plan = Generator[Msg, Any, Any]
-Watch = Callable[[str, dict[str, Any]], None]
-"""Told what happens: the kind of an event, and what there is to say about it."""
-
-T = TypeVar("T")
-_TRIES = 4
-"""How often an instrument is asked before its failure ends the session."""
-_STILL = 0.02
-"""By how much an axis may move while a frame is exposed, in its unit."""
 
 
 def message(command: str, *args: Any, **kwargs: Any) -> Msg:
@@ -53,99 +30,11 @@ def message(command: str, *args: Any, **kwargs: Any) -> Msg:
     return Msg(command, *args, **kwargs)  # type: ignore[no-untyped-call]
 
 
-class Procedure(Protocol):
-    """What becomes of the frames; all that an acquisition knows of it."""
+class Acquisition(Work):
+    """A session on a bench, as plans and bluesky's engine have it; parameters as of :class:`Work`."""
 
-    def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        """Measure a frame as it comes, and say whether it can be used."""
-
-    def progress(self) -> Mapping[str, float]:
-        """What has been reached so far: standard deviations by the name of the parameter."""
-
-    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        """The pose that lowers a standard deviation most, and to what, where that is known."""
-
-    def finish(self) -> Mapping[str, str]:
-        """Results: the text of files by name; the same frames in the same order give the same bytes."""
-
-
-class Acquisition:
-    """A session on a bench.
-
-    Parameters
-    ----------
-    bench : Bench
-        Connected or not.
-    kept : Session
-        Of the archive.
-    procedure : Procedure, optional
-        What measures the frames; without one they are only looked at for saturation and motion.
-    camera, table, oscilloscope, scanner : str, optional
-        Names on the bench; by default the only instrument of the kind.
-    retakes : int
-        How often a bad frame is taken again.
-    limits : Limits, optional
-        Of exposure, focus, vibration.
-    watch : callable, optional
-        Told what happens.
-    operator : callable, optional
-        Asked to do what no instrument can; returns when it is done.
-    """
-
-    def __init__(
-        self,
-        bench: Bench,
-        kept: Session,
-        procedure: Procedure | None = None,
-        *,
-        camera: str | None = None,
-        table: str | None = None,
-        oscilloscope: str | None = None,
-        scanner: str | None = None,
-        retakes: int = 2,
-        limits: Limits | None = None,
-        watch: Watch = lambda kind, facts: None,
-        operator: Callable[[str], None] | None = None,
-    ) -> None:
-        self.bench, self.kept, self.procedure = bench, kept, procedure
-        self._chosen: dict[type, str | None] = {
-            Camera: camera,
-            Turntable: table,
-            Oscilloscope: oscilloscope,
-            UltrasonicScanner: scanner,
-        }
-        self.retakes, self.limits, self.watch, self._operator = retakes, limits or Limits(), watch, operator
-        self.name, self.parent = "acquisition", None
-        self._busy = threading.Lock()
-        self._known: dict[int, Verdict] = {}
-        self._last: ArchivedFrame | None = None
-        self._resting = False
-
-    # What is on the bench.
-
-    def one(self, kind: type) -> Any:
-        """The instrument of a kind.
-
-        Raises
-        ------
-        UsageError
-            When there is none, or several and none was named.
-        """
-        name = self._chosen.get(kind)
-        if name is not None:
-            named = self.bench[name]
-            if not isinstance(named, kind):
-                raise UsageError(f"is no {kind.__name__}", where=name)
-            return named
-        found = [each for each in self.bench.instruments.values() if isinstance(each, kind)]
-        if len(found) != 1:
-            names = ", ".join(each.name for each in found) or "none"
-            raise UsageError(f"has {names} for a {kind.__name__}", where="bench", do="name one")
-        return found[0]
-
-    def has(self, kind: type) -> bool:
-        """Whether the bench has an instrument of a kind."""
-        return any(isinstance(each, kind) for each in self.bench.instruments.values())
+    name = "acquisition"
+    parent = None
 
     # Messages for plans.
 
@@ -187,10 +76,6 @@ class Acquisition:
         if kind != "screen" or self.has(Oscilloscope):
             yield message("picture", self, step, kind)
 
-    def reached(self, parameter: str) -> float | None:
-        """The standard deviation of a parameter that the procedure has reached; None while there is none."""
-        return None if self.procedure is None else self.procedure.progress().get(f"sigma_{parameter}")
-
     def ask(self, what: str, step: Step) -> Plan:
         """Have the operator do something before a step; not where the step has been done."""
         if not self.done(step):
@@ -225,14 +110,14 @@ class Acquisition:
     def commands(self) -> dict[str, Callable[[Msg], Any]]:
         """The messages above, for ``RunEngine.register_command``."""
         work: dict[str, Callable[..., Any]] = {
-            "expose": self._expose,
-            "move": self._move,
-            "home": self._home,
-            "picture": self._picture,
-            "ask": self._ask,
-            "check": self._check,
-            "choose": self._choose,
-            "outlook": self._outlook,
+            "expose": self.expose,
+            "move": self.move_to,
+            "home": self.home_axes,
+            "picture": self.take_picture,
+            "ask": self.have_done,
+            "check": self.look_first,
+            "choose": self.choose_pose,
+            "outlook": self.foretell,
         }
 
         def registered(do: Callable[..., Any]) -> Callable[[Msg], Any]:
@@ -282,238 +167,3 @@ class Acquisition:
     def resume(self) -> None:
         """Make the bench ready again; called by the engine before it goes on."""
         self.ready()
-
-    def rest(self) -> None:
-        """Stop the table where it stands, and whatever sends; never raises, never drives anywhere."""
-        self._resting = True
-        try:
-            self.bench.stop()
-        except InstrumentError as error:
-            self.watch("rest", {"failed": str(error)})
-
-    def settle(self) -> None:
-        """Wait for what an interrupted message still does: what it brings is stored, and judged."""
-        with self._busy:
-            pass
-
-    def ready(self) -> None:
-        """Connect all instruments, and let them move and send again.
-
-        Raises
-        ------
-        BenchError
-            When one cannot be connected.
-        """
-        self._resting = False
-        for instrument in self.bench.instruments.values():
-            self._persist(instrument.stage)
-
-    def verdict(self, found: ArchivedFrame) -> Verdict:
-        """What was found of a frame that was taken or looked at in this process."""
-        return self._known[found.id]
-
-    def done(self, step: Step) -> bool:
-        """Whether a step has its frame: a good one, or as many bad ones as are tried."""
-        frames = self.kept.frames(step.name, "frame")
-        return any(f.verdict is not None and f.verdict.ok for f in frames) or len(frames) > self.retakes
-
-    # The work behind the messages, in a thread; one at a time.
-
-    def _expose(self, step: Step, average: int = 1) -> ArchivedFrame:
-        # An engine that was paused in the middle of this replays the message while the thread still works:
-        # it waits here, and then finds the frame.
-        with self._busy:
-            for take in range(self.retakes + 1):
-                found = self.kept.find(step.name, "frame", take) or self._taken(step, take, average)
-                verdict = self._judged(found, step)
-                self._last = found
-                if verdict.ok:
-                    break
-            return found
-
-    def _move(self, position: Mapping[str, float]) -> None:
-        axes = self.one(Turntable).axes
-
-        def there() -> None:
-            statuses = [axes[axis].set(value) for axis, value in position.items()]
-            failures = [status.exception(None) for status in statuses]
-            for failure in failures:
-                if failure is not None:
-                    raise failure
-
-        self._persist(there)
-
-    def _home(self) -> None:
-        table: Turntable = self.one(Turntable)
-        for axis in table.axes:
-            if not self._persist(lambda axis=axis: table.state(axis)).homed:  # type: ignore[misc]
-                self.watch("home", {"axis": axis})
-                self._persist(lambda axis=axis: table.home(axis))  # type: ignore[misc]
-
-    def _persist(self, work: Callable[[], T]) -> T:
-        """The outcome of a work that may be begun anew; what passes is tried again, and told."""
-        for tried in range(_TRIES):
-            try:
-                return work()
-            except (ConnectionLost, DeadlineError, ProtocolError) as error:
-                if tried == _TRIES - 1 or self._resting:
-                    raise
-                self.watch("again", {"why": str(error)})
-        raise AssertionError
-
-    def _taken(self, step: Step, take: int, average: int) -> ArchivedFrame:
-        if self._resting:
-            raise StateError("the bench was brought to rest", where=step.name)
-        camera: Camera = self.one(Camera)
-        before = self._position()
-        exposures = [self._persist(camera.expose) for _ in range(average)]
-        moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
-        frame = _mean([each.frame for each in exposures], step.name)
-        first = exposures[0]
-        facts = {
-            "camera": camera.name,
-            "exposure_us": _told(first.exposure_us),
-            "gain": _told(first.gain),
-            "pattern": first.pattern,
-            "position": before,
-            "averaged": average,
-            "moved": max(moved.values(), default=0.0) > _STILL,
-            "fresh": all(each.fresh for each in exposures),
-        }
-        return self.kept.store(step.name, frame, take=take, facts=facts, clock=_clock(exposures))
-
-    def _position(self) -> dict[str, float]:
-        """Where the axes of the table stand."""
-        if not self.has(Turntable):
-            return {}
-        table: Turntable = self.one(Turntable)
-        return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
-
-    def _judged(self, found: ArchivedFrame, step: Step) -> Verdict:
-        """The verdict on a frame; the procedure sees each once, also those of before a resumption."""
-        if found.id in self._known:
-            return self._known[found.id]
-        verdict = self._looked_at(self.kept.picture(found), found, step)
-        if found.verdict is None:
-            self.kept.judge(found, verdict)
-        self._known[found.id] = verdict
-        self.watch(
-            "frame",
-            {"step": step.name, "take": found.take, "ok": verdict.ok, "why": verdict.why} | verdict.facts,
-        )
-        if self.procedure is not None and verdict.ok and found.verdict is None:
-            reached = dict(self.procedure.progress())
-            if reached:
-                self.watch("precision", {"step": step.name} | reached)
-        return verdict
-
-    def _looked_at(self, frame: Frame, found: ArchivedFrame, step: Step) -> Verdict:
-        if found.facts.get("moved"):
-            return Verdict(False, "the table moved during the exposure")
-        if not found.facts.get("fresh", True):
-            return Verdict(False, "its exposure may have begun before it was asked for")
-        fault = exposure_fault(frame, self.limits)
-        if fault:
-            return Verdict(False, fault)
-        if self.procedure is None:
-            return Verdict(True)
-        try:
-            return self.procedure.on_frame(frame, step)
-        except ImageError as error:
-            return Verdict(False, error.what)
-
-    def _picture(self, step: Step, kind: str) -> ArchivedFrame:
-        with self._busy:
-            there = self.kept.find(step.name, kind)
-            if there is not None:
-                return there
-            if kind == "screen":
-                screen = self._persist(self.one(Oscilloscope).screen)
-                clock = {"taken": screen.taken.isoformat()}
-                return self.kept.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
-            if kind == "scan":
-                scan = self._persist(self.one(UltrasonicScanner).scan)
-                facts = {
-                    "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
-                    "origin_px": list(scan.origin_px),
-                    "speed_m_s": scan.speed_m_s,
-                    "frequency_khz": scan.frequency_khz,
-                    "gain": scan.gain,
-                }
-                clock = {"taken": scan.taken.isoformat()}
-                return self.kept.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
-            raise UsageError("is no kind of picture", where=kind, do="there are screen and scan")
-
-    def _ask(self, what: str) -> None:
-        if self._operator is None:
-            raise UsageError("needs an operator", where=what)
-        self._operator(what)
-
-    def _choose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        with self._busy:
-            key = f"choice among {len(candidates)}"
-            names = {step.name: step for step in candidates}
-            for made in (note for _, note in self.kept.notes("choice") if note["key"] == key):
-                # A session that is resumed goes where it had gone.
-                return None if made["step"] is None else (names[made["step"]], made["predicted"])
-            found = None if self.procedure is None else self.procedure.next_pose(candidates, wanted)
-            step, predicted = (None, None) if found is None else (found[0].name, found[1])
-            self.kept.note(key, "choice", {"key": key, "step": step, "predicted": predicted})
-            self.watch("next", {"step": step, f"sigma_{wanted}": predicted})
-            return found
-
-    def _outlook(self, step: Step) -> None:
-        assert self.procedure is not None
-        with self._busy:
-            reached = next(iter(self.procedure.progress()), "")
-            parameter = reached.removeprefix("sigma_")
-            if not reached or reached == "sigma0":
-                return
-            try:
-                found = self.procedure.next_pose([step], parameter)
-            except EstimationError as error:
-                self.watch("outlook", {"step": step.name, "why": error.what})
-                return
-            if found is not None and found[1] is not None:
-                self.watch("outlook", {"step": step.name, f"sigma_{parameter}": found[1]})
-
-    def _check(self, count: int) -> Readiness:
-        with self._busy:
-            camera: Camera = self.one(Camera)
-            begun = len(self.kept.frames(kind="check"))
-            frames = []
-            for k in range(begun, begun + count):
-                exposure = self._persist(camera.expose)
-                frame = _mean([exposure.frame], f"check {k}")
-                self.kept.store(f"check {k}", frame, kind="check", clock=_clock([exposure]))
-                frames.append(frame)
-            found = readiness(frames, self.limits)
-            self.kept.note(f"check {begun}", "check", found.to_dict())
-            self.watch("check", found.to_dict())
-            return found
-
-
-def _mean(frames: list[Frame], name: str) -> Frame:
-    """The mean of frames of one scene, under the name of its step."""
-    first = frames[0]
-    if len(frames) == 1:
-        return Frame(first.pixels, first.full_scale, name)
-    total = np.zeros(first.pixels.shape, dtype=np.float64)
-    for frame in frames:
-        total += frame.pixels
-    return Frame((total / len(frames)).astype(np.float32), first.full_scale, name)
-
-
-def _told(value: float) -> float | None:
-    """A value of the camera; None where it does not tell."""
-    return value if math.isfinite(value) else None
-
-
-def _clock(exposures: list[Exposure]) -> dict[str, Any]:
-    """Times, and what a camera counts."""
-    return {
-        "taken": [each.taken.isoformat() for each in exposures],
-        "taken_within_s": [each.taken_within_s for each in exposures],
-        "sequence": [each.sequence for each in exposures],
-        "dropped": exposures[-1].dropped,
-    }

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..archive import ArchivedResult, Session
-from .acquisition import Procedure
 from .step import Step
+from .work import Procedure
 
 __all__ = ["Rerun", "rerun"]
 
