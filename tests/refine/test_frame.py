@@ -77,6 +77,27 @@ def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
     assert any(bow for bow in reported)
 
 
+def test_a_line_that_nothing_parts_from_an_edge_is_not_taken_for_it() -> None:
+    # A bright line within half a pixel of the upper edge at one end: told by the width of its steps alone.
+    result = oriented(FilmFrame(320035, beside=Beside(lines=1)))
+    assert result.status == "declined"
+    assert "standard deviation" in result.why
+
+
+def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
+    frame = FilmFrame(300088, beside=Beside(lines=1))  # by steps alone its corners were 1.2 px off
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_a_scratch_along_the_film_beside_an_edge_is_passed_over() -> None:
+    frame = FilmFrame(300017, beside=Beside(scratches=8))
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
 def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_fourth_is() -> None:
     frame = FilmFrame(31, crop="right")
     result = oriented(frame)
@@ -90,10 +111,12 @@ def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_
     assert not result.edges["right"].found
 
 
-def test_colour_is_measured_by_channel_and_the_best_is_kept() -> None:
-    frame = FilmFrame(41, colour=True, dpi=400)
+@pytest.mark.parametrize(("seed", "kept"), [(42, "red"), (41, "green")])
+def test_colour_is_measured_by_channel_and_the_best_is_kept(seed: int, kept: str) -> None:
+    # Red has the most contrast; of the second frame its edges are too uncertain, those in green are not.
+    frame = FilmFrame(seed, colour=True, dpi=400)
     result = oriented(frame)
-    assert result.channel == "red"  # that of the most contrast
+    assert result.channel == kept
     assert np.abs(errors(result, frame)).max() < 0.3
 
 
