@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from ..bundle import Lens, Result
 from .bundle_figures import distortion_figure, network_figure
-from .tables import Row
+from .tables import Row, symbol
 
 __all__ = ["camera_section"]
 
@@ -29,7 +29,7 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
     names, _, values = result.camera_columns(0)
     sigma = np.sqrt(np.diag(result.camera_covariance(0)))
     rows = [
-        (name, f"{value:.6g}", f"{s:.2g}", f"{true[name]:.6g}", f"{(value - true[name]) / s:+.2f}")
+        (symbol(name), *_alike(value, s, true[name]), f"{(value - true[name]) / s:+.2f}")
         for name, value, s in zip(names, values, sigma, strict=True)
     ]
     errors = np.array([float(row[-1]) for row in rows])
@@ -43,6 +43,12 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
         "network": Markup(network_figure(result)),
         "distortion": _markup(distortion_figure(Lens.of_result(result, 0))),
     }
+
+
+def _alike(*values: float) -> tuple[str, ...]:
+    """Estimate, sigma and truth with as many decimals as give the sigma two digits."""
+    decimals = max(0, 1 - int(np.floor(np.log10(values[1]))))
+    return tuple(f"{value:.{decimals}f}" for value in values)
 
 
 def _markup(figure: str | None) -> Markup | None:
