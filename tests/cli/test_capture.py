@@ -1,5 +1,6 @@
 """`reseau capture` and `reseau archive`, as a user has them, on a bench without protocols."""
 
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reseau import designs
 from reseau.cli import run
 from reseau.errors import StateError
 
@@ -169,3 +171,20 @@ def test_bad_frames_are_told_and_kept(rig: FieldRig, capsys: pytest.CaptureFixtu
     assert run(["archive", "show", "a", "--json"]) == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert [(f["take"], f["ok"]) for f in document["frames"]] == [(0, False), (1, True), (0, True)]
+
+
+def test_the_operator_is_asked_and_a_photograph_that_shows_no_reseau_ends_it(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    designs.standard_reseau().write("reseau.json")
+    designs.test_object().write("rods.json")
+    given = ["--reseau", "reseau.json", "--object", "rods.json", "--retakes", "0"]
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    assert capture("oscilloscope", *given, "--name", "a") == 1
+    err = capsys.readouterr().err.splitlines()
+    assert err[0] == "blank the screen; nothing but the reseau is photographed, then press Enter"
+    assert err[-1].startswith("reseau: PHOTO I: ")
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    assert capture("oscilloscope", *given, "--name", "b") == 2
+    assert "nobody answers; run it where someone can" in capsys.readouterr().err
+    assert rig.camera.exposures == 1
