@@ -19,7 +19,7 @@ BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="The bench, bench
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """Discover instruments (VISA, serial ports), and name the drivers that are installed."""
+    """Discover instruments (cameras, VISA, serial ports), and name the drivers that are installed."""
     from ..capture import drivers, found_instruments
     from ..provenance import canonical_json
 

@@ -22,7 +22,7 @@ from .bundle_options import (
     say_left_out,
     say_model,
 )
-from .common import AsJson, Out, is_points, progress, read_measurement, required, say
+from .common import AsJson, Out, SensorFile, corrected, is_points, progress, read_measurement, required, say
 from .measure import Channel
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ def calibrate(
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
     channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
+    sensor: SensorFile = None,
     sigma: Sigma = None,
     control: Control = None,
     leave_out: LeaveOut = None,
@@ -90,10 +91,11 @@ def calibrate(
     options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     with progress("measuring", len(images)) as step:
-        frames, model = _frames(images, channel, step), _model(pitch, side, free)
+        frames, model = _frames(images, channel, sensor, step), _model(pitch, side, free)
         done = required(calibrate_camera(frames, target, measure, _size(size), model, options), design)
     provenance = _provenance(
-        [design, *images, *([control] if control else [])], pitch=pitch, side=side, free=free, sigma=sigma,
+        [design, *images, *(path for path in (control, sensor) if path)],
+        pitch=pitch, side=side, free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
         leave_out=list(leave_out or []), components=kind,
     )  # fmt: skip
@@ -179,7 +181,7 @@ def _write_report(
 
 
 def _frames(
-    paths: list[Path], channel: Channel, step: Callable[[str], None]
+    paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs one after the other, or what was measured in them."""
     from ..images import read_frame
@@ -189,7 +191,7 @@ def _frames(
         if is_points(path):
             yield path.name, read_measurement(path).image_points()
         else:
-            yield read_frame(path, channel.value)
+            yield corrected(read_frame(path, channel.value), sensor)
 
 
 def _design(path: Path) -> TestfieldDesign | ReseauDesign:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from ..adjust import Failure
     from ..data import Frame, ImagePoints
     from ..formats import ReseauMeasurement
+    from ..refine.sensor import SensorCorrection
 
 T = TypeVar("T")
 
@@ -39,12 +41,16 @@ def corrected(frame: Frame, sensor: Path | None) -> Frame:
     UsageError
         When it is one of another sensor.
     """
-    if sensor is None:
-        return frame
+    return frame if sensor is None else _sensor_correction(sensor).apply(frame)
+
+
+@cache
+def _sensor_correction(path: Path) -> SensorCorrection:
+    """Read once for all frames of a command."""
     from ..calibration import Calibration
     from ..refine.sensor import SensorCorrection
 
-    return SensorCorrection.from_calibration(Calibration.read(sensor)).apply(frame)
+    return SensorCorrection.from_calibration(Calibration.read(path))
 
 
 def is_points(path: Path) -> bool:
