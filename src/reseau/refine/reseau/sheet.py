@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from ...adjust import Failure
-from ...data import Array, Rows
+from ...data import Array, Mask, Rows
 from ...errors import UsageError
 from ...formats import ReseauDesign
 from ...optics import Chain, RationalPolynomial
@@ -228,26 +228,26 @@ def _read(
     rings = design.rings
     assert rings is not None
     dark = _darkness(grey, nodes, mapping, design, step)
-    coded = {design.ids.index(name): sectors for name, sectors in rings.sectors.items()}
-    node_of = {(int(i), int(j)): k for k, (i, j) in enumerate(nodes)}
-    h, w = grey.shape
+    coded = np.array([design.ids.index(name) for name in rings.sectors], dtype=np.intp)
+    ahead = np.ptp(numbers, axis=0).max()
+    corner = (nodes.min(axis=0) - ahead).astype(np.intp)
+    row_of, seen = _tables(nodes, mapping, corner, int(ahead), (grey.shape[0], grey.shape[1]))
     found: list[tuple[float, float, Array, Array, Rows]] = []
     for turn in _turns():
-        expected = {k: _sectors(sectors, turn) for k, sectors in coded.items()}
-        turned = numbers @ turn.T
-        low = nodes.min(axis=0) - turned.max(axis=0)
-        high = nodes.max(axis=0) - turned.min(axis=0)
-        for shift in product(*(range(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))):
-            at = turned + shift
-            node = np.array([node_of.get((int(i), int(j)), -1) for i, j in at])
-            count = int((node >= 0).sum())
-            if count < 0.6 * min(len(nodes), len(numbers)):
-                continue
-            seen = _in_sight(mapping, at[node < 0], nodes, (h, w))
-            read = [_agreement(dark[node[k]], expected[k]) for k in coded if node[k] >= 0]
-            agreement = max(read, default=-1.0)
-            score = count - 0.5 * seen + _RINGS * sum(read)
-            found.append((score, agreement, turn, np.array(shift, dtype=np.float64), node))
+        turned = np.rint(numbers @ turn.T).astype(np.intp)
+        low = nodes.min(axis=0).astype(np.intp) - turned.max(axis=0)
+        high = nodes.max(axis=0).astype(np.intp) - turned.min(axis=0)
+        shifts = np.array(list(product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))))
+        at = tuple(np.moveaxis(shifts[:, None] + turned - corner, 2, 0))
+        node, missed = row_of[at], seen[at]  # (shifts, disks)
+        count = (node >= 0).sum(axis=1)
+        expected = np.stack([_sectors(sectors, turn) for sectors in rings.sectors.values()])
+        read = _agreement(dark, expected)[node[:, coded], np.arange(len(coded))]
+        there = node[:, coded] >= 0
+        score = count - 0.5 * missed.sum(axis=1) + _RINGS * np.where(there, read, 0.0).sum(axis=1)
+        best = np.where(there, read, -1.0).max(axis=1)
+        for k in np.flatnonzero(count >= 0.6 * min(len(nodes), len(numbers))):
+            found.append((score[k], best[k], turn, shifts[k].astype(np.float64), node[k]))
     if not found:
         return Failure("the disks found lie nowhere as the design says")
     found.sort(key=lambda one: -one[0])
@@ -257,6 +257,25 @@ def _read(
     if (np.linalg.det(_slope(mapping) @ turn) < 0) != mirrored:
         return Failure("the sheet is seen mirrored")
     return turn, moved, np.where(node >= 0, rows[node], -1)
+
+
+def _tables(
+    nodes: Array, mapping: Chain, corner: Rows, ahead: int, shape: tuple[int, int]
+) -> tuple[Rows, Mask]:
+    """The lattice from a corner on: the row of each node that was found, and which others are in sight.
+
+    Far from those found the projectivity alone tells the latter.
+    """
+    wide, high = (nodes.max(axis=0) - corner).astype(np.intp) + ahead + 1
+    row_of = np.full((wide, high), -1, dtype=np.intp)
+    row_of[tuple((nodes - corner).astype(np.intp).T)] = np.arange(len(nodes))
+    at = corner + np.argwhere(row_of < 0).astype(np.float64)
+    near = KDTree(nodes).query(at)[0] < _FROM
+    xy = mapping.first(at)
+    xy[near] = mapping(at[near])
+    seen = np.zeros(row_of.shape, dtype=bool)
+    seen[row_of < 0] = ((xy > 0) & (xy < np.array(shape[::-1]) - 1)).all(axis=1)
+    return row_of, seen
 
 
 def _slope(mapping: Chain) -> Array:
@@ -269,15 +288,6 @@ def _turns() -> list[Array]:
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
     return turns + [turn @ np.diag([1.0, -1.0]) for turn in turns]
-
-
-def _in_sight(mapping: Chain, at: Array, nodes: Array, shape: tuple[int, int]) -> int:
-    """How many of the nodes lie in the frame; far from those found the projectivity alone tells it."""
-    if not len(at):
-        return 0
-    near = KDTree(nodes).query(at)[0] < _FROM
-    xy = np.where(near[:, None], mapping(at), mapping.first(at))
-    return int(((xy > 0) & (xy < np.array(shape[::-1]) - 1)).all(axis=1).sum())
 
 
 def _darkness(
@@ -311,8 +321,9 @@ def _sectors(sectors: tuple[tuple[float, float], ...], turn: Array) -> Array:
     return expected
 
 
-def _agreement(dark: Array, expected: Array) -> float:
-    """1 where a ring is as it should be, 0 on an empty ground, -1 for the opposite."""
+def _agreement(dark: Array, expected: Array) -> Array:
+    """How far rings are as codes say (m, c): 1 where so, 0 on an empty ground, -1 for the opposite."""
     # Means, so that codes of many and of few dark sectors weigh alike.
-    on, off = dark[expected > 0], dark[expected == 0]
-    return float((on.mean() if len(on) else 0.0) - (off.mean() if len(off) else 0.0))
+    on, off = (part / np.maximum(part.sum(axis=1, keepdims=True), 1) for part in (expected, 1 - expected))
+    agreement: Array = dark @ (on - off).T
+    return agreement
