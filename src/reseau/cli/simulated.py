@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["OscilloscopeSession", "TestfieldSession", "World", "captured_oscilloscope", "captured_testfield"]
 
 _POSES = 12
-_HALF_SECTOR = 100
-"""That the scanner's head sweeps over, gradians: what stands beside it is seen as well."""
+_SETTINGS: dict[str, dict[str, Any]] = {"scanner": {"half_sector": 100}, "table": {"speed": 1000.0}}
+"""The head sweeps over all that is in the tank; the table loses no time."""
 _PITCH_MM, _JITTER_PX, _FILL = 0.027, 0.0086, 0.8
 """Of the camera before the testfield: the paper's."""
 
@@ -98,8 +98,9 @@ def _carried_out(
     with BenchLock([entry.address for entry in entries.values()], "the demo"):
         bench = Bench(file.model_copy(update={"instruments": entries}), _builder(simulated))
         try:
-            if "scanner" in names:
-                bench["scanner"].configure(half_sector=_HALF_SECTOR)
+            for name, changes in _SETTINGS.items():
+                if name in names:
+                    bench[name].configure(**changes)
             run = Acquisition(bench, kept, procedure, watch=watch, operator=operator)
             carry_out(run, planned(run))
         finally:
