@@ -1,4 +1,4 @@
-"""Instruments that behave like hardware, all in one shared world; in process for now."""
+"""Instruments that behave like hardware, all in one shared world."""
 
 from .camera import Camera, film
 from .display import Bending, Display, Instrument
@@ -29,11 +29,5 @@ __all__ = [
     "World",
     "film",
     "paper_stations",
-    "simulated_bench",
     "swapped",
 ]
-
-
-def simulated_bench(seed: int = 0) -> World:
-    """The bench that stands in for one of real instruments; found by its entry point."""
-    return World.standard(seed)

@@ -10,7 +10,7 @@ from reseau.designs import regular_reseau, standard_reseau
 from reseau.errors import UsageError
 from reseau.formats import Mark, ReseauDesign
 from reseau.optics.formation import coverage, mark_outline
-from reseau_sims import Faults, World, film, simulated_bench
+from reseau_sims import Faults, World, film
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def frame(world: World) -> Frame:
 
 
 def test_same_seed_same_frame_whatever_was_photographed_before(world: World, frame: Frame) -> None:
-    again = simulated_bench(3)
+    again = World.standard(3)
     again.photograph("something else")
     assert again.photo_i().sha256 == frame.sha256
     np.testing.assert_array_equal(again.photo_i().pixels, frame.pixels)

@@ -67,9 +67,7 @@ def plugin(group: str, name: str) -> Any:
 
 def drivers() -> tuple[str, ...]:
     """Names of the drivers that are installed."""
-    # The simulated world of the demo stands in the same group; it drives nothing.
-    names = {each.name for each in entry_points(group=INSTRUMENTS)}
-    return tuple(sorted(name for name in names if not name.startswith("simulated")))
+    return tuple(sorted({each.name for each in entry_points(group=INSTRUMENTS)}))
 
 
 def found_instruments() -> dict[str, tuple[str, ...] | ReseauError]:
