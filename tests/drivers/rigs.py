@@ -236,12 +236,12 @@ def v4l2_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, body, script, work, device.expose, extra={"camera": camera})
 
 
-def gige_camera(stack: ExitStack, body: CameraBody) -> GigeCamera:
+def gige_camera(stack: ExitStack, body: CameraBody, features: str = "") -> GigeCamera:
     """A simulated camera on GigE Vision, once no other test has one; without Aravis the test is skipped."""
     missing = aravis_is_missing()
     if missing:
         pytest.skip(missing)
-    return stack.enter_context(GigeCamera(body, patience_s=240.0))
+    return stack.enter_context(GigeCamera(body, features=features, patience_s=240.0))
 
 
 def gige_rig(stack: ExitStack, transport: str, script: Script) -> Rig:

@@ -248,6 +248,43 @@ def test_a_node_that_is_none_or_no_camera_is_said() -> None:
         v4l2("camera", "/dev/null").connect()
 
 
+class _Clocked:
+    """What is asked of Aravis's camera for its clock, which is an hour ahead and runs, or stands still."""
+
+    def __init__(self, name: str, *, runs: bool) -> None:
+        self._latch, self._runs, self._value = name, runs, 0
+
+    def is_feature_available(self, name: str) -> bool:
+        return name in (
+            self._latch,
+            {"TimestampLatch": "TimestampLatchValue"}.get(self._latch, "GevTimestampValue"),
+        )
+
+    def execute_command(self, name: str) -> None:
+        assert name == self._latch
+        if self._runs:
+            self._value = time.monotonic_ns() + 3_600_000_000_000
+
+    def get_integer(self, name: str) -> int:
+        assert self.is_feature_available(name)
+        return self._value
+
+
+@pytest.mark.parametrize("name", ["TimestampLatch", "GevTimestampControlLatch"])
+def test_a_camera_s_clock_is_read_where_it_can_be(name: str) -> None:
+    source = cameras.Aravis("127.0.0.1")
+    source._camera = _Clocked(name, runs=True)
+    found = source._latched()
+    assert found is not None
+    offset, doubt = found
+    assert abs(offset + 3_600_000_000_000) <= doubt < 50_000_000
+    source._camera = _Clocked(name, runs=False)
+    assert source._latched() is None
+    source._camera = _Clocked("", runs=False)
+    assert source._latched() is None
+    source._camera = None
+
+
 def test_a_camera_that_tells_nothing_of_itself_is_trusted_with_nothing() -> None:
     device = VideoCamera(CameraBody())
     # In automatic mode the exposure may be as long as the period, and it is not told.

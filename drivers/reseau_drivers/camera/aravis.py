@@ -20,7 +20,7 @@ from reseau.instruments import Deadline, Identity, choice, quantity
 
 from ..codecs.pixels import GENICAM, decode
 from .camera import CameraSettings, Taken
-from .clocks import Span, Wrapping, realtime_offset
+from .clocks import Stamps, Wrapping, realtime_offset
 from .gvcp import require_answer
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
@@ -101,19 +101,18 @@ class Aravis:
         self._lost = Event()
         self._running = False
         self._settings = AravisSettings()
-        self._numbers, self._damaged = Wrapping(_SHORT_IDS), 0
+        self._numbers = Wrapping(_SHORT_IDS)
         self._size = (0, 0)
         self._period_ns = _UNKNOWN_PERIOD_NS
         self._exposure_ns: int | None = None
         self._gain = float("nan")
-        self._triggered_ns: int | None = None
-        self._clock: tuple[int, int] | None = None
-        self._least_delay: int | None = None
+        self._stamps = Stamps()
+        self._chunks: tuple[str, ...] = ()
 
     @property
     def dropped(self) -> int:
         """Frames that were lost or damaged."""
-        return self._numbers.lost + self._damaged
+        return self._numbers.lost
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -125,12 +124,12 @@ class Aravis:
         self.close()
         library, _ = _library()
         self._lost = lost = Event()
-        self._numbers, self._damaged = Wrapping(_SHORT_IDS), 0
+        self._numbers = Wrapping(_SHORT_IDS)
         require_answer(self._address, deadline)
         with self._told("open"):
             self._camera = library.Camera.new(self._address)
             self._camera.get_device().connect("control-lost", lambda *_: lost.set())
-            self._clock = self._latched()
+            self._stamps.offset = self._latched()
 
     def close(self) -> None:
         """Let go of it, if it is open; one that does not answer is not waited for."""
@@ -164,10 +163,7 @@ class Aravis:
                 camera.clear_triggers()
             else:
                 camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
-            self._parser = None
-            if settings.chunks == "on":
-                camera.set_chunks("Timestamp,ExposureTime,Gain")
-                self._parser = camera.create_chunk_parser()
+            self._set_chunks(camera, settings.chunks == "on")
             if settings.packet_size and camera.is_gv_device():
                 camera.gv_set_packet_size(settings.packet_size)
                 camera.gv_set_packet_size_adjustment(_library()[0].GvPacketSizeAdjustment.NEVER)
@@ -193,7 +189,7 @@ class Aravis:
             camera.start_acquisition()
         self._running = True
         self._numbers.restart()
-        self._least_delay = self._triggered_ns = None
+        self._stamps.restart(self._period_ns)
 
     def request(self, deadline: Deadline) -> None:
         """Trigger it by software, where it is set so; what came before is let go."""
@@ -203,7 +199,7 @@ class Aravis:
             self._counted(buffer)
             self._stream.push_buffer(buffer)
         if self._settings.trigger == "software":
-            self._triggered_ns = time.monotonic_ns()
+            self._stamps.triggered = time.monotonic_ns()
             with self._told("trigger") as camera:
                 camera.software_trigger()
 
@@ -218,9 +214,7 @@ class Aravis:
                 return None
             try:
                 sequence = self._counted(buffer)
-                if sequence is None or not self._is_whole(buffer):
-                    return None
-                return self._read(buffer, sequence)
+                return None if sequence is None else self._read(buffer, sequence)
             finally:
                 stream.push_buffer(buffer)
 
@@ -236,29 +230,22 @@ class Aravis:
     def clock(self, deadline: Deadline) -> str:
         """How its clock stands to UTC."""
         with self._told("clock"):
-            self._clock = self._latched()
-        if self._clock is not None:
-            offset, doubt = self._clock
-            return f"offset {(offset + realtime_offset()[0]) / 1e9:.6f} ± {doubt / 1e9:.6f} s"
-        if self._least_delay is None:
-            return "offset unknown: no way to read its clock, and no frame yet"
-        offset = self._least_delay + realtime_offset()[0]
-        return f"offset at most {offset / 1e9:+.6f} s, by the arrival of frames"
-
-    def _is_whole(self, buffer: Any) -> bool:
-        return bool(buffer.get_status() == _library()[0].BufferStatus.SUCCESS)
+            self._stamps.offset = self._latched()
+        return self._stamps.told()
 
     def _counted(self, buffer: Any) -> int | None:
-        """The number of a frame counted on; damaged ones are counted too."""
+        """The number of a whole frame counted on; None of a damaged one, or one that is not newer.
+
+        A damaged one may have lost its leader, and with it its number: it is missed when the next comes.
+        """
+        if buffer.get_status() != _library()[0].BufferStatus.SUCCESS:
+            return None
         number = int(buffer.get_frame_id())
         if number > _SHORT_IDS:
             self._numbers.period = _LONG_IDS
         elif number == 0 and self._numbers.period == _SHORT_IDS:
             self._numbers.period = _SHORT_IDS_WITH_ZERO
-        sequence = self._numbers.next(number)
-        if sequence is not None and not self._is_whole(buffer):
-            self._damaged += 1
-        return sequence
+        return self._numbers.next(number)
 
     def _read(self, buffer: Any, sequence: int) -> Taken | None:
         width, height = buffer.get_image_width(), buffer.get_image_height()
@@ -270,34 +257,16 @@ class Aravis:
             )
         stride = width * layout.stored + int(buffer.get_image_padding()[0])
         exposure_ns, gain = self._exposure_ns, self._gain
-        if self._parser is not None and buffer.has_chunks():
-            with self._told("chunks"):
-                exposure_ns = int(self._parser.get_float_value(buffer, "ChunkExposureTime") * 1000)
-                gain = float(self._parser.get_float_value(buffer, "ChunkGain"))
-        began = self._began(buffer, exposure_ns or 0)
+        if buffer.has_chunks() and "ExposureTime" in self._chunks:
+            exposure_ns = int(self._parser.get_float_value(buffer, "ChunkExposureTime") * 1000)
+        if buffer.has_chunks() and "Gain" in self._chunks:
+            gain = float(self._parser.get_float_value(buffer, "ChunkGain"))
+        arrived = int(buffer.get_system_timestamp()) - realtime_offset()[0]
+        before = (exposure_ns or 0) if self._settings.stamp == "end" else 0
+        began = self._stamps.began(int(buffer.get_timestamp()), arrived, before, exposure_ns or 0)
         pixels = decode(layout, width, height, buffer.get_data(), stride)
         exposure_us = float("nan") if exposure_ns is None else exposure_ns / 1000
         return Taken(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
-
-    def _began(self, buffer: Any, exposure_ns: int) -> Span:
-        """When the exposure began: by the camera's clock where it can be read, or by when the frame came."""
-        arrived = int(buffer.get_system_timestamp()) - realtime_offset()[0]
-        stamped = int(buffer.get_timestamp())
-        before = exposure_ns if self._settings.stamp == "end" else 0
-        if self._clock is not None:
-            offset, doubt = self._clock
-            began = stamped + offset - before
-            span = Span(began - doubt, began + doubt)
-        else:
-            # A frame that came later after its stamp than another did has waited for as long somewhere.
-            delay = arrived - stamped
-            self._least_delay = delay if self._least_delay is None else min(delay, self._least_delay)
-            waited = delay - self._least_delay
-            span = Span(arrived - waited - exposure_ns - self._period_ns, arrived - exposure_ns)
-        if self._triggered_ns is None:
-            return span
-        # Everything of before was let go, so this one was exposed at the trigger, or after it.
-        return Span(max(span.earliest, self._triggered_ns), max(span.latest, arrived, self._triggered_ns))
 
     def _latched(self) -> tuple[int, int] | None:
         """What is added to the camera's clock to have ours, and its uncertainty; None: it cannot be read."""
@@ -317,6 +286,20 @@ class Aravis:
             doubt, offset, _ = min(found)
             return offset, (doubt + 1) // 2
         return None
+
+    def _set_chunks(self, camera: Any, wanted: bool) -> None:
+        """Have each frame tell with which exposure and gain it was taken, as far as it can."""
+        self._parser, self._chunks = None, ()
+        if not wanted:
+            if camera.are_chunks_available():
+                camera.set_chunk_mode(False)
+            return
+        if not camera.are_chunks_available():
+            raise RefusedError("has no chunk data")
+        offered = camera.dup_available_enumerations_as_strings("ChunkSelector")
+        self._chunks = tuple(name for name in ("ExposureTime", "Gain") if name in offered)
+        camera.set_chunks(",".join(self._chunks))
+        self._parser = camera.create_chunk_parser()
 
     def _set_region(self, camera: Any, settings: AravisSettings) -> None:
         camera.set_pixel_format_from_string(settings.format)

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-__all__ = ["Span", "Wrapping", "realtime_offset", "utc"]
+__all__ = ["Span", "Stamps", "Wrapping", "realtime_offset", "utc"]
 
 _TRIES = 5
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -81,3 +81,70 @@ class Wrapping:
         self._number = number
         self._counted += step
         return self._counted
+
+
+class Stamps:
+    """When exposures began, of frames that a camera stamps by a clock of its own.
+
+    Attributes
+    ----------
+    offset : (int, int) or None
+        What is added to the camera's clock to have ours, and its uncertainty; None where it cannot be read.
+    triggered : int or None
+        When the frame that is waited for was triggered, all others having been let go.
+
+    Examples
+    --------
+    >>> stamps = Stamps()
+    >>> stamps.restart(period=10)
+    >>> stamps.began(1000, 5000, before=3, exposure=3), stamps.began(1100, 5140, before=3, exposure=3)
+    (Span(earliest=4987, latest=4997), Span(earliest=5087, latest=5137))
+    >>> stamps.offset = 4000, 2
+    >>> stamps.began(1200, 5240, before=3, exposure=3)
+    Span(earliest=5195, latest=5199)
+    """
+
+    def __init__(self) -> None:
+        self.offset: tuple[int, int] | None = None
+        self.triggered: int | None = None
+        self._period = 0
+        self._least_delay: int | None = None
+
+    def restart(self, period: int) -> None:
+        """The camera was started anew; its frames follow one another after this period."""
+        self._period, self._least_delay, self.triggered = period, None, None
+
+    def began(self, stamped: int, arrived: int, before: int, exposure: int) -> Span:
+        """When an exposure began.
+
+        Parameters
+        ----------
+        stamped, arrived : int
+            By the camera's clock, and when its first packet came, by ours.
+        before : int
+            How long before its stamp it began.
+        exposure : int
+            How long it took.
+        """
+        if self.offset is not None:
+            begun, doubt = stamped + self.offset[0] - before, self.offset[1]
+            span = Span(begun - doubt, begun + doubt)
+        else:
+            # A frame that came later after its stamp than another did has waited for as long somewhere.
+            delay = arrived - stamped
+            self._least_delay = delay if self._least_delay is None else min(delay, self._least_delay)
+            waited = delay - self._least_delay
+            span = Span(arrived - waited - exposure - self._period, arrived - exposure)
+        if self.triggered is None:
+            return span
+        # Everything of before was let go, so this one was exposed at the trigger, or after it.
+        return Span(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
+
+    def told(self) -> str:
+        """How the camera's clock stands to UTC."""
+        real = realtime_offset()[0]
+        if self.offset is not None:
+            return f"offset {(self.offset[0] + real) / 1e9:.6f} ± {self.offset[1] / 1e9:.6f} s"
+        if self._least_delay is None:
+            return "offset unknown: no way to read its clock, and no frame yet"
+        return f"offset at most {(self._least_delay + real) / 1e9:+.6f} s, by the arrival of frames"

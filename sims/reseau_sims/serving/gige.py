@@ -58,6 +58,8 @@ class GigeCamera:
         What it looks with; frames are the upper left part of what it sees, as large as they are asked for.
     serial : str
         What it is called.
+    features : str
+        File of further features (GenICam) that it has, beside those of the library's.
     patience_s : float
         How long one waits for another simulated camera of this machine to end: there is one port.
 
@@ -69,10 +71,12 @@ class GigeCamera:
 
     ADDRESS = "127.0.0.1"
 
-    def __init__(self, body: CameraBody, *, serial: str = "SIM1", patience_s: float = 0.0) -> None:
+    def __init__(
+        self, body: CameraBody, *, serial: str = "SIM1", features: str = "", patience_s: float = 0.0
+    ) -> None:
         if not _library_is_there():
             raise UsageError("Aravis is not installed", do="apt-get install libaravis-0.8-0")
-        self.body, self._serial = body, serial
+        self.body, self._serial, self._features = body, serial, features
         self.frames = 0
         """Frames that were asked for."""
         self._turn = _one_at_a_time(patience_s)
@@ -92,16 +96,10 @@ class GigeCamera:
         return self.ADDRESS
 
     def _start(self) -> None:
-        program = Path(door.__file__)
+        memory = str(self._descriptor), str(self._size)
+        features = [self._features] if self._features else []
         self._process = subprocess.Popen(
-            [
-                sys.executable,
-                str(program),
-                self.ADDRESS,
-                self._serial,
-                str(self._descriptor),
-                str(self._size),
-            ],
+            [sys.executable, door.__file__, self.ADDRESS, self._serial, *memory, *features],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,

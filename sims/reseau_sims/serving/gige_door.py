@@ -1,9 +1,9 @@
 """The process that speaks GigE Vision: Aravis's fake camera, with pictures of the simulator behind it.
 
 Run as a script by :class:`reseau_sims.serving.gige.GigeCamera`, with the standard library alone, so that it
-is there at once: ``python gige_door.py ADDRESS SERIAL MEMORY BYTES``. For each frame it writes a request to
-its standard output and reads the order for it from its standard input; the pixels lie in memory shared by its
-file descriptor. It is a process of its own because a thread of C calls back for every frame.
+is there at once: ``python gige_door.py ADDRESS SERIAL MEMORY BYTES [FEATURES]``. For each frame it writes a
+request to its standard output and reads the order for it from its standard input; the pixels lie in memory
+shared by its file descriptor. It is a process of its own because a thread of C calls back for every frame.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import ctypes
 import mmap
 import os
 import queue
+import re
 import struct
 import sys
 import threading
@@ -38,6 +39,9 @@ _POINTER = ctypes.c_void_p
 _FILL = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32)
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "arv_gv_fake_camera_new": (_POINTER, [ctypes.c_char_p, ctypes.c_char_p]),
+    "arv_gv_fake_camera_new_full": (_POINTER, [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_char_p]),
+    "arv_fake_camera_new": (_POINTER, [ctypes.c_char_p]),
+    "arv_fake_camera_get_genicam_xml": (_POINTER, [_POINTER, ctypes.POINTER(ctypes.c_size_t)]),
     "arv_gv_fake_camera_get_fake_camera": (_POINTER, [_POINTER]),
     "arv_gv_fake_camera_is_running": (ctypes.c_int, [_POINTER]),
     "arv_fake_camera_read_register": (
@@ -64,17 +68,29 @@ class Door:
         Where the pixels of the next frame lie.
     orders, requests : binary files
         The pipe.
+    features : str
+        File of further features (GenICam), read from the end of the library's own.
     """
 
     def __init__(
-        self, address: str, serial: str, memory: mmap.mmap, orders: BinaryIO, requests: BinaryIO
+        self,
+        address: str,
+        serial: str,
+        memory: mmap.mmap,
+        orders: BinaryIO,
+        requests: BinaryIO,
+        features: str = "",
     ) -> None:
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
         self._objects = ctypes.CDLL("libgobject-2.0.so.0")
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(self._library, name)
             function.restype, function.argtypes = result, arguments
-        self._door = self._library.arv_gv_fake_camera_new(address.encode(), serial.encode())
+        named = address.encode(), serial.encode()
+        if features:
+            self._door = self._library.arv_gv_fake_camera_new_full(*named, self._described(features))
+        else:
+            self._door = self._library.arv_gv_fake_camera_new(*named)
         if not self._door or not self._library.arv_gv_fake_camera_is_running(self._door):
             raise SystemExit(f"no GigE Vision on {address}: is port 3956 taken?")
         self._camera = self._library.arv_gv_fake_camera_get_fake_camera(self._door)
@@ -84,6 +100,24 @@ class Door:
         self._lock = threading.Lock()
         self._fill = _FILL(self._frame)
         self._library.arv_fake_camera_set_fill_pattern(self._camera, self._fill, None)
+
+    def _described(self, features: str) -> bytes:
+        """Name of a file with the library's own description of the camera, and the further features."""
+        size = ctypes.c_size_t()
+        bare = self._library.arv_fake_camera_new(b"bare")
+        text = ctypes.string_at(
+            self._library.arv_fake_camera_get_genicam_xml(bare, ctypes.byref(size)), size.value
+        )
+        with open(features, "rb") as file:
+            more = file.read()
+        for name in re.findall(rb'Name="(\w+)"', more):
+            # One of the same name takes the place of the library's.
+            text = re.sub(rb'<(\w+) Name="%s".*?</\1>' % name, b"", text, count=1, flags=re.DOTALL)
+        end = text.rindex(b"</RegisterDescription>")
+        whole = features + ".xml"
+        with open(whole, "wb") as file:
+            file.write(text[:end] + more + text[end:])
+        return whole.encode()
 
     def run(self) -> None:
         """Obey orders until there are none any more."""
@@ -144,9 +178,9 @@ class Door:
 
 def main() -> None:
     """Serve until the simulator hangs up."""
-    address, serial, descriptor, size = sys.argv[1:5]
+    address, serial, descriptor, size, *features = sys.argv[1:]
     memory = mmap.mmap(int(descriptor), int(size))
-    Door(address, serial, memory, sys.stdin.buffer, sys.stdout.buffer).run()
+    Door(address, serial, memory, sys.stdin.buffer, sys.stdout.buffer, *features).run()
 
 
 if __name__ == "__main__":
