@@ -270,21 +270,20 @@ class Aravis:
 
     def _latched(self) -> tuple[int, int] | None:
         """What is added to the camera's clock to have ours, and its uncertainty; None: it cannot be read."""
-        camera, found = _held(self._camera), []
+        camera = _held(self._camera)
         for latch, value in _LATCHES:
             if not (camera.is_feature_available(latch) and camera.is_feature_available(value)):
                 continue
+            readings = []
             for _ in range(3):
                 before = time.monotonic_ns()
                 camera.execute_command(latch)
                 after = time.monotonic_ns()
-                found.append((after - before, (before + after) // 2 - int(camera.get_integer(value)), after))
-            readings = [middle - offset for _, offset, middle in found]
-            # A clock that stands still is none.
-            if readings[0] == readings[-1]:
-                return None
-            doubt, offset, _ = min(found)
-            return offset, (doubt + 1) // 2
+                readings.append((after - before, (before + after) // 2, int(camera.get_integer(value))))
+            if readings[0][2] == readings[-1][2]:
+                return None  # a clock that stands still is none
+            took, ours, theirs = min(readings)
+            return ours - theirs, (took + 1) // 2
         return None
 
     def _set_chunks(self, camera: Any, wanted: bool) -> None:
