@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import cast
 
 import numpy as np
 from scipy.special import ndtr
@@ -119,6 +120,11 @@ class Outline:
         """Each outline with its inside on the left, as after a mapping that mirrors it is not."""
         doubled_area = (self.xy[..., 0] * self.dxy[..., 1] - self.xy[..., 1] * self.dxy[..., 0]).sum(axis=-1)
         return Outline(self.xy, self.dxy * np.where(doubled_area < 0, -1.0, 1.0)[..., None, None])
+
+    def single(self) -> Outline:
+        """The same in single precision."""
+        xy, dxy = (cast(Array, nodes.astype(np.float32)) for nodes in (self.xy, self.dxy))
+        return Outline(xy, dxy)
 
     def affine(self, matrix: Array, shift: Array | None = None) -> Outline:
         """Carry the outline through matrices (..., 2, 2) and shifts (..., 2), one outline for each."""

@@ -33,6 +33,7 @@ def _table() -> tuple[Single, Single]:
 
 
 _STEP, _BELL = _table()
+f32 = np.float32
 
 
 def _compiled(function: F) -> F:
@@ -42,108 +43,149 @@ def _compiled(function: F) -> F:
 
 
 @_compiled
-def _normal(z: np.float32) -> tuple[np.float32, np.float32]:
-    """Distribution and density at z."""
-    if z <= -_SIDE:
-        return np.float32(0), np.float32(0)
-    if z >= _SIDE:
-        return np.float32(1), np.float32(0)
-    at = (z + np.float32(_SIDE)) * np.float32(_PER_SIGMA) + np.float32(0.5)
-    k = np.int32(at)
-    middle = np.float32(k) / np.float32(_PER_SIGMA) - np.float32(_SIDE)
-    d = z - middle
-    bell = _BELL[k]
-    step = _STEP[k] + bell * d * (np.float32(1) - np.float32(0.5) * d * middle)
-    return step, bell * (
-        np.float32(1) - d * (middle - np.float32(0.5) * d * (middle * middle - np.float32(1)))
-    )
+def _edges(first: np.float32, inverse: np.float32, count: int, step: Single, bell: Single) -> None:
+    """Distribution and density of the normal distribution at (first + k) · inverse."""
+    for k in range(count):
+        z = min(max((first + f32(k)) * inverse, f32(-_SIDE)), f32(_SIDE))
+        # An index without a sign is looked up without a question, many at a time.
+        i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
+        middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
+        d = z - middle
+        b = _BELL[i]
+        step[k] = _STEP[i] + b * d * (f32(1) - f32(0.5) * d * middle)
+        bell[k] = b * (f32(1) - d * (middle - f32(0.5) * d * (middle * middle - f32(1))))
 
 
 @_compiled
 def _responses(
-    pixels: Single, point: np.float32, sigma: np.float32, half: np.float32, out: Single
+    point: np.float32, count: int, sigma: np.float32, half: np.float32, work: Single, out: Single
 ) -> tuple[int, int]:
-    """Integral, value and derivative (3, c) of the response of pixels to light at a point.
+    """Integral, value and derivative (3, last − first) of the response of pixels to light at a point.
 
-    Pixels are one apart. Returns the first one that has any response, and the first beyond.
+    Pixels are at 0, 1, … Returns the first one that has any response, and the first beyond. The integral is
+    0 before and 1 behind.
     """
-    reach = np.float32(_SIDE) * sigma + half
-    per = np.float32(1) / (np.float32(2) * half)
-    inverse = np.float32(1) / sigma
-    first, last = 0, 0
-    for k in range(len(pixels)):
-        t = pixels[k] - point
-        if t <= -reach:
-            first = k + 1
-            out[0, k], out[1, k], out[2, k] = np.float32(0), np.float32(0), np.float32(0)
-        elif t >= reach:
-            out[0, k], out[1, k], out[2, k] = np.float32(1), np.float32(0), np.float32(0)
-        else:
-            right, left = t + half, t - half
-            step_r, bell_r = _normal(right * inverse)
-            step_l, bell_l = _normal(left * inverse)
-            out[0, k] = (right * step_r - left * step_l + sigma * (bell_r - bell_l)) * per
-            out[1, k] = (step_r - step_l) * per
-            out[2, k] = (bell_r - bell_l) * inverse * per
-            last = k + 1
-    return first, max(first, last)
+    reach = f32(_SIDE) * sigma + half
+    first = min(max(0, int(np.ceil(point - reach))), count)
+    n = min(count, int(np.floor(point + reach)) + 1) - first
+    if n <= 0:
+        return first, first
+    per, inverse, begin, lag = f32(0.5) / half, f32(1) / sigma, f32(first) - point - half, 1
+    if half == f32(0.5):  # neighbours share an edge
+        _edges(begin, inverse, n + 1, work[0], work[1])
+    else:
+        lag = n
+        _edges(begin, inverse, n, work[0], work[1])
+        _edges(begin + f32(2) * half, inverse, n, work[0, n:], work[1, n:])
+    for k in range(n):
+        left = begin + f32(k)
+        right = left + f32(2) * half
+        step, bell = work[0, k + lag] - work[0, k], work[1, k + lag] - work[1, k]
+        out[0, k] = (right * work[0, k + lag] - left * work[0, k] + sigma * bell) * per
+        out[1, k], out[2, k] = step * per, bell * inverse * per
+    return first, first + n
+
+
+@_compiled
+def _add_node(
+    at: tuple[int, int, int, int],
+    tangent: tuple[np.float32, np.float32],
+    normals: Single,
+    sigma: np.float32,
+    responses: tuple[Single, Single],
+    parts: Single,
+) -> None:
+    """Add what a node of an outline contributes to share and derivatives (4 + m, r, c) in its reach."""
+    (top, bottom, left, right), (dx, dy), (down, across) = at, tangent, responses
+    n = right - left
+    for r in range(top, bottom):
+        h, d = down[1, r - top], down[2, r - top]
+        of_share = -h * dy
+        share = parts[0, r, left:right]
+        for c in range(n):
+            share[c] += of_share * across[0, c]
+        if len(parts) == 1:
+            continue
+        of_y, of_width, bent = -h * dx, sigma * of_share, sigma * d * dx
+        along_x, along_y, width = (
+            parts[1, r, left:right],
+            parts[2, r, left:right],
+            parts[3, r, left:right],
+        )
+        for c in range(n):
+            value = across[1, c]
+            along_x[c] -= of_share * value
+            along_y[c] += of_y * value
+            width[c] += of_width * across[2, c] + bent * value
+        for m in range(len(normals)):
+            of_form, form = h * normals[m], parts[4 + m, r, left:right]
+            for c in range(n):
+                form[c] += of_form * across[1, c]
 
 
 @_compiled
 def formed(
-    xy: Single,
-    dxy: Single,
-    motion: Single,
-    columns: Single,
-    rows: Single,
+    nodes: Single,
+    tangents: Single,
+    generators: Single,
+    at: Single,
+    place: Single,
+    form: Single,
     sigma: Single,
     fill: float,
     parts: Single,
 ) -> None:
-    """Form share and derivatives of shapes.
+    """Form share and derivatives of shapes, whose outlines are multiplied by 1 + Σ p_i F_i.
 
     Parameters
     ----------
-    xy, dxy : ndarray (k, j, 2)
-        Nodes of their outlines, tangents times weights; see :class:`reseau.optics.Outline`.
-    motion : ndarray (k, j, 2)
-        Velocities of the nodes for a parameter of the form.
-    columns, rows : ndarray (k, c), (k, r)
-        Coordinates of the pixels.
-    sigma : ndarray (k,)
+    nodes, tangents : ndarray (k, j, 2)
+        Nodes of outlines, and tangents times weights; see :class:`reseau.optics.formation.Outline`.
+    generators : ndarray (m, 2, 2)
+        The F.
+    at : ndarray of int (n,)
+        Which outlines are wanted.
+    place : ndarray (n, 2)
+        Where their origins lie, from the centre of the first pixel of each window.
+    form : ndarray (n, m)
+        The p.
+    sigma : ndarray (n,)
         Widths of the point-spread function.
     fill : float
         Light-sensitive part of the pitch.
-    parts : ndarray (k, 1, r, c) or (k, 5, r, c)
-        The share, and its derivatives by a shift along x, along y, the width, and the form, if there is room.
+    parts : ndarray (n, 1, r, c) or (n, 4 + m, r, c)
+        The share, and if there is room its derivatives by shifts along x and y, the width, and the forms.
     """
-    half = np.float32(max(fill, 1e-6) / 2)
-    all_parts = parts.shape[1] > 1
-    across = np.empty((3, columns.shape[1]), np.float32)
-    down = np.empty((3, rows.shape[1]), np.float32)
-    for k in range(len(xy)):
-        parts[k] = np.float32(0)
-        s = sigma[k]
-        for j in range(xy.shape[1]):
-            dx, dy = dxy[k, j, 0], dxy[k, j, 1]
-            if dx == 0 and dy == 0:
+    half, (high, wide) = f32(max(fill, 1e-6) / 2), parts.shape[2:]
+    down, across = np.empty((3, high), f32), np.empty((3, wide), f32)
+    work, normals = np.empty((2, 2 * max(high, wide) + 1), f32), np.empty(len(generators), f32)
+    behind, grown = np.empty((high, wide + 1), f32), np.empty((2, 2), f32)
+    for k in range(len(at)):
+        parts[k], behind[:], grown[:] = f32(0), f32(0), f32(0)
+        grown[0, 0], grown[1, 1] = f32(1), f32(1)
+        for m in range(len(generators)):
+            grown += form[k, m] * generators[m]
+        for j in range(nodes.shape[1]):
+            u, v = tangents[at[k], j, 0], tangents[at[k], j, 1]
+            if u == 0 and v == 0:
                 continue
-            first, last = _responses(rows[k], xy[k, j, 1], s, half, down)
-            _responses(columns[k], xy[k, j, 0], s, half, across)
-            normal = motion[k, j, 0] * dy - motion[k, j, 1] * dx
-            for r in range(first, last):
-                h = down[1, r]
-                of_share = -h * dy
-                if not all_parts:
-                    for c in range(parts.shape[3]):
-                        parts[k, 0, r, c] += of_share * across[0, c]
-                    continue
-                of_y, of_form, bent = -h * dx, h * normal, s * down[2, r] * dx
-                of_width = s * of_share
-                for c in range(parts.shape[3]):
-                    value = across[1, c]
-                    parts[k, 0, r, c] += of_share * across[0, c]
-                    parts[k, 1, r, c] -= of_share * value
-                    parts[k, 2, r, c] += of_y * value
-                    parts[k, 3, r, c] += of_width * across[2, c] + bent * value
-                    parts[k, 4, r, c] += of_form * value
+            dx, dy = grown[0, 0] * u + grown[0, 1] * v, grown[1, 0] * u + grown[1, 1] * v
+            u, v = nodes[at[k], j, 0], nodes[at[k], j, 1]
+            x = grown[0, 0] * u + grown[0, 1] * v + place[k, 0]
+            y = grown[1, 0] * u + grown[1, 1] * v + place[k, 1]
+            top, bottom = _responses(y, high, sigma[k], half, work, down)
+            if top == bottom:
+                continue
+            left, right = _responses(x, wide, sigma[k], half, work, across)
+            for m in range(len(generators)):
+                f = generators[m]
+                normals[m] = (f[0, 0] * u + f[0, 1] * v) * dy - (f[1, 0] * u + f[1, 1] * v) * dx
+            _add_node((top, bottom, left, right), (dx, dy), normals, sigma[k], (down, across), parts[k])
+            for r in range(top, bottom):
+                behind[r, right] -= down[1, r - top] * dy
+        # Behind the reach of a node its integral stays 1: one sum for all.
+        for r in range(high):
+            total = f32(0)
+            for c in range(wide):
+                total += behind[r, c]
+                parts[k, 0, r, c] += total

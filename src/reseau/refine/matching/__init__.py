@@ -2,11 +2,12 @@
 
 from .matcher import SIZE, Matches, MatchOptions, match
 from .noise import grey_variance
-from .shapes import FormedShape, Shape, Some, Window
+from .shapes import FormedShape, GrownOutline, Shape, Some, Window
 
 __all__ = [
     "SIZE",
     "FormedShape",
+    "GrownOutline",
     "MatchOptions",
     "Matches",
     "Shape",

@@ -6,7 +6,7 @@ A shape has a place, a width of the point-spread function, and parameters of its
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -60,7 +60,8 @@ class GrownOutline:
     Parameters
     ----------
     nodes : Outline
-        Outlines (k, j, 2) in pixels around the point that is to be measured.
+        Outlines (k, j, 2) in pixels around the point that is to be measured; where one has fewer nodes, the
+        rest is nought. Those in single precision have their images formed in it, some eight times as fast.
     generators : ndarray (p, 2, 2)
         The F.
     """
@@ -75,6 +76,8 @@ class GrownOutline:
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`Shape`."""
+        if self.nodes.xy.dtype == np.float32:
+            return self._compiled(xy, width, form, at, window, 1)[:, 0]
         outline = self._placed(xy, form, at)
         return coverage(outline, window.columns, window.rows, width, window.response)
 
@@ -82,6 +85,9 @@ class GrownOutline:
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`Shape`."""
+        if self.nodes.xy.dtype == np.float32:
+            parts = self._compiled(xy, width, form, at, window, 4 + self.parameters)
+            return parts[:, 0], parts[:, 1:]
         motions = None
         if self.parameters:
             motions = np.einsum("pij,knj->kpni", self.generators, self.nodes.xy[at])
@@ -94,6 +100,23 @@ class GrownOutline:
             grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
             nodes, tangents = nodes @ grown, tangents @ grown
         return Outline(nodes + xy[:, None, :], tangents)
+
+    def _compiled(self, xy: Array, width: Array, form: Array, at: Rows, window: Window, parts: int) -> Array:
+        """Share, and what derivatives there is room for, (m, parts, r, c)."""
+        from ...optics.single import formed  # takes half a second, which not every command needs
+
+        corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
+        images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
+        formed(
+            self.nodes.xy,
+            self.nodes.dxy,
+            self.generators.astype(np.float32),
+            at,
+            *((xy - corner).astype(np.float32), form.astype(np.float32), width.astype(np.float32)),
+            window.response.fill,
+            images,
+        )
+        return np.asarray(images)
 
 
 @dataclass(frozen=True, eq=False)

@@ -161,7 +161,7 @@ class _Sheet:
         tangents = np.einsum("kab,jb->kja", slope, tangent) + np.einsum(
             "kabc,jb,jc->kja", bend, step, tangent
         )
-        return Outline(nodes, tangents).oriented()
+        return Outline(nodes, tangents).oriented().single()
 
     def _match(self, rows: Rows, background: int = 1) -> Matches:
         """Match disks, those of like size in windows of one size."""

@@ -23,8 +23,8 @@ from ...data import Array, Mask, Rows
 from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...formats import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
-from ..matching import Window
-from .images import TargetImages, flat_outline, stacked
+from ..matching import SIZE, GrownOutline, Window
+from .images import flat_outline, stacked
 from .lattice import LatticeFit
 
 __all__ = ["Kinds", "Placement", "Reading", "locate", "read_clusters"]
@@ -246,7 +246,8 @@ class _Clusters:
         outline = self.kinds.outline(float(f"{psf_px / scale:.2g}"))
         turned = np.swapaxes(self.frames, 1, 2)[:, None]
         nodes = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()
-        images = TargetImages.of(Outline(*(v.reshape(-1, *v.shape[2:]) for v in (nodes.xy, nodes.dxy))))
+        flat = Outline(*(v.reshape(-1, *v.shape[2:]) for v in (nodes.xy, nodes.dxy))).single()
+        images = GrownOutline(flat, SIZE)
         every = np.arange(len(images.nodes.xy))
         none = np.zeros((len(every), 2))
         columns, rows = (np.tile(v, (len(every), 1)) for v in (self.columns, self.rows))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -13,68 +12,13 @@ from ...formats import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
-from ..matching import Window
+from ..matching import SIZE, GrownOutline
 from .lattice import second_order
 
-__all__ = ["TargetImages", "flat_outline", "form_targets", "stacked"]
+__all__ = ["flat_outline", "form_targets", "stacked"]
 
 _SPACING = 1.1
 """Distance of nodes on an outline in widths of the point-spread function: good to 1e-4 of the light."""
-
-
-@dataclass(frozen=True, eq=False)
-class TargetImages:
-    """Images of unlike targets; a shape for the matcher.
-
-    Parameters
-    ----------
-    nodes : Outline
-        Outlines (k, j, 2) of the targets in single precision; where one has fewer nodes, the rest is nought.
-    """
-
-    nodes: Outline
-
-    @classmethod
-    def of(cls, outline: Outline) -> TargetImages:
-        """Those of outlines (k, j, 2) in pixels."""
-        xy, dxy = (np.asarray(nodes, dtype=np.float32) for nodes in (outline.xy, outline.dxy))
-        return cls(Outline(cast(Array, xy), cast(Array, dxy)))
-
-    @property
-    def parameters(self) -> int:
-        """One: all grow by a share."""
-        return 1
-
-    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
-        """See :class:`reseau.refine.matching.Shape`."""
-        return self._formed(xy, width, form, at, window, 1)[:, 0]
-
-    def derivatives(
-        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
-    ) -> tuple[Array, Array]:
-        """See :class:`reseau.refine.matching.Shape`."""
-        parts = self._formed(xy, width, form, at, window, 5)
-        return parts[:, 0], parts[:, 1:]
-
-    def _formed(self, xy: Array, width: Array, form: Array, at: Rows, window: Window, parts: int) -> Array:
-        """Share, and what derivatives there is room for, (m, parts, r, c)."""
-        from ...optics.single import formed  # takes half a second, which not every command needs
-
-        # Reckoned from the corner of each window.
-        corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
-        nodes, grown = self.nodes.xy[at], (1 + form[:, :1, None]).astype(np.float32)
-        images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
-        formed(
-            nodes * grown + (xy - corner)[:, None].astype(np.float32),
-            self.nodes.dxy[at] * grown,
-            nodes,
-            (window.columns - corner[:, :1]).astype(np.float32),
-            (window.rows - corner[:, 1:]).astype(np.float32),
-            width.astype(np.float32),
-            window.response.fill,
-            images,
-        )
-        return np.asarray(images)
 
 
 @lru_cache(maxsize=256)
@@ -85,7 +29,7 @@ def flat_outline(shape: str, size: float, angle: float, spacing: float) -> Outli
 
 def form_targets(
     design: TestfieldDesign, rows: Rows, mapping: Chain, frame: Array, at: Array, psf_px: float
-) -> tuple[TargetImages, Array, Array]:
+) -> tuple[GrownOutline, Array, Array]:
     """The images of targets around the images of their centroids.
 
     Parameters
@@ -101,7 +45,8 @@ def form_targets(
 
     Returns
     -------
-    images : TargetImages
+    images : GrownOutline
+        They all grow by a share.
     xy : ndarray (k, 2)
         Images of the centroids.
     reach : ndarray (k, 2)
@@ -131,7 +76,7 @@ def form_targets(
     )
     image = Outline(cast(Array, xy), cast(Array, dxy)).oriented()
     reach: Array = np.abs(xy).max(axis=1).astype(np.float64)
-    return TargetImages.of(image), value, reach
+    return GrownOutline(image, SIZE), value, reach
 
 
 def stacked(outlines: list[Outline]) -> Outline:

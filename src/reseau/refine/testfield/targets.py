@@ -18,8 +18,8 @@ from ...data import Array, Mask, Rows
 from ...formats import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
-from ..matching import FormedShape, Matches, MatchOptions, Shape, Some, Window, match
-from .images import TargetImages, form_targets
+from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, Some, Window, match
+from .images import form_targets
 from .lattice import slope_of
 from .light import Light
 from .profiles import blur_of, crossings, strip
@@ -137,7 +137,7 @@ class _Canvas:
     """Light that the marks of a testfield take or add, and the matching of each without the others."""
 
     def __init__(
-        self, scene: Scene, images: TargetImages, xy: Array, reach: Array, large: Mask, wanted: Mask
+        self, scene: Scene, images: GrownOutline, xy: Array, reach: Array, large: Mask, wanted: Mask
     ) -> None:
         self.scene, self.images, self.xy = scene, images, xy
         self.total = _line_light(scene)
