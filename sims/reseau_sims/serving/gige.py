@@ -55,7 +55,9 @@ class GigeCamera:
     Parameters
     ----------
     body : CameraBody
-        What it looks with; frames are the upper left part of what it sees, as large as they are asked for.
+        What it looks with; frames are the upper left part of what it sees, as large as they are asked for. A
+        picture has to be drawn within two seconds: the library answers nothing meanwhile, and its client
+        gives control up. Where drawing takes long, trigger by software.
     serial : str
         What it is called.
     features : str
