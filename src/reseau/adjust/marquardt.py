@@ -262,7 +262,7 @@ class Marquardt:
     def _cost(self, residuals: Array, x: Array, rows: Rows) -> Array:
         w = self.weights[rows] * self.factors[rows]
         prior = ((x - self.mean[rows]) ** 2 * self.prior_weight).sum(axis=1)
-        cost = np.einsum("mn,mn,mn->m", residuals, w, residuals) + prior
+        cost = np.einsum("mn,mn->m", residuals * w, residuals) + prior
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def _accept(self, rows: Rows, x: Array, residuals: Array, jacobian: Array) -> None:

@@ -161,13 +161,14 @@ class Patches:
         design = self.monomials
         fitted = np.zeros((len(x), design.shape[1]))
         fitted[:, 0] = np.nanmedian(np.where(around > 0, self.grey, np.nan), axis=1)
+        products = (design[:, :, None] * design[:, None]).reshape(len(design), -1)
         far = np.zeros_like(around)
         for factor in (6.0, 5.0, 4.0, 4.0, 4.0):
             off = np.where(around > 0, np.abs(self.grey - fitted @ design.T), np.nan)
             scale = np.maximum(1.4826 * np.nanmedian(off, axis=1, keepdims=True), noise)
             far = np.nan_to_num(off) / (factor * scale)
             w = around * np.clip(1 - far**2, 0, None) ** 2
-            normal = np.einsum("ni,kn,nj->kij", design, w, design) + 1e-6 * np.eye(design.shape[1])
+            normal = (w @ products).reshape(len(x), *2 * design.shape[1:]) + 1e-6 * np.eye(design.shape[1])
             fitted = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * fitted)[..., None])[..., 0]
         self.weights = np.where(far > 1.5, 0.0, self.weights)
         x[:, self.ground] = fitted

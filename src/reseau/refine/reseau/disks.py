@@ -16,6 +16,8 @@ __all__ = ["Disks", "find_disks"]
 
 _SIDES_PX = (25, 51, 101)
 """Sides of the squares in which half way between the darkest and the brightest is the threshold."""
+_SMALL = 8000
+"""Sums of so large whole numbers, and their doubles, are whole numbers of 16 bits."""
 _LEAST_AREA = 30
 _LEAST_CONTRAST = 10.0
 """Contrast in standard deviations of the noise from which on a square holds anything."""
@@ -67,49 +69,51 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     noise : float
         Standard deviation of the grey values.
     """
-    found = []
+    found, values, before = [], _compact(grey), 1
+    low = high = values
     for side in _SIDES_PX:
-        square = np.ones((side, side), np.uint8)
-        low, high = cv2.erode(grey, square), cv2.dilate(grey, square)
-        contrast = (high - low) / noise
-        dark = (grey < (low + high) / 2) & (contrast > _LEAST_CONTRAST) & valid
+        square = np.ones((side - before + 1,) * 2, np.uint8)  # what is darkest in a square of squares
+        low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
+        contrast = high - low
+        dark = (values + values < low + high) & (contrast > _LEAST_CONTRAST * noise) & valid
         found.append(_parts(dark, contrast, side))
     xy, moments, quality, t = (np.concatenate(column) for column in zip(*found, strict=True))
     if not len(xy):
         return Disks(np.empty((0, 2)), np.empty((0, 2, 2)), t)
     value, vector = np.linalg.eigh(moments)
     form = np.einsum("kij,kj,klj->kil", vector, 2 * np.sqrt(value), vector)
-    keep = np.flatnonzero(_once(xy, 2 * np.sqrt(value[:, 0]), quality))
+    keep, t = np.flatnonzero(_once(xy, 2 * np.sqrt(value[:, 0]), quality)), t / noise
     keep = keep[np.argsort(-t[keep], kind="stable")]
     return Disks(xy[keep], form[keep], t[keep])
 
 
+def _compact(grey: NDArray[Any]) -> NDArray[Any]:
+    """Grey values as small whole numbers where they are such: what follows is then three times as fast."""
+    if not max(-grey.min(), grey.max()) <= _SMALL:
+        return grey
+    whole = grey.astype(np.int16)
+    return whole if np.array_equal(whole, grey) else grey
+
+
 def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
     """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic parts."""
+    from .parts import part_sums  # takes half a second, which not every command needs
+
     h, w = mask.shape
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    left, top, wide, high, area = stats.T
-    keep = (area >= _LEAST_AREA) & (np.maximum(wide, high) < side)
-    keep &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
-    keep[0] = False  # the ground
-    number = np.cumsum(keep) - 1
-    row, column = np.nonzero(keep[labels])
-    label, count = number[labels[row, column]], int(keep.sum())
-
-    def mean(values: Any) -> Array:
-        value: Array = np.bincount(label, values, count) / area[keep]
-        return value
-
-    xy = np.stack([mean(column), mean(row)], axis=1)
-    u, v = column - xy[label, 0], row - xy[label, 1]
-    uv = mean(u * v)
-    moments = np.stack([np.stack([mean(u * u), uv], axis=1), np.stack([uv, mean(v * v)], axis=1)], axis=1)
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    sums, (left, right, top, bottom) = part_sums(labels, count)
+    keep = (sums[0] >= _LEAST_AREA) & (np.maximum(right - left, bottom - top) < side - 1)
+    keep &= (left > 0) & (top > 0) & (right < w - 1) & (bottom < h - 1)
+    area = sums[0, keep]
+    x, y, xx, xy, yy = sums[1:, keep] / area
+    centre = np.stack([x, y], axis=1)
+    moments = np.stack([xx - x * x, xy - x * y, xy - x * y, yy - y * y], axis=1).reshape(-1, 2, 2)
     axes = np.linalg.eigvalsh(moments)
-    quality = area[keep] / (4 * np.pi * np.sqrt(np.maximum(axes.prod(axis=1), 1e-9)))
+    quality = area / (4 * np.pi * np.sqrt(np.maximum(axes.prod(axis=1), 1e-9)))
     good = (quality > _ELLIPTIC) & (axes[:, 0] > _NARROWEST**2 * axes[:, 1])
-    at = np.rint(xy).astype(np.intp)
-    t = contrast[at[:, 1], at[:, 0]] * np.sqrt(area[keep])
-    return xy[good], moments[good], quality[good], t[good]
+    at = np.rint(centre).astype(np.intp)
+    t = contrast[at[:, 1], at[:, 0]] * np.sqrt(area)
+    return centre[good], moments[good], quality[good], t[good]
 
 
 def _once(xy: Array, radius: Array, quality: Array) -> Mask:
