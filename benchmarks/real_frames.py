@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from reseau.data import Array
-from reseau.refine.frame import FrameOptions, orient_frames
+from reseau.images import write_image
+from reseau.refine.frame import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
 from reseau.report.frames import contact_sheet, frame_tile
-from reseau.scans import open_scan
+from reseau.scans import Scan, open_scan
 
 __all__ = ["print_real"]
 
@@ -22,6 +25,16 @@ _SCANS: dict[str, tuple[tuple[float, float], tuple[float, ...] | None]] = {
     "kino_1265.jpg": ((22.0, 16.0), (885, 1615, 2870, 3085)),
 }
 """Formats, and where a frame is to be looked for among others: left, top, right, bottom."""
+
+_PERFORATIONS = {
+    "kino_1264.jpg": ((357, 1245, 621, 1421, 431), (2904, 1246, 3157, 1425, 431)),
+    "kino_1265.jpg": ((351, 1184, 613, 1360, 431), (2896, 1187, 3150, 1365, 431)),
+}
+"""Of the first perforation of both rows left, top, right, bottom, and the approximate pitch."""
+_EDGES = {"kino_1264.jpg": (1421, 1673, 3142, 3393), "kino_1265.jpg": (1362, 1614, 3082, 3335)}
+"""Rows at which the lower edge of the frame before, the frame's two and the upper one of the next are."""
+_SEVEN, _FRAME_MM, _GATE_MM = 7, 4 * PITCH_MM, 16.0
+"""Perforations of a row that are whole; from one frame to the next; the nominal height of the gate."""
 
 
 def print_real(folder: Path, pictures: Path | None) -> None:
@@ -44,10 +57,57 @@ def print_real(folder: Path, pictures: Path | None) -> None:
             x, y = result.px_per_mm
             bows = " ".join(f"{bow:.1f}" for bow in result.lines.bow)
             print(f"  {'':15s} σ {sigma.max():.2f}  scale {x:.2f} {y:.2f}  bows {bows}")
+    for name in _PERFORATIONS:
+        print_film(open_scan(folder / name), pictures)
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         contact_sheet(pictures / "real.png", tiles)
         print(f"  overlays: {pictures / 'real.png'}")
+
+
+def print_film(scan: Scan, pictures: Path | None) -> None:
+    """Perforations against frames of cine film: four perforations make a frame, by the same edge model."""
+    rows = [np.array(row, dtype=float) for row in _PERFORATIONS[scan.name]]
+    plane = film_plane(scan, rows, _SEVEN)
+    if not plane:
+        print(f"  {scan.name:15s} {plane.reason}")
+        return
+    edges = []
+    for k, y in enumerate(_EDGES[scan.name]):
+        ends = np.array([1000.0, y]), np.array([2800.0, y - 8.0])
+        edges.append(edge_of(scan, *(ends if k % 2 else ends[::-1]), channel=1))
+    assert all(edge is not None for edge in edges)
+    before, upper, lower, after = edges
+    print(f"  {scan.name:15s} {plane.edges} edges of perforations, rms {plane.rms_px:.1f} px; on the film:")
+    for what, a, b, nominal in (
+        ("lower edges, frame to frame", before, lower, _FRAME_MM),
+        ("upper edges, frame to frame", upper, after, _FRAME_MM),
+        ("height of the frame", upper, lower, _GATE_MM),
+    ):
+        found, sigma = plane.apart(a, b)
+        away, of = 100 * (found / nominal - 1), 100 * sigma / nominal
+        print(f"  {'':15s} {what:28s} {found:.3f} mm, {away:+.2f} ± {of:.2f} % of {nominal:g} mm")
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        write_image(pictures / f"{scan.name[:-4]}_film.png", _film_picture(scan, plane, edges))
+
+
+def _film_picture(scan: Scan, plane: FilmPlane, edges: list[Array]) -> NDArray[np.uint8]:
+    """Every edge of a perforation and of a frame on the pixels where it was found, enlarged."""
+    places = [*plane.at, *(edge[k] for edge in edges for k in (5, 25, 45))]
+    size, zoom = 24, 5
+    tiles = []
+    for x, y in places:
+        left, top = int(np.rint(x)) - size, int(np.rint(y)) - size
+        part = scan.window(top, top + 2 * size, left, left + 2 * size).astype(np.float32)
+        low, high = part.min(), part.max()
+        eight = np.rint((part - low) / max(high - low, 1) * 255).astype(np.uint8)
+        tile = cv2.resize(eight, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+        at = (np.rint((np.array([x - left, y - top]) + 0.5) * zoom - 0.5)).astype(int)
+        cv2.drawMarker(tile, (int(at[0]), int(at[1])), (255, 0, 0), cv2.MARKER_CROSS, 60, 1)
+        tiles.append(np.pad(tile, ((1, 1), (1, 1), (0, 0)), constant_values=255))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 11)
+    return np.vstack([np.hstack(tiles[i : i + 11]) for i in range(0, len(tiles), 11)])
 
 
 def _box(near: tuple[float, ...] | None) -> Array | None:

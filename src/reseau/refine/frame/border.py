@@ -9,12 +9,14 @@ the film cost little, and so do dark parts of the picture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ...data import Array, Mask
+from ...data import Array, Mask, Rows
 from .band import Band
 
 __all__ = ["Border", "Film", "best_line", "binned", "border_of", "likelihood", "row_median"]
@@ -33,6 +35,9 @@ _STRIPE, _LIT, _DETACHED = 8, 0.06, 3
 at least where there is a picture, and how often such a thing is passed."""
 _RUNNING = 101
 """Profiles over which the tone of film along an edge is taken."""
+_SHALLOW = 0.2
+"""Part of the picture's contrast by which the middle of a narrow strip may differ from film: what differs by
+more is none, or so narrow that blur has filled it."""
 _NARROW = 0.25
 """Part of the usual gap that film has at least where it is known by its tone."""
 
@@ -218,31 +223,19 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
     count = int((high - low) / size)
     tones = binned(grey, band.distance, low, size, count)
     known, beyond = np.isfinite(tones), low + (np.arange(count) + 0.5) * size
-    outer = known & (beyond < -0.4 * reach)
+    first, last = (int(np.clip((r - low) / size, 1, count - 2)) for r in (-reach, reach))
+    outer: Mask = np.asarray(known & (beyond < -0.4 * reach))
     if known.mean() < 0.5 or (film is None and outer.sum() < 3 * len(tones)):
         return None
-    if film is None:
-        level = _running(row_median(np.where(outer, tones, np.nan)))
-    else:
-        level = np.full(len(tones), film.tone)
-    over = max(1, round(_ALONG / band.columns))
-    # Medians: a scratch that crosses the edge is a few columns wide.
-    smooth = median_filter(np.where(known, tones - level[:, None], 0.0), size=(over | 1, 1), mode="nearest")
-    if film is None:
-        # Within each profile: perforations and the scanner's light change from profile to profile.
-        own = row_median(np.where(outer, smooth, np.nan))
-        spread = 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
-    else:
-        spread = film.noise
-    contrast = float(np.quantile(smooth[:, beyond > 0], 0.85))
-    least = max(_SIGNIFICANT * spread, _LEAST_CONTRAST * contrast, 1e-9)
+    ground = _ground(tones, outer, band, film, (first, last))
+    contrast = float(np.quantile(ground.smooth[:, beyond > 0], 0.85))
+    least = max(_SIGNIFICANT * ground.spread, _LEAST_CONTRAST * contrast, 1e-9)
     if contrast < 1.5 * least:
         return None
     start = int(np.clip((0.3 * reach - low) / size, 1, count - 1))
-    parted = gap if film is None else _NARROW * gap
-    found = likelihood(smooth / least, known, start, max(2, round(parted / size)))
-    first, last = (int(np.clip((r - low) / size, 1, count - 2)) for r in (-reach, reach))
-    line, narrow = np.zeros(len(found)), film is not None
+    narrow, parted = film is not None, gap if film is None else _NARROW * gap
+    found = likelihood(ground.smooth / least, known, start, max(2, round(parted / size)))
+    found[ground.foreign] = -_FILM
     for _ in range(_DETACHED):
         begin, end = best_line(found, band.place, first, last, max(2, (last - first) // 2))
         line = begin * (1 - band.place) / 2 + end * (1 + band.place) / 2
@@ -252,10 +245,9 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
     near = first_departure(found, line, max(2, round(0.1 * gap / size)))
     away = np.arange(count) - line[:, None] + 2
     outside = (away < 0) & (away > -parted / size) & known
-    differs = found > 0 if film is None else smooth > least
+    differs = found > 0 if film is None else (ground.smooth > least) & ~ground.foreign
     clean = 1.0 - float((differs & outside).sum()) / max(float(outside.sum()), 1.0)
-    at = low + size * near
-    outermost, beside = np.full(len(at), -np.inf), band.distance < -0.5 * reach
+    level, outermost, beside = ground.level, np.full(len(near), -np.inf), band.distance < -0.5 * reach
     if narrow:
         level, column = _strip(tones, line, _NARROW * gap / size)
         outermost = low + size * column
@@ -264,7 +256,58 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
     if not np.isfinite(rest).any():
         return None
     raw = 1.4826 * float(np.nanmedian(rest))
-    return Border(level, max(raw, 1e-6), spread, contrast, at, outermost, clean)
+    return Border(level, max(raw, 1e-6), ground.spread, contrast, low + size * near, outermost, clean)
+
+
+class _Ground(NamedTuple):
+    """Tone of film beside each profile (n,), smoothed departures from it (n, s), their scatter in film; and
+    which places lie beyond a strip of film, and are none of the frame's."""
+
+    level: Array
+    smooth: Array
+    spread: float
+    foreign: Mask
+
+
+def _ground(tones: Array, outer: Mask, band: Band, film: Film | None, between: tuple[int, int]) -> _Ground:
+    """Film beyond an edge: what lies beyond the reach, or a strip as dark as that of other edges."""
+    foreign = np.zeros(tones.shape, dtype=bool)
+    if film is None:
+        level = _running(row_median(np.where(outer, tones, np.nan)))
+    else:
+        level = np.full(len(tones), film.tone)
+        # Perforations of a negative differ from film in the other sense: they are none either.
+        strip = _alike(np.abs(tones - film.tone) / max(film.noise, 1e-6), band.place, *between)
+        darkest = _running(row_median(_beside(tones, strip, [-1, 0, 1])))
+        bright = float(np.nanquantile(tones, 0.85)) - film.tone
+        if abs(np.median(darkest) - film.tone) < _SHALLOW * bright:
+            level, foreign = darkest, np.asarray(np.arange(tones.shape[1]) <= strip[:, None])
+    over = max(1, round(_ALONG / band.columns))
+    # Medians: a scratch that crosses the edge is a few columns wide.
+    rest = np.where(np.isfinite(tones), tones - level[:, None], 0.0)
+    smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
+    return _Ground(level, smooth, _spread(smooth, outer) if film is None else film.noise, foreign)
+
+
+def _spread(smooth: Array, outer: Mask) -> float:
+    """Scatter of film, within each profile: perforations and the scanner's light change between profiles."""
+    own = row_median(np.where(outer, smooth, np.nan))
+    return 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
+
+
+def _alike(departure: Array, along: Array, first: int, last: int) -> Array:
+    """Columns (n,) of the straight line of a narrow strip of film: what departs least from its tone."""
+    step = np.diff(np.where(np.isfinite(departure), departure, np.nanmax(departure)), axis=1, append=0.0)
+    step[:, -1] = 0.0
+    # The sum of these steps from a column on is the last departure less that of the column.
+    begin, end = best_line(step, along, first, last, max(2, (last - first) // 4))
+    return np.asarray(begin * (1 - along) / 2 + end * (1 + along) / 2)
+
+
+def _beside(tones: Array, line: Array, away: Sequence[int] | Rows) -> Array:
+    """Tones (n, m) of the columns so far inside a line."""
+    column = np.clip(np.rint(line[:, None] + np.asarray(away)).astype(np.intp), 0, tones.shape[1] - 1)
+    return np.take_along_axis(tones, column, axis=1)
 
 
 def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
@@ -273,8 +316,7 @@ def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
     Blur fills the strip from both sides; only its middle is film.
     """
     away = np.arange(1, max(3, round(2.5 * width)) + 1)
-    column = np.clip(np.rint(line[:, None] - away).astype(np.intp), 0, tones.shape[1] - 1)
-    values = np.take_along_axis(tones, column, axis=1)
+    values = _beside(tones, line, -away)
     middle = row_median(values.T)
     best = int(np.argmin(np.where(np.isfinite(middle), middle, np.inf)))
     around = values[:, max(best - 1, 0) : best + 2]

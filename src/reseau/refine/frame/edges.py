@@ -22,7 +22,7 @@ from ...data import Array, Mask, Rows
 from .band import Band
 from .border import Border, Film, binned, border_of, row_median
 
-__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged"]
+__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_function"]
 
 _SHIFTS, _CHANGE = (3.0,), 0.15
 """Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
@@ -158,7 +158,7 @@ def _fitted(
         changes = [_CHANGE * border.contrast] * len(_SHIFTS)
         prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
         fit = adjust_batch(
-            _profile_function(distance),
+            profile_function(distance),
             initial,
             value,
             weights=weight / border.noise**2,
@@ -240,7 +240,7 @@ def _window(
     return np.where(weight > 0, value, 0.0), place, weight
 
 
-def _profile_function(distance: Array) -> Any:
+def profile_function(distance: Array) -> Any:
     """The model of a profile and its derivatives by p, b, log w, A and the c, for :func:`adjust_batch`."""
     shifts = np.array([0.0, *_SHIFTS])
 

@@ -34,6 +34,8 @@ _FILM_MM, _GAP_MM = 0.25, 0.2
 _MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
 """Standard deviation of a corner's coordinate from which on a frame is not called oriented: what is greater,
 so that a scan finer than its film is not asked for more than the film shows."""
+_STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
+"""Order of what a frame may be."""
 _MOST_W = 4.0
 """Test value from which on the shape of a frame contradicts its format."""
 
@@ -246,17 +248,13 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
         result = _judged(scan, guess, measured, corners, shape)
-        if best is None or _quality(result) > _quality(best):
+        # Channels come by their contrast: a later one has to see more.
+        if best is None or _STATUS[result.status] > _STATUS[best.status]:
             best = result
         if best.status == "oriented":  # the others show the same edges with less contrast
             break
     assert best is not None
     return best
-
-
-def _quality(result: FrameResult) -> tuple[int, float]:
-    order = {"oriented": 2, "three-edges": 1, "declined": 0}[result.status]
-    return order, 0.0 if result.lines is None else -float(np.trace(result.lines.covariance))
 
 
 def _judged(
