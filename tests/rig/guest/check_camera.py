@@ -18,13 +18,12 @@ import pytest
 
 from reseau.errors import InstrumentError, ProtocolError, RefusedError
 from reseau_drivers.camera import v4l2, video_devices
-from reseau_sims.serving import Pattern
 
 from .gadget import settle
 from .lab import steer, value
 
 FORMATS = {"GREY": "GREY", "Y16": "Y16 "}
-PATIENCE_S = 40.0
+PATIENCE_S = 20.0
 """After a change until it is seen: frames go through the loop's buffers, slowly in emulation."""
 
 
@@ -43,10 +42,13 @@ def grey() -> Iterator[str]:
 
 def _seen(camera: Any, shift: int) -> None:
     """Wait until the stripes of this shift are seen, to the bit."""
-    wanted = Pattern(640, 480, shift)(value("camera.view"))
+    wanted = steer("picture", shift)
     until = time.monotonic() + PATIENCE_S
     while not np.array_equal(pixels := camera.expose().pixels, wanted):
-        assert time.monotonic() < until, f"{np.count_nonzero(pixels != wanted)} pixels differ"
+        if time.monotonic() > until:
+            wrong = np.count_nonzero(pixels != wanted, axis=1)
+            told = f"rows {np.flatnonzero(wrong)[[0, -1]]}, grey values {pixels.min()} to {pixels.max()}"
+            raise AssertionError(f"{wrong.sum()} pixels differ: {told}; loop: {value('camera.state')}")
 
 
 def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
@@ -178,7 +180,7 @@ def test_v4l2_ctl_captures_the_same_frame(grey: str, tmp_path: Any) -> None:
     file = tmp_path / "frame"
     options = ["--stream-mmap=4", "--stream-skip=20", "--stream-count=1", f"--stream-to={file}"]
     subprocess.run(["v4l2-ctl", "-d", grey, *options], check=True, capture_output=True, timeout=50)
-    wanted = Pattern(640, 480, 17)(value("camera.view"))
+    wanted = steer("picture", 17)
     assert file.read_bytes() == wanted.tobytes()
 
 

@@ -95,6 +95,12 @@ class Lab:
 
         self.body.look_at(Pattern(640, 480, shift))
 
+    def picture(self, shift: int) -> Any:
+        """What the camera should show of these stripes, set as it is."""
+        from reseau_sims.serving import Pattern
+
+        return Pattern(640, 480, shift)(self.camera.view)
+
     def start_camera(self, fourcc: str) -> str:
         """Begin to feed the video loop; gives the node that captures."""
         from .loop import LoopCamera

@@ -74,13 +74,18 @@ class LoopCamera:
         fcntl.ioctl(self._out, S_FMT, form)
         self._controls = {name: identifier for identifier, name in _controls(self._cap)}
         self._loop()
-        self.failed = ""
+        self.failed, self.shown = "", 0
         self._stop, self._begun = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._feed, daemon=True)
         self._thread.start()
         # Injected faults are for whoever begins to stream next: not for this one.
         if not self._begun.wait(30.0):
             raise TimeoutError(f"the loop did not begin: {self.failed}")
+
+    @property
+    def state(self) -> str:
+        """What it did so far."""
+        return f"{self.shown} frames shown, {self.view}, {self.failed or 'well'}"
 
     @property
     def view(self) -> View:
@@ -114,6 +119,8 @@ class LoopCamera:
         else:
             name = next(each for each in self._controls if each.startswith("HDMI") and "Connected" in each)
             self._choose(name, "Output")
+        # Its automatic gain is the clock's seconds.
+        self._set("Gain, Automatic", 0)
         self._set("Gain", 0)
 
     def _choose(self, name: str, wanted: str) -> None:
@@ -149,6 +156,7 @@ class LoopCamera:
                     done = _buffer()
                     fcntl.ioctl(self._out, DQBUF, done)  # when the driver has shown it
                     free.append(struct.unpack_from("<I", done)[0])
+                    self.shown += 1
                 index = free.pop()
                 maps[index][: len(picture)] = picture
                 fcntl.ioctl(self._out, QBUF, _buffer(index, len(picture)))
