@@ -45,6 +45,7 @@ def test_no_frame_began_before_it_was_asked_for(at_start: bool) -> None:
     with v4l2("camera", device.open, settings={"exposure_us": 3000.0, "rate": 200.0}) as camera:
         for shift in range(30):
             pattern = Pattern(shift=shift)
+            time.sleep(0.012)  # frames of the pattern of before wait in the queue
             device.body.look_at(pattern)
             asked = datetime.now(UTC)
             shot = camera.expose()
