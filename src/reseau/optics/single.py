@@ -43,10 +43,13 @@ def _compiled(function: F) -> F:
 
 
 @_compiled
-def _edges(first: np.float32, inverse: np.float32, count: int, step: Single, bell: Single) -> None:
-    """Distribution and density of the normal distribution at (first + k) · inverse."""
+def _edges(
+    first: np.float32, inverse: np.float32, n: int, count: int, jump: np.float32, step: Single, bell: Single
+) -> None:
+    """Distribution and density at (first + k) · inverse, from k = n on a jump farther."""
     for k in range(count):
-        z = min(max((first + f32(k)) * inverse, f32(-_SIDE)), f32(_SIDE))
+        z = first + f32(k) + (jump if k >= n else f32(0))
+        z = min(max(z * inverse, f32(-_SIDE)), f32(_SIDE))
         # An index without a sign is looked up without a question, many at a time.
         i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
         middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
@@ -72,17 +75,19 @@ def _responses(
         return first, first
     per, inverse, begin, lag = f32(0.5) / half, f32(1) / sigma, f32(first) - point - half, 1
     if half == f32(0.5):  # neighbours share an edge
-        _edges(begin, inverse, n + 1, work[0], work[1])
+        _edges(begin, inverse, n + 1, n + 1, f32(0), work[0], work[1])
     else:
         lag = n
-        _edges(begin, inverse, n, work[0], work[1])
-        _edges(begin + f32(2) * half, inverse, n, work[0, n:], work[1, n:])
+        _edges(begin, inverse, n, 2 * n, f32(2) * half - f32(n), work[0], work[1])
+    before, beyond, bell, bells = work[0, :n], work[0, lag : lag + n], work[1, :n], work[1, lag : lag + n]
+    integral, value, slope = out[0], out[1], out[2]
+    # Loops over few arrays each, so that the compiler can tell that these do not overlap.
     for k in range(n):
-        left = begin + f32(k)
-        right = left + f32(2) * half
-        step, bell = work[0, k + lag] - work[0, k], work[1, k + lag] - work[1, k]
-        out[0, k] = (right * work[0, k + lag] - left * work[0, k] + sigma * bell) * per
-        out[1, k], out[2, k] = step * per, bell * inverse * per
+        value[k] = (beyond[k] - before[k]) * per
+    for k in range(n):
+        slope[k] = (bells[k] - bell[k]) * (inverse * per)
+    for k in range(n):
+        integral[k] = (begin + f32(k)) * value[k] + beyond[k] + sigma * sigma * slope[k]
     return first, first + n
 
 
@@ -98,12 +103,13 @@ def _add_node(
     """Add what a node of an outline contributes to share and derivatives (4 + m, r, c) in its reach."""
     (top, bottom, left, right), (dx, dy), (down, across) = at, tangent, responses
     n = right - left
+    integral, value, slope = across[0], across[1], across[2]
     for r in range(top, bottom):
         h, d = down[1, r - top], down[2, r - top]
         of_share = -h * dy
         share = parts[0, r, left:right]
         for c in range(n):
-            share[c] += of_share * across[0, c]
+            share[c] += of_share * integral[c]
         if len(parts) == 1:
             continue
         of_y, of_width, bent = -h * dx, sigma * of_share, sigma * d * dx
@@ -113,14 +119,14 @@ def _add_node(
             parts[3, r, left:right],
         )
         for c in range(n):
-            value = across[1, c]
-            along_x[c] -= of_share * value
-            along_y[c] += of_y * value
-            width[c] += of_width * across[2, c] + bent * value
+            along_x[c] -= of_share * value[c]
+            along_y[c] += of_y * value[c]
+        for c in range(n):
+            width[c] += of_width * slope[c] + bent * value[c]
         for m in range(len(normals)):
             of_form, form = h * normals[m], parts[4 + m, r, left:right]
             for c in range(n):
-                form[c] += of_form * across[1, c]
+                form[c] += of_form * value[c]
 
 
 @_compiled
