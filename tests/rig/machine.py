@@ -59,6 +59,11 @@ def run(folder: Path, arguments: list[str]) -> Run:
         For the report and the console.
     arguments : list of str
         Further ones of pytest.
+
+    Raises
+    ------
+    RuntimeError
+        When the parts cannot be had.
     """
     parts, home = rig_parts.fetched(), rig_parts.cache()
     kernel = bootable(parts, home)
@@ -132,7 +137,11 @@ def main(arguments: list[str]) -> int:
         print(f"rig: {lacking}", file=sys.stderr)
         return 2
     folder = Path(os.environ.get("RESEAU_RIG_OUT") or tempfile.mkdtemp(prefix="reseau-rig-"))
-    done = run(folder.resolve(), arguments)
+    try:
+        done = run(folder.resolve(), arguments)
+    except RuntimeError as error:
+        print(f"rig: {error}", file=sys.stderr)
+        return 2
     print(done.console)
     print(f"rig: {done.seconds:.1f} s, status {done.status}, report {done.report}")
     return done.status
