@@ -119,9 +119,9 @@ def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array,
 def _once(xy: Array, radius: Array, quality: Array) -> Mask:
     """Of parts found in squares of several sizes the most elliptic."""
     keep = np.ones(len(xy), dtype=bool)
-    tree = KDTree(xy)
+    near = KDTree(xy).query_ball_point(xy, 0.5 * radius)
     for k in np.argsort(-quality, kind="stable"):
         if keep[k]:
-            near = [i for i in tree.query_ball_point(xy[k], 0.5 * radius[k]) if i != k]
-            keep[near] = False
+            keep[near[k]] = False
+            keep[k] = True
     return keep
