@@ -35,10 +35,15 @@ def _table() -> tuple[Single, Single]:
 _STEP, _BELL = _table()
 f32 = np.float32
 
+_FREE = {"nnan", "ninf", "nsz"}
+"""What the compiler may take for granted. Not that sums can be taken in another order, nor that a product
+goes into a sum unrounded: what it makes of that differs from one compilation to the next, in the last bits.
+"""
+
 
 def _compiled(function: F) -> F:
     """Compile with Numba, kept on disk; other threads may run meanwhile."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FREE}
     return cast(F, numba.njit(**options)(function))
 
 

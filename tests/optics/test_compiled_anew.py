@@ -1,0 +1,35 @@
+"""What is compiled anew gives the same bytes as what was compiled before: results can be computed again."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+MEASURED = """
+    import hashlib
+    from reseau.refine import measure_testfield
+    from reseau_sims import FieldBench, Station
+    bench = FieldBench(seed=3)
+    found = measure_testfield(bench.record(Station(30, 90, 90)), bench.design)
+    print(hashlib.sha256(found.points.xy.tobytes() + found.points.cov.tobytes()).hexdigest())
+    """
+
+
+@pytest.mark.slow
+def test_compiled_or_from_the_cache_a_measurement_is_the_same_to_the_byte(tmp_path: Path) -> None:
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(MEASURED)],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        for _ in range(2)
+    ]
+    assert len(said[0]) == len(hashlib.sha256().hexdigest())
+    assert said[0] == said[1]
