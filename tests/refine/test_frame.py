@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from reseau.data import Array
-from reseau.refine.frame import FrameOptions, FrameResult, orient_frames
+from reseau.procedures.frame import helped
+from reseau.refine.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of
 from reseau.scans import scan_of
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -89,6 +90,19 @@ def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
     result = oriented(frame)
     assert result.status == "oriented", result.why
     assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None:
+    """The line is at one distance from the edge all along: alone, nothing tells them apart."""
+    frame = FilmFrame(20120, beside=Beside(lines=1))
+    alone = oriented(frame)
+    assert alone.status == "declined"
+    roll = roll_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0)
+    assert isinstance(roll, Roll)
+    (found,) = helped(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
+    assert found.status == "oriented", found.why
+    assert "roll" in found.why
+    assert np.abs(errors(found, frame)).max() < 0.4
 
 
 def test_a_scratch_along_the_film_beside_an_edge_is_passed_over() -> None:

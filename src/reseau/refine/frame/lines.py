@@ -175,7 +175,7 @@ def adjust_lines(
         if isinstance(found, Failure):
             return found
         corners = _corners(found.adjustment.values, corners)
-        bow = _bow_of(found.adjustment.values[2::3], found.adjustment.sigma[2::3])
+        bow = _bow_of(found.adjustment.values[2:12:3], found.adjustment.sigma[2:12:3])
         # Whatever is far from the lines of all is left out for good.
         keep = (np.abs(found.adjustment.w) < 4.0) | ~np.isfinite(found.adjustment.w)
     keep[bounds[-1] :] = True
@@ -213,7 +213,7 @@ def _frame_axes(corners: Array) -> tuple[Array, Array, Array]:
 def _corners(values: Array, corners: Array) -> Array:
     """Corners of the adjusted chords."""
     a, b, normal = _frame_axes(corners)
-    ends = values.reshape(4, 3)
+    ends = values[:12].reshape(4, 3)
     return crossings_of(a + ends[:, :1] * normal, b + ends[:, 1:2] * normal)
 
 
@@ -233,12 +233,18 @@ def _problem(
     """Observations of the profiles, then of the shape; and where each edge's begin."""
     a, b, normal = _frame_axes(corners)
     rows, observed, sigma, bounds = [], [], [], [0]
+    # What an edge's ends may err by themselves are unknowns, so that the shape tells something of them.
+    drawn = [k for k, edge in enumerate(edges) if edge is not None and edge.ends > 0]
+    names = [*_NAMES, *(f"{k}.{end}" for k in drawn for end in ("start", "stop"))]
     for k, edge in enumerate(edges):
         if edge is not None:
             along = b[k] - a[k]
             place = 2 * ((edge.xy - a[k]) @ along) / (along @ along) - 1
-            part = np.zeros((len(place), 12))
+            part = np.zeros((len(place), len(names)))
             part[:, 3 * k : 3 * k + 3] = np.stack([(1 - place) / 2, (1 + place) / 2, -(1 - place**2)], 1)
+            if k in drawn:
+                own = 12 + 2 * drawn.index(k)
+                part[:, own : own + 2] = part[:, 3 * k : 3 * k + 2]
             rows.append(part)
             observed.append((edge.xy - a[k]) @ normal[k])
             sigma.append(edge.sigma)
@@ -259,11 +265,13 @@ def _problem(
         if shape is None:
             return design
         step = 0.01
-        slope = [(of_shape(x + step * e) - of_shape(x - step * e)) / (2 * step) for e in np.eye(12)]
+        slope = [(of_shape(x + step * e) - of_shape(x - step * e)) / (2 * step) for e in np.eye(len(x))]
         return np.concatenate([design, np.stack(slope, axis=1)])
 
     prior = {name: bow for name in _NAMES if name.endswith("bow")}
-    parameters = Parameters(_NAMES, np.zeros(12), prior_sigma=prior)
+    for name, k in zip(names[12:], np.repeat(drawn, 2), strict=True):
+        prior[name] = edges[k].ends
+    parameters = Parameters(names, np.zeros(len(names)), prior_sigma=prior)
     return GaussMarkov(
         function, np.concatenate(observed), np.concatenate(sigma), parameters, jacobian
     ), bounds
@@ -278,7 +286,7 @@ def _lines(
     rejected: Sequence[int],
 ) -> Lines:
     """Everything that follows from the adjusted chords and bows."""
-    values = fit.values
+    values = fit.values[:12]
     step = 1e-3
     slope = np.stack(
         [
@@ -287,10 +295,10 @@ def _lines(
         ],
         axis=1,
     )
-    cofactor = fit.covariance.copy()
+    cofactor = fit.covariance[:12, :12].copy()
     for k, edge in enumerate(edges):
         if edge is not None:
-            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2 + edge.ends**2 * np.eye(2)
+            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2
     covariance = slope @ cofactor @ slope.T
     used, out, rms, coverage = (np.zeros(4) for _ in range(4))
     a, b, _ = _frame_axes(corners)
@@ -305,7 +313,7 @@ def _lines(
             place = ((edge.xy[kept] - a[k]) @ along) / (along @ along)
             # Of thirty sections, those in which a profile was used.
             coverage[k] = len(np.unique(np.floor(place * 30))) / 28
-    sigma = fit.sigma
+    sigma = fit.sigma[:12]
     return Lines(
         _corners(values, corners),
         covariance,
