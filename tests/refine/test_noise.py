@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.refine.matching.noise import course, grey_variance
+from reseau.refine.matching.noise import course, grey_variance, medians
 
 A, B = 1.5, 0.08
 STARTS = np.stack(np.meshgrid(np.arange(20, 380, 30), np.arange(20, 280, 30)), axis=-1).reshape(-1, 2) + 0.3
@@ -65,3 +65,11 @@ def test_weights_are_inverse_to_the_variances_of_a_patch_and_never_wild():
     assert weights[0] * (A + B * grey[0]) == pytest.approx(np.full(3, A + B * 100))
     assert weights.max() <= 20
     assert weights.min() > 0
+
+
+def test_medians_are_of_the_values_in_use_alone():
+    values = np.array(
+        [[3.0, 1.0, 2.0, 9.0], [4.0, np.nan, 1.0, 7.0], [1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]]
+    )
+    used = np.array([[1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 1], [0, 0, 0, 0]], dtype=bool)
+    np.testing.assert_array_equal(medians(values, used)[:, 0], [2.0, 2.5, 2.5, 0.0])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...data import Array, Mask, Rows
 from ...optics.formation import Outline
+from .noise import medians
 from .patches import CONTRAST, LEVEL, WIDTH, MatchOptions, Patches, X, Y
 from .shapes import GrownOutline, Shape, Some
 
@@ -247,9 +248,7 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:
     """1.4826 × the median of the absolute residuals in use, (k, 1); not below half their rms."""
-    size = np.where(used > 0, np.abs(residuals), np.nan)
-    size[~(used > 0).any(axis=1), 0] = 0.0
-    sigma: Array = 1.4826 * np.nanmedian(size, axis=1, keepdims=True)
+    sigma = 1.4826 * medians(np.abs(residuals), used > 0)
     # An image of few grey steps may have half its residuals at nought.
     return np.maximum(sigma, 0.5 * _rms(residuals, used, 0))
 

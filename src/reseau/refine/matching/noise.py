@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data import Array
+from ...data import Array, Mask
 
-__all__ = ["course", "grey_variance"]
+__all__ = ["course", "grey_variance", "medians"]
 
 _SIGNIFICANT = 5.0
 """Standard deviations by which a growth of the variance must differ from none to be taken for true."""
@@ -66,3 +66,13 @@ def course(grey: Array, variance: tuple[float, float]) -> Array:
     mean = np.maximum(expected.mean(axis=1, keepdims=True), 1e-12)
     weights: Array = 1 / np.maximum(expected / mean, _LEAST)
     return weights
+
+
+def medians(values: Array, used: Mask) -> Array:
+    """Medians (k, 1) of those values (k, n) in use that are numbers; 0 where there is none."""
+    used = used & ~np.isnan(values)
+    ordered = np.sort(np.where(used, values, np.inf), axis=1)  # those out of use come last
+    count, each = used.sum(axis=1), np.arange(len(values))
+    middle = 0.5 * (ordered[each, np.maximum(count - 1, 0) // 2] + ordered[each, count // 2])
+    median: Array = np.where(count > 0, middle, 0.0)[:, None]
+    return median

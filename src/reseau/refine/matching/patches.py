@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...data import Array, Mask, Rows
 from ...optics.formation import PixelResponse
-from .noise import course
+from .noise import course, medians
 from .shapes import Shape, Window
 
 __all__ = ["CONTRAST", "LEVEL", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
@@ -158,15 +158,16 @@ class Patches:
         x[:, WIDTH] = np.log(self.psf)
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs a value
+        there = around > 0
         design = self.monomials
         fitted = np.zeros((len(x), design.shape[1]))
-        fitted[:, 0] = np.nanmedian(np.where(around > 0, self.grey, np.nan), axis=1)
+        fitted[:, :1] = medians(self.grey, there)
         products = (design[:, :, None] * design[:, None]).reshape(len(design), -1)
         far = np.zeros_like(around)
         for factor in (6.0, 5.0, 4.0, 4.0, 4.0):
-            off = np.where(around > 0, np.abs(self.grey - fitted @ design.T), np.nan)
-            scale = np.maximum(1.4826 * np.nanmedian(off, axis=1, keepdims=True), noise)
-            far = np.nan_to_num(off) / (factor * scale)
+            off = np.abs(self.grey - fitted @ design.T)
+            scale = np.maximum(1.4826 * medians(off, there), noise)
+            far = np.where(there, off, 0.0) / (factor * scale)
             w = around * np.clip(1 - far**2, 0, None) ** 2
             normal = (w @ products).reshape(len(x), *2 * design.shape[1:]) + 1e-6 * np.eye(design.shape[1])
             fitted = np.linalg.solve(normal, ((w * self.grey) @ design + 1e-6 * fitted)[..., None])[..., 0]
