@@ -104,6 +104,8 @@ class SimulatedBench:
         See :class:`~reseau_sims.laboratory.Laboratory`.
     flat : bool
         Whether the testfield is a plane, before a lens that distorts.
+    in_process : bool
+        Whether the camera is in this process also where Aravis is installed.
 
     Attributes
     ----------
@@ -131,6 +133,7 @@ class SimulatedBench:
         camera: Sight | None = None,
         repeatable: bool = False,
         flat: bool = False,
+        in_process: bool = False,
     ) -> None:
         for what, known, asked in (
             ("table", get_args(TableKind), table),
@@ -165,17 +168,17 @@ class SimulatedBench:
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
             addresses["oscilloscope"] = f"TCPIP::{core.HOST},{core.port}::inst0::INSTR"
-            door = "" if camera is None else self._camera(camera, stack)
+            door = "" if camera is None else self._camera(camera, in_process, stack)
             self._servers = stack.pop_all()
         axes = "".join(_axis_entry(table, name) for name in AXES)
         self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + door
 
-    def _camera(self, sight: Sight, stack: ExitStack) -> str:
+    def _camera(self, sight: Sight, in_process: bool, stack: ExitStack) -> str:
         """The camera; its part of the ``bench.toml``, where it can be reached from outside."""
         first = self.laboratory.expose(sight)  # what takes long is computed now
         body = CameraBody(InLaboratory(self.laboratory, sight), first.width, first.height)
         self.scripts["camera"] = body.script
-        if not aravis_is_installed():
+        if in_process or not aravis_is_installed():
             self.video = VideoCamera(body)
             return ""
         served = GigeCamera(body, patience_s=_PATIENCE_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -125,7 +126,10 @@ def _builder(simulated: Any) -> Callable[[str, InstrumentEntry], Instrument] | N
     def build(name: str, entry: InstrumentEntry) -> Instrument:
         if name != "camera":
             return built(name, entry)
-        made: Instrument = plugin(INSTRUMENTS, "v4l2")(name, simulated.video.open, seconds=30.0)
+        settings = {"exposure_us": 10_000.0}  # as the other door has it
+        made: Instrument = plugin(INSTRUMENTS, "v4l2")(
+            name, simulated.video.open, settings=settings, seconds=30.0
+        )
         return made
 
     return build
@@ -144,7 +148,8 @@ def captured_oscilloscope(
     from ..capture import plans, plugin
     from ..procedures.live import LiveOscilloscope
 
-    with plugin("reseau.simulators", "bench")(seed, camera="screen", repeatable=True) as simulated:
+    options = {"camera": "screen", "repeatable": True, "in_process": not _speaks_gige()}
+    with plugin("reseau.simulators", "bench")(seed, **options) as simulated:
         world: World = simulated.laboratory.world
         kept = archive.begin("oscilloscope", "oscilloscope", {"seed": seed}, simulated.toml)
         live = LiveOscilloscope(
@@ -176,9 +181,8 @@ def captured_testfield(
     from ..procedures.measuring import measurer_of
     from ..refine import TestfieldOptions
 
-    with plugin("reseau.simulators", "bench")(
-        seed, camera="testfield", repeatable=True, flat=True
-    ) as simulated:
+    options = {"camera": "testfield", "repeatable": True, "flat": True, "in_process": not _speaks_gige()}
+    with plugin("reseau.simulators", "bench")(seed, **options) as simulated:
         field = simulated.laboratory.field
         measure = measurer_of(field.design, TestfieldOptions(row_jitter_px=_JITTER_PX, fill=_FILL))
         model = CameraModel("brown", ("c", "x0", "y0", "K1"), (_PITCH_MM, _PITCH_MM))
@@ -197,8 +201,13 @@ def captured_testfield(
     return TestfieldSession(found, true, live.finish()["calibration.json"], len(kept.frames(kind="frame")))
 
 
+def _speaks_gige() -> bool:
+    """Whether the driver of GigE Vision has what it needs: PyGObject."""
+    return importlib.util.find_spec("gi") is not None
+
+
 def _way(simulated: Any) -> str:
     """How frames came."""
     if simulated.video is None:
         return "GigE Vision"
-    return "Video4Linux, simulated in process (Aravis is not installed)"
+    return "Video4Linux, simulated in process (Aravis or PyGObject is not installed)"
