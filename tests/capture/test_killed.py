@@ -33,6 +33,13 @@ from .fieldrig import FieldRig
 KILLS = int(os.environ.get("RESEAU_KILLS", "200"))
 POSES = paper_steps()[:12]
 FRAMES = 40
+HEAVY = (
+    "reseau.optics.single",
+    "reseau.bundle.compiled",
+    "reseau.refine.testfield.measure",
+    "reseau.bundle.adjustment",
+)
+"""What takes long to import."""
 
 
 def work(place: Path, kind: str, seed: int) -> None:
@@ -76,7 +83,7 @@ def faulty(seed: int) -> Iterator[Bench]:
 def ended(place: Path, kind: str, after_s: float | None, seed: int = 0) -> bool:
     """Whether a process came to its end before it was killed, or an instrument ended it."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([work.__module__])
+    context.set_forkserver_preload([work.__module__, *HEAVY])
     process = context.Process(target=work, args=(place, kind, seed))
     process.start()
     process.join(after_s)
