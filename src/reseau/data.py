@@ -116,6 +116,13 @@ class ImagePoints:
         sigma: Array = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
         return sigma
 
+    def to_csv(self) -> str:
+        """The points as lines ``id,x,y,sx,sy``."""
+        lines = ["id,x,y,sx,sy"]
+        for name, (x, y), (sx, sy) in zip(self.names, self.xy, self.sigma, strict=True):
+            lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
+        return "\n".join(lines) + "\n"
+
     def select(self, keep: Sequence[str] | Mask) -> ImagePoints:
         """The points of these names, in their order, or those of a mask (n,).
 

@@ -35,7 +35,6 @@ def carry_out(
     *,
     park: Mapping[str, float] | None = None,
     paused: Callable[[], Decision] = lambda: "stop",
-    about: Mapping[str, Any] | None = None,
 ) -> Any:
     """Carry out a plan, and then whatever the procedure makes of the frames.
 
@@ -50,8 +49,6 @@ def carry_out(
         an abort or an error it always stands where it stopped.
     paused : callable
         Asked when the plan was interrupted, by Ctrl-C or by :meth:`RunEngine.request_pause`.
-    about : mapping, optional
-        What else the record should say of the run.
 
     Returns
     -------
@@ -80,7 +77,7 @@ def carry_out(
     try:
         run.ready()
         with contextlib.redirect_stdout(sys.stderr), _terminated(engine, ended, in_main):
-            outcome = _engaged(engine, _whole(run, plan, park or {}), about or {}, paused, ended)
+            outcome = _engaged(engine, _whole(run, plan, park or {}), paused, ended)
         run.settle()
         status = "stopped" if outcome is None else "done"
         if outcome is not None:
@@ -121,12 +118,11 @@ def _to_rest(run: Acquisition) -> Plan:
 def _engaged(
     engine: Any,
     plan: Plan,
-    about: Mapping[str, Any],
     paused: Callable[[], Decision],
     ended: threading.Event,
 ) -> Any:
     """What the engine returns; None when the plan was ended before its end."""
-    todo: Callable[[], Any] = lambda: engine(plan, **about)  # noqa: E731
+    todo: Callable[[], Any] = lambda: engine(plan)  # noqa: E731
     while True:
         try:
             return todo()

@@ -11,7 +11,6 @@ from .common import (
     AsJson,
     Out,
     is_points,
-    points_csv,
     points_document,
     progress,
     read_measurement,
@@ -58,11 +57,11 @@ def _points(correction: CameraCorrection, source: Path, out: Path | None, as_jso
     points = correction.apply(read_measurement(source).image_points())
     document = canonical_json(points_document(points, correction.unit, "common"))
     if out is not None:
-        write_whole(out, document if suffix == ".json" else points_csv(points))
+        write_whole(out, document if suffix == ".json" else points.to_csv())
     if as_json:
         say(document)
     elif out is None:
-        say(points_csv(points))
+        say(points.to_csv())
     else:
         say(f"{out}: {len(points)} points in {correction.unit}\n")
 

@@ -22,14 +22,24 @@ from .bundle_options import (
     say_left_out,
     say_model,
 )
-from .common import AsJson, Out, SensorFile, corrected, is_points, progress, read_measurement, required, say
+from .common import (
+    AsJson,
+    Out,
+    SensorFile,
+    corrected,
+    is_points,
+    parsed_design,
+    progress,
+    read_measurement,
+    required,
+    say,
+)
 from .measure import Channel
 
 if TYPE_CHECKING:
     from ..bundle import FieldDifference, Kind, Lens
     from ..calibration import Calibration
     from ..data import Frame, ImagePoints
-    from ..formats import ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraModel
     from ..provenance import Provenance
 
@@ -80,12 +90,13 @@ def calibrate(
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
     workers = _processes(images, jobs)
+    from ..formats import read_text
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..refine import TestfieldOptions
 
     outputs(out, report)
     distance = positive(distance)
-    target, kind = _design(design), component_kind(components)
+    target, kind = parsed_design(read_text(design), design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
     level = level_of(eliminate, "--eliminate")
     options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
@@ -192,16 +203,6 @@ def _frames(
             yield path.name, read_measurement(path).image_points()
         else:
             yield corrected(read_frame(path, channel.value), sensor)
-
-
-def _design(path: Path) -> TestfieldDesign | ReseauDesign:
-    """A design, told apart by its schema."""
-    from ..formats import ReseauDesign, TestfieldDesign
-    from ..formats.document import read_text
-
-    if '"testfield-design/' in read_text(path)[:4096]:
-        return TestfieldDesign.read(path)
-    return ReseauDesign.read(path)
 
 
 def _model(pitch: float | None, side: str, free: str) -> CameraModel:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
-from .common import say
+from .common import parsed_design, say
 from .events import Display
-from .sessions import INPUT, ArchivePlace, ObjectsPlace, opened, parsed, procedure_of, steps_of
+from .sessions import INPUT, ArchivePlace, ObjectsPlace, opened, procedure_of, steps_of
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
@@ -266,7 +266,7 @@ def _begun(
         if path is None:
             raise UsageError("is needed", where=f"--{role.removesuffix('.json')}")
         texts[role] = read_text(path)
-        parsed(texts[role], path)
+        parsed_design(texts[role], path)
     path = where.bench or Path("bench.toml")
     text = read_text(path)
     bench = Bench(BenchFile.parse_toml(text, where=path))

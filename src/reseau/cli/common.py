@@ -16,7 +16,7 @@ from ..errors import EstimationError, InputError, UsageError
 if TYPE_CHECKING:
     from ..adjust import Failure
     from ..data import Frame, ImagePoints
-    from ..formats import ReseauMeasurement
+    from ..formats import ReseauDesign, ReseauMeasurement, TestfieldDesign
     from ..refine.sensor import SensorCorrection
 
 T = TypeVar("T")
@@ -66,6 +66,14 @@ def read_measurement(path: Path) -> ReseauMeasurement:
     if path.suffix.lower() == ".csv":
         return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
     return ReseauMeasurement.read(path)
+
+
+def parsed_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
+    """A design, told apart by its schema; `where` names it in messages."""
+    from ..formats import ReseauDesign, TestfieldDesign
+
+    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
+    return kind.parse(text, where=where)
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:
@@ -132,14 +140,6 @@ def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, An
         "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
     }
     return {"schema": "reseau-points/1", "unit": unit, "system": system, "points": table}
-
-
-def points_csv(points: ImagePoints) -> str:
-    """Points as ``id,x,y,sx,sy``."""
-    lines = ["id,x,y,sx,sy"]
-    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
-        lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
-    return "\n".join(lines) + "\n"
 
 
 def say(text: str) -> None:

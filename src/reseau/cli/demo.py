@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import AsJson, points_csv, progress, say
+from .common import AsJson, progress, say
 
 if TYPE_CHECKING:
     from ..data import Frame
@@ -148,7 +148,7 @@ def _documents(
         "camera.json": field.calibration,
         "reseau.json": bench.design.to_json(),
         "rods.json": bench.test_object.to_json(),
-        "true.csv": points_csv(done.third.true),
+        "true.csv": done.third.true.to_csv(),
         "comparison.json": canonical_json(truth.to_dict() | {"testfield": _testfield(field)}),
         **{f"{name}.json": document.to_json() for name, document in _measurements(done).items()},
     }

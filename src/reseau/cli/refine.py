@@ -13,7 +13,6 @@ from .common import (
     AsJson,
     Out,
     is_points,
-    points_csv,
     points_document,
     progress,
     read_measurement,
@@ -324,7 +323,7 @@ def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str
         np.concatenate([found.true.cov for _, found in third]),
     )
     document = canonical_json(points_document(points, unit, "object"))
-    write_whole(true, document if true.suffix.lower() == ".json" else points_csv(points))
+    write_whole(true, document if true.suffix.lower() == ".json" else points.to_csv())
 
 
 def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
@@ -363,4 +362,4 @@ def _say_third(
         for note in found.notes:
             say(f"  note: {note}\n")
         if true is None:
-            say(points_csv(found.true))
+            say(found.true.to_csv())

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
+from .common import parsed_design
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session, Verdict
     from ..capture import Procedure, Step
     from ..data import Frame
-    from ..formats import ReseauDesign, TestfieldDesign
     from ..procedures.live import LiveTestfield
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "SessionName",
     "input_of",
     "opened",
-    "parsed",
     "procedure_of",
     "steps_of",
 ]
@@ -86,14 +85,6 @@ def procedure_of(kept: Session) -> Procedure | None:
     return None
 
 
-def parsed(text: str, where: object) -> ReseauDesign | TestfieldDesign:
-    """A design, told apart by its schema."""
-    from ..formats import ReseauDesign, TestfieldDesign
-
-    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
-    return kind.parse(text, where=where)
-
-
 def _testfield(kept: Session) -> Procedure:
     from ..procedures.calibration import CameraModel
     from ..procedures.live import LiveTestfield
@@ -101,19 +92,19 @@ def _testfield(kept: Session) -> Procedure:
     from ..refine import TestfieldOptions
 
     given = kept.parameters
-    design = parsed(input_of(kept, "design.json"), "design.json")
+    design = parsed_design(input_of(kept, "design.json"), "design.json")
     pitch, free = given["pitch"], tuple(given["free"])
     model = CameraModel("opencv", free) if pitch is None else CameraModel("brown", free, (pitch, pitch))
     options = {key: value for key, value in given.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given["row_jitter"], fill=given["fill"]))
-    return _Reported(LiveTestfield(design, measure, model, name=kept.name, options=options), options)
+    return _Reported(LiveTestfield(design, measure, model, name=kept.name, options=options))
 
 
 class _Reported:
     """A testfield procedure whose results have a report beside them."""
 
-    def __init__(self, live: LiveTestfield, options: Mapping[str, Any]) -> None:
-        self._live, self._options = live, dict(options)
+    def __init__(self, live: LiveTestfield) -> None:
+        self._live = live
 
     def on_frame(self, frame: Frame, step: Step) -> Verdict:
         return self._live.on_frame(frame, step)

@@ -301,11 +301,5 @@ class LiveOscilloscope:
         )
         made = {"calibration.json": calibration.to_json()}
         if self.third is not None:
-            made["true.csv"] = _table(self.third.true)
+            made["true.csv"] = self.third.true.to_csv()
         return made
-
-
-def _table(points: ImagePoints) -> str:
-    rows = zip(points.names, points.xy, points.sigma, strict=True)
-    lines = [f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}" for name, (x, y), (sx, sy) in rows]
-    return "\n".join(["id,x,y,sx,sy", *lines]) + "\n"
