@@ -94,7 +94,7 @@ def _depends(module: bytes) -> list[str]:
 def first_files(parts: Parts, init: bytes) -> bytes:
     """The initial file system: busybox, the modules with their order, and what is run first."""
     folder, program, plain, console = 0o040755, 0o100755, 0o100644, 0o020600
-    names = ("bin", "dev", "proc", "sys", "ro", "rw", "layer", "root", "m")
+    names = ("bin", "dev", "proc", "sys", "ro", "rw", "layer", "new", "m")
     entries: list[tuple[str, int, bytes]] = [(name, folder, b"") for name in names]
     entries += [("dev/console", console, b""), ("bin/busybox", program, parts.busybox.read_bytes())]
     entries.append(("init", program, init))
