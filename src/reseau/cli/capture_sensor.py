@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,7 +55,7 @@ def sensor(
         sharp = None
         if edge:
             sharp = required(measure_edge(capture_edge(device, ready), region), "edge")
-    result = calibrate_sensor(series, sharp)
+    result = replace(calibrate_sensor(series), edge=sharp)
     options = {"camera": identity, "levels": levels, "frames": frames, "settings": device.settings.to_dict()}
     calibration = result.calibration(
         identity,

@@ -1,4 +1,4 @@
-"""Sensors calibrated: truth recovered within its sigmas, frames corrected, files read, edges measured."""
+"""Sensors calibrated: truth recovered within its sigmas, frames corrected, files read."""
 
 from __future__ import annotations
 
@@ -6,21 +6,17 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq
 
 from reseau.adjust import Failure
 from reseau.calibration import Calibration
 from reseau.data import Array, Frame
 from reseau.errors import EstimationError, FormatError, UsageError
 from reseau.refine.sensor import (
-    EdgeSpread,
     Level,
     SensorCorrection,
     SensorResult,
     SensorSeries,
     calibrate_sensor,
-    measure_edge,
 )
 from reseau_sims.pixels import PixelSensor
 
@@ -144,47 +140,3 @@ def test_a_flickering_lamp_does_not_count_as_noise() -> None:
     still = Level.of(4000.0, [sensor.expose(LIGHT, 4000.0, rng) for _ in range(20)])
     flickering = Level.of(4000.0, [sensor.expose(LIGHT * f, 4000.0, rng) for f in rng.normal(1.0, 0.02, 20)])
     assert flickering.variance.mean() == pytest.approx(still.variance.mean(), rel=0.02)
-
-
-def edge_of(rng: np.random.Generator, psf: float, turned: bool) -> Frame:
-    """An edge formed by brute force: ten by ten points to a pixel, blurred, and averaged."""
-    fine, n = 10, 48
-    angle = np.deg2rad(rng.uniform(3, 12)) * rng.choice([-1, 1])
-    y, x = (np.mgrid[: n * fine, : n * fine] + 0.5) / fine - 0.5
-    d = (x - n / 2 - rng.uniform(-1, 1) - np.tan(angle) * (y - n / 2)) * np.cos(angle)
-    light = gaussian_filter(np.clip(d * fine + 0.5, 0, 1), psf * fine, mode="nearest")
-    pixels = 40 + 160 * light.reshape(n, fine, n, fine).mean(axis=(1, 3))
-    pixels = np.rint((pixels.T if turned else pixels) + rng.normal(0, 1.0, pixels.shape))
-    return Frame(np.clip(pixels, 0, 255).astype(np.uint8), 255.0)
-
-
-def test_the_sharpness_of_an_edge_is_recovered_within_its_sigmas() -> None:
-    widths, halves = [], []
-    for seed in range(24):
-        rng = np.random.default_rng(seed)
-        psf = rng.uniform(0.4, 1.5)
-        found = measure_edge(edge_of(rng, psf, bool(seed % 2)), (4, 4, 40, 40))
-        assert isinstance(found, EdgeSpread)
-        widths.append((abs(found.fit["psf"]) - psf) / found.fit.sigma_of("psf"))
-        half, sigma = found.mtf50
-        true = brentq(lambda f, m=found, w=psf: float(m.mtf(f, w)) - 0.5, 1e-6, 0.99)
-        halves.append((half - true) / sigma)
-        assert sigma < 0.002
-    # rms of 24 normalised errors: 1 ± 0.14; of their mean 0 ± 0.2.
-    for normalised in (widths, halves):
-        assert 0.6 < np.sqrt(np.mean(np.square(normalised))) < 1.45
-        assert abs(np.mean(normalised)) < 0.7
-
-
-@pytest.mark.parametrize(
-    ("pixels", "said"),
-    [
-        (np.zeros((8, 8)), "smaller than 16"),
-        (np.zeros((40, 40)), "without an edge"),
-        (np.repeat([[0.0] * 20 + [100.0] * 20], 40, axis=0) + np.eye(40), "slanted by"),
-    ],
-)
-def test_what_is_no_slanted_edge_is_declined(pixels: Array, said: str) -> None:
-    found = measure_edge(Frame(pixels, 255.0))
-    assert isinstance(found, Failure)
-    assert said in found.reason

@@ -3,13 +3,15 @@
 from .correction import SensorCorrection
 from .edge import EdgeSpread, measure_edge
 from .fields import Fields, estimate_fields
-from .sensor import SensorResult, calibrate_sensor
+from .free import FreeCurve
+from .sensor import SensorResult, calibrate_sensor, with_edge
 from .series import Level, SensorSeries
 from .transfer import Linearity, PhotonTransfer, fit_linearity, fit_transfer
 
 __all__ = [
     "EdgeSpread",
     "Fields",
+    "FreeCurve",
     "Level",
     "Linearity",
     "PhotonTransfer",
@@ -21,4 +23,5 @@ __all__ = [
     "fit_linearity",
     "fit_transfer",
     "measure_edge",
+    "with_edge",
 ]

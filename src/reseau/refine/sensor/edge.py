@@ -1,28 +1,35 @@
-"""Sharpness by a slanted edge: the width of the point-spread function, and the MTF that follows from it.
+"""Sharpness by a slanted edge: its free modulation transfer, and whether a Gaussian describes it.
 
 A straight edge between dark and bright, slanted by a few degrees, is seen at every distance from the centre
-of a pixel (ISO 12233). Its image is formed as that of all targets is: a Gaussian folded with the square of
-the pixel, which along the edge's normal is a trapezoid.
+of a pixel (ISO 12233).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import ndtr
 
-from ...adjust import Adjustment, Failure, GaussMarkov, Parameters, adjust
-from ...data import Array, Frame
+from ...adjust import Adjustment, CoefficientTest, Failure, NestedTest, compare
+from ...calibration import Quantity
+from ...data import Array, Frame, Mask
+from .free import FREQUENCIES, FreeCurve, fit_free
+from .gaussian import EdgePixels, approximate_edge, fit_gaussian
 
 __all__ = ["EdgeSpread", "measure_edge"]
 
-_REACH_PX = 8.0
-"""From the edge, up to which pixels take part."""
-_LEAST_SLANT = 0.02
+_REACH_PX, _REACH_PSF = 8.0, 4.0
+"""From the edge, up to which pixels take part in the Gaussian: the larger one, in pixels and in widths."""
+_FREE_REACH_PX, _FREE_REACH_PSF = 32.0, 12.0
+"""The same of the free curve."""
+_LEAST_SLANT, _MOST_SLANT = 0.02, 0.6
 """Radians; below, all pixels along the edge have nearly the same distance."""
-_ROUNDS = 3
+ALPHA = 0.01
+"""Level of the tests."""
+_SATURATED = 0.005
+"""Share of the pixels near the edge that may be at full scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +39,20 @@ class EdgeSpread:
     Parameters
     ----------
     fit : Adjustment
-        Of `offset` (px) and `slope` of the edge, `dark` and `bright` beside it, and `psf` (px, one sigma).
+        Of `offset` (px), `slope` and `bow` of the edge (held at zero where it is straight), `dark` and
+        `bright` beside it, and `psf` (px, one sigma).
+    free : FreeCurve or Failure
+        Modulation transfer without the assumption of a Gaussian; falsy where there are too few pixels.
+    gaussian : NestedTest or None
+        Whether more than the Gaussian is needed; significant where it does not describe the edge.
+    bent : CoefficientTest or None
+        Whether the edge is bent.
     """
 
     fit: Adjustment
+    free: FreeCurve | Failure
+    gaussian: NestedTest | None = None
+    bent: CoefficientTest | None = None
 
     @property
     def angle(self) -> float:
@@ -43,8 +60,8 @@ class EdgeSpread:
         return float(np.arctan(self.fit["slope"]))
 
     def mtf(self, frequency: Array | float, psf: float | None = None) -> Array:
-        """Modulation transfer at frequencies in cycles per pixel, along the normal of the edge; the pixel's
-        own square is in it.
+        """Modulation transfer of the Gaussian at frequencies in cycles per pixel, along the normal of the
+        edge; the pixel's own square is in it.
         """
         f = np.asarray(frequency, dtype=np.float64)
         width = self.fit["psf"] if psf is None else psf
@@ -54,7 +71,7 @@ class EdgeSpread:
 
     @property
     def mtf50(self) -> tuple[float, float]:
-        """Frequency at which half of the modulation is left (cycles per pixel), and its sigma."""
+        """Frequency at which the Gaussian leaves half of the modulation (cycles per pixel), and its sigma."""
 
         def half(psf: float) -> float:
             return float(brentq(lambda f: float(self.mtf(f, psf)) - 0.5, 1e-6, 0.99))
@@ -63,94 +80,140 @@ class EdgeSpread:
         slope = (half(psf + step) - half(max(psf - step, 0.0))) / (step + min(step, psf))
         return half(psf), abs(slope) * self.fit.sigma_of("psf")
 
+    def quantities(self) -> dict[str, Quantity]:
+        """What was estimated, by name: of the Gaussian, and of the free curve."""
+        half, sigma = self.mtf50
+        found = {
+            "psf": Quantity(value=abs(self.fit["psf"]), sigma=self.fit.sigma_of("psf"), unit="px"),
+            "mtf50": Quantity(value=half, sigma=sigma, unit="1/px"),
+        }
+        if isinstance(self.free, FreeCurve):
+            if (free := self.free.mtf50) is not None:
+                found["mtf50_free"] = Quantity(value=free[0], sigma=free[1], unit="1/px")
+            value, sigma = self.free.nyquist
+            found["mtf_nyquist_free"] = Quantity(value=value, sigma=sigma, unit="1")
+        return found
 
-def measure_edge(frame: Frame, region: tuple[int, int, int, int] | None = None) -> EdgeSpread | Failure:
+    def to_model(self) -> dict[str, Any]:
+        """For a calibration file: the free curve in columns, and that of the Gaussian beside it."""
+        if isinstance(self.free, Failure):
+            return {}
+        frequency = FREQUENCIES[: int(np.searchsorted(FREQUENCIES, self.free.limit, side="right"))]
+        value, sigma = self.free.mtf(frequency)
+        columns = {"frequency": frequency, "mtf": value, "sigma": sigma, "gaussian": self.mtf(frequency)}
+        return {"mtf": {name: column.tolist() for name, column in columns.items()}}
+
+    def tests(self) -> list[dict[str, Any]]:
+        """For a calibration file: whether a Gaussian describes it, it is straight, and flat beside."""
+        if isinstance(self.free, Failure):
+            return []
+        found: list[dict[str, Any]] = [
+            {"name": name, "passed": not test.significant, "statistic": test.statistic, "p": test.p}
+            for name, test in (("Gaussian edge", self.gaussian), ("straight edge", self.bent))
+            if test is not None
+        ]
+        rise, p = self.free.ends()
+        return [*found, {"name": "flat beside the edge", "passed": p >= ALPHA, "statistic": rise, "p": p}]
+
+    def validity(self) -> dict[str, Any]:
+        """For a calibration file: what was measured, and at which slant."""
+        free = "measured" if self.free else f"no free curve: {getattr(self.free, 'reason', '')}"
+        return {"edge": free, "edge_angle_deg": float(np.rad2deg(self.angle))}
+
+
+def measure_edge(
+    frame: Frame,
+    region: tuple[int, int, int, int] | None = None,
+    variance: Array | None = None,
+    good: Mask | None = None,
+) -> EdgeSpread | Failure:
     """Measure the edge in a region.
 
     Parameters
     ----------
     frame : Frame
-        With a straight edge, nearly upright or level.
+        With a straight edge, nearly upright or level; grey values in proportion to the light.
     region : (left, top, width, height), optional
         Where nothing else is; by default the whole frame.
+    variance : ndarray (height, width), optional
+        Of the frame's grey values, to a common factor, where the photon transfer is known; by default of two
+        values, for the dark and the bright side, found by the residuals.
+    good : ndarray (height, width) of bool, optional
+        Pixels to be used; by default all.
     """
     left, top, width, height = region or (0, 0, frame.width, frame.height)
-    pixels = frame.pixels[top : top + height, left : left + width].astype(np.float64)
+    inside = np.s_[max(top, 0) : top + height, max(left, 0) : left + width]
+    pixels = frame.pixels[inside].astype(np.float64)
     if min(pixels.shape) < 16:
         return Failure("the region of the edge is smaller than 16 pixels")
+    usable = np.ones(pixels.shape, dtype=bool) if good is None else good[inside]
+    noise = None if variance is None else variance[inside]
     across, along = (np.abs(np.diff(pixels, axis=axis)).sum() for axis in (1, 0))
     if along > across:
-        pixels = pixels.T
-    values = _approximate(pixels)
+        pixels, usable = pixels.T, usable.T
+        noise = None if noise is None else noise.T
+    values = approximate_edge(pixels)
     if values is None:
         return Failure("there is a row without an edge in its region")
-    if not _LEAST_SLANT < abs(values[1]) < 0.6:
+    if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
         return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°")
-    # Which pixels are near enough depends on where the edge is.
-    fit = _fitted(pixels, values)
-    for _ in range(_ROUNDS):
-        if not isinstance(fit, Adjustment):
-            return fit
-        fit = _fitted(pixels, fit.values)
-    if not isinstance(fit, Adjustment):
+    if np.mean(pixels[usable] >= frame.full_scale) > _SATURATED:
+        return Failure("its bright side is saturated: expose less")
+    around = EdgePixels.of(pixels, usable)
+    if noise is not None:
+        around = replace(around, sigma=np.sqrt(noise[usable]))
+    return _measured(around, values, noise is not None)
+
+
+def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Failure:
+    """Gaussian and free curve in turn; which of the pixels, which noise, and whether bent, they tell."""
+    first = fit_gaussian(pixels, values, _REACH_PX)
+    if isinstance(first, Failure):
+        return first
+    near, far = _reaches(first)
+    part = pixels.part(np.abs(pixels.distance(*first.values[:3])) < far)
+    bow = fit_gaussian(part, first.values, np.inf, bow=True)
+    if isinstance(bow, Failure):
+        return bow
+    free = fit_free(part, bow.values, bow=True)
+    if isinstance(free, Failure):
+        fit = fit_gaussian(pixels, first.values, near)
+        return fit if isinstance(fit, Failure) else EdgeSpread(fit, free)
+    if not known:
+        part, pixels = (_weighed(free, each) for each in (part, pixels))
+        free = fit_free(part, bow.values, bow=True)
+        if isinstance(free, Failure):
+            return free
+    bent = free.fit.test_of("bow", alpha=ALPHA)
+    wide = fit_gaussian(part, first.values, np.inf, bow=bent.significant)
+    fit = fit_gaussian(pixels, first.values, near, bow=bent.significant)
+    if isinstance(wide, Failure):
+        return wide
+    if isinstance(fit, Failure):
         return fit
-    return EdgeSpread(fit)
+    free = fit_free(part, wide.values, bow=bent.significant)
+    test = None if isinstance(free, Failure) else compare(wide, free.fit, ALPHA)
+    return EdgeSpread(fit, free, test, bent)
 
 
-def _approximate(pixels: Array) -> Array | None:
-    """Edge by the centroids of the gradient in each row, and grey values beside it; None without an edge."""
-    gradient = np.diff(pixels, axis=1)
-    sign = np.sign(gradient.sum())
-    weight = np.clip(sign * gradient, 0, None) ** 2
-    if not weight.sum(axis=1).min() > 0:
-        return None
-    x = np.arange(gradient.shape[1]) + 0.5
-    centre = (weight * x).sum(axis=1) / weight.sum(axis=1)
-    rows = np.arange(len(pixels)) - (len(pixels) - 1) / 2
-    slope, offset = np.polyfit(rows, centre, 1)
-    low, high = np.percentile(pixels, [10, 90])
-    sides = (low, high) if sign > 0 else (high, low)
-    return np.array([offset, slope, *sides, 0.7])
+def _reaches(fit: Adjustment) -> tuple[float, float]:
+    """Up to which distances pixels take part, in the Gaussian and in the free curve."""
+    psf = abs(fit["psf"])
+    return max(_REACH_PX, _REACH_PSF * psf), max(_FREE_REACH_PX, _FREE_REACH_PSF * psf)
 
 
-def _fitted(pixels: Array, values: Array) -> Adjustment | Failure:
-    """Adjust edge, grey values and width to the pixels near it; all of the same noise, found by them."""
-    rows: Array = np.arange(len(pixels))[:, None] - (len(pixels) - 1) / 2 + np.zeros(pixels.shape)
-    columns: Array = np.arange(pixels.shape[1], dtype=np.float64) + np.zeros(pixels.shape)
-    near = np.abs(_distance(rows, columns, values)) < _REACH_PX
-    y, x, grey = rows[near], columns[near], pixels[near]
-
-    def computed(p: Array) -> Array:
-        slant = np.arctan(p[1])
-        spread = _edge_spread(_distance(y, x, p), abs(p[4]), np.cos(slant), abs(np.sin(slant)))
-        formed: Array = p[2] + (p[3] - p[2]) * spread
-        return formed
-
-    parameters = Parameters(["offset", "slope", "dark", "bright", "psf"], values)
-    return adjust(GaussMarkov(computed, grey, np.ones_like(grey), parameters))
-
-
-def _distance(rows: Array, columns: Array, values: Array) -> Array:
-    """From the edge, along its normal."""
-    distance: Array = (columns - values[0] - values[1] * rows) / np.hypot(1.0, values[1])
-    return distance
-
-
-def _edge_spread(d: Array, sigma: float, c: float, s: float) -> Array:
-    """Share of the bright side in a pixel at a distance: the step folded with a Gaussian and the trapezoid
-    that the unit square is when seen along a normal with the components c and s.
-    """
-    s = max(s, 1e-3)  # along the rows the trapezoid is a square, which it is nearly here
-    wide, narrow = (c + s) / 2, (c - s) / 2
-    ends = _twice(d + wide, sigma) - _twice(d + narrow, sigma) - _twice(d - narrow, sigma)
-    spread: Array = (ends + _twice(d - wide, sigma)) / (c * s)
-    return spread
-
-
-def _twice(u: Array, sigma: float) -> Array:
-    """The second integral of the normal distribution of this width."""
-    width = max(sigma, 1e-6)
-    density = np.exp(-0.5 * (u / width) ** 2) / np.sqrt(2 * np.pi)
-    integral: Array = ((u**2 + width**2) * ndtr(u / width) + u * width * density) / 2
-    return integral
+def _weighed(free: FreeCurve, pixels: EdgePixels) -> EdgePixels:
+    """With the noise that the residuals have: its variance grows in a straight line with the light."""
+    dark, bright = free.base[3:5]
+    residual = free.fit.residuals**2 * (free.fit.problem.size / free.fit.redundancy)
+    share = np.clip((free.fit.problem.observations - free.fit.residuals - dark) / (bright - dark), 0.0, 1.0)
+    levels = np.full(2, float(residual.mean()))
+    for _ in range(2):  # squares scatter as their mean does
+        design = np.stack([1 - share, share], axis=1)
+        weight = 1 / (design @ levels)
+        found = np.linalg.lstsq(design * weight[:, None], residual * weight, rcond=None)[0]
+        levels = np.maximum(found, 1e-3 * float(residual.mean()) + 1e-12)
+    seen = (free.edge_spread(free.distance(pixels)) - dark) / (bright - dark)
+    variance = levels[0] + (levels[1] - levels[0]) * np.clip(seen, 0.0, 1.0)
+    return replace(pixels, sigma=np.sqrt(variance))

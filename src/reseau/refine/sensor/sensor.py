@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ...adjust import Failure
 from ...calibration import Calibration, Covariance, Quantity
+from ...data import Array, Frame
 from ...errors import EstimationError
 from .correction import SensorCorrection
-from .edge import EdgeSpread
+from .edge import EdgeSpread, measure_edge
 from .fields import Fields, estimate_fields
-from .series import SensorSeries
-from .transfer import Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
+from .series import Level, SensorSeries
+from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
 
-__all__ = ["SensorResult", "calibrate_sensor"]
+__all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class SensorResult:
         Of the frames.
     exposure_us : float
         The brightest unsaturated one.
-    edge : EdgeSpread, optional
-        Sharpness.
+    edge : EdgeSpread or Failure, optional
+        Sharpness; falsy where there is no edge to be measured.
     """
 
     fields: Fields
@@ -45,7 +46,7 @@ class SensorResult:
     linearity: Linearity | Failure
     full_scale: float
     exposure_us: float
-    edge: EdgeSpread | None = None
+    edge: EdgeSpread | Failure | None = None
 
     @property
     def dsnu(self) -> float:
@@ -78,12 +79,33 @@ class SensorResult:
             for name in ("b2", "b3"):
                 fit = self.linearity.fit
                 found[name] = Quantity(value=fit[name], sigma=fit.sigma_of(name), unit="1")
-        if self.edge is not None:
-            psf = self.edge.fit
-            found["psf"] = Quantity(value=abs(psf["psf"]), sigma=psf.sigma_of("psf"), unit="px")
-            half, sigma = self.edge.mtf50
-            found["mtf50"] = Quantity(value=half, sigma=sigma, unit="1/px")
+        if isinstance(self.edge, EdgeSpread):
+            found |= self.edge.quantities()
         return found
+
+    def variance(self, frame: Frame, exposures: int, exposure_us: float) -> Array:
+        """Of the grey values that the correction makes of a frame, by the photon transfer.
+
+        Parameters
+        ----------
+        frame : Frame
+            Uncorrected, the mean of some exposures.
+        exposures : int
+            How many.
+        exposure_us : float
+            Of each.
+
+        Notes
+        -----
+        With s̃ the linearised signal and q its slope, (q²(σ² + 1/12) + s̃/g) / (n r²).
+        """
+        u = (frame.pixels - self.fields.dark(exposure_us)).astype(np.float64) / self.full_scale
+        b2, b3 = self.correction.b2, self.correction.b3
+        signal, slope = u * (1 + b2 * u + b3 * u**2) * self.full_scale, 1 + 2 * b2 * u + 3 * b3 * u**2
+        fit = self.transfer.fit
+        read = slope**2 * (fit["read_noise"] ** 2 + ROUNDING)
+        noise: Array = read + np.maximum(signal, 0.0) / fit["gain"]
+        return noise / (exposures * self.fields.response.astype(np.float64) ** 2)
 
     def calibration(self, name: str, provenance: Mapping[str, Any], times: Mapping[str, str]) -> Calibration:
         """As a ``reseau-calibration/1`` of the kind camera, whose model is a sensor."""
@@ -97,15 +119,19 @@ class SensorResult:
         size = len(names)
         rows = tuple(tuple(row) for row in matrix[:size, :size].tolist())
         test = fit.global_test()
+        tests = [{"name": "photon transfer", "passed": test.passed, "statistic": test.statistic}]
+        model = self.correction.to_model()
+        if isinstance(self.edge, EdgeSpread):
+            tests, model = tests + self.edge.tests(), model | self.edge.to_model()
         return Calibration(
             kind="camera",
             name=name,
-            model=self.correction.to_model(),
+            model=model,
             parameters=self.quantities(),
             covariance=Covariance(names=names, matrix=rows),
             sigma0=fit.sigma0,
             redundancy=fit.redundancy,
-            tests=({"name": "photon transfer", "passed": test.passed, "statistic": test.statistic},),
+            tests=tuple(tests),
             validity=self.validity(),
             provenance=dict(provenance),
             times=dict(times),
@@ -115,7 +141,7 @@ class SensorResult:
         """Where the calibration holds, and how uneven the sensor is."""
         height, width = self.fields.bias.shape
         straight = isinstance(self.linearity, Linearity)
-        return {
+        found = {
             "size": [width, height],
             "full_scale": self.full_scale,
             "exposure_us": self.exposure_us,
@@ -126,17 +152,20 @@ class SensorResult:
             "linearity": "fitted" if straight else getattr(self.linearity, "reason", ""),
             "saturated": self.transfer.curve.plateau is not None,
         }
+        if self.edge is None:
+            return found
+        if isinstance(self.edge, Failure):
+            return found | {"edge": self.edge.reason}
+        return found | self.edge.validity()
 
 
-def calibrate_sensor(series: SensorSeries, edge: EdgeSpread | None = None) -> SensorResult:
+def calibrate_sensor(series: SensorSeries) -> SensorResult:
     """Calibrate a sensor.
 
     Parameters
     ----------
     series : SensorSeries
         Frames in the dark and of even light.
-    edge : EdgeSpread, optional
-        Sharpness, measured before.
 
     Raises
     ------
@@ -150,4 +179,24 @@ def calibrate_sensor(series: SensorSeries, edge: EdgeSpread | None = None) -> Se
     if isinstance(transfer, Failure):
         raise EstimationError(transfer.reason, where="photon transfer")
     brightest = curve.exposure_us[curve.bright & curve.usable].max()
-    return SensorResult(fields, transfer, linearity, series.full_scale, float(brightest), edge)
+    return SensorResult(fields, transfer, linearity, series.full_scale, float(brightest))
+
+
+def with_edge(
+    result: SensorResult, edge: Level, region: tuple[int, int, int, int] | None = None
+) -> SensorResult:
+    """The calibration with the sharpness of an edge, which is freed of what the sensor did to it.
+
+    Parameters
+    ----------
+    result : SensorResult
+        Of the same sensor.
+    edge : Level
+        Frames of a slanted edge.
+    region : (left, top, width, height), optional
+        Where nothing else is; by default the whole frame.
+    """
+    frame = Frame(edge.mean, result.full_scale, "edge")
+    corrected = result.correction.apply(frame, edge.exposure_us)
+    variance = result.variance(frame, edge.count, edge.exposure_us)
+    return replace(result, edge=measure_edge(corrected, region, variance, ~result.fields.defects))

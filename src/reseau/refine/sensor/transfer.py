@@ -18,7 +18,7 @@ from .series import SensorSeries
 
 __all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", "fit_transfer"]
 
-_ROUNDING = 1 / 12
+ROUNDING = 1 / 12
 _LINEAR = 0.7
 """Share of the saturation up to which levels take part, as EMVA 1288 has it."""
 _COLLAPSED = 0.5
@@ -69,7 +69,7 @@ def curve_of(series: SensorSeries, fields: Fields) -> Curve:
     frames = np.array([level.count for level in levels])
     freedom = (frames - 1) * int(good.sum())
     # Where nothing scatters, as in saturation or below one grey value, the rounding does.
-    safe = np.maximum(variance, _ROUNDING)
+    safe = np.maximum(variance, ROUNDING)
     order = np.argsort(times[bright])
     plateau, most = _saturation(signal[bright][order], variance[bright][order])
     usable = ~bright | (signal <= _LINEAR * most)
@@ -195,13 +195,13 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
     sigma = np.hypot(curve.variance_sigma[use], slope * curve.signal_sigma[use] * curve.bright[use])
 
     def computed(x: Array) -> Array:
-        expected: Array = x[1] ** 2 + _ROUNDING + signal / x[0]
+        expected: Array = x[1] ** 2 + ROUNDING + signal / x[0]
         return expected
 
     def jacobian(x: Array) -> Array:
         return np.stack([-signal / x[0] ** 2, np.full_like(signal, 2 * x[1])], axis=1)
 
-    start = [1 / slope, np.sqrt(max(floor - _ROUNDING, 1e-4))]
+    start = [1 / slope, np.sqrt(max(floor - ROUNDING, 1e-4))]
     parameters = Parameters(["gain", "read_noise"], start)
     found = adjust(GaussMarkov(computed, variance, sigma, parameters, jacobian), Options(scale="a-priori"))
     return found if isinstance(found, Failure) else PhotonTransfer(found, curve, saturation)
