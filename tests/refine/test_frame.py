@@ -94,7 +94,7 @@ def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
 
 def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None:
     """The line is at one distance from the edge all along: alone, nothing tells them apart."""
-    frame = FilmFrame(20120, beside=Beside(lines=1))
+    frame = FilmFrame(320035, beside=Beside(lines=1))
     alone = oriented(frame)
     assert alone.status == "declined"
     roll = roll_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0)
@@ -102,7 +102,7 @@ def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None
     (found,) = helped(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
     assert found.status == "oriented", found.why
     assert "roll" in found.why
-    assert np.abs(errors(found, frame)).max() < 0.4
+    assert np.abs(errors(found, frame)).max() < 0.5
 
 
 def test_a_scratch_along_the_film_beside_an_edge_is_passed_over() -> None:
@@ -125,12 +125,20 @@ def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_
     assert not result.edges["right"].found
 
 
-@pytest.mark.parametrize(("seed", "kept"), [(42, "red"), (41, "green")])
-def test_colour_is_measured_by_channel_and_the_best_is_kept(seed: int, kept: str) -> None:
-    # Red has the most contrast; of the second frame its edges are too uncertain, those in green are not.
-    frame = FilmFrame(seed, colour=True, dpi=400)
+def test_of_the_channels_that_of_most_contrast_is_kept() -> None:
+    frame = FilmFrame(42, colour=True, dpi=400)
     result = oriented(frame)
-    assert result.channel == kept
+    assert result.channel == "red"
+    assert np.abs(errors(result, frame)).max() < 0.3
+
+
+def test_another_channel_is_kept_where_that_of_most_contrast_hides_an_edge() -> None:
+    frame = FilmFrame(320035, colour=True)
+    pixels = frame.scan()
+    pixels[..., 0] = FilmFrame(320035, colour=True, beside=Beside(lines=1)).scan()[..., 0]
+    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    assert result.status == "oriented"
+    assert result.channel == "green"
     assert np.abs(errors(result, frame)).max() < 0.3
 
 

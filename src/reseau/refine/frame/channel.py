@@ -20,9 +20,8 @@ __all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
 
 _NEIGHBOURHOOD_PX = 0.05
 """What unevenness of the gate and the picture's own forms add to a profile's standard deviation at least."""
-_TONE = 0.25
-"""Standard deviation of the tone of film along an edge, over that of the noise of a pixel. Simulated frames
-of much noise share an error of 0.15 (their steps lie inwards), to which comes what differs between them."""
+_TONE = 0.12
+"""Standard deviation of the tone of film along an edge, over that of the noise of a pixel."""
 _FEW_GOOD, FAR = 0.2, 2.5
 """Part of an edge's profiles that show a step, below which the edge is looked for so much further away."""
 _FOREIGN = 0.25
@@ -234,7 +233,7 @@ def _edge(
             grey, band, fitted, border.level, border.noise, float(np.exp(blur.width))
         )
         if two is not None:
-            return _along_chord(band, two, own, common), rejected, ""
+            return _along_chord(band, two, own + two.bow, common), rejected, ""
     residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)

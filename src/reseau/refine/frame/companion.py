@@ -9,7 +9,7 @@ What does is that both are smooth all along the edge. Sections of it, i = 1 … 
     g_i(d) = b_i + A_i\\,\\Phi\\Bigl(\\frac{d - p(t_i)}{w}\\Bigr)
              + B_i\\,\\Phi\\Bigl(\\frac{d - q(t_i)}{w}\\Bigr)
              + C_i\\,\\Phi\\Bigl(\\frac{d - q(t_i) - h}{w}\\Bigr), \\qquad
-    p = p_0 + p_1 t, \\quad q = q_0 + q_1 t + q_2 t^2,
+    p = p_0 + p_1 t + p_2 (t^2 - 1), \\quad q = q_0 + q_1 t + q_2 t^2,
 
 with the known width w of a blurred step: where the line leaves the edge, the edge is seen by itself.
 """
@@ -41,15 +41,18 @@ _MOST_MISFIT, _LEAST_GAIN = 1.0, 3.0
 """χ² over the redundancy with which two lines describe an edge, and how often as large it is with one."""
 _TOGETHER = 1.7
 """By how much more the edge varies than from bins whose errors were independent: grain is wider."""
-_SHARED = 6
-"""Parameters of all sections: p0, p1, q0, q1, q2, h."""
+_BOW, _FARTHEST = 0.3, 2.0
+"""Widths by which the edge itself may be bowed, one sigma, and by which a line draws its steps at most."""
+_SHARED = 7
+"""Parameters of all sections: p0, p1, p2, q0, q1, q2, h."""
 
 
 class Companion(NamedTuple):
-    """Offsets (2,) of the edge at the places −1 and 1, inwards, with their covariance (2, 2)."""
+    """Offsets (2,) of the edge at the places −1 and 1, inwards, with their covariance (2, 2), and its bow."""
 
     ends: Array
     covariance: Array
+    bow: float
 
 
 def edge_beside_line(
@@ -82,18 +85,20 @@ def edge_beside_line(
     place, at, value, weight, top = sections
     model = _Model(place, at, width)
     starts = np.array([model.start(slope, top) for slope in _SLOPES])
-    spread = np.concatenate([np.full(_SHARED, 4 * width), _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
+    shared = np.array([4.0, 4.0, _BOW, 4.0, 4.0, 4.0, 4.0]) * width
+    spread = np.concatenate([shared, _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
     estimates, cofactor, chi = model.fitted(value, weight, starts, spread)
     best = int(np.argmin(chi))
     x = estimates[best]
     alone = model.start(0.0, top)
     alone[0], alone[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
-    held = np.concatenate([[4 * width] * 2, [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-6 * top, 2 * top)])
+    held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-6 * top, 2 * top)])
     without = float(model.fitted(value, weight, alone[None], held)[2][0])
     first, second = x[_SHARED + 1 :: 4] / top, x[_SHARED + 2 :: 4] / top
-    behind = x[2] + x[3] * place + x[4] * place**2 - x[0] - x[1] * place
+    behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
     there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
     there &= (behind > -0.3 * width).mean() > 0.9
+    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < _FARTHEST * width
     # What lies behind the edge at one distance all along may be the scanner's own glare.
     there &= np.ptp(behind) > width
     if chi[best] > _MOST_MISFIT or without < _LEAST_GAIN * chi[best] or not there:
@@ -101,7 +106,7 @@ def edge_beside_line(
     ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     covariance = ends @ cofactor[best, :2, :2] @ ends.T * _TOGETHER**2
     fitted = np.interp([-1.0, 1.0], band.place, line)
-    return Companion(fitted + ends @ x[:2], covariance), True
+    return Companion(fitted + ends @ x[:2], covariance, float(x[2])), True
 
 
 def _sections(
@@ -143,7 +148,7 @@ class _Model:
 
     def start(self, slope: float, top: Array) -> Array:
         """Approximate parameters, with the line behind the edge leaving it by so many widths."""
-        shared = np.array([_OUT, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
+        shared = np.array([_OUT, 0.0, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
         return np.concatenate([shared, _of_steps(0 * top, 0.2 * top, 0.8 * top, -0.3 * top)])
 
     def fitted(self, value: Array, weight: Array, starts: Array, spread: Array) -> tuple[Array, Array, Array]:
@@ -164,10 +169,10 @@ class _Model:
 
     def __call__(self, x: Array, rows: Rows) -> tuple[Array, Array]:
         m, (s, n), w, t = len(x), self.at.shape, self.width, self.place
-        p = x[:, 0, None] + x[:, 1, None] * t
-        q = x[:, 2, None] + x[:, 3, None] * t + x[:, 4, None] * t**2
+        p = x[:, 0, None] + x[:, 1, None] * t + x[:, 2, None] * (t**2 - 1)
+        q = x[:, 3, None] + x[:, 4, None] * t + x[:, 5, None] * t**2
         each = x[:, _SHARED:].reshape(m, s, 4)
-        steps = np.stack([p, q, q + x[:, 5, None]], axis=2)
+        steps = np.stack([p, q, q + x[:, 6, None]], axis=2)
         u = (self.at[None, :, :, None] - steps[:, :, None, :]) / w
         phi = ndtr(u)
         bell = each[:, :, None, 1:] * np.exp(-0.5 * u * u) / (np.sqrt(2 * np.pi) * -w)
@@ -176,7 +181,15 @@ class _Model:
         behind = bell[..., 1] + bell[..., 2]
         tt = t[None, :, None]
         for k, column in enumerate(
-            (bell[..., 0], bell[..., 0] * tt, behind, behind * tt, behind * tt**2, bell[..., 2])
+            (
+                bell[..., 0],
+                bell[..., 0] * tt,
+                bell[..., 0] * (tt**2 - 1),
+                behind,
+                behind * tt,
+                behind * tt**2,
+                bell[..., 2],
+            )
         ):
             jacobian[..., k] = column
         for i in range(s):

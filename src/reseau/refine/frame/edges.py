@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import ndtr
 
-from ...adjust import BatchOptions, adjust_batch, weight_function
+from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
 from ...data import Array, Mask, Rows
 from .band import Band
 from .border import Border, Film, binned, border_of, row_median
@@ -27,11 +27,17 @@ __all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_
 _SHIFTS, _CHANGE = (3.0,), 0.15
 """Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
 contrast, one sigma."""
-_INWARD = 2.0
-"""How far behind the edge, in widths of the step, its picture is looked at: no further than it takes."""
+_INWARD, _OUTWARD = 2.0, 4.0
+"""How far behind the edge, in widths of the step, its picture is looked at, no further than it takes; and how
+far beyond it film."""
 NEIGHBOURS = 15
 """Profiles that tell one another how well a step is determined."""
-_ROBUST = weight_function("danish", 2.5)
+_BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("danish", 2.5))
+_FREE, _HELD = 0.5, (0.02, 0.12)
+"""Logarithms by which the width of a step may differ from the expected one: at first; then, where that is of
+other edges, and where it is of this one."""
+_ROUNDS, _LEAST_PIXELS = 2, 100
+"""How often the common width is looked for, and pixels of a section that tells it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +107,12 @@ def measure_profiles(
     border = border_of(grey, band, reach, gap, film)
     if border is None:
         return None
-    fits = _fitted(grey, band, border, width)
-    if fits is None:
+    found = _fitted(grey, band, border, width)
+    if found is None:
         return None
-    offset, sigma, good, width, blur = fits
-    return EdgeProfiles(
-        band.place,
-        offset,
-        sigma,
-        good,
-        blur,
-        width,
-        border,
-    )
+    steps, width = found
+    place, sigma = np.where(steps.good, steps.place, 0.0), np.where(steps.good, steps.sigma, 1.0)
+    return EdgeProfiles(band.place, place, sigma, steps.good, steps.blur, width, border)
 
 
 def _width(grey: Array, band: Band, border: Border) -> float:
@@ -138,51 +137,122 @@ def _width(grey: Array, band: Band, border: Border) -> float:
     return float(np.clip(crossing[1] - crossing[0], 0.8, 4.0))
 
 
-def _fitted(
-    grey: Array, band: Band, border: Border, known: float | None
-) -> tuple[Array, Array, Mask, float, Array] | None:
-    """Step of every profile: offset, sigma, which are good, the common width, and each one's own."""
-    start = border.start
+class _Steps(NamedTuple):
+    """Steps of n profiles: distances, contrasts, standard deviations of the distances, which are good, and as
+    in :class:`EdgeProfiles` their own widths.
+    """
+
+    place: Array
+    contrast: Array
+    sigma: Array
+    good: Mask
+    blur: Array
+
+
+def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tuple[_Steps, float] | None:
+    """Step of every profile, and the common width."""
     width = _width(grey, band, border) if known is None else known
-    for spread in (0.5, 0.12, 0.12) if known is None else (0.02,):
-        far = 4.0 * width + 2.0
-        near = far if spread > 0.2 else _INWARD * width
-        window = _window(grey, band.distance, start, np.maximum(-far, border.outermost - start), near)
-        if window is None:
-            return None
-        value, distance, weight = window
-        one = np.ones(len(value))
-        none = [0 * one] * len(_SHIFTS)
-        initial = np.stack([start, border.level, np.log(width) * one, border.contrast * one, *none], axis=1)
-        # Film is known from its surroundings; that the picture changes at once is an exception.
-        changes = [_CHANGE * border.contrast] * len(_SHIFTS)
-        prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
-        fit = adjust_batch(
-            profile_function(distance),
-            initial,
-            value,
-            weights=weight / border.noise**2,
-            prior=(initial, prior),
-            options=BatchOptions(max_iterations=7, share=0.05, reweight=_ROBUST),
-        )
-        p, step, w = fit.estimates[:, 0], fit.estimates[:, 3], np.exp(fit.estimates[:, 2])
-        scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
-        own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
-        told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
-        # By neighbours: a profile with a step too high by chance lies too far in, and would weigh more.
-        sigma = _along(np.where(told, own, np.inf))
-        ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
-        good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
-        good &= np.abs(p - start) < 2.5 * width + 1.5
-        if not good.any():
-            return None
-        settled = float(np.clip(np.median(w[good]), 0.4, 6.0)) if known is None else known
-        blur = _own_width(fit.estimates[:, 2], fit.cofactor[:, 2, 2], np.log(width), spread, good)
-        done = spread < 0.5 and abs(np.log(settled / width)) < 0.05
-        start, width = np.where(good, p, start), settled
-        if done:
-            break
-    return np.where(good, p, 0.0), np.where(good, sigma, 1.0), good, width, blur
+    # Where the border puts them is good to a pixel or two, too little for a narrow window.
+    first = _one_by_one(grey, band, border, border.start, width, _FREE)
+    if first is None:
+        return None
+    start = _smoothed(first.place, first.good)
+    if known is None:
+        width = float(np.clip(np.exp(np.median(first.blur[0][first.good])), 0.4, 6.0))
+        for _ in range(_ROUNDS):
+            width = _common_width(grey, band, border, start, first, width)
+    steps = _one_by_one(grey, band, border, start, width, _HELD[known is None])
+    return None if steps is None else (steps, width)
+
+
+def _one_by_one(
+    grey: Array, band: Band, border: Border, start: Array, width: float, spread: float
+) -> _Steps | None:
+    """Step of every profile, its width held to the common one by so much; None where none is good."""
+    near = _OUTWARD * width + 2.0 if spread == _FREE else _INWARD * width
+    window = _window(grey, band, border, start, width, near)
+    if window is None:
+        return None
+    value, distance, weight = window
+    fit = _fit(value, distance, weight, border, start, border.level, width, spread)
+    p, step = fit.estimates[:, 0], fit.estimates[:, 3]
+    scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
+    own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
+    told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
+    # By neighbours: a profile with a step too high by chance lies too far in, and would weigh more.
+    sigma = _along(np.where(told, own, np.inf))
+    ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
+    good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
+    good &= np.abs(p - start) < 2.5 * width + 1.5
+    if not good.any():
+        return None
+    blur = _own_width(fit.estimates[:, 2], fit.cofactor[:, 2, 2], np.log(width), spread, good)
+    return _Steps(p, step, sigma, good, blur)
+
+
+def _fit(
+    value: Array,
+    distance: Array,
+    weight: Array,
+    border: Border,
+    start: Array,
+    level: Array,
+    width: float,
+    spread: float,
+) -> BatchAdjustment:
+    """Profiles adjusted, from the parameters that they are expected to have."""
+    one = np.ones(len(value))
+    none = [0 * one] * len(_SHIFTS)
+    initial = np.stack([start, level, np.log(width) * one, border.contrast * one, *none], axis=1)
+    # Film is known from its surroundings; that the picture changes at once is an exception.
+    changes = [_CHANGE * border.contrast] * len(_SHIFTS)
+    prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
+    return adjust_batch(
+        profile_function(distance),
+        initial,
+        value,
+        weights=weight / border.noise**2,
+        prior=(initial, prior),
+        options=_BATCH,
+    )
+
+
+def _smoothed(place: Array, good: Mask) -> Array:
+    """Steps of profiles by those of their neighbours: whose noise is not that of a profile's own pixels."""
+    index = np.arange(len(place))
+    return _along(np.interp(index, index[good], place[good]))
+
+
+def _common_width(
+    grey: Array, band: Band, border: Border, start: Array, steps: _Steps, width: float
+) -> float:
+    """Width of the step by sections of neighbouring profiles, each fitted as one profile: their median.
+
+    Of single profiles in noise it comes out too small, since each has unknowns of its own (Neyman and Scott
+    1948), and with a step too wide or too sharp all places lie to one side.
+    """
+    contrast = _along(np.where(steps.good, steps.contrast, np.inf))
+    lit = steps.good & np.isfinite(contrast) & (contrast > 0)
+    window = _window(grey, band, border, start, width, _INWARD * width)
+    if window is None:
+        return width
+    value, distance, weight = window
+    part = np.where(lit, contrast, border.contrast)[:, None] / border.contrast
+    value, distance = (value - border.level[:, None]) / part, distance - start[:, None]
+    each = min(NEIGHBOURS, len(value))
+    sections = len(value) // each
+    value, distance, weight = (
+        values[: sections * each].reshape(sections, -1)
+        for values in (value, distance, weight * lit[:, None] * part**2)
+    )
+    told = (weight > 0).sum(axis=1) > _LEAST_PIXELS
+    if not told.any():
+        return width
+    none = np.zeros(int(told.sum()))
+    fit = _fit(value[told], distance[told], weight[told], border, none, none, width, _FREE)
+    found = fit.estimates[fit.converged, 2]
+    # Where something else runs along the edge few sections come to an end.
+    return float(np.clip(np.exp(np.median(found)), 0.4, 6.0)) if len(found) > 0.5 * sections else width
 
 
 def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
@@ -191,7 +261,7 @@ def _own_width(found: Array, cofactor: Array, known: float, spread: float, good:
     weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
     alone = np.clip((found - known) / share, -1.0, 1.0)
     size = min(NEIGHBOURS, len(found))
-    total = uniform_filter1d(weight, size, mode="nearest")
+    total = np.maximum(uniform_filter1d(weight, size, mode="nearest"), 1e-9)
     mean = uniform_filter1d(weight * alone, size, mode="nearest") / total
     return np.stack([known + mean, 1 / (size * total)])
 
@@ -224,10 +294,11 @@ def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
 
 
 def _window(
-    grey: Array, distance: Array, start: Array, low: Array, high: float
+    grey: Array, band: Band, border: Border, start: Array, width: float, high: float
 ) -> tuple[Array, Array, Array] | None:
-    """Pixels of each profile between two distances from its start: values, distances, weights (n, s)."""
-    at = distance - start[:, None]
+    """Pixels of profiles from film to so far inwards of their starts: values, distances, weights (n, s)."""
+    low = np.maximum(-_OUTWARD * width - 2.0, border.outermost - start)
+    at = band.distance - start[:, None]
     used = (at > low[:, None]) & (at < high) & np.isfinite(grey)
     size = int(used.sum(axis=1).max(initial=0))
     if size < 8:
@@ -235,7 +306,7 @@ def _window(
     # Those used first, in their order; the rest have no weight.
     order: Rows = np.argsort(~used, axis=1, kind="stable")[:, :size]
     value, place, weight = (
-        np.take_along_axis(part, order, axis=1) for part in (grey, distance, used.astype(np.float64))
+        np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used.astype(np.float64))
     )
     return np.where(weight > 0, value, 0.0), place, weight
 

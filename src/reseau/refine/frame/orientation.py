@@ -248,13 +248,20 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
         result = _judged(scan, guess, measured, corners, shape)
-        # Channels come by their contrast: a later one has to see more.
-        if best is None or _STATUS[result.status] > _STATUS[best.status]:
+        # Channels come by their contrast: a later one has to see more, or better.
+        if best is None or _seen(result) > _seen(best):
             best = result
         if best.status == "oriented":  # the others show the same edges with less contrast
             break
     assert best is not None
     return best
+
+
+def _seen(result: FrameResult) -> tuple[int, float]:
+    """How many edges, and how well."""
+    return _STATUS[result.status], -np.inf if result.lines is None else -float(
+        np.trace(result.lines.covariance)
+    )
 
 
 def _judged(
