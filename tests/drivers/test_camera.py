@@ -132,6 +132,13 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert camera.reconnections == 1
 
 
+def test_one_that_refuses_its_first_settings_is_not_kept_open(device: VideoCamera) -> None:
+    refused = v4l2("refused", device.open, settings={"gain": 99.0})
+    with pytest.raises(RefusedError, match="gain 99 is beyond"):
+        refused.connect()
+    assert device.nodes == 0
+
+
 def test_wrong_settings_are_refused_before_anything_is_sent(camera: Cam) -> None:
     for changes in ({"format": "RGB"}, {"exposure_us": -1.0}, {"colour": 3}, {"width": 1.5}):
         with pytest.raises(SettingError):

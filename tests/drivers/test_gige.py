@@ -6,6 +6,7 @@ import itertools
 import os
 import shutil
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -18,7 +19,7 @@ import pytest
 from reseau.data import Frame
 from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, UsageError
 from reseau_drivers import camera as cameras
-from reseau_drivers.camera import AravisSettings, aravis
+from reseau_drivers.camera import AravisSettings, aravis, gvcp
 from reseau_sims import World
 from reseau_sims.laboratory import Laboratory
 from reseau_sims.serving import CameraBody, Fault, GigeCamera, InLaboratory, Pattern, Still, View
@@ -199,9 +200,45 @@ def test_the_plug_pulled_and_put_back(simulated: GigeCamera, camera: Cam) -> Non
 
 def test_a_camera_that_another_controls_is_refused(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
-    with pytest.raises(InstrumentError):
+    began = time.monotonic()
+    with pytest.raises(RefusedError, match=r"other .connect.: 127.0.0.1 is controlled by another program"):
         aravis("other", simulated.address, settings=SIZE).connect()
+    # The library alone would try for six seconds, and then say that nobody answers.
+    assert time.monotonic() - began < 3.0
     assert camera.expose().fresh
+    assert camera.reconnections == 1
+
+
+def test_a_camera_named_otherwise_that_another_controls_is_refused_before_it_is_set(
+    simulated: GigeCamera, camera: Cam, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Only IP addresses are asked before; of other names the library finds out itself.
+    camera.expose()
+    monkeypatch.setattr(gvcp, "_is_ip", lambda address: False)
+    with pytest.raises(RefusedError, match="is controlled by another program"):
+        aravis("other", simulated.address, settings=SIZE).connect(20.0)
+    assert camera.expose().fresh
+
+
+def test_control_that_is_still_ours_is_waited_for(simulated: GigeCamera, camera: Cam) -> None:
+    camera.expose()
+    source = camera._source
+    assert isinstance(source, cameras.Aravis)
+    # A cable was pulled: the camera missed that it was let go.
+    held, source._camera, source._stream = [source._camera], None, None
+    source._ours_until = time.monotonic() + 3.0
+    threading.Timer(0.5, held.clear).start()
+    camera._connected = False
+    assert camera.expose().fresh
+    assert camera.reconnections == 2
+
+
+def test_one_that_refuses_its_settings_is_not_kept_from_others(simulated: GigeCamera) -> None:
+    refused = aravis("refused", simulated.address, settings=SIZE | {"format": "Mono12"})
+    with pytest.raises(RefusedError):
+        refused.connect()
+    with aravis("other", simulated.address, settings=SIZE | LIGHT) as camera:
+        assert camera.expose().fresh
 
 
 def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> None:

@@ -21,7 +21,7 @@ from reseau.instruments import Deadline, Identity, choice, quantity
 from ..codecs.pixels import GENICAM, decode
 from .camera import CameraSettings, Taken
 from .clocks import Stamps, Wrapping, realtime_offset
-from .gvcp import require_answer
+from .gvcp import HEARTBEAT_S, controlled_elsewhere, require_answer, require_control
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
 
@@ -100,6 +100,7 @@ class Aravis:
         self._parser: Any = None
         self._lost = Event()
         self._running = False
+        self._ours_until = 0.0
         self._settings = AravisSettings()
         self._numbers = Wrapping(_SHORT_IDS)
         self._size = (0, 0)
@@ -126,9 +127,12 @@ class Aravis:
         self._lost = lost = Event()
         self._numbers = Wrapping(_SHORT_IDS)
         require_answer(self._address, deadline)
+        require_control(self._address, deadline, self._ours_until)
         with self._told("open"):
             self._camera = library.Camera.new(self._address)
             self._camera.get_device().connect("control-lost", lambda *_: lost.set())
+            if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
+                raise controlled_elsewhere(self._address)
             self._stamps.offset = self._latched()
 
     def close(self) -> None:
@@ -141,6 +145,8 @@ class Aravis:
             releasing = Thread(target=_release, args=(held, running), name="Aravis", daemon=True)
             releasing.start()
             releasing.join(_RELEASE_S)
+            # One that did not hear it takes it that we are still there, until it misses our heartbeat.
+            self._ours_until = time.monotonic() + HEARTBEAT_S
 
     def identify(self, deadline: Deadline) -> Identity:
         """What it says it is."""

@@ -40,6 +40,11 @@ class VideoCamera(Video):
             self._nodes.append(node)
             return node
 
+    @property
+    def nodes(self) -> int:
+        """How many are open."""
+        return len(self._nodes)
+
     def unplug(self, *, power: bool = False) -> None:
         """Pull its cable: all nodes are dead from now on; new ones can be opened while it is plugged in."""
         with self.body.lock:

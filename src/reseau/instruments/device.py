@@ -126,15 +126,20 @@ class Device(ABC, Generic[S]):
     def _establish(self, deadline: Deadline) -> None:
         # What was there a moment ago may be back in a moment: a cable, a port that is made anew.
         grace = deadline.part(_GRACE_S) if self.reconnections else None
-        while True:
-            try:
-                self._open(deadline)
-                break
-            except ConnectionLost:
-                if grace is None or grace.over:
-                    raise
-                time.sleep(grace.at_most(0.05))
-        self._push(self._settings, deadline)
+        try:
+            while True:
+                try:
+                    self._open(deadline)
+                    break
+                except ConnectionLost:
+                    if grace is None or grace.over:
+                        raise
+                    time.sleep(grace.at_most(0.05))
+            self._push(self._settings, deadline)
+        except InstrumentError:
+            # Also one that is there and refuses: what is not connected is not kept from others.
+            self._drop()
+            raise
         self._connected = True
         self.reconnections += 1
 
