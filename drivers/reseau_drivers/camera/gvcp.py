@@ -54,8 +54,8 @@ def require_control(address: str, deadline: Deadline, ours_until: float = 0.0) -
     deadline : Deadline
         Of the question.
     ours_until : float, optional
-        Until when, by the monotonic clock, control may be one's own, of a connection that broke: so long it is
-        waited for.
+        Until when, by the monotonic clock, control may be one's own, of a connection that broke; until then
+        it is waited for.
 
     Raises
     ------
