@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 import typer
 from scipy.special import ndtr
 
+from reseau.archive import Archive, Session
 from reseau.calibration import Calibration
 from reseau.cli import run
+from reseau.errors import ArchiveError
 from reseau.images import write_image
 from reseau.refine.sensor import Level, SensorSeries, calibrate_sensor
 from reseau_sims import World
@@ -34,51 +37,136 @@ def sensor() -> PixelSensor:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, sensor: PixelSensor, monkeypatch: pytest.MonkeyPatch) -> Path:
-    lamp = Lamp(sensor, 1.0)
+def lamp(sensor: PixelSensor) -> Lamp:
+    return Lamp(sensor, 1.0)
+
+
+@pytest.fixture
+def camera(lamp: Lamp) -> VideoCamera:
     camera = VideoCamera(CameraBody(lamp, 96, 64))
     camera.controls[0x980900] = 128
-    monkeypatch.setattr("reseau_drivers.camera.KernelNode", lambda address: camera.open())
+    return camera
 
-    def by_hand(text: str, **_: Any) -> str:
-        return text
+
+@pytest.fixture
+def asked(lamp: Lamp, camera: VideoCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A folder with a bench; and what the operator was asked to do, who does it at once."""
+    asked: list[str] = []
 
     def said(text: str = "", err: bool = False, **_: Any) -> None:
-        # Whoever is asked covers the lens, or takes the cover off.
+        asked.append(text)
         if "cover" in text:
             lamp.light = 0.0
         elif "even light" in text:
             lamp.light = 1.0
         elif "edge" in text:
             y, x = np.mgrid[:64, :96]
-            lamp.light = ndtr((x - 48 - 0.1 * (y - 32)) / 0.6)
+            lamp.light = 2 * (0.1 + 0.9 * ndtr((x - 48 - 0.1 * (y - 32)) / 0.6))
 
-    monkeypatch.setattr(typer, "prompt", by_hand)
+    monkeypatch.setattr("reseau_drivers.camera.KernelNode", lambda address: camera.open())
     monkeypatch.setattr(typer, "echo", said)
-    path = tmp_path / "bench.toml"
-    path.write_text(BENCH)
-    return path
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 99))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # locks of parallel tests are apart
+    monkeypatch.chdir(tmp_path)
+    Path("bench.toml").write_text(BENCH)
+    return asked
+
+
+def capture(*options: str) -> int:
+    return run(["capture", "sensor", "--name", "monday", "--frames", "4", *options])
+
+
+def frames_of(name: str = "monday") -> list[tuple[str, str]]:
+    with Archive.open("archive") as archive:
+        return [(frame.step, frame.sha256) for frame in archive.session(name).frames(kind="frame")]
 
 
 def test_a_sensor_is_calibrated_on_the_bench(
-    bench: Path, sensor: PixelSensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    asked: list[str], sensor: PixelSensor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "sensor.json"
-    command = ["capture", "sensor", "--bench", str(bench), "--out", str(out), "--frames", "4", "--edge"]
-    assert run([*command, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    assert capture("--edge", "--out", "sensor.json", "--json") == 0
+    said = capsys.readouterr().out
+    events = [json.loads(line) for line in said.splitlines()]
+    assert [event["event"] for event in events].count("frame") == 4 * (14 + 12 + 1)
+    assert [event["event"] for event in events[-4:]] == ["result", "result", "end", "calibration"]
+    found = events[-1]["parameters"]
     for name in ("gain", "read_noise", "full_well"):
-        found = said["parameters"][name]
-        assert abs(found["value"] - getattr(sensor, name)) < 4 * found["sigma"], name
+        assert abs(found[name]["value"] - getattr(sensor, name)) < 4 * found[name]["sigma"], name
     # 0.6 px along x are less along the normal; 1/12 of them is the pixel's own square.
-    psf = said["parameters"]["psf"]
-    assert psf["value"] == pytest.approx(np.sqrt(0.6**2 / 1.01 - 1 / 12), abs=0.03)
-    assert said["validity"]["defects"] < 12
-    calibration = Calibration.read(out)
+    assert found["psf"]["value"] == pytest.approx(np.sqrt(0.6**2 / 1.01 - 1 / 12), abs=0.03)
+    # The light has the pixel's square in it already as a Gaussian: half is at √(ln 2 / 2) / (π σ).
+    half = np.sqrt(np.log(2) / 2) / (np.pi * 0.6 / np.sqrt(1.01))
+    assert abs(found["mtf50_free"]["value"] - half) < 4 * found["mtf50_free"]["sigma"] < 0.04
+    assert {test["name"] for test in events[-1]["tests"]} >= {"Gaussian edge", "straight edge"}
+    assert events[-1]["validity"]["defects"] < 12
+    assert len(asked) == 3
+
+    calibration = Calibration.read(Path("sensor.json"))
     assert calibration.times
-    assert calibration.values()["gain"] == said["parameters"]["gain"]["value"]
-    assert run(command[:-1]) == 0
-    assert "full_well" in capsys.readouterr().out
+    assert calibration.values()["gain"] == found["gain"]["value"]
+    curve = calibration.model["mtf"] if isinstance(calibration.model, dict) else {}
+    assert curve["frequency"][16] == 0.5
+    assert curve["mtf"][16] == found["mtf_nyquist_free"]["value"]
+    assert len(curve["sigma"]) == len(curve["gaussian"]) == len(curve["mtf"])
+
+
+def test_every_raw_frame_is_kept_and_the_calibration_computed_again_from_them(
+    asked: list[str], camera: VideoCamera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert capture("--edge") == 0
+    said = capsys.readouterr().out
+    assert "108/108 edge 00 003: good" in said
+    assert "monday: done, 108 frames in archive\n  calibration.json\n  report.html\n" in said
+    assert "mtf50_free" in said
+    kept = frames_of()
+    assert len(kept) == len({step for step, _ in kept}) == 108
+    assert run(["archive", "show", "monday", "--out", "results"]) == 0
+    inputs = json.loads(Path("results/calibration.json").read_text())["provenance"]["inputs"]
+    assert inputs == dict(kept)
+    assert "modulation transfer" in Path("results/report.html").read_text()
+    capsys.readouterr()
+    assert run(["archive", "rerun", "monday", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in document["results"]] == ["calibration.json", "report.html"]
+    assert document["same"]
+    assert run(["archive", "verify"]) == 0
+
+
+def test_a_session_that_was_interrupted_goes_on_where_it_stood(
+    asked: list[str], lamp: Lamp, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, left = Session.store, [20]
+
+    def full(self: Session, *arguments: Any, **more: Any) -> Any:
+        left[0] -= 1
+        if left[0] == 0:
+            raise ArchiveError("cannot be kept (No space left on device)", where="archive", do="make room")
+        return store(self, *arguments, **more)
+
+    monkeypatch.setattr(Session, "store", full)
+    assert capture() == 1
+    assert "No space left" in capsys.readouterr().err
+    before = frames_of()
+    assert 0 < len(before) < 20
+    monkeypatch.setattr(Session, "store", store)
+    asked.clear()
+    assert run(["capture", "sensor", "--resume"]) == 0
+    assert [text.split()[0] for text in asked] == ["have", "cover"]
+    assert frames_of()[: len(before)] == before
+    assert len(frames_of()) == 4 * (14 + 12)
+    assert run(["archive", "rerun", "monday"]) == 0
+    assert capsys.readouterr().out.count("the same to the byte") == 2
+    assert run(["capture", "sensor", "--resume"]) == 2
+
+
+def test_an_edge_that_cannot_be_measured_costs_the_sharpness_alone(
+    asked: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert capture("--edge", "--region", "0", "0", "20", "40", "--out", "sensor.json") == 1
+    found = capsys.readouterr()
+    assert "gain" in found.out
+    assert found.err.strip().splitlines()[-1].startswith("reseau: edge: ")
+    assert "psf" not in Calibration.read(Path("sensor.json")).parameters
 
 
 @pytest.mark.slow
@@ -118,10 +206,10 @@ def test_the_correction_is_applied_before_a_reseau_is_measured(
                 "--sensor", str(tmp_path / "design.json")]) == 2  # fmt: skip
 
 
-def test_wrong_use_is_said(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = str(tmp_path / "sensor.json")
-    for options in (["--camera", "none"], ["--bench", str(tmp_path / "none.toml")], ["--levels", "1"]):
-        base = ["capture", "sensor", "--bench", str(bench), "--out", out]
-        assert run([*base, *options]) == 2
-    assert "none is no camera" not in capsys.readouterr().out
-    assert not (tmp_path / "sensor.json").exists()
+def test_wrong_use_is_said(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for options in (["--camera", "none"], ["--bench", "none.toml"], ["--levels", "1"], ["--out", "no/where"]):
+        assert capture(*options) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert not Path("sensor.json").exists()
+    assert run(["archive", "list"]) in (0, 2)
+    assert "monday" not in capsys.readouterr().out

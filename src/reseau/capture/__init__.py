@@ -5,10 +5,10 @@ from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_in
 from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
 from .goal import Goal
 from .lock import BenchLock
+from .procedure import Procedure, Watch
 from .rerun import Rerun, rerun
 from .run import Decision, carry_out
 from .step import Step, paper_steps, read_steps, spread
-from .work import Procedure, Watch
 
 __all__ = [
     "Acquisition",

@@ -1,9 +1,9 @@
 """A plan carried out on a bench: every picture is in the archive before the next thing happens.
 
-Plans are those of bluesky, generators of messages. Three messages are this module's own: `expose`, `picture`
-and `ask`. What they bring is stored under the name of the step, and a step that has its picture does not take
-it again: a message that is replayed after a pause, or a plan that begins anew after a crash, finds what is
-there.
+Plans are those of bluesky, generators of messages. Some messages are this module's own, `expose`, `series`,
+`picture` and `ask` among them. What they bring is stored under the name of the step, and a step that has its
+picture does not take it again: a message that is replayed after a pause, or a plan that begins anew after a
+crash, finds what is there.
 """
 
 from __future__ import annotations
@@ -55,6 +55,20 @@ class Acquisition(Work):
         yield from bps.save()
         return found
 
+    def series(self, steps: Sequence[Step]) -> Plan:
+        """Take frames of one scene as fast as the camera delivers them, a step for each; only those that are
+        not there.
+        """
+        yield from bps.checkpoint()
+        yield message("series", self, steps)
+        yield from bps.create("primary")
+        yield from bps.read(self)
+        yield from bps.save()
+
+    def set_back(self) -> Plan:
+        """Have the camera expose as it did before the steps that set it."""
+        yield message("set_back", self)
+
     def move(self, position: Mapping[str, float]) -> Plan:
         """Move axes of the table, all at once."""
         if position:
@@ -69,12 +83,17 @@ class Acquisition(Work):
         yield message("home", self)
 
     def pictures(self, step: Step, kind: str) -> Plan:
-        """Sweep with the scanner (`scan`), or keep what the oscilloscope's own screen shows (`screen`).
+        """Sweep with the scanner (`scan`), keep what the oscilloscope's own screen shows (`screen`), or a
+        frame that nothing is measured in (`probe`).
 
-        Where the bench has no oscilloscope there is no such picture.
+        Returns
+        -------
+        ArchivedFrame or None
+            None where the bench has no oscilloscope for a screen.
         """
         if kind != "screen" or self.has(Oscilloscope):
-            yield message("picture", self, step, kind)
+            return (yield message("picture", self, step, kind))
+        return None
 
     def ask(self, what: str, step: Step) -> Plan:
         """Have the operator do something before a step; not where the step has been done."""
@@ -111,6 +130,8 @@ class Acquisition(Work):
         """The messages above, for ``RunEngine.register_command``."""
         work: dict[str, Callable[..., Any]] = {
             "expose": self.expose,
+            "series": self.expose_series,
+            "set_back": self.restore_exposure,
             "move": self.move_to,
             "home": self.home_axes,
             "picture": self.take_picture,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -76,8 +77,9 @@ class Readiness:
         return not self.faults
 
     def to_dict(self) -> dict[str, object]:
-        """JSON values."""
-        return asdict(self) | {"faults": list(self.faults)}
+        """JSON values; None for what could not be found."""
+        found = {key: value for key, value in asdict(self).items() if key != "faults"}
+        return {k: v if math.isfinite(v) else None for k, v in found.items()} | {"faults": list(self.faults)}
 
 
 def exposure_fault(frame: Frame, limits: Limits | None = None) -> str:
@@ -187,11 +189,13 @@ def readiness(frames: Sequence[Frame], limits: Limits | None = None) -> Readines
     means = [float(frame.pixels.mean()) for frame in (frames[0], frames[-1])]
     level = means[1] / means[0] - 1 if means[0] else 0.0
     faults = [exposure_fault(frames[0], limits)]
-    if edge > limits.edge_px:
+    if math.isinf(edge):
+        faults.append("there are no edges; focus, or have it look at something")
+    elif edge > limits.edge_px:
         faults.append(f"the sharpest edges are {edge:.1f} px wide; focus")
-    if not vibration <= limits.vibration_px + 3 * sigma:
+    if vibration > limits.vibration_px + 3 * sigma:  # neither is a number where nothing shows a shift
         faults.append(f"moves by {vibration:.2g} px from frame to frame; look for what shakes it")
-    if not np.hypot(*drift) <= limits.drift_px + 3 * float(np.hypot(*drift_sigma)):
+    if np.hypot(*drift) > limits.drift_px + 3 * float(np.hypot(*drift_sigma)):
         faults.append(f"drifted by {np.hypot(*drift):.2g} px; let it warm up")
     if abs(level) > limits.drift_level:
         faults.append(f"its brightness drifted by {100 * level:.2g} %; let it warm up")

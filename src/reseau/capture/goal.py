@@ -11,7 +11,7 @@ from ..errors import UsageError
 __all__ = ["Goal"]
 
 _LENGTHS = {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6}
-_FORM = re.compile(r"\s*sigma_(\w+)\s*<=?\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*")
+_FORM = re.compile(r"\s*sigma_(\w+)\s*<=?\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*")
 
 
 @dataclass(frozen=True)

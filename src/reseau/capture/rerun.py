@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..archive import ArchivedResult, Session
-from .step import Step
-from .work import Procedure
+from .procedure import Procedure
+from .step import Step, as_taken
 
 __all__ = ["Rerun", "rerun"]
 
@@ -43,7 +43,8 @@ def rerun(kept: Session, procedure: Procedure) -> list[Rerun]:
     for frame in kept.frames(kind="frame"):
         # What saturation or motion had spoilt, the procedure never saw.
         if frame.verdict is not None and frame.verdict.ok:
-            procedure.on_frame(kept.picture(frame), Step(frame.step, frame.facts.get("position", {})))
+            step = as_taken(Step(frame.step, frame.facts.get("position", {})), frame.facts)
+            procedure.on_frame(kept.picture(frame), step)
     contents = procedure.finish()
     latest = {result.name: result for result in kept.results()}
     return [

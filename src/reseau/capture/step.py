@@ -6,13 +6,14 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from ..errors import FormatError
 from ..formats import read_text
 
-__all__ = ["Step", "paper_steps", "read_steps", "spread"]
+__all__ = ["Step", "as_taken", "paper_steps", "read_steps", "spread"]
 
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
 """Axes of the testfield's mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
@@ -28,10 +29,20 @@ class Step:
         Unique in a session; pictures are stored under it.
     position : mapping of str to float
         Where the axes of the table stand, in their units; axes that are not named stay where they are.
+    exposure_us : float, optional
+        That the camera is set to; by default it stays as it is.
     """
 
     name: str
     position: Mapping[str, float] = field(default_factory=dict)
+    exposure_us: float | None = None
+
+
+def as_taken(step: Step, facts: Mapping[str, Any]) -> Step:
+    """A step with the exposure that its frame had, by the camera's word where it tells."""
+    if facts.get("set_exposure_us") is None:
+        return step
+    return replace(step, exposure_us=facts.get("exposure_us") or facts["set_exposure_us"])
 
 
 def _named(position: Mapping[str, float]) -> Step:

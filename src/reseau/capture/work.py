@@ -5,12 +5,9 @@ It knows no engine: each is the work behind a message of :class:`~reseau.capture
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
-
-import numpy as np
+from typing import Any, TypeVar
 
 from ..archive import ArchivedFrame, Session, Verdict
 from ..data import Frame
@@ -27,34 +24,17 @@ from ..errors import (
 from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
 from .bench import Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
-from .step import Step
+from .procedure import Procedure, Watch
+from .shots import clock_of, following, mean_frame, told
+from .step import Step, as_taken
 
-__all__ = ["Procedure", "Watch", "Work"]
-
-Watch = Callable[[str, dict[str, Any]], None]
-"""Told what happens: the kind of an event, and what there is to say about it."""
+__all__ = ["Work"]
 
 T = TypeVar("T")
 _TRIES = 4
 """How often an instrument is asked before its failure ends the session."""
 _STILL = 0.02
 """By how much an axis may move while a frame is exposed, in its unit."""
-
-
-class Procedure(Protocol):
-    """What becomes of the frames; all that an acquisition knows of it."""
-
-    def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        """Measure a frame as it comes, and say whether it can be used."""
-
-    def progress(self) -> Mapping[str, float]:
-        """What has been reached so far: standard deviations by the name of the parameter."""
-
-    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        """The pose that lowers a standard deviation most, and to what, where that is known."""
-
-    def finish(self) -> Mapping[str, str]:
-        """Results: the text of files by name; the same frames in the same order give the same bytes."""
 
 
 class Work:
@@ -107,6 +87,7 @@ class Work:
         self._known: dict[int, Verdict] = {}
         self._last: ArchivedFrame | None = None
         self._resting = False
+        self._own_us: float | None = None
 
     def one(self, kind: type) -> Any:
         """The instrument of a kind.
@@ -183,13 +164,24 @@ class Work:
         # An engine that was paused in the middle of this replays the message while the thread still works:
         # it waits here, and then finds the frame.
         with self._busy:
-            for take in range(self.retakes + 1):
-                found = self.kept.find(step.name, "frame", take) or self._taken(step, take, average)
-                verdict = self._judged(found, step)
-                self._last = found
-                if verdict.ok:
-                    break
-            return found
+            return self._exposed(step, average)
+
+    def expose_series(self, steps: Sequence[Step]) -> list[ArchivedFrame]:
+        """Frames of one scene, a step for each, as the camera delivers them; otherwise as :meth:`expose`."""
+        source = following(self.one(Camera), len(steps))
+        with self._busy:
+            return [self._exposed(step, 1, source) for step in steps]
+
+    def _exposed(
+        self, step: Step, average: int, source: Callable[[], Exposure] | None = None
+    ) -> ArchivedFrame:
+        for take in range(self.retakes + 1):
+            found = self.kept.find(step.name, "frame", take) or self._taken(step, take, average, source)
+            verdict = self._judged(found, step)
+            self._last = found
+            if verdict.ok:
+                break
+        return found
 
     def move_to(self, position: Mapping[str, float]) -> None:
         """Move axes of the table, all at once, and wait.
@@ -229,26 +221,49 @@ class Work:
                 self.watch("again", {"why": str(error)})
         raise AssertionError
 
-    def _taken(self, step: Step, take: int, average: int) -> ArchivedFrame:
-        if self._resting:
-            raise StateError("the bench was brought to rest", where=step.name)
-        camera: Camera = self.one(Camera)
+    def _taken(
+        self, step: Step, take: int, average: int, source: Callable[[], Exposure] | None = None
+    ) -> ArchivedFrame:
+        camera = self._set_up(step)
         before = self._position()
-        exposures = [self._persist(camera.expose) for _ in range(average)]
+        exposures = [self._persist(source or camera.expose) for _ in range(average)]
         moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
-        frame = _mean([each.frame for each in exposures], step.name)
+        frame = mean_frame([each.frame for each in exposures], step.name)
         first = exposures[0]
         facts = {
             "camera": camera.name,
-            "exposure_us": _told(first.exposure_us),
-            "gain": _told(first.gain),
+            "exposure_us": told(first.exposure_us),
+            "gain": told(first.gain),
             "pattern": first.pattern,
             "position": before,
             "averaged": average,
             "moved": max(moved.values(), default=0.0) > _STILL,
-            "fresh": all(each.fresh for each in exposures),
+            "fresh": source is not None or all(each.fresh for each in exposures),
         }
-        return self.kept.store(step.name, frame, take=take, facts=facts, clock=_clock(exposures))
+        if step.exposure_us is not None:
+            facts["set_exposure_us"] = step.exposure_us
+        return self.kept.store(step.name, frame, take=take, facts=facts, clock=clock_of(exposures))
+
+    def _set_up(self, step: Step) -> Camera:
+        """The camera, set to the exposure of a step where it has one."""
+        if self._resting:
+            raise StateError("the bench was brought to rest", where=step.name)
+        camera: Camera = self.one(Camera)
+        wanted, before = step.exposure_us, camera.settings.to_dict().get("exposure_us")
+        if wanted is not None and before != wanted:
+            if self._own_us is None and before is not None:
+                self._own_us = float(before)
+            self._persist(lambda: camera.configure(exposure_us=wanted))
+        return camera
+
+    def restore_exposure(self) -> None:
+        """Set the camera to the exposure that it had before any step; where it fails that is told."""
+        with self._busy:
+            try:
+                if self._own_us is not None:
+                    self.one(Camera).configure(exposure_us=self._own_us)
+            except InstrumentError as error:
+                self.watch("rest", {"failed": str(error)})
 
     def _position(self) -> dict[str, float]:
         """Where the axes of the table stand."""
@@ -286,12 +301,13 @@ class Work:
         if self.procedure is None:
             return Verdict(True)
         try:
-            return self.procedure.on_frame(frame, step)
+            return self.procedure.on_frame(frame, as_taken(step, found.facts))
         except ImageError as error:
             return Verdict(False, error.what)
 
     def take_picture(self, step: Step, kind: str) -> ArchivedFrame:
-        """The section of the scanner (`scan`), or the oscilloscope's own screen (`screen`), of a step.
+        """The section of the scanner (`scan`), the oscilloscope's own screen (`screen`), or a frame of the
+        camera that nothing is measured in (`probe`), of a step.
 
         Raises
         ------
@@ -317,7 +333,13 @@ class Work:
                 }
                 clock = {"taken": scan.taken.isoformat()}
                 return self.kept.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
-            raise UsageError("is no kind of picture", where=kind, do="there are screen and scan")
+            if kind == "probe":
+                camera = self._set_up(step)
+                exposure = self._persist(camera.expose)
+                frame = mean_frame([exposure.frame], step.name)
+                facts = {"identity": str(camera.connect()), "set_exposure_us": step.exposure_us}
+                return self.kept.store(step.name, frame, kind=kind, facts=facts, clock=clock_of([exposure]))
+            raise UsageError("is no kind of picture", where=kind, do="there are screen, scan and probe")
 
     def have_done(self, what: str) -> None:
         """Have the operator do something.
@@ -369,36 +391,10 @@ class Work:
             frames = []
             for k in range(begun, begun + count):
                 exposure = self._persist(camera.expose)
-                frame = _mean([exposure.frame], f"check {k}")
-                self.kept.store(f"check {k}", frame, kind="check", clock=_clock([exposure]))
+                frame = mean_frame([exposure.frame], f"check {k}")
+                self.kept.store(f"check {k}", frame, kind="check", clock=clock_of([exposure]))
                 frames.append(frame)
             found = readiness(frames, self.limits)
             self.kept.note(f"check {begun}", "check", found.to_dict())
             self.watch("check", found.to_dict())
             return found
-
-
-def _mean(frames: list[Frame], name: str) -> Frame:
-    """The mean of frames of one scene, under the name of its step."""
-    first = frames[0]
-    if len(frames) == 1:
-        return Frame(first.pixels, first.full_scale, name)
-    total = np.zeros(first.pixels.shape, dtype=np.float64)
-    for frame in frames:
-        total += frame.pixels
-    return Frame((total / len(frames)).astype(np.float32), first.full_scale, name)
-
-
-def _told(value: float) -> float | None:
-    """A value of the camera; None where it does not tell."""
-    return value if math.isfinite(value) else None
-
-
-def _clock(exposures: list[Exposure]) -> dict[str, Any]:
-    """Times, and what a camera counts."""
-    return {
-        "taken": [each.taken.isoformat() for each in exposures],
-        "taken_within_s": [each.taken_within_s for each in exposures],
-        "sequence": [each.sequence for each in exposures],
-        "dropped": exposures[-1].dropped,
-    }

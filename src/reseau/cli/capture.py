@@ -19,9 +19,20 @@ from .sessions import INPUT, ArchivePlace, ObjectsPlace, opened, procedure_of, s
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
-    from ..capture import Acquisition, Bench, Decision, Plan
+    from ..capture import Acquisition, Bench, Decision, Limits, Plan
 
-__all__ = ["app"]
+__all__ = [
+    "AsEvents",
+    "BenchPath",
+    "CameraName",
+    "Name",
+    "PlanFile",
+    "Resume",
+    "Where",
+    "app",
+    "conduct",
+    "operator",
+]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -63,9 +74,16 @@ Retakes = Annotated[int, typer.Option(min=0, help="How often a bad frame is take
 CameraName = Annotated[str | None, typer.Option("--camera", help="Where the bench has several.")]
 
 
+def operator(what: str) -> None:
+    """Have someone do it, and say so by a line; at a terminal or through a pipe."""
+    typer.echo(f"{what}, then press Enter", err=True)
+    if not sys.stdin.readline():
+        raise UsageError("nobody answers", where=what, do="run it where someone can")
+
+
 @dataclass(frozen=True)
-class _Where:
-    """Bench and session of a command."""
+class Where:
+    """Bench and session of a command, and who does what no instrument can."""
 
     archive: str
     objects: str | None
@@ -74,6 +92,7 @@ class _Where:
     camera: str | None
     resume: bool
     as_json: bool
+    operator: Callable[[str], None] = operator
 
 
 Parameters = Callable[["Bench"], dict[str, Any]]
@@ -144,8 +163,8 @@ def coded_field(
             plan = plans.poses(run, every, *how)
         return plans.homed(run, plan) if given["home"] else plan
 
-    where = _Where(archive, objects, bench, name, camera, resume, as_json)
-    _conduct(where, "testfield", planned, parameters, {"design.json": design})
+    where = Where(archive, objects, bench, name, camera, resume, as_json)
+    conduct(where, "testfield", planned, parameters, {"design.json": design})
 
 
 @app.command()
@@ -174,8 +193,8 @@ def oscilloscope(
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.oscilloscope(run, given["body"], given["average"], given["checks"])
 
-    where = _Where(archive, objects, bench, name, camera, resume, as_json)
-    _conduct(where, "oscilloscope", planned, parameters, {"reseau.json": reseau, "object.json": object_})
+    where = Where(archive, objects, bench, name, camera, resume, as_json)
+    conduct(where, "oscilloscope", planned, parameters, {"reseau.json": reseau, "object.json": object_})
 
 
 @app.command()
@@ -195,8 +214,8 @@ def scan(
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.scan(run, given["count"])
 
-    where = _Where(archive, objects, bench, name, None, resume, as_json)
-    _conduct(where, "scan", planned, lambda _: {"count": count, "retakes": 0, "park": {}})
+    where = Where(archive, objects, bench, name, None, resume, as_json)
+    conduct(where, "scan", planned, lambda _: {"count": count, "retakes": 0, "park": {}})
 
 
 @app.command()
@@ -223,18 +242,37 @@ def frames(
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.frames(run, given["count"], given["average"], given["checks"])
 
-    where = _Where(archive, objects, bench, name, camera, resume, as_json)
-    _conduct(where, "frames", planned, parameters)
+    where = Where(archive, objects, bench, name, camera, resume, as_json)
+    conduct(where, "frames", planned, parameters)
 
 
-def _conduct(
-    where: _Where,
+def conduct(
+    where: Where,
     plan: str,
     planned: Planned,
     parameters: Parameters,
     inputs: Mapping[str, Path | None] | None = None,
+    *,
+    limits: Limits | None = None,
+    afterwards: Callable[[Session], None] = lambda kept: None,
 ) -> None:
-    """Begin a session or go on with one, carry its plan out, and say what came of it."""
+    """Begin a session or go on with one, carry its plan out, and say what came of it.
+
+    Parameters
+    ----------
+    where : Where
+        Bench and session.
+    plan : str
+        Kind of session.
+    planned, parameters : callable
+        What gives the plan of an acquisition and parameters; the parameters of a new session on a bench.
+    inputs : mapping, optional
+        Designs that a new session is given.
+    limits : Limits, optional
+        Of its frames.
+    afterwards : callable
+        Called with a session that is done.
+    """
     from ..capture import Acquisition, BenchLock, carry_out
 
     with opened(where.archive, where.objects, create=not where.resume) as archive:
@@ -247,15 +285,16 @@ def _conduct(
         addresses = [entry.address for entry in bench.file.instruments.values()]
         with BenchLock(addresses, f"session {kept.name}"), bench, display:
             run = Acquisition(
-                bench, kept, procedure_of(kept), camera=where.camera, retakes=given["retakes"],
-                watch=display.watch, operator=_operator,
+                bench, kept, procedure_of(kept), camera=where.camera or given.get("camera"),
+                retakes=given["retakes"], limits=limits, watch=display.watch, operator=where.operator,
             )  # fmt: skip
             why = carry_out(run, planned(run, given), park=given["park"], paused=_paused)
         _conclude(where, kept, why)
+        afterwards(kept)
 
 
 def _begun(
-    archive: Archive, where: _Where, plan: str, parameters: Parameters, inputs: Mapping[str, Path | None]
+    archive: Archive, where: Where, plan: str, parameters: Parameters, inputs: Mapping[str, Path | None]
 ) -> tuple[Session, Bench]:
     """A new session, with the files that it was given."""
     from ..capture import Bench, BenchFile
@@ -277,7 +316,7 @@ def _begun(
     return kept, bench
 
 
-def _resumed(archive: Archive, where: _Where, plan: str) -> tuple[Session, Bench]:
+def _resumed(archive: Archive, where: Where, plan: str) -> tuple[Session, Bench]:
     """A session that was begun before: all but the bench is as it was begun."""
     from ..capture import Bench, BenchFile
     from ..formats import read_text
@@ -296,7 +335,7 @@ def _resumed(archive: Archive, where: _Where, plan: str) -> tuple[Session, Bench
     return kept, Bench(BenchFile.parse_toml(text, where=where.bench or kept.name))
 
 
-def _conclude(where: _Where, kept: Session, why: str | None) -> None:
+def _conclude(where: Where, kept: Session, why: str | None) -> None:
     """Say how it ended; what was not reached is a failure."""
     if kept.status != "done":
         message = f"{kept.name}: stopped; `--resume --name {kept.name}` goes on"
@@ -309,13 +348,6 @@ def _conclude(where: _Where, kept: Session, why: str | None) -> None:
         return
     typer.echo(f"reseau: {message}", err=True)
     raise typer.Exit(1)
-
-
-def _operator(what: str) -> None:
-    """Have someone do it, and say so by a line; at a terminal or through a pipe."""
-    typer.echo(f"{what}, then press Enter", err=True)
-    if not sys.stdin.readline():
-        raise UsageError("nobody answers", where=what, do="run it where someone can")
 
 
 def _paused() -> Decision:

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from datetime import UTC, datetime
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import AsJson, say, writable
+from .capture import AsEvents, BenchPath, CameraName, Name, PlanFile, Resume, Where, conduct, operator
+from .common import say, writable
+from .sessions import ArchivePlace, ObjectsPlace
 
 if TYPE_CHECKING:
+    from ..archive import Session
+    from ..calibration import Calibration
+    from ..capture import Acquisition, Bench, Plan
     from ..instruments import Camera
-    from ..refine.sensor import SensorResult
 
 __all__ = ["sensor"]
 
+CALIBRATION = "calibration.json"
+
 
 def sensor(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Calibration to write.")],
-    bench: Annotated[Path, typer.Option("--bench", "-b", help="The bench.")] = Path("bench.toml"),
-    camera: Annotated[str | None, typer.Option("--camera", help="Where the bench has several.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Calibration to write, too.")] = None,
+    archive: ArchivePlace = "archive",
+    bench: BenchPath = None,
+    name: Name = "",
+    camera: CameraName = None,
     levels: Annotated[int, typer.Option(min=5, help="Exposures in light.")] = 14,
     frames: Annotated[int, typer.Option(min=2, help="Of each exposure.")] = 8,
     longest_ms: Annotated[float, typer.Option(min=0.2, help="Longest exposure.")] = 1000.0,
@@ -29,50 +36,52 @@ def sensor(
     region: Annotated[
         tuple[int, int, int, int] | None, typer.Option(help="Of the edge: left top width height.")
     ] = None,
+    retakes: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
     yes: Annotated[bool, typer.Option("--yes", help="Wait for nobody: all is done by others.")] = False,
-    as_json: AsJson = False,
+    objects: ObjectsPlace = None,
+    resume: Resume = False,
+    plan: PlanFile = None,
+    as_json: AsEvents = False,
 ) -> None:
     """Calibrate a camera's sensor: dark, flat, linearity, noise and gain, full well, defects, sharpness."""
-    from ..capture import Bench
-    from ..capture.sensor import SensorPlan, capture_edge, capture_sensor
-    from ..formats import write_whole
-    from ..provenance import Provenance, canonical_json
-    from ..refine.sensor import calibrate_sensor, measure_edge
-    from .common import required
+    from ..capture.sensor import ALL_LIMITS, SensorPlan
+    from ..capture.sensor import sensor as series
 
-    writable(out)
-    plan = SensorPlan(levels, frames, longest_ms * 1000)
+    if out is not None:
+        writable(out)
 
-    def ready(what: str) -> None:
-        typer.echo(f"please {what}", err=True)
-        if not yes:
-            typer.prompt("Enter when done", default="", show_default=False, err=True)
+    def parameters(found: Bench) -> dict[str, Any]:
+        chosen, device = _camera(found, camera)
+        settings = device.settings.to_dict()
+        own = float(settings["exposure_us"]) if edge else None
+        return {
+            **vars(wanted := SensorPlan(levels, frames, longest_ms * 1000, own)),
+            "count": wanted.count,
+            "camera": chosen,
+            "settings": settings,
+            "region": None if region is None else list(region),
+            "retakes": retakes,
+            "park": {},
+        }
 
-    with Bench.read(bench) as found:
-        device = _camera(found, camera)
-        identity = str(device.connect())
-        series = capture_sensor(device, plan, ready, lambda said: typer.echo(said, err=True))
-        sharp = None
-        if edge:
-            sharp = required(measure_edge(capture_edge(device, ready), region), "edge")
-    result = replace(calibrate_sensor(series), edge=sharp)
-    options = {"camera": identity, "levels": levels, "frames": frames, "settings": device.settings.to_dict()}
-    calibration = result.calibration(
-        identity,
-        Provenance({}, options).to_dict(),
-        {"taken": datetime.now(UTC).isoformat(timespec="seconds")},
-    )
-    write_whole(out, calibration.to_json())
-    if as_json:
-        quantities = {name: each.model_dump() for name, each in result.quantities().items()}
-        said = {"schema": "reseau-sensor/1", "parameters": quantities, "validity": result.validity()}
-        say(canonical_json(said))
-    else:
-        say(_told(result) + f"{out}\n")
+    def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
+        return series(run, SensorPlan(*(given[key] for key in ("levels", "frames", "longest_us", "edge_us"))))
+
+    def afterwards(kept: Session) -> None:
+        _told(kept, out, as_json)
+
+    who = _others if yes else operator
+    where = Where(archive, objects, bench, name, camera, resume, as_json, who)
+    conduct(where, "sensor", planned, parameters, limits=ALL_LIMITS, afterwards=afterwards)
 
 
-def _camera(bench: Any, name: str | None) -> Camera:
-    """The camera of a name, or the only one.
+def _others(what: str) -> None:
+    """Say what others do."""
+    typer.echo(what, err=True)
+
+
+def _camera(bench: Bench, name: str | None) -> tuple[str, Camera]:
+    """The camera of a name, or the only one, and its name.
 
     Raises
     ------
@@ -90,20 +99,54 @@ def _camera(bench: Any, name: str | None) -> Camera:
         raise UsageError(
             "is no camera of this bench", where=chosen, do=f"there are {', '.join(found) or 'none'}"
         )
-    device: Camera = found[chosen]
-    return device
+    return chosen, found[chosen]
 
 
-def _told(result: SensorResult) -> str:
+def _told(kept: Session, out: Path | None, as_json: bool) -> None:
+    """Say what was found, and write it where it was asked for.
+
+    Raises
+    ------
+    EstimationError
+        When an edge was shown in which there was nothing to measure; all else is kept and written.
+    """
+    from ..calibration import Calibration
+    from ..errors import EstimationError
+    from ..formats import write_whole
+
+    last = [result for result in kept.results() if result.name == CALIBRATION][-1]
+    found = Calibration.parse(kept.content(last).decode("utf-8"), where=CALIBRATION)
+    if out is not None:
+        begun = {"begun": kept.begun.isoformat(timespec="seconds")}
+        write_whole(out, found.model_copy(update={"times": begun}).to_json())
+    if as_json:
+        quantities = {name: each.model_dump() for name, each in found.parameters.items()}
+        told = {"parameters": quantities, "validity": found.validity, "tests": list(found.tests)}
+        say(json.dumps({"event": "calibration", "schema": "reseau-sensor/1", **told}) + "\n")
+    else:
+        say(_lines(found) + (f"{out}\n" if out is not None else ""))
+    if kept.parameters["edge_us"] is not None and "psf" not in found.parameters:
+        raise EstimationError(found.validity.get("edge", "has no good frame"), where="edge")
+
+
+def _lines(found: Calibration) -> str:
     """What was found, a line for each."""
     lines = [
-        f"{name:<11} {each.value:.5g} ± {each.sigma:.2g} {each.unit}"
-        for name, each in result.quantities().items()
+        f"{name:<16} {each.value:.5g} ± {each.sigma:.2g} {each.unit}"
+        for name, each in found.parameters.items()
     ]
-    validity = result.validity()
-    lines.append(f"{'dark':<11} ± {result.dsnu:.3g} DN from pixel to pixel")
-    lines.append(f"{'response':<11} ± {100 * result.prnu:.3g} % from pixel to pixel, uneven light included")
-    lines.append(f"{'defects':<11} {validity['defects']} pixels")
+    validity = found.validity
+    lines.append(f"{'dark':<16} ± {validity['dsnu']:.3g} DN from pixel to pixel")
+    lines.append(
+        f"{'response':<16} ± {100 * validity['prnu']:.3g} % from pixel to pixel, uneven light included"
+    )
+    lines.append(f"{'defects':<16} {validity['defects']} pixels")
     if not validity["saturated"]:
-        lines.append("full well   not reached: give more light or longer exposures")
+        lines.append("full well        not reached: give more light or longer exposures")
+    lines += [f"{test['name']:<16} {_verdict(test)}" for test in found.tests if "p" in test]
     return "\n".join(lines) + "\n"
+
+
+def _verdict(test: dict[str, Any]) -> str:
+    """Of a test of the edge."""
+    return f"{'yes' if test['passed'] else 'no'} (p = {test['p']:.2g})"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..capture import Procedure, Step
     from ..data import Frame
     from ..procedures.live import LiveTestfield
+    from ..procedures.live_sensor import LiveSensor
 
 __all__ = [
     "INPUT",
@@ -82,6 +83,12 @@ def procedure_of(kept: Session) -> Procedure | None:
             ReseauDesign.parse(input_of(kept, name), where=name) for name in ("reseau.json", "object.json")
         )
         return LiveOscilloscope(reseau, rods, name=kept.name, options=kept.parameters)
+    if kept.plan == "sensor":
+        from ..procedures.live_sensor import LiveSensor
+
+        region = kept.parameters["region"]
+        chosen = None if region is None else tuple(region)
+        return _Sensor(LiveSensor(name=kept.name, region=chosen, options=kept.parameters), kept)
     return None
 
 
@@ -125,3 +132,29 @@ class _Reported:
         title = f"Calibration, session {self._live.name}"
         report = bundle_report(found.searched, title=title, provenance=self._live.provenance)
         return made | {"report.html": report}
+
+
+class _Sensor:
+    """A sensor's calibration under the name of its camera, with a report beside it."""
+
+    def __init__(self, live: LiveSensor, kept: Session) -> None:
+        self.live, self._kept = live, kept
+
+    def on_frame(self, frame: Frame, step: Step) -> Verdict:
+        return self.live.on_frame(frame, step)
+
+    def progress(self) -> dict[str, float]:
+        return self.live.progress()
+
+    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        return self.live.next_pose(candidates, wanted)
+
+    def finish(self) -> dict[str, str]:
+        from ..report.sensor import sensor_report
+
+        probes = self._kept.frames(kind="probe")
+        camera = probes[0].facts["identity"] if probes else self._kept.name
+        report = sensor_report(
+            self.live.result(), title=f"Sensor of {camera}", provenance=self.live.provenance
+        )
+        return self.live.calibrated(camera) | {"report.html": report}

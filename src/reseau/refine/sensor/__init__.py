@@ -5,7 +5,7 @@ from .edge import EdgeSpread, measure_edge
 from .fields import Fields, estimate_fields
 from .free import FreeCurve
 from .sensor import SensorResult, calibrate_sensor, with_edge
-from .series import Level, SensorSeries
+from .series import Level, LevelSums, SensorSeries
 from .transfer import Linearity, PhotonTransfer, fit_linearity, fit_transfer
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Fields",
     "FreeCurve",
     "Level",
+    "LevelSums",
     "Linearity",
     "PhotonTransfer",
     "SensorCorrection",

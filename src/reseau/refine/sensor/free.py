@@ -178,6 +178,14 @@ class FreeCurve:
         spread: Array = gaussian + self.spline.integrals(distance) @ a
         return spread
 
+    def line_spread(self, distance: Array) -> tuple[Array, Array]:
+        """Line-spread function (1/px) at distances from the edge, and that of the Gaussian it is beyond."""
+        step, c, s = self._step
+        a, _ = self._coefficients
+        gaussian = edge_slope(distance, abs(self.base[5]), c, s)
+        whole = step + float(self.spline.integrals(self.spline.knots[-1:])[0] @ a)
+        return (step * gaussian + self.spline.lines(distance) @ a) / whole, gaussian
+
     def distance(self, pixels: EdgePixels) -> Array:
         """Of pixels from the edge."""
         return pixels.distance(float(self.base[0]), self.fit["slope"], self.fit["bow"])

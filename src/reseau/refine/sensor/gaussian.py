@@ -157,7 +157,10 @@ def _fitted(pixels: EdgePixels, values: Array, reach_px: float, bow: bool) -> Ad
     part = pixels.part(np.abs(pixels.distance(*values[:3])) < reach_px)
     parameters = Parameters(["offset", "slope", "bow", "dark", "bright", "psf"], values)
     free = parameters if bow else parameters.fix("bow")
-    return adjust(GaussMarkov(lambda p: _formed(part, p), part.grey, part.sigma, free), ENOUGH)
+    edge = GaussMarkov(
+        lambda p: _formed(part, p), part.grey, part.sigma, free, lambda p: _derivatives(part, p)
+    )
+    return adjust(edge, ENOUGH)
 
 
 def _formed(pixels: EdgePixels, p: Array) -> Array:
@@ -165,6 +168,24 @@ def _formed(pixels: EdgePixels, p: Array) -> Array:
     spread = edge_spread(pixels.distance(*p[:3]), abs(p[5]), np.cos(slant), abs(np.sin(slant)))
     formed: Array = p[3] + (p[4] - p[3]) * spread
     return formed
+
+
+def _derivatives(pixels: EdgePixels, p: Array) -> Array:
+    """Of :func:`_formed` by its parameters (n, 6)."""
+    slant, width, step = np.arctan(p[1]), abs(p[5]), p[4] - p[3]
+    c, s = np.cos(slant), abs(np.sin(slant))
+    d = pixels.distance(*p[:3])
+    spread, rise = edge_spread(d, width, c, s), edge_slope(d, width, c, s)
+    by_slope, by_bow = pixels.turning(*p[:3])
+    by_offset = -1 / np.hypot(1.0, p[1] + 2 * p[2] * pixels.y / pixels.half**2)
+    # The trapezoid turns with the slope, too.
+    wide, narrow, near = (c + s) / 2, (c - s) / 2, _close(d, width)
+    dc, ds = -np.sin(slant) * c**2, np.sign(p[1]) * c**3
+    by_wide, by_narrow = (_once(near + at, width) - _once(near - at, width) for at in (wide, narrow))
+    turned = (by_wide * (dc + ds) / 2 - by_narrow * (dc - ds) / 2) / (c * s) - spread * (dc / c + ds / s)
+    by_width = np.sign(p[5]) * width * _folded(_never, d, width, c, s)
+    columns = [rise * by_offset, rise * by_slope + turned, rise * by_bow]
+    return np.column_stack([*(step * column for column in columns), 1 - spread, spread, step * by_width])
 
 
 def edge_spread(d: Array, sigma: float, c: float, s: float) -> Array:
@@ -180,11 +201,24 @@ def edge_slope(d: Array, sigma: float, c: float, s: float) -> Array:
 
 
 def _folded(integral: _Integral, d: Array, sigma: float, c: float, s: float) -> Array:
-    s = max(s, 1e-3)  # along the rows the trapezoid is a square, which it is nearly here
+    d, s = _close(d, sigma), max(s, 1e-3)  # along the rows the trapezoid is a square, which it is nearly here
     wide, narrow = (c + s) / 2, (c - s) / 2
     ends = integral(d + wide, sigma) - integral(d + narrow, sigma) - integral(d - narrow, sigma)
     folded: Array = (ends + integral(d - wide, sigma)) / (c * s)
     return folded
+
+
+def _close(d: Array, sigma: float) -> Array:
+    """Distances no farther than where all has risen: beyond, differences of squares would be rounding."""
+    reach = 9 * sigma + 1.5
+    close: Array = np.clip(d, -reach, reach)
+    return close
+
+
+def _never(u: Array, sigma: float) -> Array:
+    """The normal distribution of this width itself."""
+    integral: Array = ndtr(u / max(sigma, 1e-6))
+    return integral
 
 
 def _once(u: Array, sigma: float) -> Array:

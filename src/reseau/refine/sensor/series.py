@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import UsageError
 
-__all__ = ["Image32", "Level", "SensorSeries"]
+__all__ = ["Image32", "Level", "LevelSums", "SensorSeries"]
 
 Image32 = NDArray[np.float32]
 
@@ -36,7 +36,7 @@ class Level:
     variance: Image32
 
     @classmethod
-    def of(cls, exposure_us: float, frames: Iterable[NDArray[Any]]) -> Self:
+    def of(cls, exposure_us: float, frames: Iterable[NDArray[Any]]) -> Level:
         """The level of frames, which are taken one by one and not kept.
 
         Raises
@@ -44,27 +44,63 @@ class Level:
         UsageError
             When there are fewer than two, or they differ in size.
         """
-        count, level = 0, 0.0
-        mean: NDArray[np.float64] = np.zeros(0)
-        scatter: NDArray[np.float64] = np.zeros(0)
+        sums = LevelSums(exposure_us)
         for frame in frames:
-            values = frame.astype(np.float64)
-            count += 1
-            if count == 1:
-                mean, scatter, level = values, np.zeros_like(values), float(values.mean())
-                continue
-            if values.shape != mean.shape:
-                raise UsageError(f"frames of {mean.shape} and {values.shape}", where="sensor series")
-            # The frame's own mean is put to that of the first; Welford's recurrence for the rest.
-            values -= values.mean() - level
-            step = values - mean
-            mean = mean + step / count
-            scatter += step * (values - mean)
-        if count < 2:
+            sums.add(frame)
+        return sums.level()
+
+
+class LevelSums:
+    """A level while its frames come in; none is kept.
+
+    Parameters
+    ----------
+    exposure_us : float
+        Exposure time.
+    """
+
+    def __init__(self, exposure_us: float) -> None:
+        self.exposure_us, self.count = exposure_us, 0
+        self._first = 0.0
+        self._mean: NDArray[np.float64] = np.zeros((0, 0))
+        self._scatter: NDArray[np.float64] = np.zeros((0, 0))
+
+    def add(self, frame: NDArray[Any]) -> None:
+        """Take a frame in.
+
+        Raises
+        ------
+        UsageError
+            When it has another size than the first.
+        """
+        values = frame.astype(np.float64)
+        if not self.count:
+            self.count, self._first = 1, float(values.mean())
+            self._mean, self._scatter = values, np.zeros_like(values)
+            return
+        if values.shape != self._mean.shape:
+            raise UsageError(f"frames of {self._mean.shape} and {values.shape}", where="sensor series")
+        # The frame's own mean is put to that of the first; Welford's recurrence for the rest.
+        self.count += 1
+        values -= values.mean() - self._first
+        step = values - self._mean
+        self._mean = self._mean + step / self.count
+        self._scatter += step * (values - self._mean)
+
+    def level(self) -> Level:
+        """The level so far.
+
+        Raises
+        ------
+        UsageError
+            When there are fewer than two frames.
+        """
+        if self.count < 2:
             raise UsageError("needs at least two frames of each exposure", where="sensor series")
         # One degree of freedom of all pixels together went into each frame's mean.
-        variance = scatter / (count - 1) * (mean.size / (mean.size - 1))
-        return cls(exposure_us, count, mean.astype(np.float32), variance.astype(np.float32))
+        variance = self._scatter / (self.count - 1) * (self._mean.size / (self._mean.size - 1))
+        mean = self._mean.astype(np.float32)
+        return Level(self.exposure_us, self.count, mean, variance.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)

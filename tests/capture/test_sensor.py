@@ -1,0 +1,205 @@
+"""The series of a sensor: streamed, tried again, killed and resumed; and what its procedure holds of it."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import signal
+import time
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.archive import Archive, Session
+from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step, carry_out, rerun
+from reseau.capture.sensor import ALL_LIMITS, SensorPlan, sensor
+from reseau.data import Frame
+from reseau.errors import DeadlineError, EstimationError, StateError
+from reseau.procedures.live_sensor import LiveSensor
+from reseau_drivers.camera import v4l2
+from reseau_sims.pixels import PixelSensor
+from reseau_sims.serving import CameraBody, Lamp, VideoCamera
+
+PLAN = SensorPlan(levels=10, frames=3, longest_us=40_000.0)
+
+
+class Rig:
+    """A camera before a lamp, which whoever is asked covers."""
+
+    def __init__(self, light: float = 1.0) -> None:
+        drawn = PixelSensor.drawn(np.random.default_rng(2), 48, 32, full_well=12_000.0)
+        self.light, self.lamp = light, Lamp(drawn, light)
+        camera = VideoCamera(CameraBody(self.lamp, 48, 32))
+        camera.controls[0x980900] = 128
+        self.settings = {"format": "Y12", "exposure_us": 1000.0, "buffers": 16}
+        self.camera = v4l2("eye", camera.open, settings=self.settings)
+        entry = InstrumentEntry(driver="v4l2", address="in process")
+        file = BenchFile(name="sensor", instruments={"eye": entry})
+        self.bench = Bench(file, lambda name, entry: self.camera)
+        self.events: list[tuple[str, dict[str, Any]]] = []
+
+    def operator(self, what: str) -> None:
+        self.lamp.light = 0.0 if "cover" in what else self.light
+
+    def carry_out(self, kept: Session, plan: SensorPlan = PLAN) -> None:
+        run = Acquisition(
+            self.bench, kept, LiveSensor(name="eye"), limits=ALL_LIMITS, operator=self.operator,
+            watch=lambda kind, facts: self.events.append((kind, facts)),
+        )  # fmt: skip
+        carry_out(run, sensor(run, plan))
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[Session]:
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        yield archive.begin("s", "sensor", {})
+
+
+def test_a_series_is_streamed_and_the_camera_set_back(kept: Session) -> None:
+    rig = Rig()
+    with rig.bench:
+        rig.carry_out(kept)
+        assert rig.camera.settings.to_dict()["exposure_us"] == 1000.0
+    frames = kept.frames(kind="frame")
+    assert len(frames) == PLAN.count == len({frame.step for frame in frames})
+    assert all(frame.verdict is not None and frame.verdict.ok for frame in frames)
+    # Light at growing exposures, then the dark at three of them; as the camera told them.
+    exposures = {frame.step.rpartition(" ")[0]: frame.facts["exposure_us"] for frame in frames}
+    light = [exposure for step, exposure in exposures.items() if step.startswith("light")]
+    assert light == sorted(set(light))
+    dark = [exposure for step, exposure in exposures.items() if step.startswith("dark")]
+    assert dark == [light[0], light[5], light[9]]
+    assert kept.frames(kind="probe")[0].facts["identity"] == str(rig.camera.connect())
+    # Of a stream only the first of a level is waited for: numbers follow one another.
+    numbers = [frame.clock["sequence"][0] for frame in frames]
+    gaps = np.diff(np.array(numbers).reshape(-1, PLAN.frames), axis=1)
+    assert (gaps == 1).mean() > 0.9
+
+
+def test_a_frame_that_does_not_come_is_asked_for_again(
+    kept: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, fails = Rig(), [3, 17, 30]
+    taken, frames = [0], type(rig.camera).frames
+
+    def failing(self: Any, count: int, seconds: float | None = None) -> Iterator[Any]:
+        for shot in frames(self, count, seconds):
+            taken[0] += 1
+            if taken[0] in fails:
+                raise DeadlineError("delivered no new frame", where="eye")
+            yield shot
+
+    monkeypatch.setattr(type(rig.camera), "frames", failing)
+    with rig.bench:
+        rig.carry_out(kept)
+    assert [kind for kind, _ in rig.events].count("again") == len(fails)
+    assert len(kept.frames(kind="frame")) == PLAN.count
+    assert kept.results()
+
+
+def test_no_light_and_too_much_of_it_are_said(tmp_path: Path) -> None:
+    for light, said in ((0.0, "sees nearly nothing at 8 ms"), (1e4, "saturated at its shortest exposure")):
+        with Archive.open(tmp_path / f"{light:g}", create=True) as archive, (rig := Rig(light)).bench:
+            kept = archive.begin("s", "sensor", {})
+            with pytest.raises(StateError, match=said):
+                rig.carry_out(kept, SensorPlan(5, 2, 8000.0))
+            assert rig.camera.settings.to_dict()["exposure_us"] == 1000.0
+            assert not kept.frames(kind="frame")
+
+
+@pytest.mark.parametrize("light", [0.1, 3.0])
+def test_exposures_reach_from_little_light_to_saturation(kept: Session, light: float) -> None:
+    rig = Rig(light)
+    with rig.bench:
+        rig.carry_out(kept, SensorPlan(10, 2, 60_000.0))
+    validity = json.loads(kept.content(kept.results()[-1]))["validity"]
+    assert validity["saturated"]
+
+
+def test_the_procedure_holds_no_frames() -> None:
+    rng, peaks = np.random.default_rng(0), []
+    for count in (10, 200):
+        live = LiveSensor(name="eye")
+        tracemalloc.start()
+        for k in range(count):
+            frame = Frame(rng.integers(0, 4095, (200, 300)).astype(np.uint16), 4095.0)
+            assert live.on_frame(frame, Step(f"light 00 {k:03d}", exposure_us=100.0)).ok
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # Two images of the sums, and what one frame needs on its way into them.
+    assert peaks[1] < peaks[0] + 100_000
+    assert peaks[1] < 9 * 8 * 200 * 300
+
+
+def test_what_is_no_frame_of_the_series_is_no_good() -> None:
+    live = LiveSensor(name="eye")
+    frame = Frame(np.full((8, 8), 100, dtype=np.uint8), 255.0)
+    assert not live.on_frame(frame, Step("00000")).ok
+    assert live.on_frame(frame, Step("light 00 000", exposure_us=1.0)).ok
+    other = Frame(np.zeros((8, 9), dtype=np.uint8), 255.0)
+    assert "frames of" in live.on_frame(other, Step("light 00 001", exposure_us=1.0)).why
+    white = Frame(np.full((8, 8), 255, dtype=np.uint8), 255.0)
+    assert "saturated" in live.on_frame(white, Step("edge 00 000", exposure_us=1.0)).why
+    with pytest.raises(EstimationError, match="eye: 0 dark and 0 bright"):
+        live.finish()
+
+
+def work(place: Path) -> None:
+    """What `reseau capture sensor` does: begin or resume, and carry on to the end."""
+    with Archive.open(place, create=True) as archive, (rig := Rig()).bench:
+        names = [each.name for each in archive.sessions()]
+        kept = archive.session("s") if "s" in names else archive.begin("s", "sensor", {})
+        kept.recover()
+        rig.carry_out(kept)
+
+
+def ended(place: Path, after_s: float | None) -> bool:
+    """Whether a process came to its end before it was killed."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([work.__module__, "reseau.procedures.live_sensor"])
+    process = context.Process(target=work, args=(place,))
+    process.start()
+    process.join(after_s)
+    if process.is_alive():
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+    process.join(60)
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode == 0
+
+
+def stored(place: Path) -> dict[str, str]:
+    """Good frames of a session, each once."""
+    with Archive.open(place, create=True) as archive:
+        frames = [] if not archive.sessions() else archive.session("s").frames(kind="frame")
+    assert len(frames) == len({frame.step for frame in frames})
+    return {frame.step: frame.sha256 for frame in frames}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_killed_at_any_moment_no_frame_is_lost_or_doubled(tmp_path: Path) -> None:
+    rng, began = random.Random(1), time.monotonic()
+    assert ended(tmp_path / "undisturbed", None)
+    seconds, kills = time.monotonic() - began, 0
+    for number in range(12):
+        place, held = tmp_path / f"killed {number}", dict[str, str]()
+        while not ended(place, rng.uniform(0, 0.7) * seconds):
+            kills, before, held = kills + 1, held, stored(place)
+            assert before.items() <= held.items()
+        assert held.items() <= stored(place).items()
+        with Archive.open(place) as archive:
+            kept = archive.session("s")
+            assert kept.status == "done"
+            assert len(stored(place)) == PLAN.count
+            (again,) = rerun(kept, LiveSensor(name="eye"))
+            assert again.same
+            inputs = json.loads(kept.content(kept.results()[-1]))["provenance"]["inputs"]
+            assert inputs == stored(place)
+    assert kills > 6
