@@ -292,6 +292,56 @@ def test_an_archive_on_a_read_only_disk_can_be_read(tmp_path: Path, monkeypatch:
             session.end("done")
 
 
+def test_what_a_killed_process_left_in_the_log_is_read_on_a_read_only_disk_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = """
+        import os, sys
+        import numpy as np
+        from reseau.archive import Archive
+        from reseau.data import Frame
+        archive = Archive.open(sys.argv[1], create=True)
+        session = archive.begin("s", "frames", {})
+        for k in range(3):
+            session.store(str(k), Frame(np.full((8, 8), k, np.uint8), 255.0))
+        os._exit(9)
+        """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(script), str(tmp_path)], check=False)
+    assert (tmp_path / "index.sqlite-wal").stat().st_size > 0
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    with Archive.open(tmp_path) as archive:
+        assert [f.step for f in archive.session("s").frames()] == ["0", "1", "2"]
+        with pytest.raises(ArchiveError, match="readonly"):
+            archive.session("s").end("done")
+    with pytest.raises(ArchiveError, match="may only be read; name another archive"):
+        Archive.open(tmp_path, create=True)
+
+
+def test_an_index_that_is_damaged_is_told(tmp_path: Path) -> None:
+    with Archive.open(tmp_path, create=True) as archive:
+        session = archive.begin("s", "frames", {})
+        for k in range(50):
+            session.store(str(k), frame(k), facts={"gain": 2.5})
+        assert verify(archive)
+    index = tmp_path / "index.sqlite"
+    sound = index.read_bytes()
+    index.write_bytes(sound.replace(b'{"gain": ', b'{"gain"# '))
+    with Archive.open(tmp_path) as archive, pytest.raises(ArchiveError, match=r"Expecting ':'"):
+        archive.session("s").frames()
+    # A page of one of the indices: what is asked for below does not go there.
+    with sa.create_engine(f"sqlite:///{index}").connect() as connection:
+        root = connection.scalar(
+            sa.text("SELECT rootpage FROM sqlite_master WHERE name = 'ix_frames_sha256'")
+        )
+    page = int.from_bytes(sound[16:18], "big")
+    index.write_bytes(sound[: (root - 1) * page] + bytes(page) + sound[root * page :])
+    with Archive.open(tmp_path) as archive:
+        found = verify(archive)
+        assert not found
+        assert len(found.damaged) >= 1
+        assert all(line.startswith("index: ") for line in found.damaged)
+
+
 def test_two_processes_write_into_one_archive(tmp_path: Path) -> None:
     script = """
         import sys

@@ -71,7 +71,9 @@ class Archive:
                 raise ArchiveError(f"cannot be made ({error.strerror})", where=folder) from None
         elif not index.is_file():
             raise ArchiveError("is no archive", where=folder, do="`reseau capture` makes one")
-        read_only = not create and not (os.access(index, os.W_OK) and os.access(folder, os.W_OK))
+        read_only = not all(os.access(path, os.W_OK) for path in (folder, index) if path.exists())
+        if create and read_only:
+            raise ArchiveError("may only be read", where=folder, do="name another archive")
         engine = schema.make(f"sqlite:///{index}", create=create, read_only=read_only)
         kept = LocalObjects(folder / _OBJECTS) if objects is None else objects_at(objects)
         return cls(engine, kept, str(folder))
@@ -164,6 +166,10 @@ class Archive:
             SessionSummary(name, plan, utc(begun), frames, results, status or "not ended")
             for name, plan, begun, frames, results, status in rows
         ]
+
+    def faults(self) -> list[str]:
+        """What is wrong with the index itself, as far as its database can tell."""
+        return schema.faults(self._engine)
 
     def files(self) -> list[tuple[str, str, int, str]]:
         """Hash, suffix, size and name of every file that the index names."""

@@ -6,6 +6,7 @@ import sqlite3
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from json import JSONDecodeError
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -19,6 +20,7 @@ __all__ = [
     "connected",
     "ends",
     "events",
+    "faults",
     "frames",
     "inputs",
     "make",
@@ -183,7 +185,11 @@ def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
 
 def _sqlite(path: Path, read_only: bool) -> Engine:
     # A write-ahead log lets readers look on while frames come in; FULL has every commit outlast a power cut.
-    options = "mode=ro&immutable=1&uri=true" if read_only else "uri=true"
+    options = "uri=true"
+    if read_only:
+        # Where there is no log, none must be made; in one that is left over is what was written last.
+        log = path.with_name(f"{path.name}-wal")
+        options += "&mode=ro" if log.is_file() and log.stat().st_size else "&mode=ro&immutable=1"
     engine = sa.create_engine(f"sqlite:///file:{path}?{options}", connect_args={"timeout": 30})
 
     @sa.event.listens_for(engine, "connect")
@@ -214,9 +220,23 @@ def connected(engine: Engine) -> Iterator[sa.Connection]:
     try:
         with engine.begin() as connection:
             yield connection
-    except (DBAPIError, PoolTimeout) as error:
+    except (DBAPIError, PoolTimeout, JSONDecodeError) as error:
         what = f"the index does not take it ({_brief(error)})"
         raise ArchiveError(what, where=_shown(engine.url)) from None
+
+
+def faults(engine: Engine) -> list[str]:
+    """What a database finds wrong with itself; PostgreSQL watches over its pages by checksums of its own."""
+    if engine.dialect.name != "sqlite":
+        return []
+    try:
+        with connected(engine) as connection:
+            said = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
+            astray = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
+    except ArchiveError as error:  # too much is damaged for it to look at all
+        return [error.what]
+    found = [line for text in said if text != "ok" for line in str(text).splitlines()]
+    return found + [f"a row of {table} belongs to none of {parent}" for table, _, parent, _ in astray]
 
 
 def _brief(error: Exception) -> str:

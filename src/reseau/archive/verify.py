@@ -22,7 +22,7 @@ class Verified:
     size : int
         Their bytes.
     damaged : tuple of str
-        What is missing or changed, by the frame or result it is.
+        What is missing or changed, by the frame or result it is; and what is wrong with the index.
     unknown : tuple of str
         Files that the index does not name: of a process that was killed between file and index. They harm
         nothing; resuming the session enters its own.
@@ -38,7 +38,7 @@ class Verified:
 
 
 def verify(archive: Archive, step: Callable[[str], None] = lambda name: None) -> Verified:
-    """Read every file again and compare it with its hash.
+    """Read every file again and compare it with its hash, and have the index look at itself.
 
     Parameters
     ----------
@@ -47,7 +47,8 @@ def verify(archive: Archive, step: Callable[[str], None] = lambda name: None) ->
     step : callable, optional
         Told the name of each file that has been read.
     """
-    damaged, known, total = [], set(), 0
+    damaged = [f"index: {line}" for line in archive.faults()]
+    known, total = set(), 0
     for sha256, suffix, size, name in archive.files():
         total += size
         if (sha256, suffix) not in known:
