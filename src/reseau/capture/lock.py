@@ -51,20 +51,24 @@ class BenchLock:
         StateError
             When another process has one of the instruments; says which process.
         """
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with suppress(PermissionError):  # another user made it, for all
-            self._folder.chmod(0o1777)
         try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with suppress(PermissionError):  # another user made it, for all
+                self._folder.chmod(0o1777)
             for address in self._addresses:
                 self._take(address)
+        except OSError as error:
+            self.__exit__()
+            raise StateError(f"cannot be locked ({error.strerror})", where=self._folder) from None
         except BaseException:
             self.__exit__()
             raise
         return self
 
     def _take(self, address: str) -> None:
-        path = self._folder / f"{hashlib.sha256(address.encode()).hexdigest()[:20]}.lock"
-        handle = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+", encoding="utf-8")
+        # A device is the same by all its names.
+        real = os.path.realpath(address) if address.startswith("/") else address
+        handle = _for_all(self._folder / f"{hashlib.sha256(real.encode()).hexdigest()[:20]}.lock")
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -77,7 +81,7 @@ class BenchLock:
         self._held.append(handle)
         handle.truncate(0)
         since = datetime.now(UTC).isoformat(timespec="seconds")
-        owner = {"owner": self._owner, "pid": os.getpid(), "user": getpass.getuser(), "since": since}
+        owner = {"owner": self._owner, "pid": os.getpid(), "user": _user(), "since": since}
         json.dump(owner, handle)
         handle.flush()
 
@@ -87,3 +91,22 @@ class BenchLock:
             with suppress(OSError):
                 handle.truncate(0)
             handle.close()
+
+
+def _for_all(path: Path) -> IO[str]:
+    """A file that all users may write, open."""
+    try:
+        # In a folder for all the system lets nobody open another's file as one to be made.
+        number = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        os.fchmod(number, 0o666)
+    return os.fdopen(number, "r+", encoding="utf-8")
+
+
+def _user() -> str:
+    """Who this process belongs to; in a container the number may have no name."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return str(os.getuid())
