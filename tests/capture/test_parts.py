@@ -1,5 +1,6 @@
 """Poses from tables, goals from words, and what frames say of focus, vibration and drift."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,14 @@ def test_a_shift_is_found_within_its_sigma(dx: float, dy: float, seed: int) -> N
     found, sigma = shift_between(scene(seed=seed), scene((dx, dy), seed=seed + 100))
     assert np.all(np.abs(found - [dx, dy]) < 5 * sigma + 0.004)  # the linearisation leaves thousandths
     assert np.all(sigma < 0.01)
+
+
+def test_a_scene_without_edges_is_told_in_words_that_any_index_takes() -> None:
+    """JSON knows no infinity; PostgreSQL refuses it."""
+    flat = [Frame(np.full((60, 60), 90, np.uint8), 255.0)] * 2
+    found = readiness(flat)
+    assert found.faults == ("there are no edges; focus, or have it look at something",)
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["edge_px"] is None
 
 
 def test_a_quiet_bench_is_ready() -> None:
@@ -112,7 +121,18 @@ def test_goals_are_read_in_their_units() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "c < 1", "sigma_c > 1 um", "sigma_c < um", "sigma_c < 1 parsec", "sigma_c < 0 um"]
+    "text",
+    [
+        "",
+        "c < 1",
+        "sigma_c > 1 um",
+        "sigma_c < um",
+        "sigma_c < 1 parsec",
+        "sigma_c < 0 um",
+        "sigma_c < 1.2.3 um",
+        "sigma_c < .",
+        "sigma_c < 1e999 um",
+    ],
 )
 def test_what_is_no_goal_is_told(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 'sigma_c < 0\.5 um'"):
