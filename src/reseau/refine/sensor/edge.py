@@ -172,27 +172,27 @@ def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Fa
     if isinstance(first, Failure):
         return first
     near, far = _reaches(first)
-    part = pixels.part(np.abs(pixels.distance(*first.values[:3])) < far)
-    bow = fit_gaussian(part, first.values, np.inf, bow=True)
-    if isinstance(bow, Failure):
-        return bow
-    free = fit_free(part, bow.values, bow=True)
+    pixels = pixels.part(np.abs(pixels.distance(*first.values[:3])) < far)
+    wide = fit_gaussian(pixels, first.values, np.inf, bow=True)
+    if isinstance(wide, Failure):
+        return wide
+    free = fit_free(pixels, wide.values, bow=True)
     if isinstance(free, Failure):
         fit = fit_gaussian(pixels, first.values, near)
         return fit if isinstance(fit, Failure) else EdgeSpread(fit, free)
     if not known:
-        part, pixels = (_weighed(free, each) for each in (part, pixels))
-        free = fit_free(part, bow.values, bow=True)
+        pixels = _weighed(free, pixels)
+        free = fit_free(pixels, wide.values, bow=True)
         if isinstance(free, Failure):
             return free
     bent = free.fit.test_of("bow", alpha=ALPHA)
-    wide = fit_gaussian(part, first.values, np.inf, bow=bent.significant)
+    wide = fit_gaussian(pixels, first.values, np.inf, bow=bent.significant)
     fit = fit_gaussian(pixels, first.values, near, bow=bent.significant)
     if isinstance(wide, Failure):
         return wide
     if isinstance(fit, Failure):
         return fit
-    free = fit_free(part, wide.values, bow=bent.significant)
+    free = fit_free(pixels, wide.values, bow=bent.significant)
     test = None if isinstance(free, Failure) else compare(wide, free.fit, ALPHA)
     return EdgeSpread(fit, free, test, bent)
 
@@ -206,14 +206,12 @@ def _reaches(fit: Adjustment) -> tuple[float, float]:
 def _weighed(free: FreeCurve, pixels: EdgePixels) -> EdgePixels:
     """With the noise that the residuals have: its variance grows in a straight line with the light."""
     dark, bright = free.base[3:5]
-    residual = free.fit.residuals**2 * (free.fit.problem.size / free.fit.redundancy)
-    share = np.clip((free.fit.problem.observations - free.fit.residuals - dark) / (bright - dark), 0.0, 1.0)
+    residual = free.fit.residuals**2 * (len(pixels.grey) / free.fit.redundancy)
+    share = np.clip((pixels.grey + free.fit.residuals - dark) / (bright - dark), 0.0, 1.0)
     levels = np.full(2, float(residual.mean()))
     for _ in range(2):  # squares scatter as their mean does
         design = np.stack([1 - share, share], axis=1)
         weight = 1 / (design @ levels)
         found = np.linalg.lstsq(design * weight[:, None], residual * weight, rcond=None)[0]
         levels = np.maximum(found, 1e-3 * float(residual.mean()) + 1e-12)
-    seen = (free.edge_spread(free.distance(pixels)) - dark) / (bright - dark)
-    variance = levels[0] + (levels[1] - levels[0]) * np.clip(seen, 0.0, 1.0)
-    return replace(pixels, sigma=np.sqrt(variance))
+    return replace(pixels, sigma=np.sqrt(levels[0] + (levels[1] - levels[0]) * share))

@@ -170,14 +170,6 @@ class FreeCurve:
         value, sigma = self.mtf(NYQUIST)
         return float(value[0]), float(sigma[0])
 
-    def edge_spread(self, distance: Array) -> Array:
-        """Grey values at distances from the edge."""
-        step, c, s = self._step
-        a, _ = self._coefficients
-        gaussian = self.fit["dark"] + step * edge_spread(distance, abs(self.base[5]), c, s)
-        spread: Array = gaussian + self.spline.integrals(distance) @ a
-        return spread
-
     def line_spread(self, distance: Array) -> tuple[Array, Array]:
         """Line-spread function (1/px) at distances from the edge, and that of the Gaussian it is beyond."""
         step, c, s = self._step
@@ -185,10 +177,6 @@ class FreeCurve:
         gaussian = edge_slope(distance, abs(self.base[5]), c, s)
         whole = step + float(self.spline.integrals(self.spline.knots[-1:])[0] @ a)
         return (step * gaussian + self.spline.lines(distance) @ a) / whole, gaussian
-
-    def distance(self, pixels: EdgePixels) -> Array:
-        """Of pixels from the edge."""
-        return pixels.distance(float(self.base[0]), self.fit["slope"], self.fit["bow"])
 
     def ends(self) -> tuple[float, float]:
         """How much of the step still rises in the outer quarters of the region (share), and the probability
@@ -260,9 +248,11 @@ def _knots(pixels: EdgePixels, base: Array, step: float) -> Array:
     half of the rows end; what is beyond is flat.
     """
     d = pixels.distance(*base[:3])
-    rows = np.unique(pixels.y)
-    ends = np.array([(d[pixels.y == row].min(), d[pixels.y == row].max()) for row in rows])
-    left, right = np.median(ends, axis=0)
+    rows = np.unique(pixels.y, return_inverse=True)[1]
+    ends = np.zeros((2, int(rows.max()) + 1))
+    np.minimum.at(ends[0], rows, d)
+    np.maximum.at(ends[1], rows, d)
+    left, right = np.median(ends, axis=1)
     core = 3 * abs(float(base[5])) + 1.0
     return np.concatenate([-_side(-float(left), core, step)[::-1], [0.0], _side(float(right), core, step)])
 
