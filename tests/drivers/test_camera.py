@@ -39,9 +39,9 @@ def test_it_is_a_camera_by_the_protocol(camera: Cam) -> None:
     assert isinstance(camera, Camera)
 
 
-@pytest.mark.parametrize("at_start", [False, True])
-def test_no_frame_began_before_it_was_asked_for(at_start: bool) -> None:
-    device = VideoCamera(CameraBody(), start_of_exposure=at_start)
+@pytest.mark.parametrize("stamps", [{}, {"start_of_exposure": True}, {"webcam": True}])
+def test_no_frame_began_before_it_was_asked_for(stamps: dict[str, bool]) -> None:
+    device = VideoCamera(CameraBody(), **stamps)
     with v4l2("camera", device.open, settings={"exposure_us": 3000.0, "rate": 200.0}) as camera:
         for shift in range(30):
             pattern = Pattern(shift=shift)
@@ -64,6 +64,14 @@ def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
             shot = camera.expose()
             assert 0 < shot.taken_within_s < within
             assert abs((datetime.now(UTC) - shot.taken).total_seconds()) < 1.0
+
+
+def test_the_stamps_of_a_webcam_are_no_starts_of_exposures() -> None:
+    # The kernel's driver says that they are; they are when the first packet of a frame came.
+    device = VideoCamera(CameraBody(), webcam=True)
+    with v4l2("camera", device.open, settings={"exposure_us": 2000.0, "rate": 100.0}) as camera:
+        assert camera.expose().taken_within_s == pytest.approx(6e-3, abs=1e-3)
+        assert "first packet" in camera.check(5.0)["clock"]
 
 
 def test_a_series_has_every_frame_once_and_says_which_are_fresh(device: VideoCamera, camera: Cam) -> None:

@@ -32,6 +32,9 @@ _UNKNOWN_PERIOD_NS = 1_000_000_000
 _TICK_NS = 100_000
 """By which a stamp may lie ahead of the moment in which it is read: clocks of processors differ by less."""
 _MOST_CONTROLS = 500
+_WEBCAMS = "uvcvideo"
+"""The kernel's driver of USB webcams. It says that it stamps starts of exposures, but stamps a frame when its
+first packet comes, unless it is told to believe the camera's own clock (its parameter ``hwtimestamps``)."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class V4l2:
         self._period_ns = _UNKNOWN_PERIOD_NS
         self._exposure_ns: int | None = None
         self._gain = float("nan")
-        self._stamp_ns, self._stamped_at_start = 0, False
+        self._stamp_ns, self._stamped_at = 0, "end of the frame"
         self._controls: dict[int, uapi.Control] = {}
 
     @property
@@ -196,8 +199,7 @@ class V4l2:
 
     def clock(self, deadline: Deadline) -> str:
         """Frames are stamped by the clock of this machine."""
-        where = "start of the exposure" if self._stamped_at_start else "end of the frame"
-        return f"offset 0 s, stamped by the kernel at the {where}"
+        return f"offset 0 s, stamped by the kernel at the {self._stamped_at}"
 
     def _whole(self, buffer: uapi.Buffer) -> bool:
         need = size_of(self._layout, self._format.width, self._format.height, self._format.stride)
@@ -213,13 +215,18 @@ class V4l2:
         self._stamp_ns = stamp
         # Drivers that stamp where a frame is to end may be ahead of that by a part of the period.
         stamp = min(stamp, now)
-        self._stamped_at_start = buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
-        if self._stamped_at_start:
-            return Span(stamp, stamp + 1000)
+        at_start = buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
         # Rows are read one after the other, which takes up to a period; an unknown exposure may fill one.
         exposure = self._exposure_ns
-        longest = self._period_ns if exposure is None else exposure
-        return Span(stamp - self._period_ns - longest, stamp - (exposure or 0))
+        earliest = stamp - self._period_ns - (self._period_ns if exposure is None else exposure)
+        if at_start and self._identity.maker == _WEBCAMS:
+            self._stamped_at = "first packet of the frame"
+            return Span(earliest, stamp)
+        if at_start:
+            self._stamped_at = "start of the exposure"
+            return Span(stamp, stamp + 1000)
+        self._stamped_at = "end of the frame"
+        return Span(earliest, stamp - (exposure or 0))
 
     def _set_format(self, settings: V4l2Settings) -> None:
         now = uapi.Format.parse(self._ask(uapi.G_FMT, uapi.Format(0, 0, "GREY").build()))

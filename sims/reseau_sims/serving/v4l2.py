@@ -26,8 +26,10 @@ def _fail(number: int) -> OSError:
 class VideoCamera(Video):
     """A camera with nodes; parameters as of :class:`Video`."""
 
-    def __init__(self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False) -> None:
-        super().__init__(body, first=first, start_of_exposure=start_of_exposure)
+    def __init__(
+        self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
+    ) -> None:
+        super().__init__(body, first=first, start_of_exposure=start_of_exposure, webcam=webcam)
         self.plugged_in = True
         self._nodes: list[VideoNode] = []
 
@@ -138,7 +140,8 @@ class VideoNode:
 
     def _capability(self, data: bytes) -> bytearray:
         can = uapi.Capability.VIDEO_CAPTURE | uapi.Capability.STREAMING
-        return uapi.Capability("simulated", "Simulated camera", "platform:reseau", (6, 1, 0), can).build()
+        driver = "uvcvideo" if self._camera.webcam else "simulated"
+        return uapi.Capability(driver, "Simulated camera", "platform:reseau", (6, 1, 0), can).build()
 
     def _list_format(self, data: bytes) -> bytearray:
         index = int.from_bytes(data[:4], "little")

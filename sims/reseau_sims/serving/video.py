@@ -90,10 +90,15 @@ class Video:
         Number of its first frame.
     start_of_exposure : bool
         What it stamps; otherwise the end of the frame.
+    webcam : bool
+        Whether it is on USB: the kernel stamps its frames when their first packet comes, and calls that the
+        start of the exposure.
     """
 
-    def __init__(self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False) -> None:
-        self.body, self.first, self._at_start = body, first, start_of_exposure
+    def __init__(
+        self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
+    ) -> None:
+        self.body, self.first, self._at_start, self.webcam = body, first, start_of_exposure, webcam
         self.stream: Stream | None = None
         """Of the one who owns it."""
         self._last: _Exposed | None = None
@@ -195,6 +200,6 @@ class Video:
             return
         index = stream.queued.popleft()
         stream.memory[index].data[: len(frame.data)] = frame.data
-        source = uapi.Buffer.START_OF_EXPOSURE if self._at_start else 0
+        source = uapi.Buffer.START_OF_EXPOSURE if self._at_start or self.webcam else 0
         flags = frame.flags | uapi.Buffer.MONOTONIC | source
         stream.done.append(uapi.Buffer(index, len(frame.data), flags, frame.stamp_ns, frame.sequence))
