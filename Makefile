@@ -5,10 +5,12 @@ BIN    := $(VENV)/bin
 OUT    ?= out
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
+# What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
+ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test lint rig slow clean
+.PHONY: demo test lint rig slow aravis clean
 
-demo: $(VENV)/.core
+demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
 
 test: lint
@@ -25,6 +27,14 @@ rig: $(VENV)/.test
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+
+# Where Aravis is installed, what Python uses it with (built from its source); without, all else works.
+aravis: $(VENV)/.core
+ifneq ($(ARAVIS),)
+	@$(BIN)/python -c 'import gi' 2>/dev/null || $(PIP) -e '.[aravis]' >$(VENV)/aravis.log 2>&1 \
+	|| echo "without GigE Vision: PyGObject could not be installed (apt-get install libgirepository1.0-dev" \
+	"libcairo2-dev pkg-config gcc python3-dev; see $(VENV)/aravis.log)"
+endif
 
 clean:
 	rm -rf $(VENV) $(OUT) build dist

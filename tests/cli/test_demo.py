@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +18,7 @@ from reseau.cli import run
 from reseau.formats import ReseauDesign, ReseauMeasurement
 from reseau.refine.correction import InstrumentCorrection
 from reseau_sims import World
+from reseau_sims.serving import aravis_is_installed
 
 FILES = {
     "archive",
@@ -39,10 +42,17 @@ Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "out"
-    assert run(["demo", "--out", str(folder), "--seed", "2"]) == 0
-    return folder
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Its folder, and what it said."""
+    folder, said = tmp_path_factory.mktemp("demo") / "out", StringIO()
+    with redirect_stdout(said):
+        assert run(["demo", "--out", str(folder), "--seed", "2"]) == 0
+    return folder, said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def out(made: tuple[Path, str]) -> Path:
+    return made[0]
 
 
 def true_coordinates(path: Path) -> dict[str, tuple[float, ...]]:
@@ -106,7 +116,17 @@ def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> No
     assert max(body["error_normalised"]) < 2.0
 
 
-def test_same_seed_same_bytes_but_for_the_clock(out: Path, reseau: Run, tmp_path: Path) -> None:
+def test_it_says_by_which_way_frames_came(made: tuple[Path, str]) -> None:
+    gige = aravis_is_installed()
+    ways = ("Video4Linux, simulated in process (Aravis or PyGObject is not installed)", "GigE Vision")
+    assert f"\n{ways[gige]}; every frame is in" in made[1]
+    assert ways[not gige] not in made[1]
+
+
+def test_same_seed_same_bytes_but_for_the_clock_whichever_way_frames_come(
+    out: Path, reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reseau.cli.simulated._speaks_gige", lambda: False)
     status, text, err = reseau("demo", "--out", tmp_path / "again", "--seed", 2, "--json")
     assert (status, err) == (0, "")
     assert text == (out / "comparison.json").read_text()
