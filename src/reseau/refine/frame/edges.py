@@ -36,6 +36,9 @@ _BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("da
 _FREE, _HELD = 0.5, (0.02, 0.12)
 """Logarithms by which the width of a step may differ from the expected one: at first; then, where that is of
 other edges, and where it is of this one."""
+_MODEL = 0.012, 0.05
+"""Part of the picture's contrast to which the model describes a profile: more where the width is yet unknown, lest
+what it does not describe be taken for blunders."""
 _ROUNDS, _LEAST_PIXELS = 2, 100
 """How often the common width is looked for, and pixels of a section that tells it."""
 
@@ -211,7 +214,7 @@ def _fit(
         profile_function(distance),
         initial,
         value,
-        weights=weight / border.noise**2,
+        weights=weight / (border.noise**2 + (_MODEL[spread == _FREE] * border.contrast) ** 2),
         prior=(initial, prior),
         options=_BATCH,
     )
@@ -259,7 +262,7 @@ def _own_width(found: Array, cofactor: Array, known: float, spread: float, good:
     """Logarithm of the width without the prior that held it, mean over neighbours, and variance (2, n)."""
     share = np.clip(1 - cofactor / spread**2, 1e-3, 1.0)
     weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
-    alone = np.clip((found - known) / share, -1.0, 1.0)
+    alone = np.where(good, np.clip((found - known) / share, -1.0, 1.0), 0.0)
     size = min(NEIGHBOURS, len(found))
     total = np.maximum(uniform_filter1d(weight, size, mode="nearest"), 1e-9)
     mean = uniform_filter1d(weight * alone, size, mode="nearest") / total
