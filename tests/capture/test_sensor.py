@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive, Session
-from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step, carry_out, rerun
+from reseau.capture import Acquisition, Bench, BenchFile, Decision, InstrumentEntry, Step, carry_out, rerun
 from reseau.capture.sensor import ALL_LIMITS, SensorPlan, sensor
 from reseau.data import Frame
 from reseau.errors import DeadlineError, EstimationError, StateError
@@ -47,12 +47,12 @@ class Rig:
     def operator(self, what: str) -> None:
         self.lamp.light = 0.0 if "cover" in what else self.light
 
-    def carry_out(self, kept: Session, plan: SensorPlan = PLAN) -> None:
+    def carry_out(self, kept: Session, plan: SensorPlan = PLAN, decision: Decision = "stop") -> None:
         run = Acquisition(
             self.bench, kept, LiveSensor(name="eye"), limits=ALL_LIMITS, operator=self.operator,
             watch=lambda kind, facts: self.events.append((kind, facts)),
         )  # fmt: skip
-        carry_out(run, sensor(run, plan))
+        carry_out(run, sensor(run, plan), paused=lambda: decision)
 
 
 @pytest.fixture
@@ -101,6 +101,38 @@ def test_a_frame_that_does_not_come_is_asked_for_again(
     assert [kind for kind, _ in rig.events].count("again") == len(fails)
     assert len(kept.frames(kind="frame")) == PLAN.count
     assert kept.results()
+
+
+@pytest.mark.parametrize("decision", ["resume", "stop"])
+def test_interrupted_in_the_middle_of_a_series_it_goes_on_there(
+    kept: Session, monkeypatch: pytest.MonkeyPatch, decision: Decision
+) -> None:
+    rig = Rig()
+    taken, frames = [0], type(rig.camera).frames
+
+    def interrupted(self: Any, count: int, seconds: float | None = None) -> Iterator[Any]:
+        for shot in frames(self, count, seconds):
+            taken[0] += 1
+            if taken[0] == 9:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.02)
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.2)
+            yield shot
+
+    monkeypatch.setattr(type(rig.camera), "frames", interrupted)
+    with rig.bench:
+        rig.carry_out(kept, decision=decision)
+        if decision == "stop":
+            assert kept.status == "stopped"
+            assert not kept.results()
+            assert rig.camera.settings.to_dict()["exposure_us"] == 1000.0
+            rig.carry_out(kept)
+    assert kept.status == "done"
+    steps = [frame.step for frame in kept.frames(kind="frame")]
+    assert len(steps) == len(set(steps)) == PLAN.count
+    (again,) = rerun(kept, LiveSensor(name="eye"))
+    assert again.same
 
 
 def test_no_light_and_too_much_of_it_are_said(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,8 @@ def asked(lamp: Lamp, camera: VideoCamera, tmp_path: Path, monkeypatch: pytest.M
             lamp.light = 1.0
         elif "edge" in text:
             y, x = np.mgrid[:64, :96]
-            lamp.light = 2 * (0.1 + 0.9 * ndtr((x - 48 - 0.1 * (y - 32)) / 0.6))
+            step = 0.1 + 0.9 * ndtr((x - 48 - 0.1 * (y - 32)) / 0.6)
+            lamp.light = step * float(os.environ.get("LIGHT_OF_THE_EDGE", "2"))
 
     monkeypatch.setattr("reseau_drivers.camera.KernelNode", lambda address: camera.open())
     monkeypatch.setattr(typer, "echo", said)
@@ -167,6 +169,18 @@ def test_an_edge_that_cannot_be_measured_costs_the_sharpness_alone(
     assert "gain" in found.out
     assert found.err.strip().splitlines()[-1].startswith("reseau: edge: ")
     assert "psf" not in Calibration.read(Path("sensor.json")).parameters
+
+
+def test_an_edge_that_fills_the_pixels_is_told(
+    asked: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LIGHT_OF_THE_EDGE", "40")
+    assert capture("--edge") == 1
+    found = capsys.readouterr()
+    assert found.err.strip().splitlines()[-1] == "reseau: edge: its bright side is saturated: expose less"
+    with Archive.open("archive") as archive:
+        results = [result.name for result in archive.session("monday").results()]
+    assert results == ["calibration.json", "report.html"]
 
 
 @pytest.mark.slow

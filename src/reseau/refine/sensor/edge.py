@@ -29,7 +29,7 @@ _LEAST_SLANT, _MOST_SLANT = 0.02, 0.6
 ALPHA = 0.01
 """Level of the tests."""
 _SATURATED = 0.005
-"""Share of the pixels near the edge that may be at full scale."""
+"""Share of the pixels of the region that may be at full scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +147,8 @@ def measure_edge(
     if min(pixels.shape) < 16:
         return Failure("the region of the edge is smaller than 16 pixels")
     usable = np.ones(pixels.shape, dtype=bool) if good is None else good[inside]
+    if np.mean(pixels[usable] >= frame.full_scale) > _SATURATED:
+        return Failure("its bright side is saturated: expose less")
     noise = None if variance is None else variance[inside]
     across, along = (np.abs(np.diff(pixels, axis=axis)).sum() for axis in (1, 0))
     if along > across:
@@ -158,8 +160,6 @@ def measure_edge(
     if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
         return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°")
-    if np.mean(pixels[usable] >= frame.full_scale) > _SATURATED:
-        return Failure("its bright side is saturated: expose less")
     around = EdgePixels.of(pixels, usable)
     if noise is not None:
         around = replace(around, sigma=np.sqrt(noise[usable]))

@@ -20,6 +20,9 @@ from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_lineari
 
 __all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
 
+_FULL = 0.97
+"""Of the signal at which pixels are full: beyond, an edge is cut off."""
+
 
 @dataclass(frozen=True, eq=False)
 class SensorResult:
@@ -198,5 +201,7 @@ def with_edge(
     """
     frame = Frame(edge.mean, result.full_scale, "edge")
     corrected = result.correction.apply(frame, edge.exposure_us)
+    if (well := result.transfer.saturation) is not None:
+        corrected = replace(corrected, full_scale=min(corrected.full_scale, _FULL * well))
     variance = result.variance(frame, edge.count, edge.exposure_us)
     return replace(result, edge=measure_edge(corrected, region, variance, ~result.fields.defects))
