@@ -231,11 +231,19 @@ def test_an_exposure_that_takes_longer_than_one_waits_ends_in_time(camera: Cam) 
     assert time.monotonic() - began < 1.0
 
 
-def test_stop_from_another_thread_ends_an_exposure(camera: Cam) -> None:
+def test_stop_from_another_thread_ends_an_exposure(device: VideoCamera, camera: Cam) -> None:
     camera.configure(exposure_us=1e6)
-    threading.Timer(0.15, camera.stop).start()
+
+    def stop() -> None:
+        while device.stream is None or not device.stream.on:
+            time.sleep(0.001)  # before that there is nothing to stop, and the exposure would begin anew
+        camera.stop()
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
     with pytest.raises(StateError, match="was stopped"):
         camera.expose(5.0)
+    stopping.join()
 
 
 def test_the_self_test_tells_rate_losses_clock_and_dark_noise(device: VideoCamera, camera: Cam) -> None:

@@ -161,7 +161,9 @@ def test_a_camera_without_chunk_data_is_not_asked_for_any() -> None:
         pass
 
 
-def test_a_frame_triggered_by_a_line_is_fresh_and_one_of_before_is_not() -> None:
+def test_a_frame_triggered_by_a_line_is_fresh_and_one_of_before_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with ExitStack() as stack:
         address = gige_camera(stack, CameraBody()).address
         known = {
@@ -180,10 +182,22 @@ def test_a_frame_triggered_by_a_line_is_fresh_and_one_of_before_is_not() -> None
         # A pulse nobody asked for, then one a moment after the question.
         sender.send(1, IMAGE)
         time.sleep(0.1)
-        pulse = threading.Timer(0.15, sender.send, (2, IMAGE[::-1]))
-        pulse.start()
-        shot = camera.expose(2.0)
-        pulse.join()
+        asked, request = threading.Event(), camera._source.request
+
+        def question(deadline: Deadline) -> None:
+            request(deadline)
+            asked.set()
+
+        def pulse() -> None:
+            asked.wait(5.0)
+            time.sleep(0.05)
+            sender.send(2, IMAGE[::-1])
+
+        monkeypatch.setattr(camera._source, "request", question)
+        pulsing = threading.Thread(target=pulse)
+        pulsing.start()
+        shot = camera.expose(5.0)
+        pulsing.join()
         assert shot.fresh
         assert shot.pixels.tobytes() == IMAGE[::-1]
         assert shot.dropped == 0

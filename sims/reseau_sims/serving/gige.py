@@ -35,7 +35,7 @@ __all__ = ["GigeCamera", "aravis_is_installed"]
 _LARGEST = 2048
 """Rows and columns of the library's fake camera."""
 _FORMATS = {layout.code: layout for layout in GENICAM.values()}
-_START_S = 10.0
+_OBEY_S = 10.0
 _AN_HOUR_NS = 3_600_000_000_000
 
 
@@ -89,6 +89,8 @@ class GigeCamera:
         # A file, not a pipe: the library may warn of much, and nobody reads it.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
         self._ended, self._lock = False, threading.Lock()
+        self._given = self._obeyed = 0
+        self._heard = threading.Condition()
         self._last: tuple[int, int, bytes] | None = None
         self._start()
 
@@ -109,12 +111,13 @@ class GigeCamera:
             env={**os.environ, "PYTHONPATH": ""},
         )
         assert self._process.stdout is not None
-        if len(self._process.stdout.read(door.REQUEST.size)) < door.REQUEST.size:
+        if self._process.stdout.read(door.REQUEST.size) != door.OBEYED:
             self._process.wait(5.0)
             self._said.seek(0)
             said = self._said.read().decode("utf-8", "replace").strip()
             self.close()
             raise UsageError(said or "ended at once", where="simulated GigE camera")
+        self._given = self._obeyed = 0
         self._thread = threading.Thread(target=self._serve, name="GigeCamera", daemon=True)
         self._thread.start()
 
@@ -122,12 +125,17 @@ class GigeCamera:
         stdout = self._process.stdout
         assert stdout is not None
         while len(data := stdout.read(door.REQUEST.size)) == door.REQUEST.size:
+            if data == door.OBEYED:
+                with self._heard:
+                    self._obeyed += 1
+                    self._heard.notify_all()
+                continue
             number, stamp, exposure, gain, code, left, top, width, height, _ = door.REQUEST.unpack(data)
             layout = _FORMATS.get(code, GENICAM["Mono8"])
             view = View(float(exposure), float(gain), 0.0, left, top, width, height, layout.full_scale)
             pixels = encode(layout, self._filled(view))
-            self._answer(number, stamp, pixels)
             self.frames += 1
+            self._answer(number, stamp, pixels)
 
     def _filled(self, view: View) -> NDArray[Any]:
         """What is seen; black where a frame reaches beyond the sensor."""
@@ -161,7 +169,7 @@ class GigeCamera:
     def _befall(self, fault: Fault) -> None:
         """What befalls the camera itself, behind the frame."""
         if fault.kind == "stuck":
-            self._order(door.STICK)
+            self._besides(door.STICK)
         elif fault.kind in ("disconnected", "wrong state"):
             self.hang_up()
         elif fault.kind == "power-cycled":
@@ -169,11 +177,11 @@ class GigeCamera:
 
     def hang_up(self) -> None:
         """Take its control from whoever has it, and stop; it can be opened anew."""
-        self._order(door.HANG_UP)
+        self._besides(door.HANG_UP)
 
     def power_cycle(self) -> None:
         """Switch it off and on: it forgets who had it, and how it was set."""
-        self._order(door.RESET)
+        self._besides(door.RESET)
 
     def pull_plug(self) -> None:
         """Nobody answers any more, until :meth:`plug_in`."""
@@ -185,6 +193,16 @@ class GigeCamera:
         """There it is again, as switched on."""
         self._close_pipes()
         self._start()
+
+    def _besides(self, kind: bytes) -> None:
+        """An order besides any frame, obeyed when this returns, unless the frames' own thread gives it."""
+        with self._heard:
+            self._given += 1
+            number = self._given
+        self._order(kind)
+        if threading.current_thread() is not self._thread:
+            with self._heard:
+                self._heard.wait_for(lambda: self._obeyed >= number, _OBEY_S)
 
     def _order(
         self,

@@ -21,6 +21,8 @@ from typing import Any, BinaryIO
 
 REQUEST = struct.Struct("<QQIIIIIIII")
 """Number, its own time (ns), exposure (µs), gain (dB), pixel format, left, top, width, height, triggered."""
+OBEYED = bytes(REQUEST.size)
+"""In place of a request: up and running, or an order besides any frame was obeyed."""
 ORDER = struct.Struct("<cddqqI")
 """Kind, seconds to wait, share of packets lost, frame number or −1, time (ns) or −1, bytes of the frame."""
 FRAME, STICK, HANG_UP, RESET, END = b"F", b"S", b"H", b"R", b"E"
@@ -121,7 +123,7 @@ class Door:
 
     def run(self) -> None:
         """Obey orders until there are none any more."""
-        self._send(REQUEST.pack(*[0] * 10))
+        self._send(OBEYED)
         while len(data := self._orders.read(ORDER.size)) == ORDER.size:
             order = ORDER.unpack(data)
             if order[0] == END:
@@ -130,6 +132,7 @@ class Door:
                 self._frames.put(order)
             else:
                 self._obey(order[0])
+                self._send(OBEYED)
         # The library's thread may wait for a frame, which never comes now.
         os._exit(0)
 
