@@ -251,7 +251,7 @@ def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> No
     assert float(rate) > 0  # how even they arrive is the machine's
     lost, of = map(int, found["dropped"].split(" of "))
     assert of == 12 + lost
-    # The library's camera stamps by this machine's clock; between stamp and arrival a frame is drawn and sent.
+    # The library's camera stamps by this machine's clock; from stamp to arrival a frame is drawn and sent.
     offset = float(found["clock"].split("offset at most ")[1].split(" s")[0])
     assert 0 <= offset < 1.0
     assert "by the arrival of frames" in found["clock"]
