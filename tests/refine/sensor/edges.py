@@ -20,6 +20,8 @@ def rays(kind: str, rng: np.random.Generator) -> Array:
     """Where light of one point falls (n, 2), as a cloud of equal rays."""
     u, v, third = _DRAWN[:, 0], _DRAWN[:, 1], _DRAWN[:, 2]
     normal = np.stack([norm.ppf(u), norm.ppf(v)], axis=1)
+    if kind == "none":
+        return np.zeros_like(normal)
     if kind == "gaussian":
         return normal * rng.uniform(0.3, 1.2)
     if kind == "defocus":

@@ -142,6 +142,20 @@ def test_a_bent_edge_is_found_and_modelled() -> None:
     assert 0.75 < rms(np.array(curves)) < 1.3
 
 
+def test_an_edge_with_no_blur_but_the_pixels_is_measured() -> None:
+    over = []
+    for seed in range(8):
+        edge = edge_of("none", np.random.default_rng([seed, 9]))
+        found, free = measured(edge)
+        value, sigma = free.mtf(SHOWN)
+        over.append((value - edge.truth(SHOWN)) / sigma)
+        # The width takes part by its square: where noise would have that negative it is held, with no sigma.
+        width, scatter = abs(found.fit["psf"]), found.fit.sigma_of("psf")
+        assert width == pytest.approx(0.02) if scatter == 0 else width < 0.3
+        assert found.mtf50[0] == pytest.approx(edge.half(), abs=0.03)
+    assert 0.7 < rms(np.array(over)) < 1.3
+
+
 def test_where_the_noise_is_known_it_is_taken_at_its_ratios() -> None:
     over = []
     for seed in range(8):

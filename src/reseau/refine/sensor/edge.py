@@ -40,7 +40,7 @@ class EdgeSpread:
     ----------
     fit : Adjustment
         Of `offset` (px), `slope` and `bow` of the edge (held at zero where it is straight), `dark` and
-        `bright` beside it, and `psf` (px, one sigma).
+        `bright` beside it, and `psf` (px, one sigma; held where the edge shows no width).
     free : FreeCurve or Failure
         Modulation transfer without the assumption of a Gaussian; falsy where there are too few pixels.
     gaussian : NestedTest or None
@@ -76,7 +76,7 @@ class EdgeSpread:
         def half(psf: float) -> float:
             return float(brentq(lambda f: float(self.mtf(f, psf)) - 0.5, 1e-6, 0.99))
 
-        psf, step = self.fit["psf"], 1e-4
+        psf, step = abs(self.fit["psf"]), 1e-4
         slope = (half(psf + step) - half(max(psf - step, 0.0))) / (step + min(step, psf))
         return half(psf), abs(slope) * self.fit.sigma_of("psf")
 

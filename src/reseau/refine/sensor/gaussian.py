@@ -22,6 +22,8 @@ __all__ = ["EdgePixels", "approximate_edge", "edge_slope", "edge_spread", "fit_g
 _NEAR_PX = 8.0
 """From the approximate edge, where its gradient is looked for."""
 _ROUNDS = 3
+_SHARPEST_PX = 0.02
+"""Width at which that of an edge is held that shows none."""
 ENOUGH = Options(tolerance=1e-7)
 """What is left to correct, in standard deviations."""
 _Integral = Callable[[Array, float], Array]
@@ -160,7 +162,11 @@ def _fitted(pixels: EdgePixels, values: Array, reach_px: float, bow: bool) -> Ad
     edge = GaussMarkov(
         lambda p: _formed(part, p), part.grey, part.sigma, free, lambda p: _derivatives(part, p)
     )
-    return adjust(edge, ENOUGH)
+    found = adjust(edge, ENOUGH)
+    if isinstance(found, Failure) and abs(found.values.get("psf", np.inf)) < _SHARPEST_PX:
+        # The width takes part by its square alone, which would be negative here.
+        return adjust(edge.with_parameters(free.fix("psf", at=_SHARPEST_PX)), ENOUGH)
+    return found
 
 
 def _formed(pixels: EdgePixels, p: Array) -> Array:
