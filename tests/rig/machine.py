@@ -17,6 +17,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from reseau_sims import World
+
 from . import parts as rig_parts
 from .kernel import PARAMETERS, bootable, first_files
 
@@ -26,6 +30,8 @@ HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
 _PATIENCE_S = 420.0
 _GUEST_DIED, _TOO_LATE = 125, 124
+_ROWS, _COLUMNS = slice(300, 780), slice(400, 1040)
+"""What the guest's camera, which is small, shows of a photograph."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,8 @@ def run(folder: Path, arguments: list[str]) -> Run:
     pytest += ["-p", "no:cacheprovider", f"--junitxml={report}", str(HERE / "guest"), *arguments]
     python = ["env", "PYTHONDONTWRITEBYTECODE=1", sys.executable]
     command = [*python, "-m", "tests.rig.guest.lab", *python, *pytest]
+    # Drawn here: in emulation that takes long.
+    np.save(folder / "world.npy", World.standard(seed=5).photo_i().pixels[_ROWS, _COLUMNS])
     (folder / "command").write_text(f"#!/bin/sh\nexec {shlex.join(command)}\n")
     with tempfile.NamedTemporaryFile(dir=home, suffix=".cpio") as files:
         files.write(first_files(parts, (HERE / "guest/init").read_bytes()))

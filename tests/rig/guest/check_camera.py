@@ -22,7 +22,8 @@ from reseau_drivers.camera import v4l2, video_devices
 from .gadget import settle
 from .lab import steer, value
 
-FORMATS = {"GREY": "GREY", "Y16": "Y16 "}
+FORMATS = {"GREY": "GREY", "Y10": "Y10 ", "Y12": "Y12 ", "Y16": "Y16 ", "YUYV": "YUYV"}
+WORLD = -1
 PATIENCE_S = 20.0
 """After a change until it is seen: frames go through the loop's buffers, slowly in emulation."""
 
@@ -41,7 +42,7 @@ def grey() -> Iterator[str]:
 
 
 def _seen(camera: Any, shift: int) -> None:
-    """Wait until the stripes of this shift are seen, to the bit."""
+    """Wait until the stripes of this shift, or the world, are seen, to the bit."""
     wanted = steer("picture", shift)
     until = time.monotonic() + PATIENCE_S
     while not np.array_equal(pixels := camera.expose().pixels, wanted):
@@ -54,19 +55,29 @@ def _seen(camera: Any, shift: int) -> None:
 def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
     node, name = looped
     with v4l2("camera", node, settings={"format": name}) as camera:
-        for shift in (0, 9, 25):
+        for shift in (0, 9, WORLD):
             steer("look_at", shift)
             _seen(camera, shift)
         shot = camera.expose()
-        assert shot.full_scale == {"GREY": 255, "Y16": 65535}[name]
+        assert shot.full_scale == {"Y10": 1023, "Y12": 4095, "Y16": 65535}.get(name, 255)
+        assert shot.pattern == ("YUYV" if name == "YUYV" else "")
+        if name in ("GREY", "Y16"):
+            drawn = np.load(Path(os.environ["RIG_OUT"], "world.npy"))
+            assert (shot.pixels == drawn * np.uint16(257 if name == "Y16" else 1)).all()
 
 
 def test_brightness_and_gain_act_on_the_picture(grey: str) -> None:
     with v4l2("camera", grey) as camera:
         steer("look_at", 3)
-        for changes in ({"brightness": 138}, {"brightness": 128, "gain": 60.0}, {"gain": 0.0}):
+        seen = []
+        for changes in ({}, {"brightness": 138}, {"brightness": 128, "gain": 60.0}, {"gain": 0.0}):
             camera.configure(**changes)
             _seen(camera, 3)
+            seen.append(camera.expose().pixels.astype(float))
+    plain, brighter, amplified, again = seen
+    assert (brighter == plain + 10).all()
+    assert amplified.mean() == pytest.approx(10 ** (6 / 20) * plain.mean(), rel=0.01)
+    assert (again == plain).all()
 
 
 @pytest.mark.parametrize("source", ["End of Frame", "Start of Exposure"])
@@ -96,14 +107,18 @@ def test_lost_frames_are_counted(grey: str) -> None:
 
 
 def test_numbers_wrap_without_a_gap_of_billions(grey: str) -> None:
+    # The virtual driver begins at −128 then.
     with v4l2("camera", grey) as camera:
         camera.stop()
         steer("camera._set", "Wrap Sequence Number", 1)
         try:
-            shots = list(camera.frames(40))
+            shots = list(camera.frames(150))
         finally:
             steer("camera._set", "Wrap Sequence Number", 0)
-    assert shots[-1].sequence - shots[0].sequence < 400
+    assert shots[0].sequence < 1 << 32 <= shots[-1].sequence
+    steps = shots[-1].sequence - shots[0].sequence
+    assert steps == 149 + shots[-1].dropped - shots[0].dropped
+    assert steps < 1000
 
 
 @pytest.mark.parametrize("button", ["Inject VIDIOC_STREAMON Error", "Inject Fatal Streaming Error"])

@@ -17,6 +17,8 @@ from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 __all__ = ["steer", "value"]
 
 SOCKET, KEY = "/run/lab.sock", b"lab"
@@ -89,17 +91,22 @@ class Lab:
         script = self.scope_script if which == "scope" else self.script
         script.fault_at(script.count, Fault(kind, seconds))
 
-    def look_at(self, shift: int) -> None:
-        """Show the camera other stripes."""
-        from reseau_sims.serving import Pattern
+    def _sight(self, shift: int) -> Any:
+        """Stripes; below 0 what the host drew of the world."""
+        from reseau.data import Frame
+        from reseau_sims.serving import Pattern, Still
 
-        self.body.look_at(Pattern(640, 480, shift))
+        if shift >= 0:
+            return Pattern(640, 480, shift)
+        return Still(Frame(np.load(Path(os.environ["RIG_OUT"], "world.npy")), 255.0))
+
+    def look_at(self, shift: int) -> None:
+        """Show the camera something else."""
+        self.body.look_at(self._sight(shift))
 
     def picture(self, shift: int) -> Any:
-        """What the camera should show of these stripes, set as it is."""
-        from reseau_sims.serving import Pattern
-
-        return Pattern(640, 480, shift)(self.camera.view)
+        """What the camera should show of it, set as it is."""
+        return self._sight(shift)(self.camera.view)
 
     def start_camera(self, fourcc: str) -> str:
         """Begin to feed the video loop; gives the node that captures."""

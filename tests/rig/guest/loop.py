@@ -14,8 +14,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reseau_sims.serving import CameraBody, View
 
@@ -38,7 +40,8 @@ G_CTRL, S_CTRL = _both_ways(27, 8), _both_ways(28, 8)
 QUERYCTRL, QUERYMENU = _both_ways(36, 68), _both_ways(37, 44)
 S_DV_TIMINGS, ENUM_DV_TIMINGS = _both_ways(87, 132), _both_ways(98, 148)
 OUTPUT, MAPPED, PROGRESSIVE, NEXT = 2, 1, 1, 0x80000000
-TYPES = {"GREY": np.dtype(np.uint8), "Y16 ": np.dtype("<u2")}
+BITS = {"GREY": 8, "Y10 ": 10, "Y12 ": 12, "Y16 ": 16, "YUYV": 8}
+"""Of a grey value; more than eight lie in the low bits of two bytes."""
 
 
 def nodes() -> dict[str, str]:
@@ -59,11 +62,11 @@ class LoopCamera:
     body : CameraBody
         Its width and height are those of the frames.
     fourcc : str
-        GREY or Y16.
+        GREY, Y10, Y12, Y16 or YUYV.
     """
 
     def __init__(self, body: CameraBody, fourcc: str) -> None:
-        self._body, self._type = body, TYPES[fourcc]
+        self._body, self._fourcc = body, fourcc
         found = nodes()
         self.node = found["cap"]
         self._out, self._cap = (os.open(found[end], os.O_RDWR) for end in ("out", "cap"))
@@ -91,7 +94,7 @@ class LoopCamera:
     def view(self) -> View:
         """How the capture node is set: its brightness is an offset; it has no exposure and no gain in dB."""
         brightness = float(self._get("Brightness") - 128)
-        full = float(np.iinfo(self._type).max)
+        full = float(2 ** BITS[self._fourcc] - 1)
         gain = self._get("Gain") / 10
         return View(10_000.0, gain, brightness * full / 255, 0, 0, self._body.width, self._body.height, full)
 
@@ -151,7 +154,7 @@ class LoopCamera:
                 wanted = self._body.sight, self.view
                 if wanted != drawn:
                     drawn = wanted
-                    picture = np.ascontiguousarray(self._body.draw(wanted[1]), self._type).tobytes()
+                    picture = _bytes(self._body.draw(wanted[1]), self._fourcc)
                 if not free:
                     done = _buffer()
                     fcntl.ioctl(self._out, DQBUF, done)  # when the driver has shown it
@@ -176,6 +179,13 @@ class LoopCamera:
             fcntl.ioctl(self._out, QUERYBUF, data)
             (offset,), (length,) = struct.unpack_from("<I", data, 64), struct.unpack_from("<I", data, 72)
             yield mmap.mmap(self._out, length, offset=offset)
+
+
+def _bytes(picture: NDArray[Any], fourcc: str) -> bytes:
+    if fourcc == "YUYV":
+        # Every second byte is of colour, of which there is none.
+        picture = np.stack([picture, np.full_like(picture, 128)], -1)
+    return np.ascontiguousarray(picture, np.uint8 if BITS[fourcc] == 8 else "<u2").tobytes()
 
 
 def _buffer(index: int = 0, used: int = 0) -> bytearray:
