@@ -23,6 +23,14 @@ descriptors, sockets and threads are as many as before.
 Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disconnected; of the instrument:
 stuck, wrong state, out of range, power-cycled. `test_endurance` goes on with one fault in a hundred answers.
 
+Of cameras an answer is a frame. Late, it is sent late; dropped, all of it is lost; truncated, half of its
+packets are lost (GigE Vision) or it is torn in the middle (V4L2); corrupted, the same, as a packet with a
+wrong checksum never arrives, or its buffer is marked as damaged; repeated, the one of before comes again.
+Disconnected, the cable is pulled, and on GigE Vision put back 0.2 s later; stuck, no frame comes any more
+until it is started anew; wrong state, control is lost, or the kernel's queue reports an error; out of
+range, the frame is stamped an hour ahead; power-cycled, the camera forgets who had it and how it was set.
+No frame that was handed out was damaged, stale, or another one's.
+
 """
 
 

@@ -89,7 +89,8 @@ class GigeCamera:
         # A file, not a pipe: the library may warn of much, and nobody reads it.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
         self._ended, self._lock = False, threading.Lock()
-        self._given = self._obeyed = 0
+        self._given, self._obeyed, self._serving = 0, 0, False
+        self._replugging: threading.Thread | None = None
         self._heard = threading.Condition()
         self._last: tuple[int, int, bytes] | None = None
         self._start()
@@ -117,7 +118,7 @@ class GigeCamera:
             said = self._said.read().decode("utf-8", "replace").strip()
             self.close()
             raise UsageError(said or "ended at once", where="simulated GigE camera")
-        self._given = self._obeyed = 0
+        self._given, self._obeyed, self._serving = 0, 0, True
         self._thread = threading.Thread(target=self._serve, name="GigeCamera", daemon=True)
         self._thread.start()
 
@@ -136,6 +137,10 @@ class GigeCamera:
             pixels = encode(layout, self._filled(view))
             self.frames += 1
             self._answer(number, stamp, pixels)
+
+        with self._heard:
+            self._serving = False
+            self._heard.notify_all()
 
     def _filled(self, view: View) -> NDArray[Any]:
         """What is seen; black where a frame reaches beyond the sensor."""
@@ -170,7 +175,11 @@ class GigeCamera:
         """What befalls the camera itself, behind the frame."""
         if fault.kind == "stuck":
             self._besides(door.STICK)
-        elif fault.kind in ("disconnected", "wrong state"):
+        elif fault.kind == "disconnected":
+            # The thread of the frames, which this is, ends with the process that is unplugged.
+            self._replugging = threading.Thread(target=self._unplug_for, args=(fault.seconds,), daemon=True)
+            self._replugging.start()
+        elif fault.kind == "wrong state":
             self.hang_up()
         elif fault.kind == "power-cycled":
             self.power_cycle()
@@ -194,6 +203,11 @@ class GigeCamera:
         self._close_pipes()
         self._start()
 
+    def _unplug_for(self, seconds: float) -> None:
+        self.pull_plug()
+        time.sleep(seconds)
+        self.plug_in()
+
     def _besides(self, kind: bytes) -> None:
         """An order besides any frame, obeyed when this returns, unless the frames' own thread gives it."""
         with self._heard:
@@ -202,7 +216,7 @@ class GigeCamera:
         self._order(kind)
         if threading.current_thread() is not self._thread:
             with self._heard:
-                self._heard.wait_for(lambda: self._obeyed >= number, _OBEY_S)
+                self._heard.wait_for(lambda: self._obeyed >= number or not self._serving, _OBEY_S)
 
     def _order(
         self,
@@ -224,6 +238,8 @@ class GigeCamera:
         if self._ended:
             return
         self._ended = True
+        if self._replugging is not None:
+            self._replugging.join()
         self._order(door.END)
         try:
             self._process.wait(5.0)
