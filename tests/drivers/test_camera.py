@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -18,7 +19,8 @@ from reseau.instruments import Camera
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import V4l2Settings, v4l2
 from reseau_drivers.codecs import v4l2 as uapi
-from reseau_sims.serving import CameraBody, Fault, Pattern, VideoCamera
+from reseau_sims import World
+from reseau_sims.serving import CameraBody, Fault, Pattern, Still, VideoCamera, View
 
 Cam = cameras.Camera[V4l2Settings]
 
@@ -94,6 +96,15 @@ def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, 
         assert shot.pattern == {"YUYV": "YUYV", "SRGGB8": "RGGB"}.get(name, "")
         assert shot.frame.pixels is shot.pixels
         assert len(shot.raw) == (shot.pixels.size * 2 if name == "YUYV" else 0)
+
+
+def test_frames_are_to_the_bit_what_the_world_drew() -> None:
+    frame = World.standard(seed=5).photo_i()
+    device = VideoCamera(CameraBody(Still(frame), frame.width, frame.height))
+    with v4l2("camera", device.open, settings={"exposure_us": 10_000.0}, seconds=10.0) as camera:
+        assert camera.expose().frame.sha256 == frame.sha256
+        camera.configure(format="Y16")
+        assert (camera.expose().pixels == frame.pixels * np.uint16(257)).all()
 
 
 def test_a_compressed_frame_keeps_its_file(device: VideoCamera) -> None:
@@ -256,6 +267,31 @@ def test_the_self_test_tells_rate_losses_clock_and_dark_noise(device: VideoCamer
     assert "offset 0 s" in found["clock"]
     assert "noise 0 at the shortest exposure" in found["dark"]
     assert camera.settings == before
+
+
+class _Noisy:
+    """Light of 1000 grey values at 10 ms, on a dark level of 50 with a noise of 3."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(8)
+
+    def __call__(self, view: View) -> Any:
+        noise = self._rng.normal(0.0, 3.0, (view.height, view.width))
+        return np.rint(50 + 1000 * view.light + noise).astype(np.uint16)
+
+
+def test_the_self_test_measures_what_is_there(device: VideoCamera, camera: Cam) -> None:
+    device.body.look_at(_Noisy())
+    camera.configure(format="Y16", rate=50.0)
+    script = device.body.script
+    script.fault_at(script.count + 3, Fault("dropped"))
+    script.fault_at(script.count + 5, Fault("corrupted"))
+    found = camera.check(5.0)
+    assert found["dropped"] == "2 of 14"
+    mean, noise = (float(word) for word in re.findall(r"[\d.]+", found["dark"]))
+    # The shortest exposure is 100 µs: a hundredth of that light. Rounding to grey values adds its noise.
+    assert mean == pytest.approx(60.0, abs=0.5)
+    assert noise == pytest.approx(np.hypot(3.0, 12**-0.5), abs=0.15)
 
 
 def test_a_reading_is_what_bluesky_takes(camera: Cam) -> None:
