@@ -16,7 +16,14 @@ import numpy as np
 import psutil
 import pytest
 
-from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, UsageError
+from reseau.errors import (
+    ConnectionLost,
+    DeadlineError,
+    InstrumentError,
+    RefusedError,
+    SettingError,
+    UsageError,
+)
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import AravisSettings, aravis, gvcp
 from reseau_sims import World
@@ -133,6 +140,43 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert camera.settings == before
     assert (camera.expose().pixels == seen(0)).all()
     assert camera.reconnections == 1
+
+
+def test_any_feature_is_set_by_its_name_also_after_the_plug_was_pulled(
+    simulated: GigeCamera, camera: Cam
+) -> None:
+    source = camera._source
+    assert isinstance(source, cameras.Aravis)
+    camera.configure(features="BinningHorizontal=2 GainAuto=Continuous TestBoolean=True")
+    camera.expose()
+    simulated.pull_plug()
+    simulated.plug_in()
+    with pytest.raises(InstrumentError):
+        camera.expose(1.5)
+    camera.connect()
+    assert source._camera.get_integer("BinningHorizontal") == 2
+    assert source._camera.get_string("GainAuto") == "Continuous"
+    assert source._camera.get_boolean("TestBoolean")
+    assert camera.reconnections == 2
+
+
+@pytest.mark.parametrize(
+    ("features", "error", "said"),
+    [
+        ("Nope=1", RefusedError, "has no feature Nope"),
+        ("GainAuto=Sometimes", RefusedError, "'Sometimes' not an entry"),
+        ("ExposureTimeAbs=1234.5", RefusedError, "ExposureTimeAbs is 1234, not 1234.5"),
+        ("GainAuto", SettingError, "features: 'GainAuto' sets no feature"),
+        ('DeviceVendorName="me', SettingError, "is not whole"),
+    ],
+)
+def test_a_feature_that_is_none_or_takes_no_such_value_is_said(
+    camera: Cam, features: str, error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        camera.configure(features=features)
+    assert (camera.settings.features, camera.reconnections) == ("", 1)
+    assert camera.expose().fresh
 
 
 def test_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Cam) -> None:

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reseau.errors import DeadlineError, SettingError, UsageError
-from reseau.instruments import Deadline, Settings, Status, choice, quantity
+from reseau.instruments import Deadline, Settings, Status, choice, quantity, text
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Pulser(Settings):
     voltage: float = quantity(300.0, "V", 40.0, 300.0)
     averages: int = quantity(1, "", 1, 64)
     mode: str = choice("echo", "echo", "through")
+    note: str = text("")
 
 
 @pytest.mark.parametrize(
@@ -35,6 +36,7 @@ class Pulser(Settings):
         {"averages": 1.5},
         {"averages": 65},
         {"mode": "other"},
+        {"note": 3},
         {"colour": 3},
     ],
 )
@@ -53,7 +55,7 @@ def test_a_bench_narrows_limits() -> None:
 
 @given(st.floats(40, 300))
 def test_what_is_within_the_limits_is_taken(voltage: float) -> None:
-    assert Pulser(voltage).to_dict() == {"voltage": voltage, "averages": 1, "mode": "echo"}
+    assert Pulser(voltage).to_dict() == {"voltage": voltage, "averages": 1, "mode": "echo", "note": ""}
 
 
 def test_a_deadline_runs_out_and_its_parts_never_after_it() -> None:

@@ -16,11 +16,12 @@ from threading import Event, Thread
 from typing import Any
 
 from reseau.errors import ConnectionLost, InstrumentError, ProtocolError, RefusedError, UsageError
-from reseau.instruments import Deadline, Identity, choice, quantity
+from reseau.instruments import Deadline, Identity, choice, quantity, text
 
 from ..codecs.pixels import GENICAM, decode
 from .camera import CameraSettings, Taken
 from .clocks import Stamps, Wrapping, realtime_offset
+from .features import require_within, same_value, wanted_features
 from .gvcp import HEARTBEAT_S, controlled_elsewhere, require_answer, require_control
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
@@ -46,6 +47,11 @@ class AravisSettings(CameraSettings):
     stamp: str = choice("end", "end", "start")
     chunks: str = choice("off", "off", "on")
     packet_size: int = quantity(0, "B", 0, 65535)
+    features: str = text("")  # by name, before all others; see :mod:`.features`
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted_features(self.features)
 
 
 @cache
@@ -163,6 +169,8 @@ class Aravis:
         self.halt()
         self._settings = settings
         with self._told("set") as camera:
+            for name, value in wanted_features(settings.features):
+                self._set_feature(camera, name, value)
             self._set_region(camera, settings)
             self._set_light(camera, settings)
             if settings.trigger == "off":
@@ -292,6 +300,15 @@ class Aravis:
             return ours - theirs, (took + 1) // 2
         return None
 
+    def _set_feature(self, camera: Any, name: str, value: str) -> None:
+        if not camera.is_feature_available(name):
+            raise RefusedError(f"has no feature {name}", do="arv-tool-0.8 features lists those that it has")
+        # No names for the device and its nodes: see :meth:`_told`.
+        camera.get_device().get_feature(name).set_value_from_string(value)
+        got = str(camera.get_device().get_feature(name).get_value_as_string())
+        if not same_value(got, value):
+            raise RefusedError(f"{name} is {got}, not {value}")
+
     def _set_chunks(self, camera: Any, wanted: bool) -> None:
         """Have each frame tell with which exposure and gain it was taken, as far as it can."""
         self._parser, self._chunks = None, ()
@@ -325,19 +342,19 @@ class Aravis:
 
     def _set_light(self, camera: Any, settings: AravisSettings) -> None:
         if settings.rate:
-            _within("rate", settings.rate, camera.get_frame_rate_bounds())
+            require_within("rate", settings.rate, camera.get_frame_rate_bounds())
             camera.set_frame_rate(settings.rate)
         self._period_ns = _UNKNOWN_PERIOD_NS
         if camera.is_frame_rate_available() and camera.get_frame_rate() > 0:
             self._period_ns = int(1e9 / camera.get_frame_rate())
         if settings.exposure_us:
-            _within("exposure_us", settings.exposure_us, camera.get_exposure_time_bounds())
+            require_within("exposure_us", settings.exposure_us, camera.get_exposure_time_bounds())
             camera.set_exposure_time(settings.exposure_us)
         self._exposure_ns = None
         if camera.is_exposure_time_available():
             self._exposure_ns = int(camera.get_exposure_time() * 1000)
         if settings.gain >= 0:
-            _within("gain", settings.gain, camera.get_gain_bounds())
+            require_within("gain", settings.gain, camera.get_gain_bounds())
             camera.set_gain(settings.gain)
         self._gain = float(camera.get_gain()) if camera.is_gain_available() else float("nan")
 
@@ -369,12 +386,6 @@ def _held(thing: Any) -> Any:
     if thing is None:
         raise ConnectionLost("was closed meanwhile")
     return weakref.proxy(thing)
-
-
-def _within(name: str, value: float, bounds: Any) -> None:
-    low, high = float(bounds[0]), float(bounds[1])
-    if not low <= value <= high:
-        raise RefusedError(f"{name} {value:g} is beyond its {low:g}…{high:g}")
 
 
 def _meaning(error: Any, what: str, lost: bool) -> InstrumentError:

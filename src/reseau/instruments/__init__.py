@@ -7,7 +7,7 @@ group ``reseau.instruments``; so may be those of others.
 from .deadline import Deadline
 from .device import Device
 from .protocols import Camera, Exposure, Instrument, Movable, Oscilloscope, Turntable, UltrasonicScanner
-from .settings import Limits, Settings, choice, quantity
+from .settings import Limits, Settings, choice, quantity, text
 from .status import Status
 from .values import AxisState, BScan, Identity, ScreenPicture, Waveform
 
@@ -31,4 +31,5 @@ __all__ = [
     "Waveform",
     "choice",
     "quantity",
+    "text",
 ]

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from ..errors import SettingError
 
-__all__ = ["Limits", "Settings", "choice", "quantity"]
+__all__ = ["Limits", "Settings", "choice", "quantity", "text"]
 
 Limits = Mapping[str, tuple[float, float]]
 """Lowest and highest value of a setting, by its name."""
@@ -35,9 +35,14 @@ def choice(default: str, *options: str) -> Any:
     return field(default=default, metadata={"options": options})
 
 
+def text(default: str) -> Any:
+    """A field of settings that is text of its own form, which the driver checks."""
+    return field(default=default, metadata={"text": True})
+
+
 @dataclass(frozen=True)
 class Settings:
-    """Base of an instrument's settings; its fields are made by :func:`quantity` and :func:`choice`.
+    """Base of an instrument's settings; fields are made by :func:`quantity`, :func:`choice`, :func:`text`.
 
     Raises
     ------
@@ -64,6 +69,10 @@ class Settings:
                     raise SettingError(
                         f"{value!r} is none of {', '.join(each.metadata['options'])}", where=each.name
                     )
+                continue
+            if "text" in each.metadata:
+                if not isinstance(value, str):
+                    raise SettingError(f"{value!r} is no text", where=each.name)
                 continue
             whole = isinstance(each.default, int)
             if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
