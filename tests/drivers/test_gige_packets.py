@@ -23,7 +23,7 @@ from reseau.instruments import Deadline
 from reseau_drivers.camera import Aravis, AravisSettings, Taken, aravis
 from reseau_sims.serving import CameraBody
 
-from .rigs import gige_camera
+from .rigs import aravis_is_missing, gige_camera
 
 WIDTH, HEIGHT, HALF = 64, 32, 1024
 IMAGE = bytes(range(256)) * 8
@@ -147,6 +147,40 @@ def test_blocks_that_wrap_come_twice_or_never_are_told_apart() -> None:
         # A camera that counts from 1: none is lost between 65535 and 1; 2 and 3 never came.
         assert numbers == [65534, 65535, 65536, 65539]
         assert pair.source.dropped == 2
+
+
+class _Numbered:
+    """A whole buffer of Aravis's, of which only the number is asked."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def get_status(self) -> Any:
+        from gi.repository import Aravis as library
+
+        return library.BufferStatus.SUCCESS
+
+    def get_frame_id(self) -> int:
+        return self._number
+
+
+@pytest.mark.skipif(bool(aravis_is_missing()), reason=aravis_is_missing())
+@pytest.mark.parametrize(
+    ("numbers", "lost"),
+    [
+        ([*range(65530, 65536), *range(1, 6)], 0),  # GigE Vision 1
+        ([*range(65530, 65536), *range(6)], 0),  # of cameras that use 0, too
+        (range(65530, 65542), 0),  # GigE Vision 2 and USB3 Vision, which do not wrap
+        (range(65530, 65542, 3), 6),
+    ],
+)
+def test_numbers_are_counted_on_however_many_bits_they_have(numbers: Any, lost: int) -> None:
+    source = Aravis("127.0.0.1")
+    counted = [source._counted(_Numbered(number)) for number in numbers]
+    assert counted[-1] is not None
+    assert counted[0] is not None
+    assert counted[-1] - counted[0] == len(counted) - 1 + lost
+    assert source.dropped == lost
 
 
 def test_a_frame_of_another_size_is_none() -> None:
