@@ -96,7 +96,12 @@ def _rows(result: SensorResult) -> list[tuple[str, str, str, str]]:
 def _edge(edge: EdgeSpread) -> dict[str, object]:
     """Tests of the edge, and the free curve in steps of a sixteenth."""
     tests = [
-        (test["name"], "yes" if test["passed"] else "no", f"{test['p']:.2g}", f"{test['statistic']:.3g}")
+        (
+            test["name"],
+            "yes" if test["passed"] else "no",
+            f"{test['p']:.2g}" if test["p"] >= 5e-4 else "< 0.001",
+            f"{test['statistic']:.3g}",
+        )
         for test in edge.tests()
     ]
     curve: list[tuple[str, ...]] = []

@@ -114,7 +114,7 @@ def plain_iso(frame: Frame, frequency: Array) -> Array:
     lines = (spread[2:] - spread[:-2]) / 2
     k = np.arange(len(lines))
     lines = lines * _hamming(k - (len(lines) - 1) / 2, len(lines))
-    along_row = frequency / np.cos(np.arctan(line[0]))
+    along_row = frequency * np.cos(np.arctan(line[0]))
     found = np.abs(np.exp(-2j * np.pi * np.outer(along_row, k / 4)) @ lines) / abs(lines.sum())
     return found / np.sinc(along_row / 2)
 
