@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from reseau.data import Frame
 from reseau.designs import coded_testfield
 from reseau.errors import StateError
 from reseau.formats import TestfieldDesign
-from reseau.instruments import AxisState, Deadline, Device, Identity, Settings, Status, quantity
+from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Settings, Status, quantity
 from reseau.procedures.calibration import CameraModel
 from reseau.procedures.live import LiveTestfield
 from reseau.procedures.measuring import measurer_of
@@ -70,6 +71,7 @@ class Axis:
     """One axis."""
 
     parent = None
+    unit, limits = "deg", (-5.0, 360.0)
 
     def __init__(self, table: FieldTable, key: str) -> None:
         self._table, self.key, self.name = table, key, f"table_{key}"
@@ -138,6 +140,19 @@ class FieldCamera(_Simple):
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Taken]:
         return (self.expose(seconds) for _ in range(count))
+
+
+class Sweeper(_Simple):
+    """A scanner that does not tell its frequency."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, Settings())
+        self.sweeps = 0
+
+    def scan(self, seconds: float | None = None) -> BScan:
+        self.sweeps += 1
+        pixels = np.full((20, 30), self.sweeps, np.uint8)
+        return BScan(pixels, (0.1, 0.1), (0.0, 0.0), 1480.0, math.nan, 3.0, datetime.now(UTC))
 
 
 class FieldRig:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive, Session
-from reseau.capture import Goal, Plan, Step, carry_out, paper_steps, plans, rerun
+from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
 from reseau.errors import ArchiveError, EstimationError, StateError, UsageError
 
 from .fieldrig import FieldRig
@@ -34,7 +34,10 @@ def kept(tmp_path: Path) -> Session:
 
 def test_the_papers_recordings_are_36_and_each_has_a_name() -> None:
     assert len(EVERY) == len({step.name for step in EVERY}) == 36
-    assert len(paper_steps(heights=(0.0, 100.0))) == 72
+    lifted = at_heights(EVERY, (0.0, 100.0))
+    assert len({step.name for step in lifted}) == 72
+    assert lifted[36].position == dict(EVERY[0].position) | {"z": 100.0}
+    assert at_heights(EVERY, ()) == EVERY
     assert [step.position for step in paper_steps(axes=("tilt",))] == [{"tilt": t} for t in (0.0, 30.0, 45.0)]
 
 

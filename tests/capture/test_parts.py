@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reseau.capture import Goal, Limits, edge_sigma, exposure_fault, read_steps, readiness, shift_between
@@ -41,6 +41,7 @@ def test_a_frame_without_edges_has_no_focus() -> None:
 
 
 @given(dx=st.floats(-0.4, 0.4), dy=st.floats(-0.4, 0.4), seed=st.integers(0, 5))
+@settings(deadline=None)
 def test_a_shift_is_found_within_its_sigma(dx: float, dy: float, seed: int) -> None:
     found, sigma = shift_between(scene(seed=seed), scene((dx, dy), seed=seed + 100))
     assert np.all(np.abs(found - [dx, dy]) < 5 * sigma + 0.004)  # the linearisation leaves thousandths

@@ -11,9 +11,10 @@ import pytest
 
 from reseau import designs
 from reseau.cli import run
+from reseau.data import Frame
 from reseau.errors import StateError
 
-from ..capture.fieldrig import DESIGN, FieldRig
+from ..capture.fieldrig import DESIGN, FieldRig, Sweeper
 
 BENCH = """\
 schema = "reseau-bench/1"
@@ -34,7 +35,7 @@ TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
     """A folder with a bench, a design and poses; and what stands behind the bench."""
     rig = FieldRig()
-    made = {"table": rig.table, "camera": rig.camera}
+    made = {"table": rig.table, "camera": rig.camera, "near": Sweeper("near"), "far": Sweeper("far")}
     monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # locks of parallel tests are apart
     monkeypatch.chdir(tmp_path)
@@ -89,11 +90,66 @@ def test_options_come_from_a_toml_file_and_the_command_line_wins(
     Path("plan.toml").write_text('count = 3\nname = "toml"\n')
     assert capture("frames", "--plan", "plan.toml", "--count", "2", "--json") == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [event["event"] for event in events] == ["frame", "frame", "end"]
+    assert [event["event"] for event in events] == ["begin", "frame", "frame", "end"]
+    assert (events[0]["session"], events[0]["archive"], events[0]["poses"]) == ("toml", "archive", 2)
     assert events[-1]["status"] == "done"
+    Path("plan.toml").write_text('checks = 0\nfirst = "x"\n')
+    assert capture("testfield", "--plan", "plan.toml") == 2
+    assert "--first" in capsys.readouterr().err
     Path("plan.toml").write_text("cuont = 3\n")
     assert capture("frames", "--plan", "plan.toml") == 2
     assert "plan.toml: unknown key `cuont`; there are" in capsys.readouterr().err
+
+
+def test_toml_names_options_as_the_command_line_does_and_may_hold_lists_and_tables(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("monday.toml").write_text(
+        'design = "field.json"\nposes = "poses.csv"\npitch = 0.027\nfree = ["c", "x0", "y0", "K1"]\n'
+        "row-jitter = 0.0086\nfill = 0.8\nchecks = 0\njson = true\n[park]\ntilt = 7\nroll = 0.5\n"
+    )
+    Path("poses.csv").write_text("tilt\n0\n")
+    assert capture("testfield", "--plan", "monday.toml", "--name", "monday") == 1
+    told, failed = capsys.readouterr()
+    assert '"event": "end", "status": "failed"' in told
+    assert "1 image" in failed  # of one nothing can be computed
+    assert (rig.table.stands["tilt"], rig.table.stands["roll"]) == (7, 0.5)
+    assert run(["archive", "show", "monday", "--json"]) == 0
+    given = json.loads(capsys.readouterr().out)["parameters"]
+    assert (given["free"], given["row_jitter"], given["park"]) == (
+        ["c", "x0", "y0", "K1"],
+        0.0086,
+        {"tilt": 7.0, "roll": 0.5},
+    )
+    Path("photos.toml").write_text('reseau = "none.json"\nobject = "none.json"\nbody = false\n')
+    assert capture("oscilloscope", "--plan", "photos.toml") == 2
+    assert "none.json: cannot be read" in capsys.readouterr().err
+
+
+def test_a_session_that_is_resumed_heeds_no_other_options_and_says_so(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert capture("frames", "--count", "2", "--name", "a") == 0
+    capsys.readouterr()
+    assert capture("frames", "--resume", "--name", "a", "--count", "3") == 2
+    assert capsys.readouterr().err == "reseau: --count: is as the session was begun; leave it out\n"
+    assert rig.camera.exposures == 2
+
+
+def test_what_a_program_is_told_is_json_line_by_line(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def strict(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 120)
+    assert capture("frames", "--checks", "2", "--name", "a", "--json") == 1
+    told, failed = capsys.readouterr()
+    events = [json.loads(line, parse_constant=strict) for line in told.splitlines()]
+    assert [event["event"] for event in events] == ["begin", "check", "end"]
+    assert events[1]["edge_px"] is None
+    assert events[-1]["status"] == "failed"
+    assert failed == f"reseau: {events[-1]['why']}\n"
 
 
 def test_a_session_that_failed_is_resumed_where_it_stood(
@@ -141,6 +197,13 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
         (["frames", "--resume"], "is no archive"),
         (["testfield", *TESTFIELD, "--until", "c < 1"], "is no goal"),
         (["testfield", *TESTFIELD, "--park", "tilt"], "--park: is 'tilt'"),
+        (["testfield", *TESTFIELD, "--park", "z=0"], "--park: the table has no axis z; it has tilt, roll"),
+        (["testfield", *TESTFIELD, "--park", "roll=400"], "--park: roll 400 is not between -5 and 360 deg"),
+        (["testfield", *TESTFIELD, "--heights", "0,50"], "z 0: the table has no axis z"),
+        (["testfield", *TESTFIELD[:-6], "--free", "c,q"], "q: is none of c, x0"),
+        (["testfield", *TESTFIELD, "--until", "sigma_K2 < 1"], "sigma_K2: is none of c, x0, y0, K1"),
+        (["testfield", *TESTFIELD, "--until", "sigma_c < 1 px"], "sigma_c: is in mm, not px"),
+        (["testfield", *TESTFIELD[:4], "--until", "sigma_fx < 1 um"], "sigma_fx: is in px, not mm"),
         (["scan"], "has none for a UltrasonicScanner"),
         (["frames", "--camera", "table"], "table: is no Camera"),
         (["frames", "--archive", "poses.csv"], "cannot be made"),
@@ -154,6 +217,10 @@ def test_what_cannot_be_done_is_told_in_one_line(
     assert says in err.splitlines()[-1]
     assert "Traceback" not in err
     assert rig.camera.exposures == 0
+    assert not rig.table.moves
+    if Path("archive").is_dir():  # no session began that could do nothing
+        assert run(["archive", "list"]) == 0
+        assert capsys.readouterr().out == ""
 
 
 def test_a_bench_in_use_is_refused(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,6 +229,48 @@ def test_a_bench_in_use_is_refused(rig: FieldRig, capsys: pytest.CaptureFixture[
     with BenchLock(["sim-camera"], "session other"):
         assert capture("frames", "--name", "a") == 1
     assert "sim-camera: is in use by session other" in capsys.readouterr().err
+    assert capture("frames", "--name", "a") == 0  # the name was not given away
+
+
+def test_a_session_that_another_process_carries_out_is_not_resumed(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not on another bench either, and before its frames are looked through."""
+    from reseau.archive import Archive, tiff_of
+    from reseau.capture import BenchLock
+
+    rig.camera.spoil = lambda number, pixels: 0 // 0
+    with pytest.raises(ZeroDivisionError):
+        capture("frames", "--name", "a")
+    with Archive.open("archive") as archive:
+        key = {"session": "a", "step": "00000", "kind": "frame", "take": 0}
+        archive.objects.put(tiff_of(Frame(np.zeros((4, 4), np.uint8), 255.0), key), ".tif")
+        with BenchLock([f"{archive.place}: a"], "session a"):
+            assert capture("frames", "--resume") == 1
+        assert "archive: a: is in use by session a (process" in capsys.readouterr().err
+        assert not archive.session("a").frames()
+
+
+def test_sections_are_those_of_the_scanner_that_is_named_and_the_session_keeps_to_it(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("near", "far")
+    Path("bench.toml").write_text(
+        BENCH + "".join(f'[instruments.{n}]\ndriver = "{n}"\naddress = "sim-{n}"\n' for n in names)
+    )
+    assert capture("scan") == 2
+    assert "bench: has near, far for a UltrasonicScanner; name one" in capsys.readouterr().err
+    assert capture("scan", "--scanner", "far", "--count", "2", "--name", "a") == 0
+    out = capsys.readouterr().out
+    assert out == "session a\n1/2 section 000: scan\n2/2 section 001: scan\na: done, 2 scans in archive\n"
+    assert capture("scan", "--resume", "--name", "a") == 0
+    capsys.readouterr()
+    assert run(["archive", "show", "a", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["parameters"]["scanner"] == "far"
+    assert [f["facts"]["frequency_khz"] for f in document["frames"]] == [None, None]
+    assert run(["archive", "list"]) == 0
+    assert "2 frames   0 results  done       a" in capsys.readouterr().out
 
 
 def test_bad_frames_are_told_and_kept(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:

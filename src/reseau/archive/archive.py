@@ -16,7 +16,7 @@ from ..errors import ArchiveError
 from . import schema
 from .objects import LocalObjects, Objects, objects_at
 from .records import SessionSummary, utc
-from .session import Session
+from .session import INPUT, Session
 
 __all__ = ["Archive"]
 
@@ -88,8 +88,15 @@ class Archive:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def begin(self, name: str, plan: str, parameters: Mapping[str, Any], bench: str = "") -> Session:
-        """Begin a session.
+    def begin(
+        self,
+        name: str,
+        plan: str,
+        parameters: Mapping[str, Any],
+        bench: str = "",
+        inputs: Mapping[str, str] | None = None,
+    ) -> Session:
+        """Begin a session, with all that it is given, or not at all.
 
         Parameters
         ----------
@@ -101,6 +108,8 @@ class Archive:
             Of the plan, JSON values.
         bench : str
             The text of ``bench.toml``.
+        inputs : mapping, optional
+            The text of files that it works with, designs, by name.
 
         Raises
         ------
@@ -109,6 +118,10 @@ class Archive:
         """
         if not name or any(c in name for c in "/\\\0") or name.startswith("."):
             raise ArchiveError("is no name of a session", where=repr(name), do="leave out slashes")
+        files = {}
+        for role, text in (inputs or {}).items():
+            data, suffix = text.encode("utf-8"), Path(role).suffix
+            files[role] = data, suffix, self.objects.put(data, suffix)
         row = {
             "name": name,
             "plan": plan,
@@ -122,7 +135,15 @@ class Archive:
                 raise ArchiveError(
                     "is the name of a session in this archive", where=name, do="use --resume, or another name"
                 )
-            connection.execute(schema.sessions.insert().values(row))
+            made = connection.execute(schema.sessions.insert().values(row)).inserted_primary_key
+            assert made is not None
+            for role, (data, suffix, sha256) in files.items():
+                connection.execute(
+                    schema.frames.insert().values(
+                        session_id=made[0], step=role, kind=INPUT, take=0, sha256=sha256, suffix=suffix,
+                        size=len(data), facts={}, clock={}, stored=row["begun"],
+                    )
+                )  # fmt: skip
         return self.session(name)
 
     def session(self, name: str) -> Session:
@@ -147,8 +168,8 @@ class Archive:
         """All sessions in the order in which they were begun, with how many frames and results they have."""
         s = schema.sessions.c
 
-        def count(table: sa.Table) -> sa.ScalarSelect[int]:
-            return sa.select(sa.func.count()).where(table.c.session_id == s.id).scalar_subquery()
+        def count(table: sa.Table, *where: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
+            return sa.select(sa.func.count()).where(table.c.session_id == s.id, *where).scalar_subquery()
 
         ended = (
             sa.select(schema.ends.c.status)
@@ -157,9 +178,8 @@ class Archive:
             .limit(1)
             .scalar_subquery()
         )
-        query = sa.select(
-            s.name, s.plan, s.begun, count(schema.frames), count(schema.results), ended
-        ).order_by(s.id)
+        taken = count(schema.frames, schema.frames.c.kind != INPUT)
+        query = sa.select(s.name, s.plan, s.begun, taken, count(schema.results), ended).order_by(s.id)
         with schema.connected(self._engine) as connection:
             rows = connection.execute(query).all()
         return [

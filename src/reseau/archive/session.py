@@ -18,7 +18,10 @@ from .objects import Objects
 from .picture import frame_of, tiff_of
 from .records import ArchivedFrame, ArchivedResult, Verdict, utc
 
-__all__ = ["Session"]
+__all__ = ["INPUT", "Session"]
+
+INPUT = "input"
+"""Kind of the files that a session was given."""
 
 
 class Session:
@@ -177,6 +180,23 @@ class Session:
         """
         return frame_of(self.objects.get(archived.sha256, archived.suffix), archived.name)[0]
 
+    def given(self) -> dict[str, ArchivedFrame]:
+        """The files that the session was given, by name."""
+        return {each.step: each for each in self.frames(kind=INPUT)}
+
+    def input(self, name: str) -> str:
+        """The text of a file that it was given.
+
+        Raises
+        ------
+        ArchiveError
+            When it was given none of this name, or it is lost or damaged.
+        """
+        found = self.find(name, INPUT)
+        if found is None:
+            raise ArchiveError(f"was given no {name}", where=self.name)
+        return self.objects.get(found.sha256, found.suffix).decode("utf-8")
+
     def judge(self, archived: ArchivedFrame, verdict: Verdict) -> None:
         """Write down what was found of a frame; the last word counts, and all are kept."""
         row = {"frame_id": archived.id, "ok": verdict.ok, "why": verdict.why, "facts": verdict.facts}
@@ -277,7 +297,7 @@ class Session:
 
     @property
     def status(self) -> str:
-        """How it ended last: done, aborted, failed; or that it did not end."""
+        """How it ended last: done, stopped, failed; or that it did not end."""
         e = schema.ends.c
         query = sa.select(e.status).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
         with schema.connected(self._engine) as connection:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .adjustment import Options, adjust_network, problem_of
 from .approximate import Approximate, approximate
 from .between import sigma_between_images
-from .calibrated import calibration_of
+from .calibrated import UNITS, calibration_of
 from .components import Kind, estimate_components, reweighted
 from .document import searched_document, to_document
 from .fields import (
@@ -23,6 +23,7 @@ from .problem import BundleFit, BundleProblem
 from .result import Result
 
 __all__ = [
+    "UNITS",
     "Additional",
     "Approximate",
     "BundleFit",

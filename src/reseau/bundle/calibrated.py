@@ -13,12 +13,13 @@ from .between import sigma_between_images
 from .network import Camera
 from .result import Result
 
-__all__ = ["calibration_of"]
+__all__ = ["UNITS", "calibration_of"]
 
-_UNITS = {
+UNITS = {
     "c": "mm", "x0": "mm", "y0": "mm", "K1": "mm^-2", "K2": "mm^-4", "K3": "mm^-6", "P1": "mm^-1",
     "P2": "mm^-1", "fx": "px", "fy": "px", "cx": "px", "cy": "px",
 }  # fmt: skip
+"""Of a camera's parameters; those that are not here have none."""
 
 
 def calibration_of(
@@ -58,10 +59,10 @@ def calibration_of(
     covariance = result.camera_covariance(c)
     sigma = np.sqrt(np.diag(covariance))
     parameters = {
-        key: Quantity(value=value, sigma=0.0, unit=_UNITS.get(key, ""))
+        key: Quantity(value=value, sigma=0.0, unit=UNITS.get(key, ""))
         for key, value in entry.parameters.items()
     } | {
-        key: Quantity(value=float(value), sigma=float(s), unit=_UNITS.get(key, ""))
+        key: Quantity(value=float(value), sigma=float(s), unit=UNITS.get(key, ""))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
     between = zip(names, sigma_between_images(result, c).tolist(), strict=True)

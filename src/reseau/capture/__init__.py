@@ -8,7 +8,7 @@ from .lock import BenchLock
 from .procedure import Procedure, Watch
 from .rerun import Rerun, rerun
 from .run import Decision, carry_out
-from .step import Step, paper_steps, read_steps, spread
+from .step import Step, at_heights, paper_steps, read_steps, spread
 
 __all__ = [
     "Acquisition",
@@ -26,6 +26,7 @@ __all__ = [
     "Rerun",
     "Step",
     "Watch",
+    "at_heights",
     "carry_out",
     "drivers",
     "edge_sigma",

@@ -195,6 +195,29 @@ class Bench:
             raise UsageError("is not on this bench", where=name, do=f"there are {known or 'none'}")
         return self.instruments[name]
 
+    def one(self, kind: type, name: str | None = None) -> Any:
+        """The instrument of a kind: that of a name, or the only one.
+
+        Raises
+        ------
+        UsageError
+            When there is none, or several and none was named.
+        """
+        found = {each: made for each, made in self.instruments.items() if isinstance(made, kind)}
+        names = ", ".join(found) or "none"
+        if name is not None:
+            if not isinstance(self[name], kind):
+                raise UsageError(f"is no {kind.__name__}", where=name, do=f"there are {names}")
+            return self[name]
+        if len(found) != 1:
+            do = "name one" if found else None
+            raise UsageError(f"has {names} for a {kind.__name__}", where="bench", do=do)
+        return next(iter(found.values()))
+
+    def has(self, kind: type) -> bool:
+        """Whether there is an instrument of a kind."""
+        return any(isinstance(each, kind) for each in self.instruments.values())
+
     def connect(self, seconds: float | None = None) -> dict[str, Identity]:
         """Connect all at once.
 

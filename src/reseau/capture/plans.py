@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Sequence
 
 from ..errors import EstimationError, StateError
+from ..instruments import UltrasonicScanner
 from .acquisition import Acquisition, Plan
 from .goal import Goal
 from .step import Step
@@ -85,20 +86,25 @@ def scan(run: Acquisition, count: int = 1) -> Plan:
     for k in range(count):
         step = Step(f"section {k:03d}")
         yield from run.pictures(step, "scan")
+        yield from run.pictures(step, "screen")
 
 
 def oscilloscope(run: Acquisition, body: bool = True, average: int = 1, checks: int = 0) -> Plan:
-    """PHOTO I of the reseau alone, II with a section of the test object behind it, III with one of a body."""
+    """PHOTO I of the reseau alone, II with a section of the test object behind it, III with one of a body.
+
+    Where the bench has no scanner, the operator sweeps.
+    """
+    sweeps = run.has(UltrasonicScanner)
     photos = {"PHOTO I": "blank the screen; nothing but the reseau is photographed"}
-    photos["PHOTO II"] = "put the test object into the tank"
+    photos["PHOTO II"] = "put the test object into the tank" + ("" if sweeps else ", and sweep")
     if body:
-        photos["PHOTO III"] = "put the body into the tank"
+        photos["PHOTO III"] = "put the body into the tank" + ("" if sweeps else ", and sweep")
     for name, what in photos.items():
         step = Step(name)
         yield from run.ask(what, step)
         if name == "PHOTO I":
             yield from _ready(run, checks)
-        else:
+        elif sweeps:
             yield from run.pictures(step, "scan")
         found = yield from run.at(step, average)
         verdict = run.verdict(found)

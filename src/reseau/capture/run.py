@@ -64,7 +64,7 @@ def carry_out(
     Notes
     -----
     To be called in the main thread, where the engine minds Ctrl-C: once, and it pauses after the pose; twice,
-    and it pauses at once. SIGTERM ends it as `stop` does.
+    and it pauses at once. SIGTERM, and SIGHUP of a terminal that is closed, end it as `stop` does.
     """
     in_main = threading.current_thread() is threading.main_thread()
     # Off the main thread there are no signals to be minded.
@@ -83,12 +83,14 @@ def carry_out(
         if outcome is not None:
             _keep_results(run)
         run.kept.end(status)
-        run.watch("end", {"status": status})
-        return None if outcome is None else outcome.plan_result
+        found = None if outcome is None else outcome.plan_result
+        run.watch("end", {"status": status, "why": found if isinstance(found, str) else ""})
+        return found
     except Exception as error:
         known = _known(error)
         with contextlib.suppress(ReseauError):  # an archive that is full cannot be told that it is
             run.kept.end("failed", str(known or error))
+        run.watch("end", {"status": "failed", "why": str(known or error)})
         if known is not None:
             raise known from None
         raise
@@ -138,7 +140,7 @@ def _engaged(
 
 @contextlib.contextmanager
 def _terminated(engine: Any, ended: threading.Event, in_main: bool) -> Iterator[None]:
-    """Have SIGTERM end the run as Ctrl-C twice and `stop` would."""
+    """Have SIGTERM and SIGHUP end the run as Ctrl-C twice and `stop` would."""
     if not in_main:
         yield
         return
@@ -148,11 +150,12 @@ def _terminated(engine: Any, ended: threading.Event, in_main: bool) -> Iterator[
         with contextlib.suppress(Exception):  # there may be nothing to pause any more
             engine.request_pause(False)
 
-    before = signal.signal(signal.SIGTERM, end)
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _keep_results(run: Acquisition) -> None:
@@ -160,7 +163,8 @@ def _keep_results(run: Acquisition) -> None:
     if run.procedure is None:
         return
     frames = run.kept.frames(kind="frame")
-    inputs = {f.name: f.sha256 for f in frames if f.verdict is not None and f.verdict.ok}
+    inputs = {name: given.sha256 for name, given in run.kept.given().items()}
+    inputs |= {f.name: f.sha256 for f in frames if f.verdict is not None and f.verdict.ok}
     there = {result.name: run.kept.content(result) for result in run.kept.results()}
     for name, content in run.procedure.finish().items():
         if there.get(name) != content.encode("utf-8"):

@@ -40,7 +40,7 @@ def mean_frame(frames: list[Frame], name: str) -> Frame:
 
 
 def told(value: float) -> float | None:
-    """A value of the camera; None where it does not tell."""
+    """A value of an instrument; None where it does not tell."""
     return value if math.isfinite(value) else None
 
 

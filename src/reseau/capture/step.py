@@ -13,7 +13,7 @@ from typing import Any
 from ..errors import FormatError
 from ..formats import read_text
 
-__all__ = ["Step", "as_taken", "paper_steps", "read_steps", "spread"]
+__all__ = ["Step", "as_taken", "at_heights", "paper_steps", "read_steps", "spread"]
 
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
 """Axes of the testfield's mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
@@ -49,34 +49,36 @@ def _named(position: Mapping[str, float]) -> Step:
     return Step(" ".join(f"{axis} {value:g}" for axis, value in position.items()), dict(position))
 
 
-def paper_steps(
-    tilts: Sequence[float] = (0.0, 30.0, 45.0), heights: Sequence[float] = (), axes: Sequence[str] = ()
-) -> tuple[Step, ...]:
+def paper_steps(tilts: Sequence[float] = (0.0, 30.0, 45.0), axes: Sequence[str] = ()) -> tuple[Step, ...]:
     """The 36 recordings of Vosselman and Förstner: nine positions, each with the camera turned four times.
 
     Parameters
     ----------
     tilts : sequence of float
         φ (degrees). The board that is not tilted is recorded from one position, another from four.
-    heights : sequence of float
-        Of the board (mm), where a z-stage makes the testfield three-dimensional; each pose at each.
     axes : sequence of str, optional
         Names of the axes that the table has; by default those of the paper. What it lacks is not turned.
     """
     quarters = (0.0, 90.0, 180.0, 270.0)
-    have = set(axes or (TILT, ROLL, CAMERA_ROLL, HEIGHT))
+    have = set(axes or (TILT, ROLL, CAMERA_ROLL))
     steps: dict[str, Step] = {}
-    for height in heights or (None,):
-        for phi in tilts if TILT in have else (0.0,):
-            for kappa in quarters if phi and ROLL in have else (0.0,):
-                for camera in quarters if CAMERA_ROLL in have else (0.0,):
-                    position = {TILT: phi, ROLL: kappa, CAMERA_ROLL: camera}
-                    position = {axis: value for axis, value in position.items() if axis in have}
-                    if height is not None and HEIGHT in have:
-                        position[HEIGHT] = height
-                    step = _named(position)
-                    steps.setdefault(step.name, step)
+    for phi in tilts if TILT in have else (0.0,):
+        for kappa in quarters if phi and ROLL in have else (0.0,):
+            for camera in quarters if CAMERA_ROLL in have else (0.0,):
+                position = {TILT: phi, ROLL: kappa, CAMERA_ROLL: camera}
+                step = _named({axis: value for axis, value in position.items() if axis in have})
+                steps.setdefault(step.name, step)
     return tuple(steps.values())
+
+
+def at_heights(steps: Sequence[Step], heights: Sequence[float]) -> tuple[Step, ...]:
+    """Each pose at each height of the board (mm), as a z-stage lifts it; without heights, the poses alone."""
+    lifted = [
+        Step(f"{step.name} {HEIGHT} {height:g}", {**step.position, HEIGHT: height})
+        for height in heights
+        for step in steps
+    ]
+    return tuple(lifted or steps)
 
 
 def read_steps(path: Path) -> tuple[Step, ...]:

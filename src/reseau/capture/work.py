@@ -90,28 +90,12 @@ class Work:
         self._own_us: float | None = None
 
     def one(self, kind: type) -> Any:
-        """The instrument of a kind.
-
-        Raises
-        ------
-        UsageError
-            When there is none, or several and none was named.
-        """
-        name = self._chosen.get(kind)
-        if name is not None:
-            named = self.bench[name]
-            if not isinstance(named, kind):
-                raise UsageError(f"is no {kind.__name__}", where=name)
-            return named
-        found = [each for each in self.bench.instruments.values() if isinstance(each, kind)]
-        if len(found) != 1:
-            names = ", ".join(each.name for each in found) or "none"
-            raise UsageError(f"has {names} for a {kind.__name__}", where="bench", do="name one")
-        return found[0]
+        """The instrument of a kind: that which was named, or the only one; as :meth:`Bench.one`."""
+        return self.bench.one(kind, self._chosen.get(kind))
 
     def has(self, kind: type) -> bool:
         """Whether the bench has an instrument of a kind."""
-        return any(isinstance(each, kind) for each in self.bench.instruments.values())
+        return self.bench.has(kind)
 
     def reached(self, parameter: str) -> float | None:
         """The standard deviation of a parameter that the procedure has reached; None while there is none."""
@@ -280,10 +264,9 @@ class Work:
         if found.verdict is None:
             self.kept.judge(found, verdict)
         self._known[found.id] = verdict
-        self.watch(
-            "frame",
-            {"step": step.name, "take": found.take, "ok": verdict.ok, "why": verdict.why} | verdict.facts,
-        )
+        told = {"step": step.name, "take": found.take, "ok": verdict.ok, "why": verdict.why}
+        # Of before a resumption, it took no time to take.
+        self.watch("frame", told | {"there": found.verdict is not None} | verdict.facts)
         if self.procedure is not None and verdict.ok and found.verdict is None:
             reached = dict(self.procedure.progress())
             if reached:
@@ -316,30 +299,33 @@ class Work:
         """
         with self._busy:
             there = self.kept.find(step.name, kind)
-            if there is not None:
-                return there
-            if kind == "screen":
-                screen = self._persist(self.one(Oscilloscope).screen)
-                clock = {"taken": screen.taken.isoformat()}
-                return self.kept.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
-            if kind == "scan":
-                scan = self._persist(self.one(UltrasonicScanner).scan)
-                facts = {
-                    "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
-                    "origin_px": list(scan.origin_px),
-                    "speed_m_s": scan.speed_m_s,
-                    "frequency_khz": scan.frequency_khz,
-                    "gain": scan.gain,
-                }
-                clock = {"taken": scan.taken.isoformat()}
-                return self.kept.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
-            if kind == "probe":
-                camera = self._set_up(step)
-                exposure = self._persist(camera.expose)
-                frame = mean_frame([exposure.frame], step.name)
-                facts = {"identity": str(camera.connect()), "set_exposure_us": step.exposure_us}
-                return self.kept.store(step.name, frame, kind=kind, facts=facts, clock=clock_of([exposure]))
-            raise UsageError("is no kind of picture", where=kind, do="there are screen, scan and probe")
+            found = self._pictured(step, kind) if there is None else there
+            self.watch("picture", {"step": step.name, "kind": kind, "there": there is not None})
+            return found
+
+    def _pictured(self, step: Step, kind: str) -> ArchivedFrame:
+        if kind == "screen":
+            screen = self._persist(self.one(Oscilloscope).screen)
+            clock = {"taken": screen.taken.isoformat()}
+            return self.kept.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
+        if kind == "scan":
+            scan = self._persist(self.one(UltrasonicScanner).scan)
+            facts = {
+                "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
+                "origin_px": list(scan.origin_px),
+                "speed_m_s": told(scan.speed_m_s),
+                "frequency_khz": told(scan.frequency_khz),
+                "gain": told(scan.gain),
+            }
+            clock = {"taken": scan.taken.isoformat()}
+            return self.kept.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
+        if kind == "probe":
+            camera = self._set_up(step)
+            exposure = self._persist(camera.expose)
+            frame = mean_frame([exposure.frame], step.name)
+            facts = {"identity": str(camera.connect()), "set_exposure_us": step.exposure_us}
+            return self.kept.store(step.name, frame, kind=kind, facts=facts, clock=clock_of([exposure]))
+        raise UsageError("is no kind of picture", where=kind, do="there are screen, scan and probe")
 
     def have_done(self, what: str) -> None:
         """Have the operator do something.

@@ -2,109 +2,40 @@
 
 from __future__ import annotations
 
-import sys
-import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..errors import UsageError
-from .common import parsed_design, say
-from .events import Display
-from .sessions import INPUT, ArchivePlace, ObjectsPlace, opened, procedure_of, steps_of
+from .acquisition import CameraName, Where, conduct, in_session
+from .sessions import model_of, steps_of
 
 if TYPE_CHECKING:
-    from ..archive import Archive, Session
-    from ..capture import Acquisition, Bench, Decision, Limits, Plan
+    from ..capture import Acquisition, Bench, Goal, Plan, Step
+    from ..procedures.calibration import CameraModel
 
-__all__ = [
-    "AsEvents",
-    "BenchPath",
-    "CameraName",
-    "Name",
-    "PlanFile",
-    "Resume",
-    "Where",
-    "app",
-    "conduct",
-    "operator",
-]
+__all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True,
     help="Acquisitions on a bench: every frame is in the archive before the next is taken.",
 )
 
-
-def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
-    """Have a TOML file give the options that the command line does not."""
-    from ..errors import FormatError
-    from ..formats import read_text
-
-    if path is None:
-        return None
-    try:
-        given = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(f"is no TOML ({error})", where=path) from None
-    known = {name.name for name in context.command.params} - {"plan"}
-    unknown = [key for key in given if key.replace("-", "_") not in known]
-    if unknown:
-        names = ", ".join(sorted(str(name) for name in known))
-        raise FormatError(f"unknown key `{unknown[0]}`", where=path, do=f"there are {names}")
-    context.default_map = {key.replace("-", "_"): value for key, value in given.items()}
-    return path
-
-
-PlanFile = Annotated[
-    Path | None,
-    typer.Option("--plan", is_eager=True, callback=_from_toml, help="TOML with options of this command."),
-]
-BenchPath = Annotated[Path | None, typer.Option("--bench", "-b", help="The bench; by default bench.toml.")]
-Name = Annotated[str, typer.Option("--name", "-n", help="Of the session; by default plan and time.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with a session that did not end.")]
-AsEvents = Annotated[bool, typer.Option("--json", help="Write every event as a line of JSON.")]
 Average = Annotated[int, typer.Option(min=1, help="Exposures to a frame, averaged.")]
 Checks = Annotated[int, typer.Option(min=0, help="Frames to look at before anything is taken; 0: none.")]
 Retakes = Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")]
-CameraName = Annotated[str | None, typer.Option("--camera", help="Where the bench has several.")]
-
-
-def operator(what: str) -> None:
-    """Have someone do it, and say so by a line; at a terminal or through a pipe."""
-    typer.echo(f"{what}, then press Enter", err=True)
-    if not sys.stdin.readline():
-        raise UsageError("nobody answers", where=what, do="run it where someone can")
-
-
-@dataclass(frozen=True)
-class Where:
-    """Bench and session of a command, and who does what no instrument can."""
-
-    archive: str
-    objects: str | None
-    bench: Path | None
-    name: str
-    camera: str | None
-    resume: bool
-    as_json: bool
-    operator: Callable[[str], None] = operator
-
-
-Parameters = Callable[["Bench"], dict[str, Any]]
-Planned = Callable[["Acquisition", dict[str, Any]], "Plan"]
+TableName = Annotated[str | None, typer.Option("--table", help="Where the bench has several.")]
+ScannerName = Annotated[str | None, typer.Option("--scanner", help="Where the bench has several.")]
+ScopeName = Annotated[str | None, typer.Option("--oscilloscope", help="Where the bench has several.")]
 
 
 @app.command("testfield")
+@in_session()
 def coded_field(
+    where: Where,
     design: Annotated[Path | None, typer.Option("--design", "-d", help="Of the testfield or sheet.")] = None,
-    archive: ArchivePlace = "archive",
-    bench: BenchPath = None,
-    name: Name = "",
     poses: Annotated[
         Path | None, typer.Option(help="CSV of poses, a column for each axis; by default the paper's 36.")
     ] = None,
@@ -125,22 +56,23 @@ def coded_field(
     ] = False,
     park: Annotated[str, typer.Option(help="Where the table ends, as tilt=0,roll=0; else it stays.")] = "",
     camera: CameraName = None,
-    objects: ObjectsPlace = None,
-    resume: Resume = False,
-    plan: PlanFile = None,
-    as_json: AsEvents = False,
+    table: TableName = None,
 ) -> None:
     """Record a testfield from many poses, and calibrate the camera while the recordings come in."""
-    from ..capture import Goal, paper_steps, plans, read_steps, spread
+    from ..capture import Goal, Step, at_heights, paper_steps, plans, read_steps, spread
+    from ..instruments import Camera, Turntable
 
-    if until:
-        Goal.parse(until)
-    steps = read_steps(poses) if poses is not None else None
+    goal = Goal.parse(until) if until else None
+    ends = _position(park)
 
     def parameters(found: Bench) -> dict[str, Any]:
-        chosen = steps or paper_steps(heights=_numbers(heights, "--heights"), axes=_axes(found))
-        return {
-            "steps": [[step.name, dict(step.position)] for step in chosen],
+        found.one(Camera, camera)
+        axes = found.one(Turntable, table).axes
+        every = paper_steps(axes=tuple(axes)) if poses is None else read_steps(poses)
+        steps = at_heights(every, _numbers(heights, "--heights"))
+        _within(axes, [*steps, Step("--park", ends)])
+        given = {
+            "steps": [[step.name, dict(step.position)] for step in steps],
             "until": until,
             "first": first,
             "pitch": pitch,
@@ -151,227 +83,130 @@ def coded_field(
             "checks": checks,
             "retakes": retakes,
             "home": home,
-            "park": _position(park),
+            "park": ends,
+            "camera": camera,
+            "table": table,
         }
+        _of_model(goal, model_of(given))
+        return given
 
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         every, how = steps_of(given), (given["average"], given["checks"])
         if given["until"]:
-            goal, begin = Goal.parse(given["until"]), spread(every, given["first"])
-            plan = plans.until(run, goal, begin, every, *how)
+            wanted, begin = Goal.parse(given["until"]), spread(every, given["first"])
+            plan = plans.until(run, wanted, begin, every, *how)
         else:
             plan = plans.poses(run, every, *how)
         return plans.homed(run, plan) if given["home"] else plan
 
-    where = Where(archive, objects, bench, name, camera, resume, as_json)
     conduct(where, "testfield", planned, parameters, {"design.json": design})
 
 
 @app.command()
+@in_session()
 def oscilloscope(
+    where: Where,
     reseau: Annotated[Path | None, typer.Option("--reseau", "-r", help="Design of the reseau.")] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="Design of the test object.")] = None,
-    archive: ArchivePlace = "archive",
-    bench: BenchPath = None,
-    name: Name = "",
     body: Annotated[bool, typer.Option("--body/--no-body", help="Whether PHOTO III is taken.")] = True,
     average: Average = 1,
     checks: Checks = 0,
     retakes: Retakes = 2,
     camera: CameraName = None,
-    objects: ObjectsPlace = None,
-    resume: Resume = False,
-    plan: PlanFile = None,
-    as_json: AsEvents = False,
+    scanner: ScannerName = None,
+    scope: ScopeName = None,
 ) -> None:
     """Take PHOTO I, II and III of an oscilloscope, and refine them while they come in."""
     from ..capture import plans
+    from ..instruments import Camera, Oscilloscope, UltrasonicScanner
 
     def parameters(found: Bench) -> dict[str, Any]:
-        return {"body": body, "average": average, "checks": checks, "retakes": retakes, "park": {}}
+        found.one(Camera, camera)
+        for kind, name in ((UltrasonicScanner, scanner), (Oscilloscope, scope)):
+            if name is not None or found.has(kind):  # the operator does without
+                found.one(kind, name)
+        how = {"body": body, "average": average, "checks": checks, "retakes": retakes, "park": {}}
+        return how | {"camera": camera, "scanner": scanner, "oscilloscope": scope}
 
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.oscilloscope(run, given["body"], given["average"], given["checks"])
 
-    where = Where(archive, objects, bench, name, camera, resume, as_json)
     conduct(where, "oscilloscope", planned, parameters, {"reseau.json": reseau, "object.json": object_})
 
 
 @app.command()
+@in_session()
 def scan(
-    archive: ArchivePlace = "archive",
-    bench: BenchPath = None,
-    name: Name = "",
+    where: Where,
     count: Annotated[int, typer.Option(min=1, help="Sections.")] = 1,
-    objects: ObjectsPlace = None,
-    resume: Resume = False,
-    plan: PlanFile = None,
-    as_json: AsEvents = False,
+    scanner: ScannerName = None,
+    scope: ScopeName = None,
 ) -> None:
-    """Sweep with the ultrasonic scanner, and keep the sections."""
+    """Sweep with the ultrasonic scanner, and keep the sections; beside each an oscilloscope's screen."""
     from ..capture import plans
+    from ..instruments import Oscilloscope, UltrasonicScanner
+
+    def parameters(found: Bench) -> dict[str, Any]:
+        found.one(UltrasonicScanner, scanner)
+        if scope is not None or found.has(Oscilloscope):
+            found.one(Oscilloscope, scope)
+        return {"count": count, "retakes": 0, "park": {}, "scanner": scanner, "oscilloscope": scope}
 
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.scan(run, given["count"])
 
-    where = Where(archive, objects, bench, name, None, resume, as_json)
-    conduct(where, "scan", planned, lambda _: {"count": count, "retakes": 0, "park": {}})
+    conduct(where, "scan", planned, parameters)
 
 
 @app.command()
+@in_session()
 def frames(
-    archive: ArchivePlace = "archive",
-    bench: BenchPath = None,
-    name: Name = "",
+    where: Where,
     count: Annotated[int, typer.Option(min=1, help="Frames.")] = 1,
     average: Average = 1,
     checks: Checks = 0,
     retakes: Retakes = 0,
     camera: CameraName = None,
-    objects: ObjectsPlace = None,
-    resume: Resume = False,
-    plan: PlanFile = None,
-    as_json: AsEvents = False,
 ) -> None:
     """Take frames one after the other."""
     from ..capture import plans
+    from ..instruments import Camera
 
     def parameters(found: Bench) -> dict[str, Any]:
-        return {"count": count, "average": average, "checks": checks, "retakes": retakes, "park": {}}
+        found.one(Camera, camera)
+        how = {"count": count, "average": average, "checks": checks, "retakes": retakes, "park": {}}
+        return how | {"camera": camera}
 
     def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
         return plans.frames(run, given["count"], given["average"], given["checks"])
 
-    where = Where(archive, objects, bench, name, camera, resume, as_json)
     conduct(where, "frames", planned, parameters)
 
 
-def conduct(
-    where: Where,
-    plan: str,
-    planned: Planned,
-    parameters: Parameters,
-    inputs: Mapping[str, Path | None] | None = None,
-    *,
-    limits: Limits | None = None,
-    afterwards: Callable[[Session], None] = lambda kept: None,
-) -> None:
-    """Begin a session or go on with one, carry its plan out, and say what came of it.
-
-    Parameters
-    ----------
-    where : Where
-        Bench and session.
-    plan : str
-        Kind of session.
-    planned, parameters : callable
-        What gives the plan of an acquisition and parameters; the parameters of a new session on a bench.
-    inputs : mapping, optional
-        Designs that a new session is given.
-    limits : Limits, optional
-        Of its frames.
-    afterwards : callable
-        Called with a session that is done.
-    """
-    from ..capture import Acquisition, BenchLock, carry_out
-
-    with opened(where.archive, where.objects, create=not where.resume) as archive:
-        if where.resume:
-            kept, bench = _resumed(archive, where, plan)
-        else:
-            kept, bench = _begun(archive, where, plan, parameters, inputs or {})
-        given = kept.parameters
-        display = Display(where.as_json, len(given.get("steps", [])) or given.get("count"))
-        addresses = [entry.address for entry in bench.file.instruments.values()]
-        with BenchLock(addresses, f"session {kept.name}"), bench, display:
-            run = Acquisition(
-                bench, kept, procedure_of(kept), camera=where.camera or given.get("camera"),
-                retakes=given["retakes"], limits=limits, watch=display.watch, operator=where.operator,
-            )  # fmt: skip
-            why = carry_out(run, planned(run, given), park=given["park"], paused=_paused)
-        _conclude(where, kept, why)
-        afterwards(kept)
+def _within(axes: Mapping[str, Any], steps: Sequence[Step]) -> None:
+    """Refuse poses to which the table cannot go, before it goes to any."""
+    for step in steps:
+        for axis, value in step.position.items():
+            if axis not in axes:
+                have = ", ".join(axes)
+                raise UsageError(f"the table has no axis {axis}", where=step.name, do=f"it has {have}")
+            low, high = axes[axis].limits
+            if not low <= value <= high:
+                what = f"{axis} {value:g} is not between {low:g} and {high:g} {axes[axis].unit}"
+                raise UsageError(what, where=step.name)
 
 
-def _begun(
-    archive: Archive, where: Where, plan: str, parameters: Parameters, inputs: Mapping[str, Path | None]
-) -> tuple[Session, Bench]:
-    """A new session, with the files that it was given."""
-    from ..capture import Bench, BenchFile
-    from ..formats import read_text
+def _of_model(goal: Goal | None, model: CameraModel) -> None:
+    """Refuse a goal for what is not estimated, or in a unit that it does not have."""
+    from ..bundle import UNITS
 
-    texts = {}
-    for role, path in inputs.items():
-        if path is None:
-            raise UsageError("is needed", where=f"--{role.removesuffix('.json')}")
-        texts[role] = read_text(path)
-        parsed_design(texts[role], path)
-    path = where.bench or Path("bench.toml")
-    text = read_text(path)
-    bench = Bench(BenchFile.parse_toml(text, where=path))
-    name = where.name or f"{plan}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-    kept = archive.begin(name, plan, parameters(bench), text)
-    for role, content in texts.items():
-        kept.store(role, content.encode("utf-8"), kind=INPUT, suffix=".json")
-    return kept, bench
-
-
-def _resumed(archive: Archive, where: Where, plan: str) -> tuple[Session, Bench]:
-    """A session that was begun before: all but the bench is as it was begun."""
-    from ..capture import Bench, BenchFile
-    from ..formats import read_text
-
-    if not where.name:
-        open_ = [s.name for s in archive.sessions() if s.plan == plan and s.status != "done"]
-        if len(open_) != 1:
-            names = ", ".join(open_) or "none"
-            raise UsageError(f"{names} can be resumed", where="--resume", do="name one with --name")
-        where = replace(where, name=open_[0])
-    kept = archive.session(where.name)
-    if kept.plan != plan:
-        raise UsageError(f"is a session of {kept.plan}", where=kept.name, do=f"use `capture {kept.plan}`")
-    kept.recover()
-    text = kept.bench if where.bench is None else read_text(where.bench)
-    return kept, Bench(BenchFile.parse_toml(text, where=where.bench or kept.name))
-
-
-def _conclude(where: Where, kept: Session, why: str | None) -> None:
-    """Say how it ended; what was not reached is a failure."""
-    if kept.status != "done":
-        message = f"{kept.name}: stopped; `--resume --name {kept.name}` goes on"
-    elif why:
-        message = f"{kept.name}: {why}"
-    else:
-        if not where.as_json:
-            say(f"{kept.name}: done, {len(kept.frames(kind='frame'))} frames in {where.archive}\n")
-            say("".join(f"  {result.name}\n" for result in kept.results()))
+    if goal is None:
         return
-    typer.echo(f"reseau: {message}", err=True)
-    raise typer.Exit(1)
-
-
-def _paused() -> Decision:
-    """What is to become of an interrupted session; where nobody can be asked it stops, to be resumed."""
-    if not sys.stdin.isatty():
-        return "stop"
-    answers: dict[str, Decision] = {"r": "resume", "s": "stop", "a": "abort"}
-    while True:
-        typer.echo("paused: [r]esume, [s]top (to go on later), [a]bort? ", err=True, nl=False)
-        line = sys.stdin.readline()
-        if not line:
-            return "stop"
-        if line.strip().lower()[:1] in answers:
-            return answers[line.strip().lower()[:1]]
-
-
-def _axes(bench: Bench) -> tuple[str, ...]:
-    """Axes of the table, where the bench has one."""
-    from ..instruments import Turntable
-
-    tables = [each for each in bench.instruments.values() if isinstance(each, Turntable)]
-    if not tables:
-        raise UsageError("has no table", where=bench.file.name, do="name poses by hand with `capture frames`")
-    return tuple(tables[0].axes)
+    if goal.parameter not in model.chosen:
+        raise UsageError(f"is none of {', '.join(model.chosen)}", where=f"sigma_{goal.parameter}")
+    unit = UNITS.get(goal.parameter, "")
+    if goal.unit and goal.unit != unit:
+        raise UsageError(f"is in {unit or 'no unit'}, not {goal.unit}", where=f"sigma_{goal.parameter}")
 
 
 def _numbers(text: str, option: str) -> tuple[float, ...]:

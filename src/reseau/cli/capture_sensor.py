@@ -8,26 +8,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .capture import AsEvents, BenchPath, CameraName, Name, PlanFile, Resume, Where, conduct, operator
+from .acquisition import CameraName, Where, conduct, in_session, operator
 from .common import say, writable
-from .sessions import ArchivePlace, ObjectsPlace
 
 if TYPE_CHECKING:
     from ..archive import Session
     from ..calibration import Calibration
     from ..capture import Acquisition, Bench, Plan
-    from ..instruments import Camera
 
 __all__ = ["sensor"]
 
 CALIBRATION = "calibration.json"
 
 
+@in_session("out", "yes")
 def sensor(
+    where: Where,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Calibration to write, too.")] = None,
-    archive: ArchivePlace = "archive",
-    bench: BenchPath = None,
-    name: Name = "",
     camera: CameraName = None,
     levels: Annotated[int, typer.Option(min=5, help="Exposures in light.")] = 14,
     frames: Annotated[int, typer.Option(min=2, help="Of each exposure.")] = 8,
@@ -38,26 +35,23 @@ def sensor(
     ] = None,
     retakes: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
     yes: Annotated[bool, typer.Option("--yes", help="Wait for nobody: all is done by others.")] = False,
-    objects: ObjectsPlace = None,
-    resume: Resume = False,
-    plan: PlanFile = None,
-    as_json: AsEvents = False,
 ) -> None:
     """Calibrate a camera's sensor: dark, flat, linearity, noise and gain, full well, defects, sharpness."""
     from ..capture.sensor import ALL_LIMITS, SensorPlan
     from ..capture.sensor import sensor as series
+    from ..instruments import Camera
 
     if out is not None:
         writable(out)
 
     def parameters(found: Bench) -> dict[str, Any]:
-        chosen, device = _camera(found, camera)
+        device = found.one(Camera, camera)
         settings = device.settings.to_dict()
         own = float(settings["exposure_us"]) if edge else None
         return {
             **vars(wanted := SensorPlan(levels, frames, longest_ms * 1000, own)),
             "count": wanted.count,
-            "camera": chosen,
+            "camera": device.name,
             "settings": settings,
             "region": None if region is None else list(region),
             "retakes": retakes,
@@ -68,38 +62,15 @@ def sensor(
         return series(run, SensorPlan(*(given[key] for key in ("levels", "frames", "longest_us", "edge_us"))))
 
     def afterwards(kept: Session) -> None:
-        _told(kept, out, as_json)
+        _told(kept, out, where.as_json)
 
     who = _others if yes else operator
-    where = Where(archive, objects, bench, name, camera, resume, as_json, who)
-    conduct(where, "sensor", planned, parameters, limits=ALL_LIMITS, afterwards=afterwards)
+    conduct(where, "sensor", planned, parameters, limits=ALL_LIMITS, operator=who, afterwards=afterwards)
 
 
 def _others(what: str) -> None:
     """Say what others do."""
     typer.echo(what, err=True)
-
-
-def _camera(bench: Bench, name: str | None) -> tuple[str, Camera]:
-    """The camera of a name, or the only one, and its name.
-
-    Raises
-    ------
-    UsageError
-        When there is none, or more than one and none was named.
-    """
-    from ..errors import UsageError
-    from ..instruments import Camera
-
-    found = {each: device for each, device in bench.instruments.items() if isinstance(device, Camera)}
-    if name is None and len(found) != 1:
-        raise UsageError(f"has {len(found)} cameras", where="bench", do="name one with --camera")
-    chosen = next(iter(found)) if name is None else name
-    if chosen not in found:
-        raise UsageError(
-            "is no camera of this bench", where=chosen, do=f"there are {', '.join(found) or 'none'}"
-        )
-    return chosen, found[chosen]
 
 
 def _told(kept: Session, out: Path | None, as_json: bool) -> None:
@@ -143,10 +114,11 @@ def _lines(found: Calibration) -> str:
     lines.append(f"{'defects':<16} {validity['defects']} pixels")
     if not validity["saturated"]:
         lines.append("full well        not reached: give more light or longer exposures")
-    lines += [f"{test['name']:<16} {_verdict(test)}" for test in found.tests if "p" in test]
+    lines += [f"{test['name']:<20} {_verdict(test)}" for test in found.tests if "p" in test]
     return "\n".join(lines) + "\n"
 
 
 def _verdict(test: dict[str, Any]) -> str:
     """Of a test of the edge."""
-    return f"{'yes' if test['passed'] else 'no'} (p = {test['p']:.2g})"
+    likely = f"p = {test['p']:.2g}" if test["p"] >= 5e-4 else "p < 0.001"
+    return f"{'yes' if test['passed'] else 'no'} ({likely})"

@@ -1,13 +1,18 @@
-"""What is seen of an acquisition: a bar where there is a terminal, lines elsewhere, JSON for programs."""
+"""What is seen of an acquisition: lines, below them a bar where there is a terminal; JSON for programs."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Any, ParamSpec, Self, TypeVar
 
 __all__ = ["Display"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class Display:
@@ -23,7 +28,7 @@ class Display:
 
     def __init__(self, as_json: bool, total: int | None) -> None:
         self._json, self._total = as_json, total
-        self._poses, self._frames, self._reached = 0, 0, ""
+        self._poses, self._there, self._frames, self._reached = 0, 0, 0, ""
         self._began = time.monotonic()
         self._bar: Any = None
         self._stream = sys.stdout  # while the engine runs, what it prints itself goes elsewhere
@@ -32,15 +37,12 @@ class Display:
         if not self._json and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+            from rich.table import Column
 
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=30),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
+            # What is told last may be cut off where the terminal is narrow.
+            text = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis"))
+            columns = BarColumn(bar_width=12), MofNCompleteColumn(), TimeRemainingColumn(), text
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
             self._task = self._bar.add_task("begins", total=self._total)
         return self
@@ -49,55 +51,86 @@ class Display:
         if self._bar is not None:
             self._bar.stop()
 
+    def aside(self, question: Callable[P, T]) -> Callable[P, T]:
+        """What asks somebody something, and the bar is out of the way for as long."""
+
+        def asked(*args: P.args, **kwargs: P.kwargs) -> T:
+            if self._bar is None:
+                return question(*args, **kwargs)
+            self._bar.stop()
+            try:
+                return question(*args, **kwargs)
+            finally:
+                self._bar.start()
+
+        return asked
+
     def watch(self, kind: str, facts: dict[str, Any]) -> None:
         """Show an event."""
         if self._json:
-            self._say(json.dumps({"event": kind, **facts}, default=str))
+            # JSON has no word for what is no number.
+            plain = {
+                k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in facts.items()
+            }
+            self._say(json.dumps({"event": kind, **plain}, default=str))
             return
         if kind == "precision":
             self._reached = _told(facts)
-        if kind == "frame":
+        if kind == "frame" or facts.get("kind") == "scan":
             self._frames += 1
-            self._poses += bool(facts["ok"])
-            self._reached = ""
+            self._poses += facts.get("ok", True)
+            self._there += facts.get("ok", True) and facts.get("there", False)
+            if self._poses == self._there:
+                self._began = time.monotonic()
+        line = self._line(kind, facts)
+        if line:
+            self._say(line)
         if self._bar is not None:
-            text = f"{facts.get('step', kind)} · {self._frames} frames {self._reached}"
-            self._bar.update(self._task, completed=self._poses, description=text)
-        else:
-            self._line(kind, facts)
+            at = f"{facts.get('step') or kind} · {self._frames} frames"
+            self._bar.update(self._task, completed=self._poses, description=f"{at} · {self._reached}")
 
-    def _line(self, kind: str, facts: dict[str, Any]) -> None:
+    def _line(self, kind: str, facts: dict[str, Any]) -> str:
         """One line for what is worth one."""
+        if kind == "begin":
+            return f"session {facts['session']}"
         if kind == "frame":
             of = f"/{self._total}" if self._total else ""
-            outcome = f"{facts['points']} points" if "points" in facts else "good"
+            good = f"{facts['points']} points" if "points" in facts else "good"
             take = f" take {facts['take']}" if facts["take"] else ""
-            left = self._left()
-            outcome = outcome if facts["ok"] else facts["why"]
-            self._say(f"{self._poses}{of} {facts['step']}{take}: {outcome}{left}")
-        elif kind == "precision":
-            self._say(f"    {self._reached}")
-        elif kind == "outlook":
-            self._say(
-                f"    {facts['step']} would bring {_told(facts)}" if "why" not in facts else facts["why"]
+            outcome = good if facts["ok"] else facts["why"]
+            return f"{self._poses}{of} {facts['step']}{take}: {outcome}{self._left()}"
+        if kind == "picture":
+            of = f"/{self._total}" if self._total else ""
+            return f"{self._poses}{of} {facts['step']}: {facts['kind']}"
+        if kind == "precision":
+            return f"    {self._reached}"
+        if kind == "outlook":
+            return f"    {facts['step']} would bring {_told(facts)}" if "why" not in facts else facts["why"]
+        if kind == "next":
+            return (
+                f"next: {facts['step']}, would bring {_told(facts)}" if facts["step"] else "no pose is left"
             )
-        elif kind == "next":
-            self._say(f"next: {facts['step']}" if facts["step"] else "no pose is left")
-        elif kind == "check":
-            self._say("checks: " + ("; ".join(facts["faults"]) or "good"))
-        elif kind == "again":
-            self._say(f"once more: {facts['why']}")
-        elif kind == "rest" and "failed" in facts:
-            self._say(f"at rest, but: {facts['failed']}")
+        if kind == "check":
+            return "checks: " + ("; ".join(facts["faults"]) or "good")
+        if kind == "again":
+            return f"once more: {facts['why']}"
+        if kind == "rest" and "failed" in facts:
+            return f"at rest, but: {facts['failed']}"
+        return ""
 
     def _say(self, line: str) -> None:
+        if self._bar is not None and self._stream.isatty():
+            self._bar.console.print(line, markup=False, highlight=False)
+            return
         self._stream.write(line + "\n")
         self._stream.flush()
 
     def _left(self) -> str:
-        if not self._total or not self._poses or self._poses >= self._total:
+        """How long the rest takes, by those that have been taken now."""
+        taken = self._poses - self._there
+        if not self._total or not taken or self._poses >= self._total:
             return ""
-        seconds = (time.monotonic() - self._began) / self._poses * (self._total - self._poses)
+        seconds = (time.monotonic() - self._began) / taken * (self._total - self._poses)
         return f", {seconds:.0f} s left"
 
 

@@ -10,29 +10,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import UsageError
 from .common import parsed_design
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session, Verdict
     from ..capture import Procedure, Step
     from ..data import Frame
+    from ..procedures.calibration import CameraModel
     from ..procedures.live import LiveTestfield
     from ..procedures.live_sensor import LiveSensor
 
 __all__ = [
-    "INPUT",
     "ArchivePlace",
     "ObjectsPlace",
     "SessionName",
-    "input_of",
+    "model_of",
     "opened",
     "procedure_of",
     "steps_of",
 ]
-
-INPUT = "input"
-"""Kind of the files that a session was given: designs."""
 
 ArchivePlace = Annotated[
     str, typer.Option("--archive", "-a", envvar="RESEAU_ARCHIVE", help="Folder, or URL of a database.")
@@ -48,20 +44,6 @@ def opened(place: str, objects: str | None, *, create: bool = False) -> Archive:
     from ..archive import Archive
 
     return Archive.open(place, objects, create=create)
-
-
-def input_of(kept: Session, name: str) -> str:
-    """The text of a file that a session was given.
-
-    Raises
-    ------
-    UsageError
-        When it was given none.
-    """
-    found = kept.find(name, INPUT)
-    if found is None:
-        raise UsageError(f"was given no {name}", where=kept.name)
-    return kept.objects.get(found.sha256, found.suffix).decode("utf-8")
 
 
 def steps_of(parameters: Mapping[str, Any]) -> tuple[Step, ...]:
@@ -80,9 +62,12 @@ def procedure_of(kept: Session) -> Procedure | None:
         from ..procedures.live import LiveOscilloscope
 
         reseau, rods = (
-            ReseauDesign.parse(input_of(kept, name), where=name) for name in ("reseau.json", "object.json")
+            ReseauDesign.parse(kept.input(name), where=name) for name in ("reseau.json", "object.json")
         )
-        return LiveOscilloscope(reseau, rods, name=kept.name, options=kept.parameters)
+        check = kept.parameters.get("check", ())
+        return LiveOscilloscope(
+            reseau, rods, name=kept.name, options=kept.parameters, inputs=_inputs(kept), check=check
+        )
     if kept.plan == "sensor":
         from ..procedures.live_sensor import LiveSensor
 
@@ -93,18 +78,31 @@ def procedure_of(kept: Session) -> Procedure | None:
 
 
 def _testfield(kept: Session) -> Procedure:
-    from ..procedures.calibration import CameraModel
     from ..procedures.live import LiveTestfield
     from ..procedures.measuring import measurer_of
     from ..refine import TestfieldOptions
 
     given = kept.parameters
-    design = parsed_design(input_of(kept, "design.json"), "design.json")
-    pitch, free = given["pitch"], tuple(given["free"])
-    model = CameraModel("opencv", free) if pitch is None else CameraModel("brown", free, (pitch, pitch))
+    design = parsed_design(kept.input("design.json"), "design.json")
     options = {key: value for key, value in given.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given["row_jitter"], fill=given["fill"]))
-    return _Reported(LiveTestfield(design, measure, model, name=kept.name, options=options))
+    live = LiveTestfield(
+        design, measure, model_of(given), name=kept.name, options=options, inputs=_inputs(kept)
+    )
+    return _Reported(live)
+
+
+def model_of(parameters: Mapping[str, Any]) -> CameraModel:
+    """What a testfield's session estimates of its camera."""
+    from ..procedures.calibration import CameraModel
+
+    pitch, free = parameters["pitch"], tuple(parameters["free"])
+    return CameraModel("opencv", free) if pitch is None else CameraModel("brown", free, (pitch, pitch))
+
+
+def _inputs(kept: Session) -> dict[str, str]:
+    """SHA-256 of what a session was given, by name."""
+    return {name: given.sha256 for name, given in kept.given().items()}
 
 
 class _Reported:

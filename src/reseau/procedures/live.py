@@ -62,6 +62,8 @@ class LiveTestfield:
         Of the calibration.
     options : mapping
         What of the parameters influenced the result, for its provenance.
+    inputs : mapping
+        SHA-256 of the files that it works with, by name; for its provenance.
     least_points : int
         A frame with fewer is no good.
     """
@@ -74,13 +76,14 @@ class LiveTestfield:
         *,
         name: str,
         options: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
         least_points: int = 8,
     ) -> None:
         self.design, self.model, self.name = design, model, name
         self._measure, self._options, self._least = measure, dict(options or {}), least_points
         self._measured: dict[str, ImagePoints] = {}
         self._places: dict[str, Mapping[str, float]] = {}
-        self._inputs: dict[str, str] = {}
+        self._inputs = dict(inputs or {})
         self._size: tuple[int, int] | None = None
         self._current: tuple[int, Calibrated | Failure] | None = None
 
@@ -157,7 +160,7 @@ class LiveTestfield:
         for candidate in candidates:
             joined = _joined(network, result, mount.pose(candidate.position))
             predicted = sigma0 * _sigma(network if joined is None else joined, column)
-            if best is None or predicted < best[1]:
+            if np.isfinite(predicted) and (best is None or predicted < best[1]):
                 best = candidate, predicted
         return best
 
@@ -226,8 +229,8 @@ class LiveOscilloscope:
         The reseau; the rods.
     name : str
         Of the calibration.
-    options : mapping
-        For its provenance.
+    options, inputs : mapping
+        For its provenance: parameters, and the SHA-256 of the files that it works with, by name.
     check : iterable of str
         Marks to be held out of PHOTO I.
     """
@@ -239,11 +242,12 @@ class LiveOscilloscope:
         *,
         name: str,
         options: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
         check: Iterable[str] = (),
     ) -> None:
         self.reseau, self.test_object, self.name = reseau, test_object, name
         self._check = tuple(check)
-        self._options, self._inputs = dict(options or {}), dict[str, str]()
+        self._options, self._inputs = dict(options or {}), dict(inputs or {})
         self.first: PhotoI | None = None
         self.second: PhotoII | None = None
         self.third: PhotoIII | None = None
