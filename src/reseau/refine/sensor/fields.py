@@ -85,16 +85,17 @@ def _dark_lines(levels: tuple[Level, ...]) -> tuple[Image32, Image32]:
 
 def _unshaded(response: np.ndarray) -> np.ndarray:
     """The response without what changes slowly: light that falls off is no defect."""
-    height, width = response.shape
-    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1).reshape(-1, 10)
+    across, down = (np.vander(np.linspace(-1, 1, n), 4, increasing=True) for n in response.shape[::-1])
     flat = response.ravel()
     usual = np.abs(flat - np.median(flat)) < 10 * _MAD * np.median(np.abs(flat - np.median(flat))) + 1e-12
-    step = max(1, flat.size // 20000)
-    chosen = np.flatnonzero(usual)[::step]
-    coefficients = np.linalg.lstsq(terms[chosen], flat[chosen], rcond=None)[0]
-    smooth: np.ndarray = (flat - terms @ coefficients).reshape(response.shape)
-    return smooth
+    chosen = np.flatnonzero(usual)[:: max(1, flat.size // 20000)]
+    row, column = np.divmod(chosen, response.shape[1])
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    terms = np.stack([across[column, i] * down[row, j] for i, j in powers], axis=-1)
+    surface = np.zeros((4, 4))
+    surface[tuple(np.transpose(powers))] = np.linalg.lstsq(terms, flat[chosen], rcond=None)[0]
+    rest: np.ndarray = response - down @ surface.T @ across.T
+    return rest
 
 
 def _outliers(values: np.ndarray) -> Mask:
