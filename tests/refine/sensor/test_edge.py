@@ -199,6 +199,13 @@ def test_frequencies_that_the_distances_do_not_resolve_are_not_told() -> None:
     assert set(found.quantities()) == {"psf", "mtf50"}
 
 
+def test_noise_is_no_edge() -> None:
+    for seed in range(20):
+        found = measure_edge(Frame(np.random.default_rng(seed).normal(100, 3, (40, 20)), 255.0))
+        assert isinstance(found, Failure)
+        assert "no edge above the noise" in found.reason
+
+
 def gaussian_edge(rng: np.random.Generator, psf: float, turned: bool) -> Frame:
     """An edge formed by ten by ten points to a pixel, blurred, and averaged; of whole grey values."""
     fine, n = 10, 48

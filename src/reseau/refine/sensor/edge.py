@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ...adjust import Adjustment, CoefficientTest, Failure, NestedTest, compare
+from ...adjust.threads import one_thread
 from ...calibration import Quantity
 from ...data import Array, Frame, Mask
 from .free import FREQUENCIES, FreeCurve, fit_free
@@ -26,6 +27,8 @@ _FREE_REACH_PX, _FREE_REACH_PSF = 32.0, 12.0
 """The same of the free curve."""
 _LEAST_SLANT, _MOST_SLANT = 0.02, 0.6
 """Radians; below, all pixels along the edge have nearly the same distance."""
+_LEAST_CONTRAST, _BESIDE_PX = 5.0, 2.0
+"""Of an edge, in standard deviations of a pixel; and from the edge, where both sides begin."""
 ALPHA = 0.01
 """Level of the tests."""
 _SATURATED = 0.005
@@ -157,13 +160,28 @@ def measure_edge(
     values = approximate_edge(pixels)
     if values is None:
         return Failure("there is a row without an edge in its region")
+    if not _contrast(pixels, values) > _LEAST_CONTRAST:
+        return Failure("there is no edge above the noise in its region")
     if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
         return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°")
     around = EdgePixels.of(pixels, usable)
     if noise is not None:
         around = replace(around, sigma=np.sqrt(noise[usable]))
-    return _measured(around, values, noise is not None)
+    with one_thread():
+        return _measured(around, values, noise is not None)
+
+
+def _contrast(pixels: Array, values: Array) -> float:
+    """Difference of the two sides over the noise of a pixel, both robust; 0 without two sides."""
+    rows = np.arange(len(pixels)) - (len(pixels) - 1) / 2
+    aside = np.arange(pixels.shape[1]) - values[0] - values[1] * rows[:, None]
+    left, right = pixels[aside < -_BESIDE_PX], pixels[aside > _BESIDE_PX]
+    if not len(left) or not len(right):
+        return 0.0
+    noise = 1.4826 * float(np.median(np.abs(np.diff(pixels, axis=0)))) / np.sqrt(2)
+    step = abs(float(np.median(left) - np.median(right)))
+    return step / noise if noise > 0 else np.inf if step > 0 else 0.0
 
 
 def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Failure:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from ...adjust.threads import one_thread
 from ...data import Mask
 from .series import Image32, Level, SensorSeries
 
@@ -93,8 +94,9 @@ def _unshaded(response: np.ndarray) -> np.ndarray:
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
     terms = np.stack([across[column, i] * down[row, j] for i, j in powers], axis=-1)
     surface = np.zeros((4, 4))
-    surface[tuple(np.transpose(powers))] = np.linalg.lstsq(terms, flat[chosen], rcond=None)[0]
-    rest: np.ndarray = response - down @ surface.T @ across.T
+    with one_thread():  # the same sums however many processors there are
+        surface[tuple(np.transpose(powers))] = np.linalg.lstsq(terms, flat[chosen], rcond=None)[0]
+        rest: np.ndarray = response - down @ surface.T @ across.T
     return rest
 
 

@@ -18,6 +18,7 @@ from scipy.optimize import brentq
 from scipy.stats import f as fisher
 
 from ...adjust import Adjustment, Failure, GaussMarkov, Parameters, adjust
+from ...adjust.threads import one_thread
 from ...data import Array
 from .gaussian import ENOUGH, EdgePixels, edge_slope, edge_spread
 
@@ -120,7 +121,8 @@ class FreeCurve:
         a, cov = self._coefficients
         step, c, s = self._step
         gaussian = np.exp(-2 * (np.pi * self.base[5] * f) ** 2) * np.sinc(f * c) * np.sinc(f * s)
-        lines, areas = self.spline.transforms(f), self.spline.transforms(np.zeros(1)).real[0]
+        with one_thread():  # the same sums however many processors there are
+            lines, areas = self.spline.transforms(f), self.spline.transforms(np.zeros(1)).real[0]
         whole = step + float(areas @ a)
         z = (step * gaussian + lines @ a) / whole
         by = (lines - z[:, None] * areas) / whole
