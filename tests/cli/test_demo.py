@@ -89,15 +89,32 @@ def test_every_frame_is_in_the_archive_and_can_be_computed_with_again(out: Path)
         ]
         assert verify(archive)
         kinds = [frame.kind for frame in archive.session("oscilloscope").frames()]
-        assert kinds == ["frame", "screen", "scan", "frame", "screen", "scan", "frame", "screen"]
+        assert kinds == ["input"] * 2 + [
+            "frame",
+            "screen",
+            "scan",
+            "frame",
+            "screen",
+            "scan",
+            "frame",
+            "screen",
+        ]
         results = archive.session("testfield").results()
     camera, kept = Calibration.read(out / "camera.json"), results[0]
     assert kept.name == "calibration.json"
-    assert len(kept.inputs) == 12
+    assert len(kept.inputs) == 13  # the design is one of them
     truth = json.loads((out / "comparison.json").read_text())["testfield"]["parameters"]
     for name, row in truth.items():
         assert camera.parameters[name].value == row["value"]
         assert abs(row["value"] - row["true"]) < 4 * row["sigma"]
+
+
+@pytest.mark.parametrize("name", ["oscilloscope", "testfield"])
+def test_results_come_out_of_the_archive_again_to_the_byte(out: Path, reseau: Run, name: str) -> None:
+    status, said, err = reseau("archive", "rerun", name, "--archive", out / "archive")
+    second = {"oscilloscope": "true.csv", "testfield": "report.html"}[name]
+    assert said == f"calibration.json: the same to the byte\n{second}: the same to the byte\n"
+    assert (status, err) == (0, "")
 
 
 def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> None:

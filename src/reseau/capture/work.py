@@ -310,7 +310,7 @@ class Work:
             return self.kept.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
         if kind == "scan":
             scan = self._persist(self.one(UltrasonicScanner).scan)
-            facts = {
+            facts: dict[str, Any] = {
                 "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
                 "origin_px": list(scan.origin_px),
                 "speed_m_s": told(scan.speed_m_s),

@@ -115,7 +115,6 @@ def _documents(
     """All that is written beside the photographs, by the names of the files."""
     from ..provenance import canonical_json
     from ..report import oscilloscope_report
-    from ..report.bundle import bundle_report
     from ..report.camera import camera_section
     from ..report.overview import overview_png
 
@@ -143,9 +142,9 @@ def _documents(
     return {
         "report.html": page,
         "overview.png": overview,
-        "testfield.html": bundle_report(field.calibrated.searched, title=f"The testfield, seed {seed}"),
+        "testfield.html": field.documents["report.html"],
         "calibration.json": calibration.to_json(),
-        "camera.json": field.calibration,
+        "camera.json": field.documents["calibration.json"],
         "reseau.json": bench.design.to_json(),
         "rods.json": bench.test_object.to_json(),
         "true.csv": done.third.true.to_csv(),

@@ -5,7 +5,7 @@ Live and offline it is made here, of what the archive holds, so that both do the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..capture import Procedure, Step
     from ..data import Frame
     from ..procedures.calibration import CameraModel
-    from ..procedures.live import LiveTestfield
+    from ..procedures.live import LiveOscilloscope, LiveTestfield
     from ..procedures.live_sensor import LiveSensor
 
 __all__ = [
@@ -26,8 +26,10 @@ __all__ = [
     "SessionName",
     "model_of",
     "opened",
+    "oscilloscope_of",
     "procedure_of",
     "steps_of",
+    "testfield_of",
 ]
 
 ArchivePlace = Annotated[
@@ -55,29 +57,30 @@ def steps_of(parameters: Mapping[str, Any]) -> tuple[Step, ...]:
 
 def procedure_of(kept: Session) -> Procedure | None:
     """What becomes of a session's frames; None where they are only kept."""
-    if kept.plan == "testfield":
-        return _testfield(kept)
-    if kept.plan == "oscilloscope":
-        from ..formats import ReseauDesign
-        from ..procedures.live import LiveOscilloscope
-
-        reseau, rods = (
-            ReseauDesign.parse(kept.input(name), where=name) for name in ("reseau.json", "object.json")
-        )
-        check = kept.parameters.get("check", ())
-        return LiveOscilloscope(
-            reseau, rods, name=kept.name, options=kept.parameters, inputs=_inputs(kept), check=check
-        )
-    if kept.plan == "sensor":
-        from ..procedures.live_sensor import LiveSensor
-
-        region = kept.parameters["region"]
-        chosen = None if region is None else tuple(region)
-        return _Sensor(LiveSensor(name=kept.name, region=chosen, options=kept.parameters), kept)
-    return None
+    made: dict[str, Callable[[Session], Procedure]] = {
+        "testfield": testfield_of,
+        "oscilloscope": oscilloscope_of,
+        "sensor": _sensor_of,
+    }
+    return made[kept.plan](kept) if kept.plan in made else None
 
 
-def _testfield(kept: Session) -> Procedure:
+def oscilloscope_of(kept: Session) -> LiveOscilloscope:
+    """The procedure of a session of `capture oscilloscope`."""
+    from ..formats import ReseauDesign
+    from ..procedures.live import LiveOscilloscope
+
+    reseau, rods = (
+        ReseauDesign.parse(kept.input(name), where=name) for name in ("reseau.json", "object.json")
+    )
+    given = kept.parameters
+    return LiveOscilloscope(
+        reseau, rods, name=kept.name, options=given, inputs=_inputs(kept), check=given.get("check", ())
+    )
+
+
+def testfield_of(kept: Session) -> _Reported:
+    """The procedure of a session of `capture testfield`."""
     from ..procedures.live import LiveTestfield
     from ..procedures.measuring import measurer_of
     from ..refine import TestfieldOptions
@@ -90,6 +93,14 @@ def _testfield(kept: Session) -> Procedure:
         design, measure, model_of(given), name=kept.name, options=options, inputs=_inputs(kept)
     )
     return _Reported(live)
+
+
+def _sensor_of(kept: Session) -> _Sensor:
+    from ..procedures.live_sensor import LiveSensor
+
+    region = kept.parameters["region"]
+    chosen = None if region is None else tuple(region)
+    return _Sensor(LiveSensor(name=kept.name, region=chosen, options=kept.parameters), kept)
 
 
 def model_of(parameters: Mapping[str, Any]) -> CameraModel:
@@ -109,26 +120,26 @@ class _Reported:
     """A testfield procedure whose results have a report beside them."""
 
     def __init__(self, live: LiveTestfield) -> None:
-        self._live = live
+        self.live = live
 
     def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        return self._live.on_frame(frame, step)
+        return self.live.on_frame(frame, step)
 
     def progress(self) -> dict[str, float]:
-        return self._live.progress()
+        return self.live.progress()
 
     def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        return self._live.next_pose(candidates, wanted)
+        return self.live.next_pose(candidates, wanted)
 
     def finish(self) -> dict[str, str]:
         from ..procedures.calibration import Calibrated
         from ..report.bundle import bundle_report
 
-        made = self._live.finish()
-        found = self._live.calibrated()
+        made = self.live.finish()
+        found = self.live.calibrated()
         assert isinstance(found, Calibrated)
-        title = f"Calibration, session {self._live.name}"
-        report = bundle_report(found.searched, title=title, provenance=self._live.provenance)
+        title = f"Calibration, session {self.live.name}"
+        report = bundle_report(found.searched, title=title, provenance=self.live.provenance)
         return made | {"report.html": report}
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import EstimationError
+from .sessions import oscilloscope_of, testfield_of
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
@@ -25,8 +26,8 @@ __all__ = ["OscilloscopeSession", "TestfieldSession", "World", "captured_oscillo
 _POSES = 12
 _SETTINGS: dict[str, dict[str, Any]] = {"scanner": {"half_sector": 100}, "table": {"speed": 1000.0}}
 """The head sweeps over all that is in the tank; the table loses no time."""
-_PITCH_MM, _JITTER_PX, _FILL = 0.027, 0.0086, 0.8
-"""Of the camera before the testfield: the paper's."""
+_CAMERA = {"pitch": 0.027, "free": ["c", "x0", "y0", "K1"], "row_jitter": 0.0086, "fill": 0.8}
+"""Before the testfield: the paper's."""
 
 
 class World(Protocol):
@@ -67,11 +68,11 @@ class OscilloscopeSession:
 
 @dataclass(frozen=True, eq=False)
 class TestfieldSession:
-    """The calibration of the camera before the testfield, and what its parameters truly are."""
+    """The calibration of the camera before the testfield, its files, and what its parameters truly are."""
 
     calibrated: Calibrated
     true: dict[str, float]
-    calibration: str
+    documents: dict[str, str]
     poses: int
 
 
@@ -146,15 +147,14 @@ def captured_oscilloscope(
         When a photograph could not be refined.
     """
     from ..capture import plans, plugin
-    from ..procedures.live import LiveOscilloscope
 
     options = {"camera": "screen", "repeatable": True, "in_process": not _speaks_gige()}
     with plugin("reseau.simulators", "bench")(seed, **options) as simulated:
         world: World = simulated.laboratory.world
-        kept = archive.begin("oscilloscope", "oscilloscope", {"seed": seed}, simulated.toml)
-        live = LiveOscilloscope(
-            world.design, world.test_object, name="oscilloscope", check=world.check_marks()
-        )
+        inputs = {"reseau.json": world.design.to_json(), "object.json": world.test_object.to_json()}
+        given = {"seed": seed, "check": list(world.check_marks())}
+        kept = archive.begin("oscilloscope", "oscilloscope", given, simulated.toml, inputs)
+        live = oscilloscope_of(kept)
         names = ("scanner", "oscilloscope", "camera")
         _carried_out(simulated, kept, live, plans.oscilloscope, names, watch)
         way = _way(simulated)
@@ -174,31 +174,25 @@ def captured_testfield(
     EstimationError
         When the calibration fails.
     """
-    from ..adjust import Failure
     from ..capture import paper_steps, plans, plugin, spread
-    from ..procedures.calibration import CameraModel
-    from ..procedures.live import LiveTestfield
-    from ..procedures.measuring import measurer_of
-    from ..refine import TestfieldOptions
 
+    steps = spread(paper_steps(), _POSES)
+    given = {"seed": seed, "steps": [[step.name, dict(step.position)] for step in steps], **_CAMERA}
     options = {"camera": "testfield", "repeatable": True, "flat": True, "in_process": not _speaks_gige()}
     with plugin("reseau.simulators", "bench")(seed, **options) as simulated:
         field = simulated.laboratory.field
-        measure = measurer_of(field.design, TestfieldOptions(row_jitter_px=_JITTER_PX, fill=_FILL))
-        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (_PITCH_MM, _PITCH_MM))
-        kept = archive.begin("testfield", "testfield", {"seed": seed, "poses": _POSES}, simulated.toml)
-        live = LiveTestfield(field.design, measure, model, name="testfield")
-        steps = spread(paper_steps(), _POSES)
+        inputs = {"design.json": field.design.to_json()}
+        kept = archive.begin("testfield", "testfield", given, simulated.toml, inputs)
+        procedure = testfield_of(kept)
 
         def planned(run: Any) -> Plan:
             return plans.homed(run, plans.poses(run, steps))
 
-        _carried_out(simulated, kept, live, planned, ("table", "camera"), watch)
+        _carried_out(simulated, kept, procedure, planned, ("table", "camera"), watch)
         true = dict(zip(field.camera.names, field.camera.values.tolist(), strict=True))
-    found = live.calibrated()
-    if isinstance(found, Failure):
-        raise EstimationError(found.reason, where="testfield")
-    return TestfieldSession(found, true, live.finish()["calibration.json"], len(kept.frames(kind="frame")))
+    made = {result.name: kept.content(result).decode("utf-8") for result in kept.results()}
+    found = procedure.live.calibrated().required()
+    return TestfieldSession(found, true, made, len(kept.frames(kind="frame")))
 
 
 def _speaks_gige() -> bool:
