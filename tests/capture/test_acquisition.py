@@ -225,6 +225,18 @@ def test_a_session_that_was_stopped_goes_on_where_it_stood_and_ends_the_same(
     assert kept.content(kept.results()[-1]) == undisturbed.content(undisturbed.results()[-1])
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_terminal_that_is_closed_stops_it_at_rest(rig: FieldRig, kept: Session, number: int) -> None:
+    pid = os.getpid()
+    rig.camera.during = lambda count: os.kill(pid, number) if count == 2 else None
+    run = rig.acquisition(kept)
+    carry_out(run, plans.poses(run, FEW))
+    assert kept.status == "stopped"
+    assert rig.table.stops > 0
+    assert len(kept.frames()) < len(FEW)
+    assert rig.events[-1] == ("end", {"status": "stopped", "why": ""})
+
+
 def test_an_instrument_that_fails_ends_the_session_at_rest_and_nothing_is_lost(
     rig: FieldRig, kept: Session
 ) -> None:

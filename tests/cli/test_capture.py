@@ -84,6 +84,83 @@ def test_a_testfield_from_poses_to_a_calibration_that_can_be_rerun(
     assert "damaged" in capsys.readouterr().out
 
 
+OWN = """\
+from reseau.capture import Step
+
+def plan(run, tilts, average=1):
+    for tilt in tilts:
+        yield from run.at(Step(f"tilt {tilt}", {"tilt": tilt}), average)
+"""
+
+
+def test_a_plan_of_ones_own_is_carried_out_and_resumed_as_it_was_begun(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("own.py").write_text(OWN)
+    Path("own.toml").write_text('generator = "own.py"\n[set]\ntilts = [10, 20, 30]\naverage = 2\n')
+
+    def stall(axis: str, position: float) -> None:
+        if position == 30:
+            raise StateError("stalled", where="table", command="move")
+
+    rig.table.before = stall
+    assert capture("own", "--plan", "own.toml", "--name", "a") == 1
+    assert rig.camera.exposures == 4
+    Path("own.py").unlink()
+    rig.table.before = lambda axis, position: None
+    assert capture("own", "--resume") == 0
+    assert capsys.readouterr().out.endswith("a: done, 3 frames in archive\n")
+    assert rig.camera.exposures == 6
+    assert rig.table.stands["tilt"] == 30
+    assert run(["archive", "show", "a", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["parameters"]["set"] == {"tilts": [10, 20, 30], "average": 2}
+    assert [f["facts"].get("averaged") for f in document["frames"]] == [None, 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "says"),
+    [
+        (OWN, ["--set", "tilts=[1]", "--set", "rolls=2"], "own.py: its plan does not fit (got an unexpected"),
+        (OWN, [], "own.py: its plan does not fit (missing a required argument: 'tilts')"),
+        (OWN, ["--set", "tilts"], "--set: is 'tilts'; write it like tilt=30"),
+        ("def plan(run:\n", [], "own.py: line 1 is no Python"),
+        ("def plan(run):\n    return 1\n", [], "own.py: has no generator `plan(run, …)`"),
+    ],
+)
+def test_a_plan_of_ones_own_that_cannot_be_is_told_in_one_line(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str], text: str, options: list[str], says: str
+) -> None:
+    Path("own.py").write_text(text)
+    assert capture("own", "--generator", "own.py", *options) == 2
+    err = capsys.readouterr().err
+    assert says in err
+    assert err.count("\n") == 1
+    assert not Path("archive").exists()
+
+
+def test_what_an_archive_cannot_do_is_told_in_one_line(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert capture("frames", "--name", "a") == 0
+    rig.camera.spoil = lambda number, pixels: pixels // 20
+    assert capture("testfield", *TESTFIELD, "--name", "b") == 1
+    capsys.readouterr()
+    for arguments, says in {
+        ("show", "c"): "c: is no session of this archive",
+        ("show", "a", "--out", "poses.csv"): "poses.csv: cannot be made (File exists); name a folder",
+        ("show", "a", "--out", "none/deep"): "none/deep: cannot be made (No such file",
+        ("rerun", "a"): "a: frames computes nothing",
+        ("rerun", "b"): "b: has no results; it is failed",
+        ("export", "a", "--out", "a.tar"): "a.tar: ends in '.tar'; use .zip",
+        ("list", "--archive", "none"): "is no archive",
+    }.items():
+        assert run(["archive", *arguments]) in (1, 2)
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert says in err
+
+
 def test_options_come_from_a_toml_file_and_the_command_line_wins(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,7 @@ from . import (
     bundle_compare,
     calibrate,
     capture,
+    capture_own,
     capture_sensor,
     demo,
     design,
@@ -45,6 +46,7 @@ app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
 app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
+capture.app.command()(capture_own.own)
 app.add_typer(capture.app, name="capture")
 app.add_typer(archive.app, name="archive")
 app.command()(orient.orient)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 import sys
 import tomllib
 from collections import Counter
@@ -49,15 +50,16 @@ def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
         parameter = known.get(key.replace("_", "-"))
         if parameter is None:
             raise FormatError(f"unknown key `{key}`", where=path, do=f"there are {', '.join(sorted(known))}")
-        context.default_map[str(parameter.name)] = value if parameter.nargs != 1 else _as_written(value)
+        several = parameter.nargs != 1 or parameter.multiple
+        context.default_map[str(parameter.name)] = _as_written(value, several)
     return path
 
 
-def _as_written(value: Any) -> Any:
-    """A list or a table of TOML as the command line has them: 0,50 and tilt=0,roll=0."""
+def _as_written(value: Any, several: bool) -> Any:
+    """A list or a table of TOML as the command line has them: 0,50 and tilt=0,roll=0, or one by one."""
     if isinstance(value, Mapping):
-        return ",".join(f"{key}={each}" for key, each in value.items())
-    return ",".join(str(each) for each in value) if isinstance(value, list) else value
+        value = [f"{key}={json.dumps(each, default=str)}" for key, each in value.items()]
+    return ",".join(str(each) for each in value) if isinstance(value, list) and not several else value
 
 
 CameraName = Annotated[str | None, typer.Option("--camera", help="Where the bench has several.")]
@@ -229,9 +231,10 @@ def _new(
     texts = {}
     for role, path in inputs.items():
         if path is None:
-            raise UsageError("is needed", where=f"--{role.removesuffix('.json')}")
+            raise UsageError("is needed", where=f"--{Path(role).stem}")
         texts[role] = read_text(path)
-        parsed_design(texts[role], path)
+        if Path(role).suffix == ".json":
+            parsed_design(texts[role], path)
     path = where.bench or Path("bench.toml")
     text = read_text(path)
     bench = Bench(BenchFile.parse_toml(text, where=path))

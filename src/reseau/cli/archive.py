@@ -50,9 +50,10 @@ def show(
     with opened(archive, objects) as found:
         kept = found.session(session)
         if out is not None:
-            out.mkdir(exist_ok=True) if out.parent.is_dir() else writable(out)
-            for result in kept.results():
-                write_whole(out / result.name, kept.content(result))
+            contents = {result.name: kept.content(result) for result in kept.results()}
+            _folder(out)
+            for name, content in contents.items():
+                write_whole(out / name, content)
         if as_json:
             say(canonical_json(described(kept)))
             return
@@ -61,8 +62,24 @@ def show(
         for frame in kept.frames():
             say(f"  {frame.sha256[:12]}  {_verdict(frame):<8} {frame.name}\n")
         for made in kept.results():
-            origin = f"of {len(made.inputs)} frames, by {made.software}"
+            origin = f"of {len(made.inputs)} files, by {made.software}"
             say(f"  {made.sha256[:12]}  result   {made.name}, {origin}\n")
+
+
+def _folder(path: Path) -> None:
+    """Make a folder where there is none.
+
+    Raises
+    ------
+    InputError
+        When it cannot be made.
+    """
+    from ..errors import InputError
+
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=path, do="name a folder") from None
 
 
 def _verdict(frame: ArchivedFrame) -> str:
@@ -122,6 +139,8 @@ def rerun(
         procedure = procedure_of(kept)
         if procedure is None:
             raise UsageError(f"{kept.plan} computes nothing", where=session)
+        if not kept.results():
+            raise UsageError(f"has no results; it is {kept.status}", where=session)
         done = computed(kept, procedure)
     same = all(each.same for each in done)
     if as_json:

@@ -39,10 +39,11 @@ class Display:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
 
-            # What is told last may be cut off where the terminal is narrow.
-            text = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis"))
+            # Where the terminal is narrow, what is told last is cut off.
+            rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+            text = TextColumn("{task.description}", table_column=rest)
             columns = BarColumn(bar_width=12), MofNCompleteColumn(), TimeRemainingColumn(), text
-            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True, expand=True)
             self._bar.start()
             self._task = self._bar.add_task("begins", total=self._total)
         return self

@@ -1,0 +1,79 @@
+"""What is seen of an acquisition at a terminal, a narrow one too: pose, frames, precision, time left."""
+
+import io
+import re
+
+import pytest
+
+from reseau.cli.events import Display
+
+
+class Terminal(io.StringIO):
+    """What a terminal was sent."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def at_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Of 80 columns, for both streams."""
+    made = Terminal()
+    for name, value in {"COLUMNS": "80", "TERM": "xterm", "NO_COLOR": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("sys.stderr", made)
+    monkeypatch.setattr("sys.stdout", made)
+    return made
+
+
+def shown(terminal: Terminal) -> list[str]:
+    """Its lines, without what moves the cursor."""
+    return re.sub(r"\x1b\[[0-9?;]*[A-Za-z]", "", terminal.getvalue()).replace("\r", "\n").splitlines()
+
+
+def frame(step: str, **more: object) -> dict[str, object]:
+    return {"step": step, "take": 0, "ok": True, "why": "", "there": False} | more
+
+
+def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = at_terminal(monkeypatch)
+    with Display(False, 3) as display:
+        for k in range(2):
+            display.watch("frame", frame(f"tilt {k}", points=300))
+        display.watch("precision", {"step": "tilt 1", "sigma_c": 0.0123, "sigma_x0": 0.5, "sigma_K1": 1e-5})
+        display.watch("outlook", {"step": "tilt 2", "sigma_c": 0.01})
+    lines = shown(terminal)
+    assert any(re.search(r"2/3 +[0-9-]+:.* tilt 2 · 2 frames · sigma_c 0.0123", line) for line in lines)
+    # Above it stays what happened.
+    assert "    tilt 2 would bring sigma_c 0.01" in [line.rstrip() for line in lines]
+
+
+def test_a_bad_frame_is_told_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = at_terminal(monkeypatch)
+    with Display(False, 3) as display:
+        display.watch("frame", frame("tilt 0", ok=False, why="the table moved during the exposure"))
+    assert "0/3 tilt 0: the table moved during the exposure" in [line.rstrip() for line in shown(terminal)]
+
+
+def test_nothing_is_drawn_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = at_terminal(monkeypatch)
+    with Display(False, 3) as display:
+
+        def ask(what: str) -> str:
+            before = terminal.getvalue()
+            display.watch("frame", frame("tilt 0"))
+            assert "━" not in terminal.getvalue().removeprefix(before)
+            return f"{what}!"
+
+        assert display.aside(ask)("yes") == "yes!"
+
+
+def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, *[1.0] * 8, 11.0])
+    monkeypatch.setattr("reseau.cli.events.time.monotonic", lambda: next(clock))
+    display = Display(False, 12)
+    for k in range(8):
+        display.watch("frame", frame(str(k), there=True))
+    display.watch("frame", frame("8"))
+    assert capsys.readouterr().out.splitlines()[-2:] == ["8/12 7: good", "9/12 8: good, 30 s left"]
