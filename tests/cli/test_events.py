@@ -77,3 +77,12 @@ def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
         display.watch("frame", frame(str(k), there=True))
     display.watch("frame", frame("8"))
     assert capsys.readouterr().out.splitlines()[-2:] == ["8/12 7: good", "9/12 8: good, 30 s left"]
+
+
+def test_sections_are_counted_where_they_are_what_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    for sections in (True, False):
+        display = Display(False, 2, sections)
+        for kind in ("scan", "screen"):
+            display.watch("picture", {"step": "PHOTO II", "kind": kind, "there": False})
+    said = capsys.readouterr().out.splitlines()
+    assert said == ["1/2 PHOTO II: scan", "PHOTO II: screen", "PHOTO II: scan", "PHOTO II: screen"]

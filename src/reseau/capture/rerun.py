@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..adjust.threads import one_thread
 from ..archive import ArchivedResult, Session
 from .procedure import Procedure
 from .step import Step, as_taken
@@ -40,12 +41,13 @@ def rerun(kept: Session, procedure: Procedure) -> list[Rerun]:
     procedure : Procedure
         Made of the session's parameters, as the acquisition made it.
     """
-    for frame in kept.frames(kind="frame"):
-        # What saturation or motion had spoilt, the procedure never saw.
-        if frame.verdict is not None and frame.verdict.ok:
-            step = as_taken(Step(frame.step, frame.facts.get("position", {})), frame.facts)
-            procedure.on_frame(kept.picture(frame), step)
-    contents = procedure.finish()
+    with one_thread():  # the same sums however many processors there are
+        for frame in kept.frames(kind="frame"):
+            # What saturation or motion had spoilt, the procedure never saw.
+            if frame.verdict is not None and frame.verdict.ok:
+                step = as_taken(Step(frame.step, frame.facts.get("position", {})), frame.facts)
+                procedure.on_frame(kept.picture(frame), step)
+        contents = procedure.finish()
     latest = {result.name: result for result in kept.results()}
     return [
         Rerun(result, contents.get(name), contents.get(name, "").encode("utf-8") == kept.content(result))

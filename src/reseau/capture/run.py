@@ -16,6 +16,7 @@ from bluesky import plan_stubs as bps
 from bluesky import preprocessors as bpp
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
+from ..adjust.threads import one_thread
 from ..archive import Session
 from ..errors import InstrumentError, ReseauError
 from .acquisition import Acquisition, Plan
@@ -67,21 +68,16 @@ def carry_out(
     and it pauses at once. SIGTERM, and SIGHUP of a terminal that is closed, end it as `stop` does.
     """
     in_main = threading.current_thread() is threading.main_thread()
-    # Off the main thread there are no signals to be minded.
-    engine: Any = RunEngine({}, call_returns_result=True, context_managers=None if in_main else [])
-    for name, command in run.commands.items():
-        engine.register_command(name, command)
-    recorder = _Recorder(run.kept)
-    engine.subscribe(recorder)
-    ended = threading.Event()
+    engine, ended = _engine(run, in_main), threading.Event()
     try:
         run.ready()
-        with contextlib.redirect_stdout(sys.stderr), _terminated(engine, ended, in_main):
-            outcome = _engaged(engine, _whole(run, plan, park or {}), paused, ended)
-        run.settle()
-        status = "stopped" if outcome is None else "done"
-        if outcome is not None:
-            _keep_results(run)
+        with one_thread():  # the same sums however many processors there are
+            with contextlib.redirect_stdout(sys.stderr), _terminated(engine, ended, in_main):
+                outcome = _engaged(engine, _whole(run, plan, park or {}), paused, ended)
+            run.settle()
+            status = "stopped" if outcome is None else "done"
+            if outcome is not None:
+                _keep_results(run)
         run.kept.end(status)
         found = None if outcome is None else outcome.plan_result
         run.watch("end", {"status": status, "why": found if isinstance(found, str) else ""})
@@ -97,6 +93,16 @@ def carry_out(
     finally:
         run.rest()
         run.settle()
+
+
+def _engine(run: Acquisition, in_main: bool) -> Any:
+    """The engine, which knows the messages of an acquisition and keeps its documents."""
+    # Off the main thread there are no signals to be minded.
+    engine: Any = RunEngine({}, call_returns_result=True, context_managers=None if in_main else [])
+    for name, command in run.commands.items():
+        engine.register_command(name, command)
+    engine.subscribe(_Recorder(run.kept))
+    return engine
 
 
 def _whole(run: Acquisition, plan: Plan, park: Mapping[str, float]) -> Plan:

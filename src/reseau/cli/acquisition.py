@@ -195,7 +195,7 @@ def _carried_out(
     given = kept.parameters
     # Where poses are chosen nobody knows how many it will be.
     total = None if given.get("until") else len(given.get("steps", [])) or given.get("count")
-    with Display(where.as_json, total) as display:
+    with Display(where.as_json, total, sections=kept.plan == "scan") as display:
         display.watch("begin", {"session": kept.name, "archive": where.archive, "poses": total})
         chosen = {kind: given.get(kind) for kind in ("camera", "table", "oscilloscope", "scanner")}
         run = Acquisition(

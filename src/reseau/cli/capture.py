@@ -59,7 +59,7 @@ def coded_field(
     table: TableName = None,
 ) -> None:
     """Record a testfield from many poses, and calibrate the camera while the recordings come in."""
-    from ..capture import Goal, Step, at_heights, paper_steps, plans, read_steps, spread
+    from ..capture import Goal, Step, at_heights, paper_steps, read_steps
     from ..instruments import Camera, Turntable
 
     goal = Goal.parse(until) if until else None
@@ -90,16 +90,20 @@ def coded_field(
         _of_model(goal, model_of(given))
         return given
 
-    def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
-        every, how = steps_of(given), (given["average"], given["checks"])
-        if given["until"]:
-            wanted, begin = Goal.parse(given["until"]), spread(every, given["first"])
-            plan = plans.until(run, wanted, begin, every, *how)
-        else:
-            plan = plans.poses(run, every, *how)
-        return plans.homed(run, plan) if given["home"] else plan
+    conduct(where, "testfield", _recordings, parameters, {"design.json": design})
 
-    conduct(where, "testfield", planned, parameters, {"design.json": design})
+
+def _recordings(run: Acquisition, given: dict[str, Any]) -> Plan:
+    """The plan of a testfield's session."""
+    from ..capture import Goal, plans, spread
+
+    every, how = steps_of(given), (given["average"], given["checks"])
+    if given["until"]:
+        goal, begin = Goal.parse(given["until"]), spread(every, given["first"])
+        plan = plans.until(run, goal, begin, every, *how)
+    else:
+        plan = plans.poses(run, every, *how)
+    return plans.homed(run, plan) if given["home"] else plan
 
 
 @app.command()

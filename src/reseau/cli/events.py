@@ -24,10 +24,12 @@ class Display:
         Whether every event is a line of JSON on standard output.
     total : int, optional
         Poses, where it is known how many there will be.
+    sections : bool
+        Whether it is the scanner's sections that are counted.
     """
 
-    def __init__(self, as_json: bool, total: int | None) -> None:
-        self._json, self._total = as_json, total
+    def __init__(self, as_json: bool, total: int | None, sections: bool = False) -> None:
+        self._json, self._total, self._sections = as_json, total, sections
         self._poses, self._there, self._frames, self._reached = 0, 0, 0, ""
         self._began = time.monotonic()
         self._bar: Any = None
@@ -77,7 +79,7 @@ class Display:
             return
         if kind == "precision":
             self._reached = _told(facts)
-        if kind == "frame" or facts.get("kind") == "scan":
+        if kind == "frame" or self._counted(facts):
             self._frames += 1
             self._poses += facts.get("ok", True)
             self._there += facts.get("ok", True) and facts.get("there", False)
@@ -90,6 +92,10 @@ class Display:
             at = f"{facts.get('step') or kind} · {self._frames} frames"
             self._bar.update(self._task, completed=self._poses, description=f"{at} · {self._reached}")
 
+    def _counted(self, facts: dict[str, Any]) -> bool:
+        """Whether a picture is one of those that are counted."""
+        return self._sections and facts.get("kind") == "scan"
+
     def _line(self, kind: str, facts: dict[str, Any]) -> str:
         """One line for what is worth one."""
         if kind == "begin":
@@ -101,8 +107,8 @@ class Display:
             outcome = good if facts["ok"] else facts["why"]
             return f"{self._poses}{of} {facts['step']}{take}: {outcome}{self._left()}"
         if kind == "picture":
-            of = f"/{self._total}" if self._total else ""
-            return f"{self._poses}{of} {facts['step']}: {facts['kind']}"
+            at = f"{self._poses}/{self._total} " if self._counted(facts) else ""
+            return f"{at}{facts['step']}: {facts['kind']}"
         if kind == "precision":
             return f"    {self._reached}"
         if kind == "outlook":

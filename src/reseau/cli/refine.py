@@ -92,6 +92,8 @@ def refine(
     Every photograph is an image, or a file of the coordinates of its marks, rods and points, told apart by
     their names.
     """
+    from ..adjust.threads import one_thread
+
     held = tuple(name for name in check.split(",") if name)
     files = _Files(
         photo_i, photo_ii, tuple(photo_iii or ()), reseau, test_object, calibration, points, held, alpha
@@ -100,10 +102,11 @@ def refine(
     for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
         if path is not None:
             suffix_of(writable(path), suffixes)
-    if calibration is not None:
-        _by_calibration(files, calibration, true, as_json)
-    else:
-        _by_photographs(files, out, true, report, as_json)
+    with one_thread():  # the same sums however many processors there are
+        if calibration is not None:
+            _by_calibration(files, calibration, true, as_json)
+        else:
+            _by_photographs(files, out, true, report, as_json)
 
 
 def _checked(files: _Files) -> None:
