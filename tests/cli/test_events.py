@@ -40,11 +40,11 @@ def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.M
         for k in range(2):
             display.watch("frame", frame(f"tilt {k}", points=300))
         display.watch("precision", {"step": "tilt 1", "sigma_c": 0.0123, "sigma_x0": 0.5, "sigma_K1": 1e-5})
-        display.watch("outlook", {"step": "tilt 2", "sigma_c": 0.01})
+        display.watch("outlook", {"step": "tilt 2 roll 180 camera_roll 180", "sigma_c": 0.01})
     lines = shown(terminal)
-    assert any(re.search(r"2/3 +[0-9-]+:.* tilt 2 · 2 frames · sigma_c 0.0123", line) for line in lines)
+    assert any(re.search(r"2/3 +[0-9-]+:.* sigma_c 0\.0123 · 2 frames · tilt 2 ro", line) for line in lines)
     # Above it stays what happened.
-    assert "    tilt 2 would bring sigma_c 0.01" in [line.rstrip() for line in lines]
+    assert "    tilt 2 roll 180 camera_roll 180 would bring sigma_c 0.01" in [line.rstrip() for line in lines]
 
 
 def test_a_bad_frame_is_told_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,12 +59,15 @@ def test_nothing_is_drawn_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatc
     with Display(False, 3) as display:
 
         def ask(what: str) -> str:
-            before = terminal.getvalue()
+            terminal.truncate(0)
+            terminal.seek(0)
             display.watch("frame", frame("tilt 0"))
-            assert "━" not in terminal.getvalue().removeprefix(before)
+            assert [line.rstrip() for line in shown(terminal)] == ["1/3 tilt 0: good, 0 s left"]
             return f"{what}!"
 
         assert display.aside(ask)("yes") == "yes!"
+        display.watch("frame", frame("tilt 1"))
+    assert "2/3 tilt 1: good, 0 s left" in [line.rstrip() for line in shown(terminal)]
 
 
 def test_time_left_counts_what_is_taken_now_and_not_what_was_there(

@@ -89,8 +89,9 @@ class Display:
         if line:
             self._say(line)
         if self._bar is not None:
-            at = f"{facts.get('step') or kind} · {self._frames} frames"
-            self._bar.update(self._task, completed=self._poses, description=f"{at} · {self._reached}")
+            first = self._reached.split("  ")[0]  # all of them stand above
+            told = [first, f"{self._frames} frames", facts.get("step") or kind]
+            self._bar.update(self._task, completed=self._poses, description=" · ".join(filter(None, told)))
 
     def _counted(self, facts: dict[str, Any]) -> bool:
         """Whether a picture is one of those that are counted."""
