@@ -225,6 +225,23 @@ def test_a_session_that_was_stopped_goes_on_where_it_stood_and_ends_the_same(
     assert kept.content(kept.results()[-1]) == undisturbed.content(undisturbed.results()[-1])
 
 
+def test_ctrl_c_where_it_is_asked_what_to_do_stops_it(rig: FieldRig, kept: Session) -> None:
+    def interrupt(count: int) -> None:
+        if count == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.02)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def paused() -> Any:
+        raise KeyboardInterrupt
+
+    rig.camera.during = interrupt
+    run = rig.acquisition(kept)
+    carry_out(run, plans.poses(run, FEW), paused=paused)
+    assert kept.status == "stopped"
+    assert [document["exit_status"] for _, document in kept.notes("stop")] == ["success"]
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_terminal_that_is_closed_stops_it_at_rest(rig: FieldRig, kept: Session, number: int) -> None:
     pid = os.getpid()

@@ -82,6 +82,19 @@ def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
     assert capsys.readouterr().out.splitlines()[-2:] == ["8/12 7: good", "9/12 8: good, 30 s left"]
 
 
+def test_an_outlook_is_a_line_also_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    display = Display(False, 3)
+    display.watch("outlook", {"step": "tilt 2", "sigma_c": 0.01})
+    display.watch("outlook", {"step": "tilt 2", "why": "poses are 9° off"})
+    display.watch("next", {"step": "tilt 2", "sigma_c": None})
+    said = capsys.readouterr().out.splitlines()
+    assert said[:2] == [
+        "    tilt 2 would bring sigma_c 0.01",
+        "    tilt 2 cannot be foretold yet: poses are 9° off",
+    ]
+    assert said[2] == "next: tilt 2"
+
+
 def test_sections_are_counted_where_they_are_what_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     for sections in (True, False):
         display = Display(False, 2, sections)

@@ -135,7 +135,9 @@ def _engaged(
         try:
             return todo()
         except RunEngineInterrupted:
-            decision = "stop" if ended.is_set() else paused()
+            decision: Decision = "stop"
+            with contextlib.suppress(KeyboardInterrupt):  # that is an answer, too
+                decision = "stop" if ended.is_set() else paused()
             if decision == "resume":
                 todo = engine.resume
                 continue

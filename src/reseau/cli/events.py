@@ -113,7 +113,10 @@ class Display:
         if kind == "precision":
             return f"    {self._reached}"
         if kind == "outlook":
-            return f"    {facts['step']} would bring {_told(facts)}" if "why" not in facts else facts["why"]
+            known = "why" not in facts
+            return f"    {facts['step']} " + (
+                f"would bring {_told(facts)}" if known else f"cannot be foretold yet: {facts['why']}"
+            )
         if kind == "next":
             return (
                 f"next: {facts['step']}, would bring {_told(facts)}" if facts["step"] else "no pose is left"
