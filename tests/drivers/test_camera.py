@@ -137,6 +137,8 @@ def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCam
         ({"width": 4000}, "delivers 96×64 GREY, not 4000×64"),
         ({"format": "SBGGR8"}, "it offers GREY, Y10, Y12, Y16, YUYV, MJPEG, SRGGB8"),
         ({"rate": 5000.0}, "frames in a second"),
+        ({"left": 8, "top": 4, "width": 32, "height": 16, "rate": 50.0, "gain": 99.0}, "gain 99 is beyond"),
+        ({"gain": 3.0, "brightness": 300}, "brightness 300 is beyond its 0…255"),
     ],
 )
 def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
@@ -149,6 +151,19 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert (camera.settings, device.view) == (before, view)
     assert camera.expose().fresh
     assert camera.reconnections == 1
+
+
+def test_what_is_left_to_the_camera_is_as_it_was_found(device: VideoCamera, camera: Cam) -> None:
+    camera.configure(exposure_us=0.0)
+    device.controls[uapi.GAIN] = 7
+    before, period = device.view, device.period
+    changes: dict[str, Any] = {"exposure_us": 4000.0, "gain": 3.0, "brightness": 99, "rate": 50.0}
+    changes |= {"left": 8, "top": 4, "width": 32, "height": 16}
+    camera.configure(**changes)
+    assert camera.expose().pixels.shape == (16, 32)
+    camera.configure(**{name: getattr(V4l2Settings(), name) for name in changes})
+    assert (device.view, device.period) == (before, period)
+    assert camera.expose().pixels.shape == (64, 96)
 
 
 def test_one_that_refuses_its_first_settings_is_not_kept_open(device: VideoCamera) -> None:

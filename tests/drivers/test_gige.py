@@ -129,6 +129,7 @@ def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, came
         ({"rate": 5e4}, "rate 50000 is beyond"),
         ({"width": 2048, "left": 8}, "has 2048×2048 pixels, and none of 2048×480 at"),
         ({"format": "Mono12"}, "camera .configure.: refused it"),
+        ({"left": 16, "width": 320, "rate": 50.0, "exposure_us": 1.0}, "exposure_us 1 is beyond its 10…"),
     ],
 )
 def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
@@ -140,6 +141,30 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert camera.settings == before
     assert (camera.expose().pixels == seen(0)).all()
     assert camera.reconnections == 1
+
+
+def test_what_is_left_to_the_camera_is_as_it_was_found(simulated: GigeCamera) -> None:
+    def asked(camera: Cam) -> tuple[Any, ...]:
+        source = camera._source
+        assert isinstance(source, cameras.Aravis)
+        its = source._camera
+        return (*its.get_region(), its.get_frame_rate(), its.get_exposure_time(), its.get_gain())
+
+    with aravis("camera", simulated.address) as camera:
+        found = asked(camera)
+        changes = {
+            "left": 16,
+            "top": 8,
+            "width": 320,
+            "height": 200,
+            "rate": 50.0,
+            "exposure_us": 500.0,
+            "gain": 3.0,
+        }
+        camera.configure(**changes)
+        assert asked(camera) != found
+        camera.configure(**{name: getattr(AravisSettings(), name) for name in changes})
+        assert asked(camera) == found
 
 
 def test_any_feature_is_set_by_its_name_also_after_the_plug_was_pulled(

@@ -11,7 +11,8 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from operator import methodcaller
 from threading import Event, Thread
 from typing import Any
 
@@ -20,14 +21,13 @@ from reseau.instruments import Deadline, Identity, choice, quantity, text
 
 from ..codecs.pixels import GENICAM, decode
 from .camera import CameraSettings, Taken
-from .clocks import Stamps, Wrapping, realtime_offset
+from .clocks import BlockNumbers, Stamps, realtime_offset
 from .features import require_within, same_value, wanted_features
+from .found import Found
 from .gvcp import HEARTBEAT_S, controlled_elsewhere, require_answer, require_control
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
 
-_SHORT_IDS, _SHORT_IDS_WITH_ZERO, _LONG_IDS = 65535, 65536, 1 << 64
-"""Numbers of frames: GigE Vision 1 counts 1…65535 (some cameras use 0 too), version 2 in 64 bits."""
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
 _LATCHES = (
@@ -108,7 +108,7 @@ class Aravis:
         self._running = False
         self._ours_until = 0.0
         self._settings = AravisSettings()
-        self._numbers = Wrapping(_SHORT_IDS)
+        self._numbers, self._found = BlockNumbers(), Found()
         self._size = (0, 0)
         self._period_ns = _UNKNOWN_PERIOD_NS
         self._exposure_ns: int | None = None
@@ -131,7 +131,7 @@ class Aravis:
         self.close()
         library, _ = _library()
         self._lost = lost = Event()
-        self._numbers = Wrapping(_SHORT_IDS)
+        self._numbers, self._found = BlockNumbers(), Found()
         require_answer(self._address, deadline)
         require_control(self._address, deadline, self._ours_until)
         with self._told("open"):
@@ -139,6 +139,8 @@ class Aravis:
             self._camera.get_device().connect("control-lost", lambda *_: lost.set())
             if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
                 raise controlled_elsewhere(self._address)
+            # Whoever had it may have died while it sent; to whom it sends is settled when it starts.
+            self._camera.stop_acquisition()
             self._stamps.offset = self._latched()
 
     def close(self) -> None:
@@ -254,12 +256,7 @@ class Aravis:
         """
         if buffer.get_status() != _library()[0].BufferStatus.SUCCESS:
             return None
-        number = int(buffer.get_frame_id())
-        if number > _SHORT_IDS:
-            self._numbers.period = _LONG_IDS
-        elif number == 0 and self._numbers.period == _SHORT_IDS:
-            self._numbers.period = _SHORT_IDS_WITH_ZERO
-        return self._numbers.next(number)
+        return self._numbers.next(int(buffer.get_frame_id()))
 
     def _read(self, buffer: Any, sequence: int) -> Taken | None:
         width, height = buffer.get_image_width(), buffer.get_image_height()
@@ -325,37 +322,40 @@ class Aravis:
 
     def _set_region(self, camera: Any, settings: AravisSettings) -> None:
         camera.set_pixel_format_from_string(settings.format)
-        camera.set_region(0, 0, -1, -1)
-        _, _, width, height = camera.get_region()
+        now = tuple(camera.get_region())
+        asked = settings.left, settings.top, settings.width, settings.height
+        found = self._found.before("region", any(asked), lambda: now) or now
+        region = (*asked[:2], asked[2] or found[2], asked[3] or found[3]) if any(asked) else found
+        left, top, width, height = region
         sensor = camera.get_sensor_size()
-        width, height = settings.width or width, settings.height or height
-        if settings.left + width > sensor[0] or settings.top + height > sensor[1]:
+        if left + width > sensor[0] or top + height > sensor[1]:
             raise RefusedError(
-                f"has {sensor[0]}×{sensor[1]} pixels, and none of {width}×{height} at "
-                f"({settings.left}, {settings.top})"
+                f"has {sensor[0]}×{sensor[1]} pixels, and none of {width}×{height} at ({left}, {top})"
             )
-        camera.set_region(settings.left, settings.top, width, height)
-        got = tuple(camera.get_region())
-        if got != (settings.left, settings.top, width, height):
-            raise RefusedError(f"reads the region {got}, not {(settings.left, settings.top, width, height)}")
+        camera.set_region(0, 0, -1, -1)  # where it lies limits how large it may be
+        camera.set_region(*region)
+        if (got := tuple(camera.get_region())) != region:
+            raise RefusedError(f"reads the region {got}, not {region}")
         self._size = width, height
 
     def _set_light(self, camera: Any, settings: AravisSettings) -> None:
-        if settings.rate:
-            require_within("rate", settings.rate, camera.get_frame_rate_bounds())
-            camera.set_frame_rate(settings.rate)
+        for name, feature, given in (
+            ("rate", "frame_rate", settings.rate > 0),
+            ("exposure_us", "exposure_time", settings.exposure_us > 0),
+            ("gain", "gain", settings.gain >= 0),
+        ):
+            value = getattr(settings, name)
+            if given:
+                require_within(name, value, methodcaller(f"get_{feature}_bounds")(camera))
+            found = self._found.before(name, given, partial(methodcaller(f"get_{feature}"), camera))
+            if given or found is not None:
+                getattr(camera, f"set_{feature}")(value if given else found)
         self._period_ns = _UNKNOWN_PERIOD_NS
         if camera.is_frame_rate_available() and camera.get_frame_rate() > 0:
             self._period_ns = int(1e9 / camera.get_frame_rate())
-        if settings.exposure_us:
-            require_within("exposure_us", settings.exposure_us, camera.get_exposure_time_bounds())
-            camera.set_exposure_time(settings.exposure_us)
         self._exposure_ns = None
         if camera.is_exposure_time_available():
             self._exposure_ns = int(camera.get_exposure_time() * 1000)
-        if settings.gain >= 0:
-            require_within("gain", settings.gain, camera.get_gain_bounds())
-            camera.set_gain(settings.gain)
         self._gain = float(camera.get_gain()) if camera.is_gain_available() else float("nan")
 
     @contextmanager

@@ -30,7 +30,7 @@ _CHECKED = 12
 
 @dataclass(frozen=True)
 class CameraSettings(Settings):
-    """What all cameras have; 0, or a gain below 0, leaves the camera as it is."""
+    """What all cameras have; 0, or a gain below 0, leaves it to the camera, as it was found."""
 
     exposure_us: float = quantity(0.0, "µs", 0.0, 1e8)
     gain: float = quantity(-1.0, "", -1.0, 1e6)

@@ -9,9 +9,10 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-__all__ = ["Span", "Stamps", "Wrapping", "realtime_offset", "utc"]
+__all__ = ["BlockNumbers", "Span", "Stamps", "Wrapping", "realtime_offset", "utc"]
 
 _TRIES = 5
+_SHORT, _SHORT_WITH_ZERO, _LONG = 65535, 65536, 1 << 64
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -81,6 +82,28 @@ class Wrapping:
         self._number = number
         self._counted += step
         return self._counted
+
+
+class BlockNumbers(Wrapping):
+    """Frame numbers of GenICam: GigE Vision 1 counts 1…65535, some cameras 0…65535, all others in 64 bits.
+
+    Examples
+    --------
+    >>> numbers = BlockNumbers()
+    >>> [numbers.next(n) for n in (65535, 0, 1)], numbers.lost
+    ([65535, 65536, 65537], 0)
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_SHORT)
+
+    def next(self, number: int) -> int | None:
+        """As of :class:`Wrapping`; how many there are shows by itself."""
+        if number > _SHORT:
+            self.period = _LONG
+        elif number == 0 and self.period == _SHORT:
+            self.period = _SHORT_WITH_ZERO
+        return super().next(number)
 
 
 class Stamps:

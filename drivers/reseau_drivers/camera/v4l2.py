@@ -23,6 +23,7 @@ from ..codecs import v4l2 as uapi
 from ..codecs.pixels import VIDEO, decode, size_of
 from .camera import CameraSettings, Taken
 from .clocks import Span, Wrapping
+from .found import Found
 from .kernel import Mapping, Node, OpenNode
 
 __all__ = ["V4l2", "V4l2Settings"]
@@ -61,6 +62,7 @@ class V4l2:
         self._streaming = False
         self._numbers = Wrapping(1 << 32)
         self._damaged = 0
+        self._found = Found()
         self._buffers = 4
         self._format, self._layout = uapi.Format(0, 0, "GREY"), VIDEO["GREY"]
         self._period_ns = _UNKNOWN_PERIOD_NS
@@ -82,7 +84,7 @@ class V4l2:
     def open(self, deadline: Deadline) -> None:
         """Open the node anew; nothing of an earlier one is used again."""
         self.close()
-        self._numbers, self._damaged = Wrapping(1 << 32), 0
+        self._numbers, self._damaged, self._found = Wrapping(1 << 32), 0, Found()
         self._node = self._open_node()
         with self._told("query"):
             found = uapi.Capability.parse(self._ask(uapi.QUERYCAP, bytearray(uapi.Capability.SIZE)))
@@ -119,6 +121,8 @@ class V4l2:
         self._set_gain(settings.gain)
         if settings.brightness >= 0:
             self._set(uapi.BRIGHTNESS, settings.brightness, "brightness")
+        else:
+            self._put_back(uapi.BRIGHTNESS)
 
     def dark(self, settings: V4l2Settings) -> V4l2Settings:
         """Settings with the shortest exposure, where it has a control for that."""
@@ -230,9 +234,17 @@ class V4l2:
 
     def _set_format(self, settings: V4l2Settings) -> None:
         now = uapi.Format.parse(self._ask(uapi.G_FMT, uapi.Format(0, 0, "GREY").build()))
-        width, height = settings.width or now.width, settings.height or now.height
-        if settings.left or settings.top:
+        sized = bool(settings.width or settings.height)
+        width, height = self._found.before("size", sized, lambda: (now.width, now.height)) or (
+            now.width,
+            now.height,
+        )
+        width, height = settings.width or width, settings.height or height
+        moved = bool(settings.left or settings.top)
+        region = self._found.before("region", moved, self._region)
+        if moved:
             region = uapi.Selection(settings.left, settings.top, width, height)
+        if region is not None:
             got = uapi.Selection.parse(self._ask(uapi.S_SELECTION, region.build()))
             if got != region:
                 raise RefusedError(f"reads the region {got}, not {region}")
@@ -248,16 +260,26 @@ class V4l2:
             )
         self._format = took
 
+    def _region(self) -> uapi.Selection:
+        """The region of the sensor that is read."""
+        return uapi.Selection.parse(self._ask(uapi.G_SELECTION, uapi.Selection(0, 0, 0, 0).build()))
+
     def _set_rate(self, rate: float) -> None:
         self._period_ns = _UNKNOWN_PERIOD_NS
         # Not every driver knows of intervals; one that does tells the one that it took.
         with suppress(OSError):
+            interval = self._found.before("interval", bool(rate), self._interval)
             if rate:
-                self._ask(uapi.S_PARM, uapi.Interval(1000, round(rate * 1000)).build())
-            got = uapi.Interval.parse(self._ask(uapi.G_PARM, uapi.Interval(0, 0).build()))
+                interval = uapi.Interval(1000, round(rate * 1000))
+            if interval is not None:
+                self._ask(uapi.S_PARM, interval.build())
+            got = self._interval()
             self._period_ns = got.ns or _UNKNOWN_PERIOD_NS
         if rate and abs(self._period_ns * rate - 1e9) > 5e7:
             raise RefusedError(f"delivers {1e9 / self._period_ns:.4g} frames in a second, not {rate:g}")
+
+    def _interval(self) -> uapi.Interval:
+        return uapi.Interval.parse(self._ask(uapi.G_PARM, uapi.Interval(0, 0).build()))
 
     def _set_exposure(self, exposure_us: float) -> None:
         known = uapi.EXPOSURE_ABSOLUTE in self._controls
@@ -267,6 +289,8 @@ class V4l2:
             if uapi.EXPOSURE_AUTO in self._controls:
                 self._set(uapi.EXPOSURE_AUTO, uapi.EXPOSURE_MANUAL, "exposure mode")
             self._set(uapi.EXPOSURE_ABSOLUTE, max(1, round(exposure_us / 100)), "exposure_us / 100")
+        else:
+            self._put_back(uapi.EXPOSURE_ABSOLUTE, uapi.EXPOSURE_AUTO)
         automatic = (
             uapi.EXPOSURE_AUTO in self._controls and self._get(uapi.EXPOSURE_AUTO) != uapi.EXPOSURE_MANUAL
         )
@@ -277,6 +301,8 @@ class V4l2:
             if uapi.AUTOGAIN in self._controls:
                 self._set(uapi.AUTOGAIN, 0, "automatic gain")
             self._set(uapi.GAIN, round(gain), "gain")
+        else:
+            self._put_back(uapi.GAIN, uapi.AUTOGAIN)
         self._gain = float(self._get(uapi.GAIN)) if uapi.GAIN in self._controls else float("nan")
 
     def _set(self, identifier: int, value: int, name: str) -> None:
@@ -285,10 +311,18 @@ class V4l2:
             raise RefusedError(f"has no control of {name}")
         if not control.low <= value <= control.high:
             raise RefusedError(f"{name} {value} is beyond its {control.low}…{control.high}")
+        self._found.before(identifier, True, lambda: self._get(identifier))
         with self._told(f"set {control.name}"):
             self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
         if (got := self._get(identifier)) != value:
             raise RefusedError(f"{name} is {got}, not {value}", do="is it driven automatically?")
+
+    def _put_back(self, *identifiers: int) -> None:
+        """Controls as they were found, where they have been changed."""
+        for identifier in identifiers:
+            if (value := self._found.before(identifier, False)) is not None:
+                with self._told(f"set {self._controls[identifier].name}"):
+                    self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
 
     def _get(self, identifier: int) -> int:
         with self._told("get"):

@@ -167,6 +167,10 @@ class VideoNode:
         self._camera.format = uapi.Format(width, height, fourcc, stride, size)
         return self._camera.format.build()
 
+    def _get_region(self, data: bytes) -> bytearray:
+        form = self._camera.format
+        return uapi.Selection(*self._camera.region, form.width, form.height).build()
+
     def _set_region(self, data: bytes) -> bytearray:
         asked, body = uapi.Selection.parse(data), self._camera.body
         self._free()
@@ -272,6 +276,7 @@ _ANSWERS = {
     uapi.ENUM_FMT: VideoNode._list_format,
     uapi.G_FMT: VideoNode._get_format,
     uapi.S_FMT: VideoNode._set_format,
+    uapi.G_SELECTION: VideoNode._get_region,
     uapi.S_SELECTION: VideoNode._set_region,
     uapi.G_PARM: VideoNode._get_interval,
     uapi.S_PARM: VideoNode._set_interval,
