@@ -118,9 +118,9 @@ class Display:
                 f"would bring {_told(facts)}" if known else f"cannot be foretold yet: {facts['why']}"
             )
         if kind == "next":
-            return (
-                f"next: {facts['step']}, would bring {_told(facts)}" if facts["step"] else "no pose is left"
-            )
+            predicted = _told(facts)
+            brings = f", would bring {predicted}" if predicted else ""
+            return f"next: {facts['step']}{brings}" if facts["step"] else "no pose is left"
         if kind == "check":
             return "checks: " + ("; ".join(facts["faults"]) or "good")
         if kind == "again":
