@@ -281,6 +281,30 @@ def test_it_parks_only_where_it_is_told_to_and_only_when_all_is_done(rig: FieldR
     assert rig.camera.exposures == 2
 
 
+def test_it_retreats_only_where_it_is_told_to_and_only_when_it_was_ended_before(
+    rig: FieldRig, kept: Session
+) -> None:
+    def stall(axis: str, position: float) -> None:
+        if position == 90:
+            raise StateError("stalled", where="table", command="move")
+
+    rig.table.before = stall
+    run = rig.acquisition(kept)
+    with pytest.raises(StateError, match="stalled"):
+        carry_out(run, plans.poses(run, FEW[:3]), retreat={"tilt": 7.0})
+    assert rig.table.stands["tilt"] == 7
+    stops = rig.table.stops
+    with pytest.raises(
+        StateError, match="stalled"
+    ):  # where it cannot, that is told, and the first error counts
+        carry_out(run, plans.poses(run, FEW[:3]), retreat={"roll": 90.0})
+    assert ("rest", {"failed": "table (move): stalled"}) in rig.events
+    assert rig.table.stops > stops
+    rig.table.before = lambda axis, position: None
+    carry_out(run, plans.poses(run, FEW[:3]), retreat={"tilt": 7.0})
+    assert rig.table.stands["tilt"] == 30
+
+
 def test_a_plan_of_ones_own_is_a_generator(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept)
 

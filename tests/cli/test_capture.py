@@ -237,7 +237,8 @@ def test_a_session_that_failed_is_resumed_where_it_stood(
             raise StateError("stalled", where="table", command="move", do="free the axis")
 
     rig.table.before = stall
-    assert capture("testfield", *TESTFIELD, "--name", "monday", "--checks", "0") == 1
+    assert capture("testfield", *TESTFIELD, "--name", "monday", "--checks", "0", "--retreat", "tilt=3") == 1
+    assert rig.table.stands["tilt"] == 3
     assert capsys.readouterr().err.strip().endswith("reseau: table (move): stalled; free the axis")
     rig.table.before = lambda axis, position: None
     assert capture("testfield", "--resume") == 0

@@ -35,6 +35,7 @@ def carry_out(
     plan: Plan,
     *,
     park: Mapping[str, float] | None = None,
+    retreat: Mapping[str, float] | None = None,
     paused: Callable[[], Decision] = lambda: "stop",
 ) -> Any:
     """Carry out a plan, and then whatever the procedure makes of the frames.
@@ -46,8 +47,9 @@ def carry_out(
     plan : generator
         Messages.
     park : mapping, optional
-        Where the table is moved when all is done; without it, it stands where the last frame was taken. After
-        an abort or an error it always stands where it stopped.
+        Where the table is moved when all is done; without it, it stands where the last frame was taken.
+    retreat : mapping, optional
+        Where it is moved when it was ended before, or failed; without it, it stands where it stopped.
     paused : callable
         Asked when the plan was interrupted, by Ctrl-C or by :meth:`RunEngine.request_pause`.
 
@@ -69,6 +71,7 @@ def carry_out(
     """
     in_main = threading.current_thread() is threading.main_thread()
     engine, ended = _engine(run, in_main), threading.Event()
+    status = "failed"
     try:
         run.ready()
         with one_thread():  # the same sums however many processors there are
@@ -93,6 +96,8 @@ def carry_out(
     finally:
         run.rest()
         run.settle()
+        if retreat and status != "done":
+            run.retreat(retreat)
 
 
 def _engine(run: Acquisition, in_main: bool) -> Any:

@@ -18,6 +18,7 @@ from ..errors import (
     ImageError,
     InstrumentError,
     ProtocolError,
+    ReseauError,
     StateError,
     UsageError,
 )
@@ -108,6 +109,16 @@ class Work:
             self.bench.stop()
         except InstrumentError as error:
             self.watch("rest", {"failed": str(error)})
+
+    def retreat(self, position: Mapping[str, float]) -> None:
+        """Move the table away after all has come to rest; where it cannot, that is told, and it stands."""
+        try:
+            self.ready()
+            self.move_to(position)
+        except ReseauError as error:
+            self.watch("rest", {"failed": str(error)})
+        finally:
+            self.rest()
 
     def settle(self) -> None:
         """Wait for what an interrupted message still does: what it brings is stored, and judged."""

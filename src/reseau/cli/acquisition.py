@@ -202,7 +202,10 @@ def _carried_out(
             bench, kept, procedure_of(kept), **chosen, retakes=given["retakes"], limits=limits,
             watch=display.watch, operator=display.aside(operator),
         )  # fmt: skip
-        return carry_out(run, planned(run, given), park=given["park"], paused=display.aside(_paused))
+        return carry_out(
+            run, planned(run, given), park=given["park"], retreat=given.get("retreat"),
+            paused=display.aside(_paused),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ def coded_field(
         bool, typer.Option("--home", help="Have axes without a reference find it first: they will move.")
     ] = False,
     park: Annotated[str, typer.Option(help="Where the table ends, as tilt=0,roll=0; else it stays.")] = "",
+    retreat: Annotated[str, typer.Option(help="… where it goes after an abort or an error.")] = "",
     camera: CameraName = None,
     table: TableName = None,
 ) -> None:
@@ -63,14 +64,14 @@ def coded_field(
     from ..instruments import Camera, Turntable
 
     goal = Goal.parse(until) if until else None
-    ends = _position(park)
+    ends, away = _position(park, "--park"), _position(retreat, "--retreat")
 
     def parameters(found: Bench) -> dict[str, Any]:
         found.one(Camera, camera)
         axes = found.one(Turntable, table).axes
         every = paper_steps(axes=tuple(axes)) if poses is None else read_steps(poses)
         steps = at_heights(every, _numbers(heights, "--heights"))
-        _within(axes, [*steps, Step("--park", ends)])
+        _within(axes, [*steps, Step("--park", ends), Step("--retreat", away)])
         given = {
             "steps": [[step.name, dict(step.position)] for step in steps],
             "until": until,
@@ -84,6 +85,7 @@ def coded_field(
             "retakes": retakes,
             "home": home,
             "park": ends,
+            "retreat": away,
             "camera": camera,
             "table": table,
         }
@@ -220,10 +222,10 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
         raise UsageError(f"is {text!r}", where=option, do="write numbers, as 0,50,100") from None
 
 
-def _position(text: str) -> dict[str, float]:
+def _position(text: str, option: str) -> dict[str, float]:
     """A position written as ``tilt=0,roll=0``."""
     try:
         pairs = [part.split("=") for part in text.split(",") if part.strip()]
         return {axis.strip(): float(value) for axis, value in pairs}
     except ValueError:
-        raise UsageError(f"is {text!r}", where="--park", do="write it like tilt=0,roll=0") from None
+        raise UsageError(f"is {text!r}", where=option, do="write it like tilt=0,roll=0") from None
