@@ -16,6 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
+from reseau.capture import Bench, BenchFile
 from reseau.errors import (
     ConnectionLost,
     DeadlineError,
@@ -325,6 +326,23 @@ def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> No
     assert "by the arrival of frames" in found["clock"]
     assert "noise 0 at the shortest exposure" in found["dark"]
     assert camera.settings == before
+
+
+def test_a_bench_checks_it_and_gives_it_back(simulated: GigeCamera) -> None:
+    text = f'''schema = "reseau-bench/1"
+name = "cameras"
+[instruments.eye]
+driver = "aravis"
+address = "{simulated.address}"
+settings = {{width = 320, height = 240, rate = 50.0, exposure_us = 2000.0}}
+'''
+    with Bench(BenchFile.parse_toml(text, where="bench.toml")) as bench:
+        (checked,) = bench.check(10.0)
+    assert (checked.name, checked.driver, checked.error) == ("eye", "aravis", None)
+    assert list(checked.found) == ["identity", "frames", "dropped", "clock", "dark"]
+    assert checked.found["frames"].startswith("320 × 240, ")
+    with aravis("camera", simulated.address, settings=SIZE | LIGHT) as camera:
+        assert camera.expose().fresh
 
 
 def test_there_is_one_port_and_one_camera_on_it(simulated: GigeCamera) -> None:
