@@ -163,6 +163,19 @@ def test_sim_writes_a_bench_that_check_accepts(tmp_path: Path, capsys: pytest.Ca
     assert "reseau-bench/1" in capsys.readouterr().out
 
 
+def test_sim_has_the_testfield_flat_where_it_is_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[SimulatedBench] = []
+
+    def bench(seed: int, **options: Any) -> SimulatedBench:
+        made.append(SimulatedBench(seed, **options))
+        return made[-1]
+
+    monkeypatch.setattr("reseau.capture.plugin", lambda group, name: bench)
+    for flat in ([], ["--flat"]):
+        assert run(["bench", "sim", "--seconds", "0.01", *flat]) == 0
+    assert [each.laboratory.field.bend_mm > 0 for each in made] == [True, False]
+
+
 def test_list_tells_what_was_found_and_why_a_search_failed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -84,6 +84,10 @@ def sim(
     repeatable: Annotated[
         bool, typer.Option("--repeatable", help="The same state gives the same picture; nothing drifts.")
     ] = False,
+    flat: Annotated[
+        bool,
+        typer.Option("--flat", help="The testfield is a plane; else it bends in its mount, as the paper's."),
+    ] = False,
     seconds: Annotated[float, typer.Option(min=0.0, help="Serve so long; 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print the bench.toml that leads to them."""
@@ -94,7 +98,8 @@ def sim(
 
     if out is not None:
         writable(out)
-    options = {"table": table, "family": family, "camera": camera or None, "repeatable": repeatable}
+    options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None}
+    options |= {"repeatable": repeatable, "flat": flat}
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
         if camera and "[instruments.camera]" not in bench.toml:
             typer.echo("no camera: Aravis is not installed", err=True)
