@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.archive import Archive, Session
+from reseau.archive import Archive, Session, Verdict
 from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
 from reseau.errors import ArchiveError, EstimationError, StateError, UsageError
 
@@ -362,6 +362,35 @@ def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, kept
     exposures = rig.camera.exposures
     assert carry_out(again, plans.until(again, goal, first, candidates)) == ""
     assert rig.camera.exposures == exposures
+
+
+def test_looking_for_the_next_pose_ends_when_it_is_stopped(rig: FieldRig, kept: Session) -> None:
+    looked: list[str] = []
+
+    class Slow:
+        """A procedure that needs long for each candidate."""
+
+        def on_frame(self, frame: Any, step: Step) -> Verdict:
+            return Verdict(True)
+
+        def progress(self) -> dict[str, float]:
+            return {"sigma_c": 1.0}
+
+        def next_pose(self, candidates: Any, wanted: str) -> tuple[Step, float | None] | None:
+            for candidate in candidates:
+                looked.append(candidate.name)
+                if len(looked) == 2:
+                    os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(0.2)
+            return None
+
+        def finish(self) -> dict[str, str]:
+            return {}
+
+    run = rig.acquisition(kept, Slow())  # type: ignore[arg-type]
+    carry_out(run, plans.until(run, Goal("c", 0.1, "mm"), FEW[:1], EVERY))
+    assert kept.status == "stopped"
+    assert len(looked) < 6
 
 
 def test_the_closed_loop_says_when_no_pose_helps(rig: FieldRig, kept: Session) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from ..archive import Verdict
 from ..data import Frame
+from ..errors import StateError
 from .step import Step
 
-__all__ = ["Procedure", "Watch"]
+__all__ = ["Candidates", "Procedure", "Watch"]
 
 Watch = Callable[[str, dict[str, Any]], None]
 """Told what happens: the kind of an event, and what there is to say about it."""
@@ -29,3 +30,25 @@ class Procedure(Protocol):
 
     def finish(self) -> Mapping[str, str]:
         """Results: the text of files by name; the same frames in the same order give the same bytes."""
+
+
+class Candidates(list[Step]):
+    """Poses to choose from, of which no more is handed out once it is stopped: choosing may take minutes.
+
+    Parameters
+    ----------
+    stopped : callable
+        Whether somebody wants to stop.
+    those : sequence of Step
+        The poses.
+    """
+
+    def __init__(self, stopped: Callable[[], bool], those: Sequence[Step]) -> None:
+        super().__init__(those)
+        self._stopped = stopped
+
+    def __iter__(self) -> Iterator[Step]:
+        for each in super().__iter__():
+            if self._stopped():
+                raise StateError("was stopped", where="next pose")
+            yield each

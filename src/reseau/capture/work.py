@@ -25,7 +25,7 @@ from ..errors import (
 from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
 from .bench import Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
-from .procedure import Procedure, Watch
+from .procedure import Candidates, Procedure, Watch
 from .shots import clock_of, following, mean_frame, told
 from .step import Step, as_taken
 
@@ -358,7 +358,9 @@ class Work:
             for made in (note for _, note in self.kept.notes("choice") if note["key"] == key):
                 # A session that is resumed goes where it had gone.
                 return None if made["step"] is None else (names[made["step"]], made["predicted"])
-            found = None if self.procedure is None else self.procedure.next_pose(candidates, wanted)
+            found = None
+            if self.procedure is not None:
+                found = self.procedure.next_pose(Candidates(lambda: self._resting, candidates), wanted)
             step, predicted = (None, None) if found is None else (found[0].name, found[1])
             self.kept.note(key, "choice", {"key": key, "step": step, "predicted": predicted})
             self.watch("next", {"step": step, f"sigma_{wanted}": predicted})
