@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import math
 import re
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,7 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.errors import ConnectionLost, DeadlineError, ProtocolError, RefusedError, SettingError, StateError
+from reseau.errors import (
+    ConnectionLost,
+    DeadlineError,
+    ProtocolError,
+    RefusedError,
+    SettingError,
+    StateError,
+    UsageError,
+)
 from reseau.instruments import Camera
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import V4l2Settings, v4l2
@@ -321,6 +331,18 @@ def test_a_node_that_is_none_or_no_camera_is_said() -> None:
         v4l2("camera", "/dev/no-such-video").connect()
     with pytest.raises(RefusedError, match="query"):
         v4l2("camera", "/dev/null").connect()
+
+
+def test_that_aravis_is_missing_is_said_with_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    library = importlib.import_module("reseau_drivers.camera.aravis")._library
+    library.cache_clear()
+    monkeypatch.setitem(sys.modules, "gi", None)
+    said = r"Aravis is not installed .*; install gir1.2-aravis-0.8, and pip install reseau\[aravis\]"
+    with pytest.raises(UsageError, match=said):
+        cameras.aravis_cameras()
+    with pytest.raises(UsageError, match=said):
+        cameras.aravis("camera", "127.0.0.1").connect()
+    library.cache_clear()
 
 
 class _Clocked:
