@@ -22,8 +22,8 @@ Plane = NDArray[np.float32]
 
 _DARK, _BRIGHT = 14.0, 230.0
 """Grey values of unexposed film on a slide and on a negative."""
-_FAR = 4.0
-"""Distance from an outline, pixels, beyond which a pixel is wholly inside or outside."""
+_FAR, _FAR_SIGMAS = 4.0, 5.0
+"""Distance from an outline, pixels and widths of the spread, beyond which a pixel is inside or outside."""
 
 
 def light(frame: FilmFrame) -> Array:
@@ -69,7 +69,7 @@ def _share(distance: Plane, frame: FilmFrame) -> Plane:
     major, minor = max(np.cos(tilt), np.sin(tilt)), min(np.cos(tilt), np.sin(tilt))
     sigma, half = float(np.hypot(frame.blur_px, minor / np.sqrt(12))), major / 2
     share: Plane = (distance > 0).astype(np.float32)
-    near = np.abs(distance) < _FAR + half
+    near = np.abs(distance) < max(_FAR, _FAR_SIGMAS * sigma) + half
     d = distance[near].astype(np.float64)
 
     def integral(t: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...data import Array, Mask
 from .band import Band
@@ -33,9 +33,11 @@ _SHARP, _EVEN = (0.1, 0.3), 0.015
 differ from place to place, logarithm, at least so much."""
 _FARTHEST = 1.5
 """Widths by which a line may draw a step at most; one that is farther away is seen by itself."""
-_RATIO, _FEW_DRAWN = 4.0, 0.15
+_RATIO, _FEW_DRAWN = 4.0, 0.22
 """Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
 show it by chance."""
+_TOGETHER, _INDEPENDENT = 5, 2.5
+"""Neighbourhoods of profiles that a line widens alike; and as how many their means tell in a picture's forms."""
 _CLEAR = 0.6
 """Part of its profiles that show a step where nothing disturbs."""
 _ENDS = 2.0
@@ -43,6 +45,11 @@ _ENDS = 2.0
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
 take, and that which is left out besides."""
+_LEAST_AGREE = 0.45
+"""Part of an edge's profiles that agree with a line at least."""
+_BOWED, _OUTWARDS = 0.6, 0.1
+"""Bow inwards, pixels, of which a thing in the picture may be the cause; part of the profiles off a straight
+edge that lie outwards at most then."""
 _CHORD = 30
 """Points by which an edge is given that is known by its ends."""
 _OTHER_WIDTH, _UNEVEN_WIDTH = 0.12, 0.2
@@ -148,26 +155,35 @@ def _blurs(profiles: Sequence[EdgeProfiles | None]) -> list[_Blur]:
     """Widths of sharp steps: what a picture has beside its edge only widens them."""
     own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
     sharp = [_blur(blur) for blur in own]
-    if _uneven(sorted(float(np.exp(b.width)) for b, blur in zip(sharp, own, strict=True) if len(blur))):
+    seen = [blur for blur, every in zip(sharp, own, strict=True) if len(every)]
+    if not seen:
         return sharp
     # A line beside one of the edges scatters its widths, not those of the others.
-    scatter = sorted(b.scatter for b, blur in zip(sharp, own, strict=True) if len(blur))
-    typical = scatter[min(1, len(scatter) - 1)] if scatter else _EVEN
-    return [_Blur(_blur(np.concatenate(own)).width, typical)] * len(profiles)
+    texture = sorted(blur.texture for blur in seen)[min(1, len(seen) - 1)]
+    if _uneven(sorted(float(np.exp(blur.width)) for blur in seen)):
+        return [blur._replace(texture=texture) for blur in sharp]
+    scatter = sorted(blur.scatter for blur in seen)[min(1, len(seen) - 1)]
+    return [_Blur(_blur(np.concatenate(own)).width, scatter, texture)] * len(profiles)
 
 
 class _Blur(NamedTuple):
-    """Logarithm of the width of a sharp step, and by how much it differs from place to place."""
+    """Logarithm of the width of a sharp step, by how much it differs from place to place at least, and at
+    random by the picture's forms.
+    """
 
     width: float
     scatter: float
+    texture: float
 
 
 def _blur(every: Array) -> _Blur:
     if not len(every):
-        return _Blur(0.0, _EVEN)
+        return _Blur(0.0, _EVEN, 0.0)
     low, sharp = np.quantile(every, _SHARP)
-    return _Blur(float(sharp), max(float(sharp - low), _EVEN))
+    # A picture's forms move the steps, too, where it shows; a line along the edge widens neighbours alike.
+    apart = np.abs(np.diff(every[::NEIGHBOURS]))
+    texture = 1.4826 * float(np.median(apart)) / np.sqrt(2) if len(apart) > 3 else 0.0
+    return _Blur(float(sharp), max(float(sharp - low), _EVEN), texture)
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
@@ -188,12 +204,11 @@ def _drawn(found: EdgeProfiles, blur: _Blur) -> tuple[Array, float]:
     A second step of a part r of the contrast, s behind the first, is seen as one that is moved by r·s and has
     the variance w² + r(1 − r)·s². One that is too sharp is a line by itself.
     """
-    other = np.minimum(np.abs(found.blur[0] - blur.width) - blur.scatter, 1.0)
-    sure = other - 2 * np.sqrt(found.blur[1])
+    sure = _unlike(found, blur, 2.0)
     part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
     if part > _FEW_DRAWN:
         # There is such a line: what is no proof is a sign now.
-        sure = other - np.sqrt(found.blur[1])
+        sure = _unlike(found, blur, 1.0)
     moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _FARTHEST)
     if part > _FEW_DRAWN:
         moved = moved * np.sqrt(NEIGHBOURS)  # which are drawn alike
@@ -210,13 +225,13 @@ def _edge(
         return None, 0, "no contrast between film and picture"
     drawn, part = _drawn(found, blur)
     place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
+    line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
     sigma = np.hypot(sigma, drawn[found.good])
-    line = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
     rejected = int((~found.good).sum())
     if line is None:
         return None, rejected, f"no line through {len(place)} of {len(found.place)} profiles show a step"
     (start, stop, bow), agree = line
-    if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < 0.45:
+    if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
     if border.clean < 0.6:
@@ -241,6 +256,35 @@ def _edge(
     ends = _ENDS * float(np.exp(blur.width)) * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
+
+
+def _unlike(found: EdgeProfiles, blur: _Blur, sigmas: float) -> Array:
+    """By how much widths surely differ from a sharp step's, logarithm (n,): alone, or with those around."""
+    other, variance = found.blur[0] - blur.width, found.blur[1] + blur.texture**2
+    size = min(_TOGETHER * NEIGHBOURS, len(other))
+    mean, own = (uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
+    alone = np.abs(other) - sigmas * np.sqrt(variance)
+    together = mean - sigmas * np.sqrt(own / _INDEPENDENT)
+    return np.asarray(np.minimum(np.maximum(alone, together) - blur.scatter, 1.0))
+
+
+def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
+    """Chord and bow of an edge, and which profiles agree; `own` sigmas are without what may draw the steps.
+
+    A thing in the picture that bends away from a dark edge is no bow of it: those profiles that do not agree
+    with a straight one all lie inwards.
+    """
+    found = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
+    if found is None or found[0][2] > -_BOWED:
+        return found
+    straight = robust_line(place, offset, own, _NEIGHBOURHOOD_PX, bow=_BOWED / 3)
+    if straight is None:
+        return found
+    (start, stop, bow), agree = straight
+    inward = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+    outside = np.count_nonzero(inward[~agree] < 0)
+    alone = agree.mean() > _LEAST_AGREE and outside < _OUTWARDS * np.count_nonzero(~agree)
+    return straight if alone else found
 
 
 def _straight(place: Array, inward: Array) -> Mask:

@@ -37,8 +37,8 @@ _FREE, _HELD = 0.5, (0.02, 0.12)
 """Logarithms by which the width of a step may differ from the expected one: at first; then, where that is of
 other edges, and where it is of this one."""
 _MODEL = 0.012, 0.05
-"""Part of the picture's contrast to which the model describes a profile: more where the width is yet unknown, lest
-what it does not describe be taken for blunders."""
+"""Part of the picture's contrast to which the model describes a profile: more where the width is yet unknown,
+lest what it does not describe be taken for blunders."""
 _ROUNDS, _LEAST_PIXELS = 2, 100
 """How often the common width is looked for, and pixels of a section that tells it."""
 

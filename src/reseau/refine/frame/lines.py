@@ -119,7 +119,9 @@ class Lines:
     redundancy: int
 
 
-def robust_line(place: Array, offset: Array, sigma: Array, unit: float) -> tuple[Array, Mask] | None:
+def robust_line(
+    place: Array, offset: Array, sigma: Array, unit: float, bow: float = _BOW_PX
+) -> tuple[Array, Mask] | None:
     """Chord and bow of one edge, and which profiles agree: [at −1, at 1, bow] and a mask.
 
     Parameters
@@ -128,12 +130,14 @@ def robust_line(place: Array, offset: Array, sigma: Array, unit: float) -> tuple
         Along the edge (−1 to 1), inwards, and the standard deviation.
     unit : float
         What a profile's neighbourhood adds to its standard deviation at least.
+    bow : float
+        Standard deviation of the bow.
     """
     if len(place) < 12:
         return None
     design = np.stack([(1 - place) / 2, (1 + place) / 2, -(1 - place**2)], axis=1)
     total = np.hypot(sigma, unit)
-    prior = {"bow": _BOW_PX}
+    prior = {"bow": bow}
     start = [float(np.median(offset))] * 2 + [0.0]
     problem = GaussMarkov(
         lambda x: design @ x,
