@@ -132,6 +132,24 @@ def test_a_name_is_given_once_and_an_unknown_one_is_told(opened: Callable[[], Ar
             archive.begin("../s", "frames", {})
 
 
+def test_a_session_has_what_it_was_given_from_the_beginning(opened: Callable[[], Archive]) -> None:
+    with opened() as archive:
+        session = archive.begin("s", "testfield", {}, inputs={"design.json": "{}", "field.csv": "ä"})
+        session.store("0", frame())
+        assert {name: each.kind for name, each in session.given().items()} == {
+            "design.json": "input",
+            "field.csv": "input",
+        }
+        assert session.input("field.csv") == "ä"
+        with pytest.raises(ArchiveError, match=r"s: was given no other\.json"):
+            session.input("other.json")
+        with pytest.raises(ArchiveError, match="--resume"):
+            archive.begin("s", "testfield", {}, inputs={"more.json": "[]"})
+        assert len(session.given()) == 2
+        assert [each.frames for each in archive.sessions()] == [1]  # what was given is no frame
+        assert verify(archive).files == 3
+
+
 def test_verifying_finds_what_was_changed_lost_or_left_over(tmp_path: Path) -> None:
     with Archive.open(tmp_path, create=True) as archive:
         session = archive.begin("s", "frames", {})
