@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -140,6 +141,41 @@ def test_another_channel_is_kept_where_that_of_most_contrast_hides_an_edge() -> 
     assert result.status == "oriented"
     assert result.channel == "green"
     assert np.abs(errors(result, frame)).max() < 0.3
+
+
+def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
+    frame = FilmFrame(51)
+    pixels = frame.scan()
+    h, w = pixels.shape
+    # Left and right edge converge by two degrees.
+    seen = np.array([[-14.0, 0.0], [w + 14.0, 0.0], [w, h], [0.0, h]], dtype=np.float32)
+    square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
+    tilted = cv2.getPerspectiveTransform(square, seen)
+    pixels = cv2.warpPerspective(
+        pixels, tilted, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    corners = cv2.perspectiveTransform(frame.truth.corners[None], tilted)[0]
+    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    assert result.status == "oriented", result.why
+    assert "seen at a slant" in result.why
+    assert result.lines is not None
+    np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=0.3)
+
+
+def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
+    frame = FilmFrame(52)
+    pixels = frame.scan()
+    h, w = pixels.shape
+    # One corner moved alone: its edges are turned by a degree and more.
+    seen = np.array([[24.0, 16.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
+    square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
+    moved = cv2.getPerspectiveTransform(square, seen)
+    pixels = cv2.warpPerspective(
+        pixels, moved, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    assert result.status == "declined"
+    assert "do not make a frame" in result.why
 
 
 def test_what_is_no_frame_is_declined_with_what_would_help() -> None:

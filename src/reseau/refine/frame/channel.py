@@ -37,7 +37,7 @@ _RATIO, _FEW_DRAWN = 4.0, 0.22
 """Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
 show it by chance."""
 _TOGETHER, _INDEPENDENT = 5, 2.5
-"""Neighbourhoods of profiles that a line widens alike; and as how many their means tell in a picture's forms."""
+"""Neighbourhoods of profiles that a line widens alike; as how many their mean tells in a picture's forms."""
 _CLEAR = 0.6
 """Part of its profiles that show a step where nothing disturbs."""
 _ENDS = 2.0

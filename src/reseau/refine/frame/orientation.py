@@ -14,7 +14,7 @@ from ...formats import CORNERS, EDGES, FrameOrientation, MeasuredCorner, Measure
 from ...scans import Scan
 from .band import Band, read_band
 from .channel import FAR, Channel, channels_by_contrast, measure_channel
-from .lines import FrameShape, Lines, adjust_lines, derived
+from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
 from .outline import FrameGuess
 from .search import search_frames
 
@@ -36,6 +36,8 @@ _MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
 so that a scan finer than its film is not asked for more than the film shows."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Order of what a frame may be."""
+_SLANT = float(np.deg2rad(0.7))
+"""Standard deviation of an angle that a copying camera may have turned, radians."""
 _MOST_W = 4.0
 """Test value from which on the shape of a frame contradicts its format."""
 
@@ -276,8 +278,11 @@ def _judged(
     lines = adjust_lines(corners, measured.data, shape, measured.rejected)
     if isinstance(lines, Failure):
         return replace(base, why=lines.reason, edges=_reports(measured, None))
-    base = replace(base, lines=lines, edges=_reports(measured, lines))
-    worst = np.abs(np.nan_to_num(lines.shape_w)).max()
+    worst, slant = np.abs(np.nan_to_num(lines.shape_w)).max(), ""
+    if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
+        lines, converging = seen
+        worst, slant = 0.0, f"seen at a slant: opposite edges converge by {np.rad2deg(converging):.1f}°"
+    base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant)
     if worst > _MOST_W:
         w, h = guess.format_mm
         return replace(
@@ -296,6 +301,23 @@ def _judged(
         why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
         return replace(base, lines=None, why=why)
     return replace(base, status="oriented")
+
+
+def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
+    """Four edges as a tilted copying camera sees them, and by how much opposite ones converge, radians.
+
+    A perspective turns opposite edges towards one another; a single edge that is wrong makes opposite angles
+    both greater or both smaller, too.
+    """
+    free = replace(shape, angle_sigma=_SLANT, aspect_sigma=3 * shape.aspect_sigma)
+    lines = adjust_lines(corners, measured.data, free, measured.rejected)
+    if isinstance(lines, Failure):
+        return None
+    ur, lr, ll, aspect = shape_of(lines.corners, shape) - np.array(shape.deviation)
+    converging = max(abs(ur + lr), abs(lr + ll))
+    alike = abs(ur + ll) / 2 < _MOST_W * shape.angle_sigma / np.sqrt(2)
+    alike &= abs(aspect) < _MOST_W * shape.aspect_sigma and converging < _MOST_W * _SLANT
+    return (lines, float(converging)) if alike else None
 
 
 def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
