@@ -49,6 +49,10 @@ CASES = {
     "rounded corners": FilmFrame(format=RICOH._replace(radius=1.5)),
     "bowed edges": FilmFrame(bow_mm=0.1),
     "Hasselblad, slits": FilmFrame(format=HASSELBLAD),
+    "soft, hardly noise": FilmFrame(blur_px=1.5, noise=0.5, grain=0.5),
+    "1200 dpi, soft": FilmFrame(dpi=1200, blur_px=2.5),
+    "1200 dpi, soft, film": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(**_FILM, dust=40, scratches=3)),
+    "1200 dpi, soft, 7A": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(rods=1)),
 }
 
 PAPER = {"Ricoh, 600 dpi": (0.008, 0.014, 0.015, 0.010), "Hasselblad, 1200 dpi": (0.014, 0.018, 0.026, 0.028)}
