@@ -40,8 +40,9 @@ _TOGETHER, _INDEPENDENT = 5, 2.5
 """Neighbourhoods of profiles that a line widens alike; as how many their mean tells in a picture's forms."""
 _CLEAR = 0.6
 """Part of its profiles that show a step where nothing disturbs."""
-_ENDS = 2.0
-"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths."""
+_ENDS, _TOO_SHARP = 2.0, 0.3
+"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths; and
+logarithm by which steps are too sharp for those of an edge."""
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
 take, and that which is left out besides."""
@@ -52,9 +53,10 @@ _BOWED, _OUTWARDS = 0.6, 0.1
 edge that lie outwards at most then."""
 _CHORD = 30
 """Points by which an edge is given that is known by its ends."""
-_OTHER_WIDTH, _UNEVEN_WIDTH = 0.12, 0.2
+_OTHER_WIDTH, _UNEVEN_WIDTH, _SCRATCHED = 0.12, 0.2, 0.5
 """Logarithms by which an edge's width of the step differs from that of all for it to be measured with theirs,
-and by which three edges differ if the scan is sharper at one side than at another."""
+by which three edges differ if the scan is sharper at one side than at another, and the sharpest if it is none of
+an edge."""
 _MOST_GOOD = 0.85
 """Part of an edge's profiles that show a step, from which no wide ones are needed."""
 
@@ -148,6 +150,8 @@ def _widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
 
 def _uneven(widths: Sequence[float]) -> bool:
     """Whether sorted widths differ by more than what a picture beside one of the edges does to it."""
+    if len(widths) > 3 and np.log(widths[1] / widths[0]) > _SCRATCHED:
+        widths = widths[1:]  # no lens is that sharp at one edge alone
     return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN_WIDTH)
 
 
@@ -253,6 +257,8 @@ def _edge(
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
+    # Steps sharper than any are those of a scratch, and tell as little.
+    hidden |= bool(np.median(found.blur[0][found.good]) < blur.width - _TOO_SHARP)
     ends = _ENDS * float(np.exp(blur.width)) * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
