@@ -55,8 +55,8 @@ _CHORD = 30
 """Points by which an edge is given that is known by its ends."""
 _OTHER_WIDTH, _UNEVEN_WIDTH, _SCRATCHED = 0.12, 0.2, 0.5
 """Logarithms by which an edge's width of the step differs from that of all for it to be measured with theirs,
-by which three edges differ if the scan is sharper at one side than at another, and the sharpest if it is none of
-an edge."""
+by which three edges differ if the scan is sharper at one side than at another, and the sharpest if it is no
+edge's."""
 _MOST_GOOD = 0.85
 """Part of an edge's profiles that show a step, from which no wide ones are needed."""
 
