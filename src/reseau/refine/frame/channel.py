@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter
 
 from ...data import Array, Mask
 from .band import Band
 from .border import Film
 from .companion import Companion, edge_beside_line
-from .edges import NEIGHBOURS, EdgeProfiles, measure_profiles, merged
+from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
+from .sharpness import FEW_DRAWN, Sharp, common_widths, drawn_by_lines, sharp_steps
 
 __all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
 
@@ -28,21 +28,10 @@ _FOREIGN = 0.25
 """Part of the picture's contrast by which what lies beyond an edge differs from film beyond the others."""
 _UNEVEN = 0.45
 """Part of its own tone by which film may differ between edges: the scanner's light is uneven."""
-_SHARP, _EVEN = (0.1, 0.3), 0.015
-"""Quantiles of the widths of profiles: the greater is that of a sharp step, their difference tells how they
-differ from place to place, logarithm, at least so much."""
-_FARTHEST = 1.5
-"""Widths by which a line may draw a step at most; one that is farther away is seen by itself."""
-_RATIO, _FEW_DRAWN = 4.0, 0.22
-"""Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
-show it by chance."""
-_TOGETHER, _INDEPENDENT = 5, 2.5
-"""Neighbourhoods of profiles that a line widens alike; as how many their mean tells in a picture's forms."""
 _CLEAR = 0.6
 """Part of its profiles that show a step where nothing disturbs."""
-_ENDS, _TOO_SHARP = 2.0, 0.3
-"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths; and
-logarithm by which steps are too sharp for those of an edge."""
+_ENDS = 2.0
+"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths."""
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
 take, and that which is left out besides."""
@@ -53,10 +42,8 @@ _BOWED, _OUTWARDS = 0.6, 0.1
 edge that lie outwards at most then."""
 _CHORD = 30
 """Points by which an edge is given that is known by its ends."""
-_OTHER_WIDTH, _UNEVEN_WIDTH, _SCRATCHED = 0.12, 0.2, 0.5
-"""Logarithms by which an edge's width of the step differs from that of all for it to be measured with theirs,
-by which three edges differ if the scan is sharper at one side than at another, and the sharpest if it is no
-edge's."""
+_OTHER_WIDTH = 0.12
+"""Logarithm by which an edge's width of the step differs from that of all, to be measured with theirs."""
 _MOST_GOOD = 0.85
 """Part of an edge's profiles that show a step, from which no wide ones are needed."""
 
@@ -121,7 +108,7 @@ def measure_channel(
         if film is not None:
             films[k] = film
             profiles[k] = measured(k, False)
-    for k, (found, width) in enumerate(zip(profiles, _widths(profiles), strict=True)):
+    for k, (found, width) in enumerate(zip(profiles, common_widths(profiles), strict=True)):
         if found is None or width is None:
             continue
         if abs(np.log(found.width / width)) > _OTHER_WIDTH:
@@ -131,63 +118,11 @@ def measure_channel(
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, blur, channel, polarity)
-        for k, (found, blur) in enumerate(zip(profiles, _blurs(profiles), strict=True))
+        _edge(band(k, False, far[k]), found, sharp, channel, polarity)
+        for k, (found, sharp) in enumerate(zip(profiles, sharp_steps(profiles), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     return Channel(name, data, rejected, why)
-
-
-def _widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
-    """Width of the blurred step for each edge: one for all, unless they are focused differently."""
-    told = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
-    if not told:
-        return [None] * len(profiles)
-    if _uneven(told):
-        return [None if p is None else p.width for p in profiles]
-    return [told[(len(told) - 1) // 2]] * len(profiles)
-
-
-def _uneven(widths: Sequence[float]) -> bool:
-    """Whether sorted widths differ by more than what a picture beside one of the edges does to it."""
-    if len(widths) > 3 and np.log(widths[1] / widths[0]) > _SCRATCHED:
-        widths = widths[1:]  # no lens is that sharp at one edge alone
-    return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN_WIDTH)
-
-
-def _blurs(profiles: Sequence[EdgeProfiles | None]) -> list[_Blur]:
-    """Widths of sharp steps: what a picture has beside its edge only widens them."""
-    own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
-    sharp = [_blur(blur) for blur in own]
-    seen = [blur for blur, every in zip(sharp, own, strict=True) if len(every)]
-    if not seen:
-        return sharp
-    # A line beside one of the edges scatters its widths, not those of the others.
-    texture = sorted(blur.texture for blur in seen)[min(1, len(seen) - 1)]
-    if _uneven(sorted(float(np.exp(blur.width)) for blur in seen)):
-        return [blur._replace(texture=texture) for blur in sharp]
-    scatter = sorted(blur.scatter for blur in seen)[min(1, len(seen) - 1)]
-    return [_Blur(_blur(np.concatenate(own)).width, scatter, texture)] * len(profiles)
-
-
-class _Blur(NamedTuple):
-    """Logarithm of the width of a sharp step, by how much it differs from place to place at least, and at
-    random by the picture's forms.
-    """
-
-    width: float
-    scatter: float
-    texture: float
-
-
-def _blur(every: Array) -> _Blur:
-    if not len(every):
-        return _Blur(0.0, _EVEN, 0.0)
-    low, sharp = np.quantile(every, _SHARP)
-    # A picture's forms move the steps, too, where it shows; a line along the edge widens neighbours alike.
-    apart = np.abs(np.diff(every[::NEIGHBOURS]))
-    texture = 1.4826 * float(np.median(apart)) / np.sqrt(2) if len(apart) > 3 else 0.0
-    return _Blur(float(sharp), max(float(sharp - low), _EVEN), texture)
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
@@ -202,32 +137,15 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
     return [film if p is None or p.border.film.tone - film.tone > most else None for p in profiles]
 
 
-def _drawn(found: EdgeProfiles, blur: _Blur) -> tuple[Array, float]:
-    """By how much lines of the picture beside an edge may draw its steps to them, pixels (n,); how many do.
-
-    A second step of a part r of the contrast, s behind the first, is seen as one that is moved by r·s and has
-    the variance w² + r(1 − r)·s². One that is too sharp is a line by itself.
-    """
-    sure = _unlike(found, blur, 2.0)
-    part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
-    if part > _FEW_DRAWN:
-        # There is such a line: what is no proof is a sign now.
-        sure = _unlike(found, blur, 1.0)
-    moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _FARTHEST)
-    if part > _FEW_DRAWN:
-        moved = moved * np.sqrt(NEIGHBOURS)  # which are drawn alike
-    return np.asarray(np.exp(blur.width) * moved), part
-
-
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, blur: _Blur, channel: int, polarity: int
+    band: Band | None, found: EdgeProfiles | None, sharp: Sharp, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
     """The profiles of an edge that agree with its line; or why it is not found."""
     if band is None:
         return None, 0, "is not in the scan, or nothing parts it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    drawn, part = _drawn(found, blur)
+    drawn, part = drawn_by_lines(found, sharp)
     place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
     line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
     sigma = np.hypot(sigma, drawn[found.good])
@@ -243,14 +161,12 @@ def _edge(
     # An error of the film's tone moves a step by √(2π) of its width for each part of the contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
     hidden = False
-    if part > (_FEW_DRAWN if found.good.mean() > _CLEAR else _FEW_DRAWN / 5):
+    if part > (FEW_DRAWN if found.good.mean() > _CLEAR else FEW_DRAWN / 5):
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
         # A line draws an edge by its width at most: a greater bow is the edge's own.
         own = bow if abs(bow) > 2 * found.width else 0.0
         fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
-        two, hidden = edge_beside_line(
-            grey, band, fitted, border.level, border.noise, float(np.exp(blur.width))
-        )
+        two, hidden = edge_beside_line(grey, band, fitted, border.level, border.noise, sharp.width)
         if two is not None:
             return _along_chord(band, two, own + two.bow, common), rejected, ""
     residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
@@ -258,20 +174,10 @@ def _edge(
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
     # Steps sharper than any are those of a scratch, and tell as little.
-    hidden |= bool(np.median(found.blur[0][found.good]) < blur.width - _TOO_SHARP)
-    ends = _ENDS * float(np.exp(blur.width)) * part if hidden else 0.0
+    hidden |= sharp.beyond(found)
+    ends = _ENDS * sharp.width * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
-
-
-def _unlike(found: EdgeProfiles, blur: _Blur, sigmas: float) -> Array:
-    """By how much widths surely differ from a sharp step's, logarithm (n,): alone, or with those around."""
-    other, variance = found.blur[0] - blur.width, found.blur[1] + blur.texture**2
-    size = min(_TOGETHER * NEIGHBOURS, len(other))
-    mean, own = (uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
-    alone = np.abs(other) - sigmas * np.sqrt(variance)
-    together = mean - sigmas * np.sqrt(own / _INDEPENDENT)
-    return np.asarray(np.minimum(np.maximum(alone, together) - blur.scatter, 1.0))
 
 
 def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
