@@ -41,8 +41,11 @@ _MOST_MISFIT, _LEAST_GAIN = 1.0, 3.0
 """χ² over the redundancy with which two lines describe an edge, and how often as large it is with one."""
 _TOGETHER = 1.7
 """By how much more the edge varies than from bins whose errors were independent: grain is wider."""
-_BOW, _FARTHEST = 0.3, 2.0
-"""Widths by which the edge itself may be bowed, one sigma, and by which a line draws its steps at most."""
+_BOW = 0.3
+"""Widths by which the edge itself may be bowed, one sigma."""
+_FARTHEST, _WELL = (2.0, 3.2), 0.6
+"""Widths by which a line draws the edge's steps at most, where two lines describe it less well and well; and
+the χ² over the redundancy that parts these."""
 _SHARED = 7
 """Parameters of all sections: p0, p1, p2, q0, q1, q2, h."""
 
@@ -98,7 +101,8 @@ def edge_beside_line(
     behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
     there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
     there &= (behind > -0.3 * width).mean() > 0.9
-    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < _FARTHEST * width
+    farthest = _FARTHEST[int(chi[best] < _WELL)] * width
+    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest
     # What lies behind the edge at one distance all along may be the scanner's own glare.
     there &= np.ptp(behind) > width
     if chi[best] > _MOST_MISFIT or without < _LEAST_GAIN * chi[best] or not there:
