@@ -45,16 +45,18 @@ _SPACING_PX = 0.7
 
 
 class Station(NamedTuple):
-    """One recording: tilt and turn of the board, turn of the camera about its axis, all in degrees."""
+    """One recording: tilt and turn of the board, turn of the camera, all in degrees; height of the board."""
 
     phi: float
     kappa: float = 0.0
     camera_kappa: float = 0.0
+    height_mm: float = 0.0
 
     @property
     def name(self) -> str:
         """What the recording is called."""
-        return f"phi {self.phi:g} kappa {self.kappa:g} camera {self.camera_kappa:g}"
+        lifted = f" height {self.height_mm:g}" if self.height_mm else ""
+        return f"phi {self.phi:g} kappa {self.kappa:g} camera {self.camera_kappa:g}{lifted}"
 
 
 def paper_stations(tilts: tuple[float, ...] = (0.0, 30.0, 45.0)) -> tuple[Station, ...]:
@@ -145,6 +147,10 @@ class FieldBench:
         Targets that are not there.
     mirrored : bool
         Whether the frame is seen in a mirror, left to right.
+    stage_tilt : (float, float)
+        Of the stage that lifts the board: x and y of its axis in the system of the board (rad).
+    stage_sigma_mm : float
+        How far it stands off the height that it tells.
 
     Examples
     --------
@@ -183,6 +189,8 @@ class FieldBench:
     stains: tuple[Stain, ...] = ()
     missing: frozenset[str] = frozenset()
     mirrored: bool = False
+    stage_tilt: tuple[float, float] = (0.0, 0.0)
+    stage_sigma_mm: float = 0.0
 
     def distorted(self, edge_px: float) -> FieldBench:
         """The bench with a lens whose radial distortion moves the middles of the frame's edges by so much.
@@ -196,13 +204,21 @@ class FieldBench:
 
     def pose(self, station: Station) -> Pose:
         """Of the camera in the system of the board; things are set up to some millimetres."""
-        rng = stream(self.seed, "setup", *station)
+        rng = stream(self.seed, "setup", *station[:3])
         turn = np.deg2rad(station.camera_kappa) + rng.normal(0, 5e-3)
         roll = rotation_matrix(np.array([0, 0, turn]))
         x0 = np.array([*rng.normal(0, 3, 2), self.distance_mm + rng.normal(0, 5)])
         looks = roll @ np.diag([1.0, -1.0, -1.0])
         board = rotation_matrix(np.array([0, np.deg2rad(station.phi), 0])) @ self._turn(station)
-        return Pose(matrix_to_vector(looks @ board), board.T @ x0)
+        return Pose(matrix_to_vector(looks @ board), board.T @ x0 - self._lift(station))
+
+    def _lift(self, station: Station) -> Array:
+        """By what the stage moves the board (mm), in its system."""
+        if not station.height_mm:
+            return np.zeros(3)
+        moved = station.height_mm + self.stage_sigma_mm * stream(self.seed, "stage", *station).normal()
+        axis = np.array([*self.stage_tilt, 1.0])
+        return np.asarray(moved * axis / np.linalg.norm(axis))
 
     def truth(self, station: Station) -> FieldTruth:
         """Exact positions of all targets in a recording, and the mapping that forms it."""
@@ -228,7 +244,7 @@ class FieldBench:
 
     def record(self, station: Station) -> Frame:
         """Record the testfield; the same seed and station give the same frame to the bit."""
-        rng = stream(self.seed, "exposure", *station)
+        rng = stream(self.seed, "exposure", *(station if station.height_mm else station[:3]))
         shifts = self.sensor.row_shifts(rng) if self.sensor.row_jitter_px else None
         pixels = self.sensor.expose(self.light(station, shifts), rng)
         return Frame(pixels, self.sensor.full_scale, station.name, sha256(pixels.tobytes()).hexdigest())

@@ -92,16 +92,16 @@ class Axis:
 class FieldTable(_Simple):
     """A table that is where it is told to be."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, axes: tuple[str, ...] = AXES) -> None:
         super().__init__(name, Settings())
-        self.stands = dict.fromkeys(AXES, 0.0)
+        self.stands = dict.fromkeys(axes, 0.0)
         self.moves: list[tuple[str, float]] = []
         self.stops = 0
         self.before: Callable[[str, float], None] = lambda axis, position: None
 
     @property
     def axes(self) -> Mapping[str, Axis]:
-        return {key: Axis(self, key) for key in AXES}
+        return {key: Axis(self, key) for key in self.stands}
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         return self.move(axis, 0.0)
@@ -134,7 +134,7 @@ class FieldCamera(_Simple):
     def expose(self, seconds: float | None = None) -> Taken:
         self.exposures += 1
         self.during(self.exposures)
-        frame = self.field.record(Station(*(self.table.stands[axis] for axis in AXES)))
+        frame = self.field.record(Station(*(self.table.stands[axis] for axis in self.table.stands)))
         pixels = self.spoil(self.exposures, frame.pixels)
         return Taken(Frame(pixels, 255.0), self.exposures, datetime.now(UTC), self.settings.exposure_us)
 
@@ -158,20 +158,22 @@ class Sweeper(_Simple):
 class FieldRig:
     """Bench, table and camera."""
 
-    def __init__(self, seed: int = 3) -> None:
-        self.table = FieldTable("table")
-        self.camera = FieldCamera("camera", self.table, FieldBench(seed=seed, bend_mm=0.0))
+    def __init__(self, field: FieldBench | None = None, axes: tuple[str, ...] = AXES) -> None:
+        self.table = FieldTable("table", axes)
+        self.camera = FieldCamera("camera", self.table, field or FieldBench(seed=3, bend_mm=0.0))
         entries = {name: InstrumentEntry(driver="sim", address=f"sim-{name}") for name in ("table", "camera")}
         made = {"table": self.table, "camera": self.camera}
         self.bench = Bench(BenchFile(name="field", instruments=entries), lambda name, entry: made[name])
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.lock = threading.Lock()
 
-    def procedure(self, design: TestfieldDesign = DESIGN) -> LiveTestfield:
+    def procedure(
+        self, design: TestfieldDesign = DESIGN, sigmas: tuple[float, float, float] | None = None
+    ) -> LiveTestfield:
         """The testfield procedure with Brown's model, as the paper's camera wants it."""
         model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(design, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
-        return LiveTestfield(design, measure, model, name="field")
+        return LiveTestfield(design, measure, model, name="field", sigmas=sigmas)
 
     def acquisition(self, kept: Session, procedure: LiveTestfield | None = None, **more: Any) -> Acquisition:
         """An acquisition on this bench."""

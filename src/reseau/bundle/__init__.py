@@ -21,6 +21,7 @@ from .network import Additional, Camera, Network
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .problem import BundleFit, BundleProblem
 from .result import Result
+from .stage import Stage
 
 __all__ = [
     "UNITS",
@@ -38,6 +39,7 @@ __all__ = [
     "ProjectionField",
     "Result",
     "Searched",
+    "Stage",
     "adjust_network",
     "approximate",
     "by_place",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -73,6 +73,9 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     found = approximate(network)
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
+    if network.stage is not None:
+        moved, rotation, x0 = network.stage.begun(start.rotation, start.x0)
+        start = replace(start, rotation=rotation, x0=x0, stage=moved)
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from ..data import Array
 
-__all__ = ["Arrow", "Singular"]
+__all__ = ["Arrow", "Singular", "full"]
 
 
 class Singular(Exception):
@@ -115,6 +115,18 @@ class Arrow:
         """Square of the least pivot of the matrix scaled to ones; near rounding it is singular."""
         pivots = np.concatenate([self.band[:, 0], np.diagonal(self.corner)])
         return float(pivots.min(initial=1.0) ** 2)
+
+
+def full(band: Array, border: Array) -> Array:
+    """An arrow as a full symmetric matrix."""
+    b, u = len(band), len(band) + len(border)
+    full = np.zeros((u, u))
+    for k in range(band.shape[1] if b else 0):
+        at = np.arange(b - k)
+        full[at + k, at] = band[: b - k, k]
+    full[b:] = border
+    lower = np.tril(full)
+    return lower + np.tril(lower, -1).T
 
 
 def _forward(lower: Array, sides: Array) -> Array:

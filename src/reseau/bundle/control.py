@@ -73,6 +73,7 @@ def _free(network: Network) -> BundleFit | None:
     free = replace(
         network, xyz=nothing, sigma=nothing, x0=posed, rotation=posed, datum="free",
         datum_points=np.ones(len(network.points), dtype=bool), distance_of=none, distance=np.zeros((0, 2)),
+        stage=None,
     )  # fmt: skip
     start = approximate(free)
     if not finite(start.x0).any():

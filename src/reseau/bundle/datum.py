@@ -35,6 +35,7 @@ class Similarity(NamedTuple):
             self.scale * values.xyz @ self.turn.T + self.shift,
             values.cameras,
             values.extra,
+            None if values.stage is None else values.stage.turned(self.turn),
         )
 
 
@@ -91,7 +92,7 @@ def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -
 
 
 def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
-    """The similarities that held and observed coordinates and distances leave free.
+    """The similarities that held and observed coordinates, distances and a stage's readings leave free.
 
     Parameters
     ----------
@@ -111,6 +112,8 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
     for a, b in system.further.ends[system.sigma_root[system.further.slices[0]] > 0]:
         along = values.xyz[b] - values.xyz[a]
         rows.append(along[None] @ (whole[b] - whole[a]))
+    if network.stage is not None:
+        rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
     scale = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size, 1 / size])
     fixed = np.concatenate(rows) * scale

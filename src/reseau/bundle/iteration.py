@@ -121,7 +121,7 @@ def iterate(
         if (offset <= tolerance and settled) or cost <= system.floor or near or creeps:
             away = linear.values.beyond(_NEARLY * radius)
             return Iterated(linear, tuple(costs), tried, float(offset), away)
-        trial = linear.values.moved(system.unknowns, step)
+        trial = linear.values.moved(system.unknowns, step, system.ties)
         away = trial.beyond(radius)
         if len(away):
             trial = trial.confined(away, radius)

@@ -13,6 +13,7 @@ from ..data import Array, Mask, Rows
 from ..errors import UsageError
 from ..formats.network import CAMERA_PARAMETERS, CameraEntry, Network1
 from ..optics import PlaneMapping
+from .stage import Stage
 
 __all__ = ["Additional", "Camera", "Network", "finite"]
 
@@ -173,6 +174,8 @@ class Network:
         File of each image.
     unit : str
         Of object space; a label.
+    stage : Stage, optional
+        That moved the field between images which share their exterior orientation; needs control.
     """
 
     cameras: tuple[Camera, ...]
@@ -195,6 +198,7 @@ class Network:
     groups: tuple[str | None, ...]
     files: tuple[str | None, ...]
     unit: str = "mm"
+    stage: Stage | None = None
 
     def __post_init__(self) -> None:
         m, p, n = len(self.images), len(self.points), len(self.image_of)
@@ -210,6 +214,8 @@ class Network:
                 )
         if not len(self.role) == p or not len(self.groups) == len(self.files) == m:
             raise UsageError("columns differ in length", where="Network")
+        if self.stage is not None and (self.datum != "control" or len(self.stage.pose) != m):
+            raise UsageError("needs control, and a pose for each image", where="Network.stage")
 
     @classmethod
     def from_document(cls, document: Network1) -> Self:

@@ -14,12 +14,13 @@ import numpy as np
 from ..adjust.reliability import Whitened
 from ..adjust.stochastic import Blocks, Weighting
 from ..data import Array, Mask, Rows
-from .arrow import Singular
+from .arrow import Arrow, Singular
 from .careful import careful_inverse, is_small
 from .compiled import in_parallel
 from .datum import Freedom, held_for
 from .normal import posterior
 from .rank import PARALLEL
+from .stage import Ties
 from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
@@ -28,6 +29,8 @@ __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
 _RANK = 1e-14
 # How far the cofactors of the adjusted observations may be from summing to the number of unknowns.
 _EXACT, _INEXACT = 1e-7, 1e-6
+# The same where a stage ties images: frontal views leave the normal equations half of their digits.
+_TIED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +177,13 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     ends = np.flatnonzero(system.unknowns.kept >= 0)
     still = system.unknowns.kept[ends, None] + np.arange(3)
     held[still[system.movable[ends] == 0]] = True
-    if datum is not None:
-        held[held_for(freedom, system.unknowns, diagonal)] = True
-        normal.hold(held)
-    z, points, seen, further = _marginal(linear, normal, held, taking_part)
+    if system.ties is not None:
+        z, points, seen, further = _tied(linear, normal, system.ties, held, taking_part)
+    else:
+        if datum is not None:
+            held[held_for(freedom, system.unknowns, diagonal)] = True
+            normal.hold(held)
+        z, points, seen, further = _marginal(linear, normal, held, taking_part)
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     referral = None
@@ -220,6 +226,30 @@ def _marginal(
         found = _with_inverse(linear, normal, careful_inverse(normal, held), held, taking_part)
         missing = abs(_total(found) - free)
     if not missing < _INEXACT * max(1.0, system.unknowns.size / 1000.0):
+        raise Singular
+    return found
+
+
+def _tied(
+    linear: Linear, normal: Normal, ties: Ties, columns: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """The same where a stage ties images.
+
+    Raises
+    ------
+    Singular
+        When the observations do not determine the unknowns.
+    """
+    held = ties.held(columns)
+    tied = normal.tied(ties, held)
+    arrow = Arrow.factorise(np.zeros((0, 1)), tied.matrix)
+    q = arrow.inverse()
+    q[held], q[:, held] = 0.0, 0.0
+    found = _with_inverse(linear, normal, tied.back @ q @ tied.back.T, columns, taking_part)
+    slopes = normal.stage_slopes(ties)
+    found[3][-len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
+    missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
+    if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _TIED:
         raise Singular
     return found
 

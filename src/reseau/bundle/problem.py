@@ -40,9 +40,9 @@ _ENOUGH = 50
 class BundleProblem:
     """All observations of a network in one column, with approximate values.
 
-    Image coordinates come first, x and y in turn, then distances, observed coordinates, and observed interior
-    orientation. It is an :class:`~reseau.adjust.fitted.Adjustable`: robust estimation, data snooping and
-    variance components of :mod:`reseau.adjust` take it as any other problem.
+    Image coordinates come first, x and y in turn, then distances, observed coordinates, observed interior
+    orientation, readings and axis of a stage. It is an :class:`~reseau.adjust.fitted.Adjustable`: robust
+    estimation, data snooping and variance components of :mod:`reseau.adjust` take it as any other problem.
 
     Parameters
     ----------
@@ -116,12 +116,12 @@ class BundleProblem:
     def continued(self, fit: BundleFit) -> Self:
         """The same problem, begun at the estimates; points without any keep their approximate values."""
         part, images = fit.usable.points[:, None], fit.usable.images
-        start = Values(
-            np.where(images[:, None, None], fit.values.rotation, self.start.rotation),
-            np.where(images[:, None], fit.values.x0, self.start.x0),
-            np.where(part, fit.values.xyz, self.start.xyz),
-            fit.values.cameras,
-            fit.values.extra if fit.values.extra.shape == self.start.extra.shape else self.start.extra,
+        start = replace(
+            fit.values,
+            rotation=np.where(images[:, None, None], fit.values.rotation, self.start.rotation),
+            x0=np.where(images[:, None], fit.values.x0, self.start.x0),
+            xyz=np.where(part, fit.values.xyz, self.start.xyz),
+            extra=fit.values.extra if fit.values.extra.shape == self.start.extra.shape else self.start.extra,
         )
         return replace(self, start=start)
 
@@ -217,7 +217,10 @@ class _Run:
         )
         more = problem.further
         used = np.bincount(whole.camera_of[self.usable.images], minlength=len(whole.cameras)) > 0
-        self.in_further = np.concatenate([bars, part[more.coordinate[:, 0]], used[more.interior[:, 0]]])
+        coordinate, interior = part[more.coordinate[:, 0]], used[more.interior[:, 0]]
+        read = self.usable.images[more.reading]
+        axis = np.ones(more.across.shape[1], dtype=bool)
+        self.in_further = np.concatenate([bars, coordinate, interior, read, axis])
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
@@ -226,11 +229,12 @@ class _Run:
         )
         self.weighting = Weighting([whole.cov], self.weights[: 2 * n])
         self.unknowns = Unknowns.of(self.network, self.usable.images)
-        coordinate = part[more.coordinate[:, 0]]
         further = Further(
             self.network.distance_of,
             more.coordinate[coordinate],
-            more.interior[used[more.interior[:, 0]]],
+            more.interior[interior],
+            more.reading[read],
+            more.across,
             more.value[self.in_further],
             more.sigma[self.in_further],
         )
@@ -303,7 +307,7 @@ class _Run:
         xyz[points] = np.nan
         rotation = np.where(images[:, None, None], values.rotation, start.rotation)
         x0 = np.where(images[:, None], values.x0 + self.problem.centre, start.x0)
-        start = Values(rotation, x0, xyz, values.cameras, values.extra)
+        start = replace(values, rotation=rotation, x0=x0, xyz=xyz)
         return replace(self.problem, start=start, rounds=self.problem.rounds + 1)
 
     def _start(self) -> Values:
@@ -315,7 +319,7 @@ class _Run:
             extra = np.zeros((max(1, len(self.unknowns.extra)), extra.shape[1]))
         rotation = np.where(known[:, None, None], start.rotation, np.eye(3))
         x0 = np.where(known[:, None], start.x0 - centre, 0.0)
-        return Values(rotation, x0, np.nan_to_num(start.xyz - centre), start.cameras, extra)
+        return replace(start, rotation=rotation, x0=x0, xyz=np.nan_to_num(start.xyz - centre), extra=extra)
 
     def _counts(self, freedom: Freedom) -> tuple[int, int, int]:
         """Observations, unknowns before datum constraints, datum constraints."""
@@ -323,9 +327,8 @@ class _Run:
         observations = int((self.weights > 0).sum())
         free = ~network.held & part[:, None]
         kept = self.unknowns.kept >= 0
-        unknowns = (
-            self.unknowns.size - int(self.unknowns.dropped.sum()) - 3 * int(kept.sum()) + int(free.sum())
-        )
+        size = self.unknowns.size if self.system.ties is None else self.system.ties.size
+        unknowns = size - int(self.unknowns.dropped.sum()) - 3 * int(kept.sum()) + int(free.sum())
         return observations, unknowns, freedom.defect if network.datum != "control" else 0
 
     def _aligned(self, values: Values, freedom: Freedom, chosen: Mask) -> Values:
@@ -367,7 +370,7 @@ class _Run:
         rotation = np.where(images[:, None, None], values.rotation, np.nan)
         return BundleFit(
             problem=self.problem,
-            values=Values(rotation, x0, xyz, values.cameras, values.extra),
+            values=replace(values, rotation=rotation, x0=x0, xyz=xyz),
             unknowns=self.unknowns,
             usable=self.usable,
             freedom=freedom,

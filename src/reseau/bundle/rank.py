@@ -6,6 +6,7 @@ import numpy as np
 
 from ..adjust import Failure
 from ..data import Array, Mask, Rows
+from .arrow import full
 from .datum import Freedom, held_for
 from .system import Linear
 
@@ -38,7 +39,8 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
     if weak:
         listed = ", ".join(weak[:_LISTED]) + (" …" if len(weak) > _LISTED else "")
         return Failure(f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}", costs=costs)
-    vectors = _null_vectors(linear, freedom)
+    # Without what a stage ties, more would look undetermined than is.
+    vectors = _null_vectors(linear, freedom) if linear.system.ties is None else []
     if not vectors:
         return Failure("the normal equations are singular to rounding", costs=costs)
     listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
@@ -114,7 +116,7 @@ def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
     diagonal = normal.sums.diagonal
     normal.hold(held)
-    s = _full(normal.sums.band, normal.sums.border)
+    s = full(normal.sums.band, normal.sums.border)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = s * scale[:, None] * scale
     values, vectors = np.linalg.eigh(scaled)
@@ -133,15 +135,3 @@ def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
         strong = strong[np.argsort(-np.abs(vector[strong]))]
         named.append({system.unknowns.names[i]: float(vector[i] * scale[i]) for i in strong})
     return named
-
-
-def _full(band: Array, border: Array) -> Array:
-    """An arrow as a full symmetric matrix."""
-    b, u = len(band), len(band) + len(border)
-    full = np.zeros((u, u))
-    for k in range(band.shape[1] if b else 0):
-        at = np.arange(b - k)
-        full[at + k, at] = band[: b - k, k]
-    full[b:] = border
-    lower = np.tril(full)
-    return lower + np.tril(lower, -1).T

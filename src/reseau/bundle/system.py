@@ -9,12 +9,13 @@ import numpy as np
 from ..adjust.stochastic import Weighting
 from ..data import Array, Mask, Rows
 from ..optics import PlaneMapping
-from .arrow import Arrow
+from .arrow import Arrow, full
 from .compiled import chunks_of, in_parallel
 from .further import Further
 from .imaging import BROWN_IMAGE, BROWN_OBJECT, MAPPING, OPENCV, Interior, Seen, derive, mapped, misfit
 from .network import Network
 from .normal import Sums, assemble, reduce_sides, substitute
+from .stage import Tied, Ties
 from .unknowns import Unknowns
 from .values import Correction, Values
 
@@ -58,6 +59,7 @@ class System:
         self.sigma_root = np.sqrt(factors) / further.sigma
         self.movable = np.where(network.held, 0.0, 1.0)
         self.pattern = unknowns.pattern
+        self.ties = None if network.stage is None else Ties(unknowns, network.stage)
         self.chunks = chunks_of(unknowns.first)
         self.interior = _interior(network, unknowns)
 
@@ -278,13 +280,31 @@ class Normal:
         """
         return Arrow.factorise(self.sums.band, self.sums.border)
 
+    def tied(self, ties: Ties, held: Mask | None = None) -> Tied:
+        """The same in the unknowns proper, of which some (size,) may be held."""
+        linear, slopes = self.linear, self.stage_slopes(ties)
+        matrix, last = full(self.sums.band, self.sums.border), linear.further[-len(slopes) :]
+        return ties.tied(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
+
+    def stage_slopes(self, ties: Ties) -> Array:
+        """Weighted derivatives of a stage's readings and axis, the last of the further observations."""
+        system, further = self.linear.system, self.linear.system.further
+        root = system.sigma_root[further.readings.start :]
+        return ties.slopes(self.linear.values.stage, further.across, root)
+
     def correction(self) -> Correction:
         """The correction the normal equations give; raises Singular."""
-        y = self.factorise().solve(-self.sums.reduced)
+        ties, q, by_stage = self.linear.system.ties, None, 0.0
+        if ties is None:
+            y = self.factorise().solve(-self.sums.reduced)
+        else:
+            tied = self.tied(ties)
+            q = Arrow.factorise(np.zeros((0, 1)), tied.matrix).solve(-tied.gradient)
+            y, by_stage = tied.back @ q, float(tied.own @ q)
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
-        gradient = self.sums.gradient @ y + float((self.side * points).sum())
+        gradient = self.sums.gradient @ y + float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
-        return Correction(y, points, float(-gradient + self.damping * bent))
+        return Correction(y, points, float(-gradient + self.damping * bent), q)
 
     def points(self, side: Array, y: Array) -> Array:
         """Points (p, 3, s) for right-hand sides (p, 3, s) and reduced unknowns (u, s)."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..data import Array, Rows
 from ..optics.poses import rotation_matrix
 from .imaging import EBNER, Orientation
+from .stage import Moved, Ties
 from .unknowns import Unknowns
 
 __all__ = ["Correction", "Values"]
@@ -26,11 +27,14 @@ class Correction:
         Of the eliminated points.
     predicted : float
         Decrease of the weighted sum of squares, to first order.
+    tied : ndarray, optional
+        Of the unknowns proper, where a stage ties images.
     """
 
     reduced: Array
     points: Array
     predicted: float
+    tied: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,8 @@ class Values:
         Parameters of the cameras, padded.
     extra : ndarray (e, 12)
         Sets of additional parameters; one row at least.
+    stage : Moved, optional
+        Readings of a stage, and its axis.
     """
 
     rotation: Array
@@ -56,6 +62,7 @@ class Values:
     xyz: Array
     cameras: Array
     extra: Array
+    stage: Moved | None = None
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
@@ -79,9 +86,9 @@ class Values:
         """The same with these points brought back to a distance from the origin."""
         xyz = self.xyz.copy()
         xyz[points] *= radius / np.linalg.norm(xyz[points], axis=1, keepdims=True)
-        return Values(self.rotation, self.x0, xyz, self.cameras, self.extra)
+        return replace(self, xyz=xyz)
 
-    def moved(self, unknowns: Unknowns, step: Correction) -> Values:
+    def moved(self, unknowns: Unknowns, step: Correction, ties: Ties | None = None) -> Values:
         """The values after a correction; rotations turn about the axes of their camera."""
         y = step.reduced
         images = unknowns.pose >= 0
@@ -97,4 +104,7 @@ class Values:
             extra[e] += y[unknowns.extra[e] : unknowns.extra[e] + EBNER]
         kept = np.flatnonzero(unknowns.kept >= 0)
         xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
-        return Values(rotation, self.x0 + pose[:, 3:], xyz, cameras, extra)
+        x0, stage = self.x0 + pose[:, 3:], self.stage
+        if ties is not None and stage is not None and step.tied is not None:
+            stage, x0 = ties.stepped(stage, self.x0, y, step.tied)
+        return Values(rotation, x0, xyz, cameras, extra, stage)

@@ -8,9 +8,10 @@ from .lock import BenchLock
 from .procedure import Procedure, Watch
 from .rerun import Rerun, rerun
 from .run import Decision, carry_out
-from .step import Step, at_heights, paper_steps, read_steps, spread
+from .step import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
 
 __all__ = [
+    "HEIGHT",
     "Acquisition",
     "Bench",
     "BenchFile",

@@ -72,11 +72,15 @@ def paper_steps(tilts: Sequence[float] = (0.0, 30.0, 45.0), axes: Sequence[str] 
 
 
 def at_heights(steps: Sequence[Step], heights: Sequence[float]) -> tuple[Step, ...]:
-    """Each pose at each height of the board (mm), as a z-stage lifts it; without heights, the poses alone."""
+    """Each pose at each height of the board (mm), as a z-stage lifts it; without heights, the poses alone.
+
+    All heights of a pose come one after the other: only the stage moves between them, and the images have one
+    exterior orientation.
+    """
     lifted = [
         Step(f"{step.name} {HEIGHT} {height:g}", {**step.position, HEIGHT: height})
-        for height in heights
         for step in steps
+        for height in heights
     ]
     return tuple(lifted or steps)
 

@@ -40,6 +40,13 @@ def coded_field(
         Path | None, typer.Option(help="CSV of poses, a column for each axis; by default the paper's 36.")
     ] = None,
     heights: Annotated[str, typer.Option(help="Of the board (mm), as 0,50,100: each pose at each.")] = "",
+    height_sigma: Annotated[float, typer.Option(min=1e-9, help="Of a height (mm), where there is z.")] = 0.01,
+    axis_sigma: Annotated[
+        float, typer.Option(min=1e-6, help="Of z against the normal of the board (mrad), both ways.")
+    ] = 10.0,
+    field_sigma: Annotated[
+        float, typer.Option(min=1e-9, help="Of the design's points (mm), where there is z.")
+    ] = 0.05,
     until: Annotated[str, typer.Option(help="Choose poses until this holds, as 'sigma_c < 0.5 um'.")] = "",
     first: Annotated[int, typer.Option(min=4, help="Poses to begin with, where they are chosen.")] = 5,
     pitch: Annotated[
@@ -78,6 +85,7 @@ def coded_field(
             "first": first,
             "pitch": pitch,
             "free": [each.strip() for each in free.split(",") if each.strip()],
+            "sigmas": [height_sigma, axis_sigma / 1e3, field_sigma] if _lifted(steps) else None,
             "row_jitter": row_jitter,
             "fill": fill,
             "average": average,
@@ -200,6 +208,13 @@ def _within(axes: Mapping[str, Any], steps: Sequence[Step]) -> None:
             if not low <= value <= high:
                 what = f"{axis} {value:g} is not between {low:g} and {high:g} {axes[axis].unit}"
                 raise UsageError(what, where=step.name)
+
+
+def _lifted(steps: Sequence[Step]) -> bool:
+    """Whether the board is recorded at several heights."""
+    from ..capture import HEIGHT
+
+    return len({step.position.get(HEIGHT, 0.0) for step in steps}) > 1
 
 
 def _of_model(goal: Goal | None, model: CameraModel) -> None:

@@ -89,8 +89,15 @@ def testfield_of(kept: Session) -> _Reported:
     design = parsed_design(kept.input("design.json"), "design.json")
     options = {key: value for key, value in given.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given["row_jitter"], fill=given["fill"]))
+    sigmas = given.get("sigmas")
     live = LiveTestfield(
-        design, measure, model_of(given), name=kept.name, options=options, inputs=_inputs(kept)
+        design,
+        measure,
+        model_of(given),
+        name=kept.name,
+        options=options,
+        inputs=_inputs(kept),
+        sigmas=None if sigmas is None else (sigmas[0], sigmas[1], sigmas[2]),
     )
     return _Reported(live)
 

@@ -20,6 +20,7 @@ from ..bundle import Camera, Kind, Network, Options, Result, Searched, search_mo
 from ..data import Array, Frame, ImagePoints
 from ..errors import UsageError
 from ..formats.network import CAMERA_PARAMETERS
+from .heights import Heights
 from .measuring import Measurer, measured_in_order, measurer_of
 
 __all__ = [
@@ -134,6 +135,8 @@ class CalibrationOptions:
         Level of the tests by which distortion parameters that are not needed are dropped.
     workers : int
         Processes that measure.
+    heights : Heights, optional
+        Of the target on a z-stage.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -143,6 +146,7 @@ class CalibrationOptions:
     components: Kind | None = None
     level: float | None = None
     workers: int = 1
+    heights: Heights | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +226,8 @@ def calibrate_camera(
         raise UsageError("is not known without an image", where="size of the images")
     camera = first_camera(measured, design, size, model or CameraModel())
     network = network_of(measured, design, camera)
+    if options.heights is not None:
+        network = options.heights.lifted(network)
     if options.control is not None:
         network = _controlled(network, options.control)
     if options.sigma_px is not None:

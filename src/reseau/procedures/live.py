@@ -21,15 +21,17 @@ from ..formats import ReseauDesign
 from ..optics import Pose, project
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..provenance import Provenance
-from .calibration import Calibrated, CameraModel, PlaneDesign, calibrate_camera
+from .calibration import Calibrated, CalibrationOptions, CameraModel, PlaneDesign, calibrate_camera
+from .heights import Heights
 from .measuring import Measurer
-from .mount import Mount
+from .mount import HEIGHT, Mount
 from .oscilloscope import PhotoI, PhotoII, PhotoIII, photo_i, photo_ii, photo_iii
 
 __all__ = ["LiveOscilloscope", "LiveTestfield", "Place"]
 
 _LEAST_IMAGES = 3
 _MARGIN_PX = 6.0
+_PREDICTED = "predicted"
 
 
 class Place(Protocol):
@@ -66,6 +68,11 @@ class LiveTestfield:
         SHA-256 of the files that it works with, by name; for its provenance.
     least_points : int
         A frame with fewer is no good.
+    sigmas : (float, float, float), optional
+        Standard deviations of a height that the axis ``z`` was moved to, of the two angles (rad) by which it
+        is off the target's normal, and of the design's coordinates.
+        With them frames taken one after the other that differ in height alone are of one pose; without, each
+        has its own.
     """
 
     def __init__(
@@ -78,11 +85,14 @@ class LiveTestfield:
         options: Mapping[str, Any] | None = None,
         inputs: Mapping[str, str] | None = None,
         least_points: int = 8,
+        sigmas: tuple[float, float, float] | None = None,
     ) -> None:
         self.design, self.model, self.name = design, model, name
         self._measure, self._options, self._least = measure, dict(options or {}), least_points
         self._measured: dict[str, ImagePoints] = {}
         self._places: dict[str, Mapping[str, float]] = {}
+        self._sigmas, self._pose = sigmas, dict[str, int]()
+        self._stands: tuple[int, dict[str, float] | None] = (-1, None)
         self._inputs = dict(inputs or {})
         self._size: tuple[int, int] | None = None
         self._current: tuple[int, Calibrated | Failure] | None = None
@@ -97,14 +107,36 @@ class LiveTestfield:
         self._size = (frame.width, frame.height)
         self._measured[step.name] = found.points
         self._places[step.name], self._inputs[step.name] = dict(step.position), frame.sha256
+        self._stands = self._at(step)  # of good frames alone: no others come when it is computed again
+        self._pose[step.name] = self._stands[0]
         return Verdict(True, facts={"points": len(found.points)})
+
+    def _at(self, place: Place) -> tuple[int, dict[str, float] | None]:
+        """The number of a pose, and where all axes stand in it but that of the height.
+
+        A table that has been elsewhere does not come back to the same pose, but to another near it.
+        """
+        number, before = self._stands
+        position = {axis: value for axis, value in place.position.items() if axis != HEIGHT}
+        return (number, before) if position == before else (number + 1, position)
+
+    def _heights(self, more: Place | None = None) -> Heights | None:
+        """Poses and heights of what was measured; of a place, too, to which the table might go next."""
+        if self._sigmas is None:
+            return None
+        reading = {name: float(place.get(HEIGHT, 0.0)) for name, place in self._places.items()}
+        pose = dict(self._pose)
+        if more is not None:
+            pose[_PREDICTED], reading[_PREDICTED] = self._at(more)[0], float(more.position.get(HEIGHT, 0.0))
+        return Heights(pose, reading, *self._sigmas)
 
     def calibrated(self) -> Calibrated | Failure:
         """The calibration by what has been measured so far."""
         count = len(self._measured)
         if self._current is None or self._current[0] != count:
             points = list(self._measured.items())
-            found = calibrate_camera(points, self.design, self._measure, self._size, self.model)
+            options = CalibrationOptions(heights=self._heights())
+            found = calibrate_camera(points, self.design, self._measure, self._size, self.model, options)
             self._current = (count, found)
         return self._current[1]
 
@@ -158,7 +190,7 @@ class LiveTestfield:
         sigma0 = float(result.sigma0)
         best: tuple[P, float] | None = None
         for candidate in candidates:
-            joined = _joined(network, result, mount.pose(candidate.position))
+            joined = _joined(network, result, mount, candidate, self._heights(candidate))
             predicted = sigma0 * _sigma(network if joined is None else joined, column)
             if np.isfinite(predicted) and (best is None or predicted < best[1]):
                 best = candidate, predicted
@@ -187,9 +219,11 @@ def _adjusted(result: Result) -> Network:
     return replace(network, cameras=(camera,), x0=values.x0, rotation=result.rotation, xyz=values.xyz)
 
 
-def _joined(network: Network, result: Result, pose: Pose) -> Network | None:
+def _joined(
+    network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None
+) -> Network | None:
     """The network with an image from another pose; None when it would show next to nothing."""
-    camera = network.cameras[0]
+    camera, pose = network.cameras[0], _predicted(network, result, mount, place, heights)
     seen = project(Lens.of_result(result, 0).mapping, pose, network.xyz).xy
     size = np.array([camera.width, camera.height]) - 1
     inside = np.flatnonzero(((seen >= _MARGIN_PX) & (seen <= size - _MARGIN_PX)).all(axis=1))
@@ -197,9 +231,12 @@ def _joined(network: Network, result: Result, pose: Pose) -> Network | None:
         return None
     m = len(network.images)
     cov = np.median(network.cov, axis=0)
+    images = (*network.images, _PREDICTED)
+    axis = np.array([0.0, 0.0, mount.lifts]) if network.stage is None else network.stage.axis
     return replace(
         network,
-        images=(*network.images, "predicted"),
+        images=images,
+        stage=None if heights is None else heights.stage(images, axis),
         camera_of=np.append(network.camera_of, 0),
         x0=np.vstack([network.x0, pose.x0]),
         rotation=np.vstack([network.rotation, matrix_to_vector(pose.matrix)]),
@@ -208,8 +245,24 @@ def _joined(network: Network, result: Result, pose: Pose) -> Network | None:
         xy=np.concatenate([network.xy, seen[inside]]),
         cov=np.concatenate([network.cov, np.tile(cov, (len(inside), 1, 1))]),
         groups=(*network.groups, None),
-        files=(*network.files, "predicted"),
+        files=(*network.files, _PREDICTED),
     )
+
+
+def _predicted(network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None) -> Pose:
+    """Where the camera would be: moved by the stage from where it is in the same pose, or by the mount."""
+    told = mount.pose(place.position)
+    same = [
+        k
+        for k, name in enumerate(network.images)
+        if heights is not None and heights.pose[name] == heights.pose[_PREDICTED]
+    ]
+    if heights is None or not same:
+        return told
+    k, stage = same[-1], result.fit.values.stage
+    axis = np.array([0.0, 0.0, mount.lifts]) if stage is None else stage.axis
+    stood = heights.reading[network.images[k]] if stage is None else float(stage.reading[k])
+    return Pose(network.rotation[k], network.x0[k] + (stood - heights.reading[_PREDICTED]) * axis)
 
 
 def _sigma(network: Network, column: int) -> float:

@@ -37,7 +37,7 @@ class Mount:
     signs : (float, float, float)
         Which way tilt, roll and camera roll count.
     lifts : float
-        Whether z lifts the board towards the camera (1) or lowers it (−1).
+        Whether z moves the board along its normal towards the camera (1) or away from it (−1).
     looks : ndarray (3, 3)
         From the mount to the camera with all axes at zero.
     centre : ndarray (3,)
@@ -82,7 +82,7 @@ class Mount:
             looks = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
             off = cameras @ looks @ boards @ np.swapaxes(rotations, 1, 2)
             cosine = np.clip((np.trace(off, axis1=1, axis2=2) - 1) / 2, -1, 1)
-            lifts, centre = _stands((boards @ x0[:, :, None])[:, :, 0], positions)
+            lifts, centre = _stands(boards, x0, positions)
             rms = float(np.rad2deg(np.sqrt(np.mean(np.arccos(cosine) ** 2))))
             found.append(cls(int(about), (signs[0], signs[1], signs[2]), lifts, looks, centre, rms))
         best = min(
@@ -98,15 +98,16 @@ class Mount:
     def pose(self, position: Mapping[str, float]) -> Pose:
         """Of the camera in the system of the board, with the axes at a position."""
         board, camera = _turns(position, self.about, self.signs)
-        centre = self.centre - np.array([0.0, 0.0, self.lifts * position.get(HEIGHT, 0.0)])
-        return Pose(matrix_to_vector(camera @ self.looks @ board), board.T @ centre)
+        lift = np.array([0.0, 0.0, self.lifts * position.get(HEIGHT, 0.0)])
+        return Pose(matrix_to_vector(camera @ self.looks @ board), board.T @ self.centre - lift)
 
 
-def _stands(centres: Array, positions: Sequence[Mapping[str, float]]) -> tuple[float, Array]:
-    """Which way z counts, and the projection centre with z at zero, from those (m, 3) in the mount."""
+def _stands(boards: Array, x0: Array, positions: Sequence[Mapping[str, float]]) -> tuple[float, Array]:
+    """Which way z counts, and where the camera stands in the mount with z at zero, from poses (m)."""
     up = np.array([[0.0, 0.0, position.get(HEIGHT, 0.0)] for position in positions])
-    lifts = min((1.0, -1.0), key=lambda sign: float((centres + sign * up).var(axis=0).sum()))
-    return lifts, (centres + lifts * up).mean(axis=0)
+    found = {sign: (boards @ (x0 + sign * up)[:, :, None])[:, :, 0] for sign in (1.0, -1.0)}
+    lifts = min(found, key=lambda sign: float(found[sign].var(axis=0).sum()))
+    return lifts, found[lifts].mean(axis=0)
 
 
 def _turns(position: Mapping[str, float], about: int, signs: tuple[float, ...]) -> tuple[Array, Array]:
