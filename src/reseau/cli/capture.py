@@ -26,6 +26,15 @@ app = typer.Typer(
 Average = Annotated[int, typer.Option(min=1, help="Exposures to a frame, averaged.")]
 Checks = Annotated[int, typer.Option(min=0, help="Frames to look at before anything is taken; 0: none.")]
 Retakes = Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")]
+HeightSigma = Annotated[float, typer.Option(min=1e-9, help="Of a height (mm), where there is z.")]
+AxisSigma = Annotated[
+    float, typer.Option(min=1e-6, help="Of z against the normal of the board (mrad), both ways.")
+]
+FieldSigma = Annotated[float, typer.Option(min=1e-9, help="Of the design's points (mm), where there is z.")]
+Pitch = Annotated[float | None, typer.Option(min=1e-6, help="Of the pixels (mm), for Brown's model.")]
+Poses = Annotated[
+    Path | None, typer.Option(help="CSV of poses, a column for each axis; by default the paper's 36.")
+]
 TableName = Annotated[str | None, typer.Option("--table", help="Where the bench has several.")]
 ScannerName = Annotated[str | None, typer.Option("--scanner", help="Where the bench has several.")]
 ScopeName = Annotated[str | None, typer.Option("--oscilloscope", help="Where the bench has several.")]
@@ -36,22 +45,14 @@ ScopeName = Annotated[str | None, typer.Option("--oscilloscope", help="Where the
 def coded_field(
     where: Where,
     design: Annotated[Path | None, typer.Option("--design", "-d", help="Of the testfield or sheet.")] = None,
-    poses: Annotated[
-        Path | None, typer.Option(help="CSV of poses, a column for each axis; by default the paper's 36.")
-    ] = None,
+    poses: Poses = None,
     heights: Annotated[str, typer.Option(help="Of the board (mm), as 0,50,100: each pose at each.")] = "",
-    height_sigma: Annotated[float, typer.Option(min=1e-9, help="Of a height (mm), where there is z.")] = 0.01,
-    axis_sigma: Annotated[
-        float, typer.Option(min=1e-6, help="Of z against the normal of the board (mrad), both ways.")
-    ] = 10.0,
-    field_sigma: Annotated[
-        float, typer.Option(min=1e-9, help="Of the design's points (mm), where there is z.")
-    ] = 0.05,
+    height_sigma: HeightSigma = 0.01,
+    axis_sigma: AxisSigma = 10.0,
+    field_sigma: FieldSigma = 0.05,
     until: Annotated[str, typer.Option(help="Choose poses until this holds, as 'sigma_c < 0.5 um'.")] = "",
     first: Annotated[int, typer.Option(min=4, help="Poses to begin with, where they are chosen.")] = 5,
-    pitch: Annotated[
-        float | None, typer.Option(min=1e-6, help="Of the pixels (mm), for Brown's model.")
-    ] = None,
+    pitch: Pitch = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     row_jitter: Annotated[float, typer.Option(min=0, help="Of the sensor, pixels.")] = 0.0,
     fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
