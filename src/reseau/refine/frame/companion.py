@@ -26,7 +26,7 @@ from ...data import Array, Rows
 from .band import Band
 from .border import binned
 
-__all__ = ["Companion", "edge_beside_line"]
+__all__ = ["Companion", "edge_beside_line", "ends_with_line"]
 
 _SECTIONS = 20
 """Sections of an edge."""
@@ -37,8 +37,9 @@ _MODEL = 0.012
 _OUT, _BEHIND, _SLOPES = -0.5, 2.5, (0.0, -2.0, 2.0)
 """Approximate values, widths: of the edge from the line that was fitted, of the line behind it from the edge,
 and by how much that leaves it from the middle to an end."""
-_MOST_MISFIT, _LEAST_GAIN = 1.0, 3.0
-"""χ² over the redundancy with which two lines describe an edge, and how often as large it is with one."""
+_MOST_MISFIT, _LEAST_GAIN, _CLEAR_GAIN = 1.0, 3.0, 20.0
+"""χ² over the redundancy with which two lines describe an edge, and how often as large it is with one: at
+least, and where nothing else can be there."""
 _TOGETHER = 1.7
 """By how much more the edge varies than from bins whose errors were independent: grain is wider."""
 _BOW = 0.3
@@ -82,9 +83,61 @@ def edge_beside_line(
         The second tells whether a line could run so close to the edge all along that nothing parts the two:
         all sections are described by straight steps. With other things beside the edge they are not.
     """
+    two = _two_lines(grey, band, line, level, noise, width)
+    if two is None:
+        return None, True
+    x, place = two.x, two.place
+    first, second = x[_SHARED + 1 :: 4] / two.top, x[_SHARED + 2 :: 4] / two.top
+    behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
+    there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
+    there &= (behind > -0.3 * width).mean() > 0.9
+    farthest = _FARTHEST[int(two.chi < _WELL)] * width
+    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest
+    # What lies behind the edge at one distance all along may be the scanner's own glare, which is less clear.
+    there &= np.ptp(behind) > width or (two.chi < _WELL and two.without > _CLEAR_GAIN * two.chi)
+    if two.chi > _MOST_MISFIT or two.without < _LEAST_GAIN * two.chi or not there:
+        return None, min(two.without, two.chi) < _MOST_MISFIT
+    return two.companion(band, line), True
+
+
+def ends_with_line(
+    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
+) -> Companion | None:
+    """The edge with a line behind it, whether or not that describes it; as :func:`edge_beside_line`.
+
+    Its covariance is what the pixels tell of the edge if that is what is there.
+    """
+    two = _two_lines(grey, band, line, level, noise, width)
+    return None if two is None else two.companion(band, line)
+
+
+class _TwoLines(NamedTuple):
+    """An edge and a line fitted: parameters (u,), cofactors (u, u), places and contrasts of sections (s,).
+
+    Besides χ² over the redundancy with the line, and without.
+    """
+
+    x: Array
+    cofactor: Array
+    place: Array
+    top: Array
+    chi: float
+    without: float
+
+    def companion(self, band: Band, line: Array) -> Companion:
+        """The edge of it."""
+        ends = np.array([[1.0, -1.0], [1.0, 1.0]])
+        covariance = ends @ self.cofactor[:2, :2] @ ends.T * _TOGETHER**2
+        fitted = np.interp([-1.0, 1.0], band.place, line)
+        return Companion(fitted + ends @ self.x[:2], covariance, float(self.x[2]))
+
+
+def _two_lines(
+    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
+) -> _TwoLines | None:
     sections = _sections(grey - level[:, None], band, line, noise, width)
     if sections is None:
-        return None, True
+        return None
     place, at, value, weight, top = sections
     model = _Model(place, at, width)
     starts = np.array([model.start(slope, top) for slope in _SLOPES])
@@ -92,25 +145,11 @@ def edge_beside_line(
     spread = np.concatenate([shared, _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
     estimates, cofactor, chi = model.fitted(value, weight, starts, spread)
     best = int(np.argmin(chi))
-    x = estimates[best]
     alone = model.start(0.0, top)
     alone[0], alone[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
     held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-6 * top, 2 * top)])
     without = float(model.fitted(value, weight, alone[None], held)[2][0])
-    first, second = x[_SHARED + 1 :: 4] / top, x[_SHARED + 2 :: 4] / top
-    behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
-    there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
-    there &= (behind > -0.3 * width).mean() > 0.9
-    farthest = _FARTHEST[int(chi[best] < _WELL)] * width
-    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest
-    # What lies behind the edge at one distance all along may be the scanner's own glare.
-    there &= np.ptp(behind) > width
-    if chi[best] > _MOST_MISFIT or without < _LEAST_GAIN * chi[best] or not there:
-        return None, min(without, float(chi[best])) < _MOST_MISFIT
-    ends = np.array([[1.0, -1.0], [1.0, 1.0]])
-    covariance = ends @ cofactor[best, :2, :2] @ ends.T * _TOGETHER**2
-    fitted = np.interp([-1.0, 1.0], band.place, line)
-    return Companion(fitted + ends @ x[:2], covariance, float(x[2])), True
+    return _TwoLines(estimates[best], cofactor[best], place, top, float(chi[best]), without)
 
 
 def _sections(
