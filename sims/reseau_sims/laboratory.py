@@ -78,10 +78,11 @@ class _Mounted(FieldBench):
     def pose(self, station: Station) -> Pose:
         """Of the camera in the system of the board: that of the first setup, carried along."""
         first = super().pose(Station(0.0))
-        phi, kappa, camera = np.deg2rad(station)
+        phi, kappa, camera = np.deg2rad([station.phi, station.kappa, station.camera_kappa])
         board = rotation_matrix(np.array([0.0, phi, 0.0])) @ rotation_matrix(np.array([0.0, 0.0, kappa]))
         matrix = rotation_matrix(np.array([0.0, 0.0, camera])) @ first.matrix @ board
-        return Pose(matrix_to_vector(matrix), board.T @ (first.x0 + np.array(self.shift_mm)))
+        place = board.T @ (first.x0 + np.array(self.shift_mm))
+        return Pose(matrix_to_vector(matrix), place - self._lift(station))
 
 
 def _same_camera(one: World, two: World) -> bool:
