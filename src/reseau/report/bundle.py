@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from itertools import count
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -26,6 +23,7 @@ from .bundle_figures import distortion_figure, network_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, uncertainty_figure
 from .patterns import patterns_of
+from .template import rendered
 
 __all__ = ["bundle_report"]
 
@@ -63,13 +61,10 @@ def bundle_report(
     str
         An HTML page without any external resource and without clock times.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("reseau.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )  # fmt: skip
     result = searched.result
     cameras = [_camera(result, c, distances) for c in _shown(result)[:_CAMERAS]]
-    return environment.get_template("bundle.html.j2").render(
+    return rendered(
+        "bundle.html.j2",
         title=title,
         summary=_summary(result),
         warnings=result.warnings,
@@ -86,8 +81,6 @@ def bundle_report(
         left_out=left_out_table(result)[:_IMAGES],
         unit=result.network.unit,
         provenance=(provenance or Provenance()).to_dict(),
-        figure=partial(next, count(1)),
-        table=partial(next, count(1)),
     )
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
-from itertools import count, zip_longest
+from itertools import zip_longest
 
-import jinja2
 import numpy as np
 
 from ..data import Frame
@@ -20,6 +18,7 @@ from .photo_i import photo_i_section
 from .photo_ii import photo_ii_section
 from .photo_iii import photo_iii_section
 from .tables import Row
+from .template import rendered
 from .truth import Comparison, Factor, Pair
 
 __all__ = ["oscilloscope_report"]
@@ -83,8 +82,15 @@ def oscilloscope_report(
     if second is not None and test_object is not None:
         more = _of_the_instrument(second, test_object, third, pictures[1:], truth)
     facts = (provenance or Provenance()).to_dict()
-    return _render(
-        title=title, reseau=reseau, unit=reseau.unit, one=one, provenance=facts, camera=camera, **more
+    return rendered(
+        "oscilloscope.html.j2",
+        title=title,
+        reseau=reseau,
+        unit=reseau.unit,
+        one=one,
+        provenance=facts,
+        camera=camera,
+        **more,
     )
 
 
@@ -105,19 +111,6 @@ def _of_the_instrument(
         ],
         "factors": _factors(factors or factor_by_factor(second, test_object)),
     }
-
-
-def _render(**content: object) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("reseau.report"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    # Numbered as they come: which there are depends on what was done.
-    counters = {"figure": partial(next, count(1)), "table": partial(next, count(1))}
-    return environment.get_template("oscilloscope.html.j2").render(content, **counters)
 
 
 def _factors(factors: Sequence[Factor]) -> Row:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-from itertools import count
-
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
@@ -17,6 +13,7 @@ from ..data import Array
 from ..provenance import Provenance
 from ..refine.sensor import EdgeSpread, FreeCurve, Linearity, SensorResult
 from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
+from .template import rendered
 
 __all__ = ["mtf_figure", "sensor_report", "transfer_figure"]
 
@@ -52,12 +49,9 @@ def sensor_report(result: SensorResult, *, title: str, provenance: Provenance | 
     str
         An HTML page without any external resource and without clock times.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("reseau.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )  # fmt: skip
     edge = result.edge
-    return environment.get_template("sensor.html.j2").render(
+    return rendered(
+        "sensor.html.j2",
         title=title,
         summary=_summary(result),
         rows=_rows(result),
@@ -66,8 +60,6 @@ def sensor_report(result: SensorResult, *, title: str, provenance: Provenance | 
         mtf=Markup(mtf_figure(edge)) if isinstance(edge, EdgeSpread) else None,
         edge=_edge(edge) if isinstance(edge, EdgeSpread) else None,
         provenance=(provenance or Provenance()).to_dict(),
-        figure=partial(next, count(1)),
-        table=partial(next, count(1)),
     )
 
 
