@@ -5,7 +5,6 @@ file and index, and one over real protocols with one fault in a hundred answers.
 """
 
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -29,6 +28,7 @@ from reseau_sims.serving.imaging import CameraBody, InLaboratory
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .fieldrig import FieldRig
+from .killing import exit_code
 
 KILLS = int(os.environ.get("RESEAU_KILLS", "200"))
 POSES = paper_steps()[:12]
@@ -82,17 +82,9 @@ def faulty(seed: int) -> Iterator[Bench]:
 
 def ended(place: Path, kind: str, after_s: float | None, seed: int = 0) -> bool:
     """Whether a process came to its end before it was killed, or an instrument ended it."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([work.__module__, *HEAVY])
-    process = context.Process(target=work, args=(place, kind, seed))
-    process.start()
-    process.join(after_s)
-    if process.is_alive():
-        assert process.pid is not None
-        os.kill(process.pid, signal.SIGKILL)
-    process.join(60)
-    assert process.exitcode in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
-    return process.exitcode == 0
+    code = exit_code(work, (place, kind, seed), after_s, HEAVY)
+    assert code in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
+    return code == 0
 
 
 def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]:

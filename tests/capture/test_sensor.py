@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -25,6 +24,8 @@ from reseau.procedures.live_sensor import LiveSensor
 from reseau_drivers.camera import v4l2
 from reseau_sims.pixels import PixelSensor
 from reseau_sims.serving import CameraBody, Lamp, VideoCamera
+
+from .killing import exit_code
 
 PLAN = SensorPlan(levels=10, frames=3, longest_us=40_000.0)
 
@@ -193,17 +194,9 @@ def work(place: Path) -> None:
 
 def ended(place: Path, after_s: float | None) -> bool:
     """Whether a process came to its end before it was killed."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([work.__module__, "reseau.procedures.live_sensor"])
-    process = context.Process(target=work, args=(place,))
-    process.start()
-    process.join(after_s)
-    if process.is_alive():
-        assert process.pid is not None
-        os.kill(process.pid, signal.SIGKILL)
-    process.join(60)
-    assert process.exitcode in (0, -signal.SIGKILL)
-    return process.exitcode == 0
+    code = exit_code(work, (place,), after_s, ["reseau.procedures.live_sensor"])
+    assert code in (0, -signal.SIGKILL)
+    return code == 0
 
 
 def stored(place: Path) -> dict[str, str]:

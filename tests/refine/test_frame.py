@@ -177,19 +177,22 @@ def test_another_channel_is_kept_where_that_of_most_contrast_hides_an_edge() -> 
     assert np.abs(errors(result, frame)).max() < 0.3
 
 
-def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
-    frame = FilmFrame(51)
+def moved_at_its_corners(frame: FilmFrame, by: Array) -> tuple[FrameResult, Array]:
+    """A scan seen through the perspective that moves its corners (4, 2) so; and where the frame's are then."""
     pixels = frame.scan()
     h, w = pixels.shape
-    # Left and right edge converge by two degrees.
-    seen = np.array([[-14.0, 0.0], [w + 14.0, 0.0], [w, h], [0.0, h]], dtype=np.float32)
     square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
-    tilted = cv2.getPerspectiveTransform(square, seen)
-    pixels = cv2.warpPerspective(
-        pixels, tilted, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    )
-    corners = cv2.perspectiveTransform(frame.truth.corners[None], tilted)[0]
-    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    moved = cv2.getPerspectiveTransform(square, (square + by).astype(np.float32))
+    seen = cv2.warpPerspective(pixels, moved, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    options = FrameOptions(formats=((36.0, 24.0),))
+    (result,) = orient_frames(scan_of(seen, dpi=frame.dpi), options)
+    return result, cv2.perspectiveTransform(frame.truth.corners[None], moved)[0]
+
+
+def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
+    # Left and right edge converge by two degrees.
+    by = np.array([[-14.0, 0.0], [14.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    result, corners = moved_at_its_corners(FilmFrame(51), by)
     assert result.status == "oriented", result.why
     assert "seen at a slant" in result.why
     assert result.lines is not None
@@ -197,17 +200,9 @@ def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
 
 
 def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
-    frame = FilmFrame(52)
-    pixels = frame.scan()
-    h, w = pixels.shape
     # One corner moved alone: its edges are turned by a degree and more.
-    seen = np.array([[24.0, 16.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
-    square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
-    moved = cv2.getPerspectiveTransform(square, seen)
-    pixels = cv2.warpPerspective(
-        pixels, moved, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    )
-    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    by = np.array([[24.0, 16.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    result, _ = moved_at_its_corners(FilmFrame(52), by)
     assert result.status == "declined"
     assert "do not make a frame" in result.why
 

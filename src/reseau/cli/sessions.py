@@ -123,20 +123,28 @@ def _inputs(kept: Session) -> dict[str, str]:
     return {name: given.sha256 for name, given in kept.given().items()}
 
 
-class _Reported:
+class _Measured:
+    """A procedure, up to what comes of it."""
+
+    def __init__(self, live: Procedure) -> None:
+        self._measures = live
+
+    def on_frame(self, frame: Frame, step: Step) -> Verdict:
+        return self._measures.on_frame(frame, step)
+
+    def progress(self) -> Mapping[str, float]:
+        return self._measures.progress()
+
+    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        return self._measures.next_pose(candidates, wanted)
+
+
+class _Reported(_Measured):
     """A testfield procedure whose results have a report beside them."""
 
     def __init__(self, live: LiveTestfield) -> None:
+        super().__init__(live)
         self.live = live
-
-    def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        return self.live.on_frame(frame, step)
-
-    def progress(self) -> dict[str, float]:
-        return self.live.progress()
-
-    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        return self.live.next_pose(candidates, wanted)
 
     def finish(self) -> dict[str, str]:
         from ..procedures.calibration import Calibrated
@@ -150,20 +158,12 @@ class _Reported:
         return made | {"report.html": report}
 
 
-class _Sensor:
+class _Sensor(_Measured):
     """A sensor's calibration under the name of its camera, with a report beside it."""
 
     def __init__(self, live: LiveSensor, kept: Session) -> None:
+        super().__init__(live)
         self.live, self._kept = live, kept
-
-    def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        return self.live.on_frame(frame, step)
-
-    def progress(self) -> dict[str, float]:
-        return self.live.progress()
-
-    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        return self.live.next_pose(candidates, wanted)
 
     def finish(self) -> dict[str, str]:
         from ..report.sensor import sensor_report
