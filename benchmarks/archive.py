@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from reseau.archive import Archive, Verdict, tiff_of
-from reseau.data import Frame
+from reseau.core.data import Frame
 
 
 def milliseconds(work: Callable[[], object], times: int = 15) -> tuple[float, float]:

@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from shared import of_the_tests
 
-from reseau.adjust.threads import one_thread
 from reseau.bundle import BundleFit, BundleProblem, Network, problem_of
-from reseau.bundle.posterior import cofactors_of
+from reseau.bundle.solver.posterior import cofactors_of
+from reseau.core.threads import one_thread
 from reseau.exchange import read_bal
-from reseau.formats.network import Network1
+from reseau.io.network import Network1
 from reseau.optics.poses import rotation_matrix
 
 DATA = (

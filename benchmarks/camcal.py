@@ -26,12 +26,12 @@ import numpy as np
 from shared import of_the_tests
 
 from reseau.bundle import Network, adjust_network
-from reseau.data import Array, Frame
-from reseau.formats import ReseauDesign
-from reseau.formats.network import Network1
-from reseau.images import Channel, read_frame
+from reseau.core.data import Array, Frame
+from reseau.io import ReseauDesign
+from reseau.io.images import Channel, read_frame
+from reseau.io.network import Network1
+from reseau.measure import ReseauResult, measure_reseau
 from reseau.optics.formation import Outline
-from reseau.refine import ReseauResult, measure_reseau
 
 _LIMIT_PX = 0.03
 _MISNUMBERED_PX = 5.0

@@ -11,10 +11,10 @@ import numpy as np
 from photographs import Measured, Physics, measured
 
 from reseau.adjust import Failure
-from reseau.data import Array, ImagePoints, Rows
-from reseau.formats import ReseauDesign
+from reseau.core.data import Array, ImagePoints, Rows
+from reseau.io import ReseauDesign
+from reseau.measure.fitting import fit_mapping
 from reseau.procedures.oscilloscope import PhotoII, photo_i, photo_ii
-from reseau.refine import fit_mapping
 from reseau.report.factors import correctors, rods_of, with_rods_as_made
 from reseau_sims import Truth, World
 

@@ -13,14 +13,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from reseau.adjust.threads import one_thread
 from reseau.capture import Step, paper_steps, spread
-from reseau.data import Frame
+from reseau.core.data import Frame
+from reseau.core.threads import one_thread
 from reseau.designs import coded_testfield
+from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraModel
 from reseau.procedures.live import LiveTestfield
 from reseau.procedures.measuring import measurer_of
-from reseau.refine import TestfieldOptions
 from reseau_sims import FieldBench, Station
 
 AXES = ("tilt", "roll", "camera_roll")

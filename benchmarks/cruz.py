@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
+from reseau.core.data import Array
 
 __all__ = ["cruz_corners"]
 

@@ -13,9 +13,9 @@ import time
 import numpy as np
 from shared import of_the_tests
 
-from reseau.data import Array
-from reseau.refine.sensor import EdgeSpread, FreeCurve, measure_edge
-from reseau.refine.sensor.free import FREQUENCIES
+from reseau.core.data import Array
+from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
+from reseau.sensor.free import FREQUENCIES
 
 edges = of_the_tests("refine/sensor/edges.py")
 SHOWN = FREQUENCIES[1:]

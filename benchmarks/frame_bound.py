@@ -18,11 +18,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from frames import CASES, SEEDS
 
-from reseau.data import Array
-from reseau.refine.frame import FrameOptions, orient_frames
-from reseau.refine.frame.band import read_band
-from reseau.refine.frame.companion import ends_with_line
-from reseau.scans import Scan, scan_of
+from reseau.core.data import Array
+from reseau.io.scans import Scan, scan_of
+from reseau.measure.frame import FrameOptions, orient_frames
+from reseau.measure.frame.band import read_band
+from reseau.measure.frame.companion import ends_with_line
 from reseau_sims.filmframe import Beside, FilmFrame
 
 LIMIT_PX = 0.33

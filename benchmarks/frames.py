@@ -24,10 +24,10 @@ import numpy as np
 from cruz import cruz_corners
 from real_frames import print_real
 
-from reseau.data import Array
+from reseau.core.data import Array
+from reseau.io.scans import open_scan, scan_of
+from reseau.measure.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
 from reseau.procedures.frame import helped
-from reseau.refine.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
-from reseau.scans import open_scan, scan_of
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
 _FILM = {"perforations": True, "print": True, "neighbours": True}

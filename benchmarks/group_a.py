@@ -29,17 +29,12 @@ from scipy.stats import ncx2, norm
 from tables import ALPHA, SIZES, judged, print_power, rms
 
 from reseau.adjust import Adjustment, adjust
-from reseau.data import Array, ImagePoints
+from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.fitting import fit_mapping, mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import (
-    CameraCorrection,
-    CorrectionFit,
-    correct_camera,
-    fit_mapping,
-    mapping_problem,
-    measure_reseau,
-)
+from reseau.refine import CameraCorrection, CorrectionFit, correct_camera
 from reseau_sims import World
 
 COEFFICIENTS = RationalPolynomial.camera().names

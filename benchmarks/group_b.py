@@ -24,11 +24,10 @@ from group_a import EVERYTHING, in_pixels
 from tables import ALPHA, SIZES, level_band, print_power
 
 from reseau.adjust import Elimination
-from reseau.data import Array, ImagePoints
+from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau, test_object
 from reseau.optics import RationalPolynomial
-from reseau.refine import CameraCorrection, correct_camera
-from reseau.refine.correction import correct_instrument
+from reseau.refine import CameraCorrection, correct_camera, correct_instrument
 
 __all__ = ["COEFFICIENTS", "f_tests"]
 

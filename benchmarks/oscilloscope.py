@@ -39,7 +39,7 @@ from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
 from photographs import Physics
 from tables import judged, mean_square, rms, rms_over_worlds
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.report.factors import FACTORS
 
 VERDICTS = {"first": "the polynomials", "second": "Wong's display", "undecided": "neither"}

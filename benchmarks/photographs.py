@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from reseau.adjust import Failure
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
 from reseau.procedures.oscilloscope import photo_i, photo_ii, photo_iii
-from reseau.refine.correction import Registration
+from reseau.refine import Registration
 from reseau_sims import World
 
 __all__ = ["Measured", "Physics", "measured"]

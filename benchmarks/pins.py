@@ -18,10 +18,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reseau.data import Array, Frame, ImagePoints
-from reseau.images import read_frame, write_image
+from reseau.core.data import Array, Frame, ImagePoints
+from reseau.io.images import read_frame, write_image
+from reseau.measure import PinDetections, Wires, find_pins, lay_wires
+from reseau.measure.fitting import fit_mapping
 from reseau.optics import RationalPolynomial
-from reseau.refine import PinDetections, Wires, find_pins, fit_mapping, lay_wires
 
 SAME_PX = 10.0
 """A reflector this near to PLUS's wire is that wire; wires lie 50 px and more apart."""

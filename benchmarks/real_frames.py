@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
-from reseau.images import write_image
-from reseau.refine.frame import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
+from reseau.core.data import Array
+from reseau.io.images import write_image
+from reseau.io.scans import Scan, open_scan
+from reseau.measure.frame import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
 from reseau.report.frames import contact_sheet, frame_tile
-from reseau.scans import Scan, open_scan
 
 __all__ = ["print_real"]
 

@@ -18,10 +18,11 @@ import cv2
 import numpy as np
 from shared import of_the_tests
 
-from reseau.data import Array
-from reseau.formats import ReseauDesign
-from reseau.images import write_image
-from reseau.refine import ReseauOptions, ReseauResult, SmoothField, measure_reseau
+from reseau.core.data import Array
+from reseau.io import ReseauDesign
+from reseau.io.images import write_image
+from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
+from reseau.optics.field import SmoothField
 
 TRIALS = 499
 VECTORS = 50

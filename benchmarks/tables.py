@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import binom
 
-from reseau.data import Array
+from reseau.core.data import Array
 
 __all__ = ["ALPHA", "SIZES", "judged", "level_band", "mean_square", "print_power", "rms", "rms_over_worlds"]
 

@@ -22,10 +22,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from shared import of_the_tests
 
-from reseau.data import Array, Frame
+from reseau.core.data import Array, Frame
 from reseau.designs import HIDDEN, coded_testfield
-from reseau.formats import SHAPES
-from reseau.refine import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau.io import SHAPES
+from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
 from reseau_sims import FieldBench, Station, paper_stations
 from reseau_sims.testfield import JITTER_PX
 

@@ -18,21 +18,12 @@ import numpy as np
 import scipy.stats
 
 from reseau.adjust import compare
-from reseau.bundle import (
-    Additional,
-    Camera,
-    Lens,
-    Network,
-    Result,
-    adjust_network,
-    by_point,
-    common_pattern,
-)
-from reseau.data import Array, ImagePoints
+from reseau.bundle import Additional, Camera, Lens, Network, Result, adjust_network, by_point, common_pattern
+from reseau.core.data import Array, ImagePoints
 from reseau.designs import coded_testfield
-from reseau.formats import SHAPES
+from reseau.io import SHAPES
+from reseau.measure import TestfieldOptions, measure_testfield
 from reseau.procedures.calibration import network_of
-from reseau.refine import TestfieldOptions, measure_testfield
 from reseau_sims import FieldBench, Station, paper_stations
 from reseau_sims.testfield import C_MM, JITTER_PX, PITCH_MM, PIXELS
 

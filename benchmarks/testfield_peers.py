@@ -23,9 +23,9 @@ import numpy as np
 from scipy.spatial import KDTree
 from shared import of_the_tests
 
-from reseau.data import Array
+from reseau.core.data import Array
+from reseau.measure import measure_reseau
 from reseau.optics.formation import rectangles
-from reseau.refine import measure_reseau
 
 sheets = of_the_tests("refine/sheets.py")
 ROLLS, TILTS = (0.0, 100.0, 200.0, 300.0), (0.0, 30.0, 45.0)
@@ -104,7 +104,7 @@ def nearest(found: Array, view: View) -> Array:
 
 
 def ours(view: View) -> Array:
-    from reseau.data import Frame
+    from reseau.core.data import Frame
 
     result = measure_reseau(Frame(view.sheet, 255.0), sheets.DESIGN)
     return result.xy if result else np.full(view.truth.shape, np.nan)

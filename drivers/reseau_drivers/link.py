@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import serial
 from serial.tools import list_ports
 
-from reseau.errors import ConnectionLost, DeadlineError, ProtocolError, UsageError
+from reseau.core.errors import ConnectionLost, DeadlineError, ProtocolError, UsageError
 from reseau.instruments import Deadline
 
 from .codecs.stream import Damaged, Decoder

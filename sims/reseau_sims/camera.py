@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics import (
     Brown,
     Chain,

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 from reseau.optics import Chain, Derivatives, PlaneMapping, RationalPolynomial, wong_display
 from reseau.optics.mapping import as_points, as_values
 from reseau.optics.resampling import on_lattice

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.errors import UsageError
-from reseau.formats import ReseauDesign
+from reseau.core.errors import UsageError
+from reseau.io import ReseauDesign
 
 __all__ = ["Faults", "swapped"]
 

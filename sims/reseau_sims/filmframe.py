@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
+from reseau.core.data import Array
 
 from . import filmscene
 from .streams import stream

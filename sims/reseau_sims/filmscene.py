@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from reseau.data import Array
+from reseau.core.data import Array
 
 from .streams import stream
 

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array, Frame
-from reseau.errors import UsageError
+from reseau.core.data import Array, Frame
+from reseau.core.errors import UsageError
 from reseau.optics import Pose, matrix_to_vector, rotation_matrix
 
 from .reflectors import Reflectors

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array, Mask
+from reseau.core.data import Array, Mask
 
 __all__ = ["PixelSensor"]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reseau.data import Array, Mask
-from reseau.errors import UsageError
-from reseau.formats import ReseauDesign
+from reseau.core.data import Array, Mask
+from reseau.core.errors import UsageError
+from reseau.io import ReseauDesign
 from reseau.optics.formation import Outline, draw, mark_outline
 from reseau.optics.grids import line_grid
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reseau.data import Array
-from reseau.errors import UsageError
-from reseau.formats import ReseauDesign
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
+from reseau.io import ReseauDesign
 from reseau.optics import PlaneMapping
 
 __all__ = ["Reflectors", "body_of", "rods_of"]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 from reseau.optics import RationalPolynomial
 
 from .reflectors import Reflectors

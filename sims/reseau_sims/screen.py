@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics import PlaneMapping
 from reseau.optics.resampling import on_lattice
 

@@ -14,9 +14,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from reseau.data import Array, Frame, Mask
+from reseau.core.data import Array, Frame, Mask
 from reseau.designs import coded_testfield
-from reseau.formats import TestfieldDesign
+from reseau.io import TestfieldDesign
 from reseau.optics import (
     Brown,
     PixelGrid,

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.data import Array, Frame
+from reseau.core.data import Array, Frame
 from reseau.designs import standard_reseau, test_object
-from reseau.formats import ReseauDesign
+from reseau.io import ReseauDesign
 from reseau.optics import (
     Brown,
     Chain,

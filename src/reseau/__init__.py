@@ -5,4 +5,6 @@ formation), :mod:`reseau.refine` (one frame to refined image coordinates), :mod:
 module per published procedure), :mod:`reseau.report` (pages and figures).
 """
 
-__version__ = "0.1.0"
+from .core.version import __version__
+
+__all__ = ["__version__"]

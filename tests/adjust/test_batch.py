@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust import BatchOptions, BatchReason, adjust_batch
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 T = np.linspace(0.0, 4.0, 40)
 

@@ -21,7 +21,7 @@ from reseau.adjust import (
     adjust,
     check_jacobian,
 )
-from reseau.errors import EstimationError, UsageError
+from reseau.core.errors import EstimationError, UsageError
 
 T = np.linspace(0.0, 4.0, 30)
 TRUE = np.array([2.0, 0.8, 0.5])

@@ -16,7 +16,7 @@ from reseau.adjust import (
     critical_w,
     noncentrality,
 )
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 T = np.linspace(-1.0, 1.0, 12)
 A = np.stack([np.ones_like(T), T, T**2], axis=1)

@@ -20,7 +20,7 @@ from reseau.adjust import (
     robust,
     weight_function,
 )
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 T = np.linspace(0.0, 10.0, 50)
 A = np.stack([np.ones_like(T), T], axis=1)

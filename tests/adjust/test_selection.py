@@ -17,7 +17,7 @@ from reseau.adjust import (
     eliminate,
     variance_components,
 )
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 T = np.linspace(-1.0, 1.0, 40)
 POWERS = np.stack([T**i for i in range(6)], axis=1)

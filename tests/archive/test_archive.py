@@ -28,8 +28,8 @@ from reseau.archive import (
     tiff_of,
     verify,
 )
-from reseau.data import Frame
-from reseau.errors import ArchiveError
+from reseau.core.data import Frame
+from reseau.core.errors import ArchiveError
 
 POSTGRES = os.environ.get("RESEAU_POSTGRES", "")
 """URL of a server on which schemas may be made; `.ci/run` starts one."""
@@ -243,8 +243,8 @@ def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> 
         import resource, sys
         from pathlib import Path
         from reseau.archive import Archive
-        from reseau.data import Frame
-        from reseau.errors import ArchiveError
+        from reseau.core.data import Frame
+        from reseau.core.errors import ArchiveError
         import numpy as np
         with Archive.open(sys.argv[1], create=True) as archive:
             session = archive.begin("s", "frames", {})
@@ -317,7 +317,7 @@ def test_what_a_killed_process_left_in_the_log_is_read_on_a_read_only_disk_too(
         import os, sys
         import numpy as np
         from reseau.archive import Archive
-        from reseau.data import Frame
+        from reseau.core.data import Frame
         archive = Archive.open(sys.argv[1], create=True)
         session = archive.begin("s", "frames", {})
         for k in range(3):
@@ -365,7 +365,7 @@ def test_two_processes_write_into_one_archive(tmp_path: Path) -> None:
         import sys
         import numpy as np
         from reseau.archive import Archive
-        from reseau.data import Frame
+        from reseau.core.data import Frame
         with Archive.open(sys.argv[1], create=True) as archive:
             session = archive.begin(sys.argv[2], "frames", {})
             for k in range(20):

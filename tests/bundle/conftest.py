@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from reseau.bundle import Network
-from reseau.formats.network import Network1
+from reseau.io.network import Network1
 
 
 @pytest.fixture(scope="session")

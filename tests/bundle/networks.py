@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from reseau.bundle import Additional, BundleProblem, Camera, Network, approximate
-from reseau.bundle.unknowns import Unknowns
-from reseau.bundle.values import Values
-from reseau.data import Array
+from reseau.bundle import Additional, BundleProblem, Camera, Network
+from reseau.bundle.solver import approximate
+from reseau.bundle.solver.unknowns import Unknowns
+from reseau.bundle.solver.values import Values
+from reseau.core.data import Array
 from reseau.optics import Brown, Chain, OpenCV, PixelGrid, RationalPolynomial, Similarity, wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Result, sigma_between_images
-from reseau.bundle.remarks import remarks
-from reseau.data import Array
+from reseau.bundle.diagnostics.remarks import remarks
+from reseau.core.data import Array
 
 from . import networks
 

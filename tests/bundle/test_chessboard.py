@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Camera, Network, Options, Result, adjust_network, to_document
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics.poses import rotation_matrix
 
 SIZE = (9, 6)

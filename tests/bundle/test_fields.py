@@ -16,8 +16,8 @@ from reseau.bundle import (
     projection_field,
     projection_field_at,
 )
-from reseau.bundle.fields import FieldDifference
-from reseau.errors import UsageError
+from reseau.bundle.diagnostics.fields import FieldDifference
+from reseau.core.errors import UsageError
 
 from . import networks
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
-from reseau.bundle.further import Further
-from reseau.bundle.system import Linear, System, residuals
-from reseau.bundle.unknowns import Unknowns
-from reseau.bundle.values import Correction, Values
-from reseau.data import Array
+from reseau.bundle.solver.further import Further
+from reseau.bundle.solver.system import Linear, System, residuals
+from reseau.bundle.solver.unknowns import Unknowns
+from reseau.bundle.solver.values import Correction, Values
+from reseau.core.data import Array
 from reseau.optics import EbnerCorrection
 from reseau.optics.poses import Pose, matrix_to_vector, project
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Result, by_place, by_point, common_pattern, patterns
-from reseau.errors import UsageError
+from reseau.bundle import Network, Result, by_place, by_point, common_pattern
+from reseau.bundle.diagnostics import patterns
+from reseau.core.errors import UsageError
 
 from . import networks
 from .test_testfield import adjusted, paper

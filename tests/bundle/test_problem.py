@@ -13,12 +13,12 @@ import scipy.stats
 from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
 from reseau.adjust import Options as AdjustOptions
 from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
-from reseau.bundle.careful import careful_inverse
-from reseau.bundle.problem import _Run
-from reseau.bundle.remarks import remarks
-from reseau.bundle.system import residuals
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.bundle.diagnostics.remarks import remarks
+from reseau.bundle.solver.careful import careful_inverse
+from reseau.bundle.solver.problem import _Run
+from reseau.bundle.solver.system import residuals
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
 
 from . import networks

@@ -9,9 +9,9 @@ import pytest
 
 from reseau.adjust import compare
 from reseau.bundle import Additional, Camera, Network, Result, adjust_network, by_place, common_pattern
-from reseau.bundle.selection import Selection, eliminate_parameters
-from reseau.bundle.system import residuals
-from reseau.data import Array
+from reseau.bundle.modelling.selection import Selection, eliminate_parameters
+from reseau.bundle.solver.system import residuals
+from reseau.core.data import Array
 from reseau.optics.poses import matrix_to_vector
 
 from . import networks

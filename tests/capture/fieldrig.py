@@ -13,15 +13,15 @@ import numpy as np
 
 from reseau.archive import Session
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry
-from reseau.data import Frame
+from reseau.core.data import Frame
+from reseau.core.errors import StateError
 from reseau.designs import coded_testfield
-from reseau.errors import StateError
-from reseau.formats import TestfieldDesign
 from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Settings, Status, quantity
+from reseau.io import TestfieldDesign
+from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraModel
 from reseau.procedures.live import LiveTestfield
 from reseau.procedures.measuring import measurer_of
-from reseau.refine import TestfieldOptions
 from reseau_sims import FieldBench, Station
 
 AXES = ("tilt", "roll", "camera_roll")

@@ -13,7 +13,7 @@ import pytest
 
 from reseau.archive import Archive, Session, Verdict
 from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
-from reseau.errors import ArchiveError, EstimationError, StateError, UsageError
+from reseau.core.errors import ArchiveError, EstimationError, StateError, UsageError
 
 from .fieldrig import FieldRig
 

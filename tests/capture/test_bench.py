@@ -12,7 +12,7 @@ import pytest
 
 from reseau.capture import Bench, BenchFile, found_instruments, plugin
 from reseau.cli import run
-from reseau.errors import BenchError, ConnectionLost, FormatError, InputError, UsageError
+from reseau.core.errors import BenchError, ConnectionLost, FormatError, InputError, UsageError
 from reseau.instruments import Oscilloscope, Turntable, UltrasonicScanner
 from reseau_sims import Reflectors
 from reseau_sims.serving import Fault, SimulatedBench

@@ -35,9 +35,9 @@ POSES = paper_steps()[:12]
 FRAMES = 40
 HEAVY = (
     "reseau.optics.single",
-    "reseau.bundle.compiled",
-    "reseau.refine.testfield.measure",
-    "reseau.bundle.adjustment",
+    "reseau.bundle.solver.compiled",
+    "reseau.measure.testfield.measure",
+    "reseau.bundle.modelling.adjustment",
 )
 """What takes long to import."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from reseau.capture import BenchLock
-from reseau.errors import StateError
+from reseau.core.errors import StateError
 
 HOLDS = """
     import sys, time
@@ -51,7 +51,7 @@ AS_ANOTHER = """
     import os, sys
     from pathlib import Path
     from reseau.capture import BenchLock
-    from reseau.errors import StateError
+    from reseau.core.errors import StateError
     os.setuid(65534)
     for address in "ab":
         try:

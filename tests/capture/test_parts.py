@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reseau.capture import Goal, Limits, edge_sigma, exposure_fault, read_steps, readiness, shift_between
-from reseau.data import Frame
-from reseau.errors import FormatError, UsageError
+from reseau.core.data import Frame
+from reseau.core.errors import FormatError, UsageError
 
 
 def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: float = 0.5, seed: int = 0,

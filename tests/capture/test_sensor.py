@@ -18,8 +18,8 @@ import pytest
 from reseau.archive import Archive, Session
 from reseau.capture import Acquisition, Bench, BenchFile, Decision, InstrumentEntry, Step, carry_out, rerun
 from reseau.capture.sensor import ALL_LIMITS, SensorPlan, sensor
-from reseau.data import Frame
-from reseau.errors import DeadlineError, EstimationError, StateError
+from reseau.core.data import Frame
+from reseau.core.errors import DeadlineError, EstimationError, StateError
 from reseau.procedures.live_sensor import LiveSensor
 from reseau_drivers.camera import v4l2
 from reseau_sims.pixels import PixelSensor

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from reseau.cli import run
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.designs import regular_reseau
-from reseau.formats import Mark, ReseauDesign, write_whole
-from reseau.images import write_image
+from reseau.io import Mark, ReseauDesign, write_whole
+from reseau.io.images import write_image
 from reseau.optics import Chain, Inverted, PlaneMapping, RationalPolynomial, Similarity
 from reseau.optics.formation import draw, mark_outline
 

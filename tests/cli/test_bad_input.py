@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.images import write_image
+from reseau.io.images import write_image
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.formats.network import Network1
+from reseau.io.network import Network1
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import Pose, matrix_to_vector, project
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reseau.calibration.document.document import Calibration
 
-from reseau.calibration import Calibration
-from reseau.formats import ReseauMeasurement
-from reseau.images import write_image
+from reseau.io import ReseauMeasurement
+from reseau.io.images import write_image
 from reseau_sims import FieldBench, Station
 
 Run = Callable[..., tuple[int, str, str]]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ..refine import camcal
+from ..measure import camcal
 
 Run = Callable[..., tuple[int, str, str]]
 

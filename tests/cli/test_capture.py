@@ -11,8 +11,8 @@ import pytest
 
 from reseau import designs
 from reseau.cli import run
-from reseau.data import Frame
-from reseau.errors import StateError
+from reseau.core.data import Frame
+from reseau.core.errors import StateError
 
 from ..capture.fieldrig import DESIGN, FieldRig, Sweeper
 

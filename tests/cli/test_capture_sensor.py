@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from reseau.calibration.document.document import Calibration
 from scipy.special import ndtr
 
 from reseau.archive import Archive, Session
-from reseau.calibration import Calibration
 from reseau.cli import run
-from reseau.errors import ArchiveError
-from reseau.images import write_image
-from reseau.refine.sensor import Level, SensorSeries, calibrate_sensor
+from reseau.core.errors import ArchiveError
+from reseau.io.images import write_image
+from reseau.sensor import Level, SensorSeries, calibrate_sensor
 from reseau_sims import World
 from reseau_sims.pixels import PixelSensor
 from reseau_sims.serving import CameraBody, Lamp, VideoCamera

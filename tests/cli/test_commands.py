@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from reseau.calibration.document.document import Calibration
 
-from reseau.calibration import Calibration
-from reseau.formats import ReseauDesign, ReseauMeasurement
-from reseau.images import read_frame, write_image
+from reseau.io import ReseauDesign, ReseauMeasurement
+from reseau.io.images import read_frame, write_image
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from reseau.calibration.document.document import Calibration
 from threadpoolctl import threadpool_limits
 
 from reseau.archive import Archive, verify
-from reseau.calibration import Calibration
 from reseau.cli import run
-from reseau.formats import ReseauDesign, ReseauMeasurement
-from reseau.refine.correction import InstrumentCorrection
+from reseau.io import ReseauDesign, ReseauMeasurement
+from reseau.refine import InstrumentCorrection
 from reseau_sims import World
 from reseau_sims.serving import aravis_is_installed
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.formats import FrameCorners, FrameOrientation
+from reseau.io import FrameCorners, FrameOrientation
 from reseau_sims.filmframe import FilmFrame
 
 Run = Callable[..., tuple[int, str, str]]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.formats import ReseauDesign, ReseauMeasurement
-from reseau.images import write_image
+from reseau.io import ReseauDesign, ReseauMeasurement
+from reseau.io.images import write_image
 from reseau.optics import Arcs
 
 Run = Callable[..., tuple[int, str, str]]

@@ -10,7 +10,7 @@ import pytest
 
 from reseau.cli import run
 from reseau.designs import standard_reseau
-from reseau.formats import DesignPoint, Mark, ReseauDesign
+from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.optics import RationalPolynomial
 
 _CAMERA = RationalPolynomial.camera().with_values({"k": 3e-7, "d1": 1e-5})

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from reseau.designs import coded_testfield
-from reseau.formats import ReseauMeasurement, TestfieldDesign
-from reseau.images import write_image
+from reseau.io import ReseauMeasurement, TestfieldDesign
+from reseau.io.images import write_image
 from reseau_sims import FieldBench, Station
 
 Run = Callable[..., tuple[int, str, str]]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from reseau.core.errors import UsageError
 from reseau.designs import coded_sheet, regular_reseau, standard_reseau
-from reseau.errors import UsageError
-from reseau.formats import Mark, ReseauDesign
+from reseau.io import Mark, ReseauDesign
 
 DISK = Mark(shape="disk", size=2.0)
 

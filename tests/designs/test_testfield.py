@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reseau.core.errors import FormatError, UsageError
 from reseau.designs import coded_testfield
-from reseau.errors import FormatError, UsageError
-from reseau.formats import TestfieldDesign
+from reseau.io import TestfieldDesign
 
 
 def test_the_testfield_has_the_dimensions_of_the_paper() -> None:

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from reseau.core.errors import UsageError
 from reseau.designs import HIDDEN, TopologicalCode, coded_testfield
 from reseau.designs.topology import Symbols, places, words
-from reseau.errors import UsageError
 
 CODE = TopologicalCode.of(coded_testfield())
 

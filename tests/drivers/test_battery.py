@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from reseau.errors import InstrumentError
+from reseau.core.errors import InstrumentError
 from reseau_sims.serving import KINDS, Fault, Kind, Script
 
 from .rigs import RIGS, Rig, aravis_is_missing, left_open, rig

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.errors import SettingError, StateError
+from reseau.core.errors import SettingError, StateError
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, dicom_files, ping360
 from reseau_drivers.turntable import smc100, zaber

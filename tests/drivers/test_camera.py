@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.errors import (
+from reseau.core.errors import (
     ConnectionLost,
     DeadlineError,
     ProtocolError,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from reseau.capture import Bench, BenchFile
-from reseau.errors import ConnectionLost, ProtocolError, SettingError, StateError
+from reseau.core.errors import ConnectionLost, ProtocolError, SettingError, StateError
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.scanner import DicomFiles, dicom_files
 

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from reseau.capture import Bench, BenchFile
-from reseau.errors import (
+from reseau.core.errors import (
     ConnectionLost,
     DeadlineError,
     InstrumentError,

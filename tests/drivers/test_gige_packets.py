@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from reseau.errors import DeadlineError, ProtocolError, RefusedError
+from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline
 from reseau_drivers.camera import Aravis, AravisSettings, Taken, aravis
 from reseau_sims.serving import CameraBody

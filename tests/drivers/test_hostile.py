@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from reseau.errors import InstrumentError
+from reseau.core.errors import InstrumentError
 from reseau.instruments import Deadline
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, ping360

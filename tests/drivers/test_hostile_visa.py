@@ -11,7 +11,7 @@ from functools import partial
 
 import pytest
 
-from reseau.errors import InstrumentError
+from reseau.core.errors import InstrumentError
 from reseau_drivers.codecs import hislip, rpc, vxi11
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_sims import serving

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.errors import InstrumentError, ProtocolError, RefusedError, SettingError, UsageError
+from reseau.core.errors import InstrumentError, ProtocolError, RefusedError, SettingError, UsageError
 from reseau.instruments import Oscilloscope
 from reseau_drivers.oscilloscope import DIALECTS, dialect_of, oscilloscope
 from reseau_drivers.oscilloscope.dialects import fields_of

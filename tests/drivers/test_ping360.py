@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
 
-from reseau.errors import InstrumentError, ProtocolError, SettingError, StateError
+from reseau.core.errors import InstrumentError, ProtocolError, SettingError, StateError
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.scanner import Ping360, ping360
 from reseau_sims import Reflectors, World, serving

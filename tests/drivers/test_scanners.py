@@ -10,7 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from reseau.capture import Bench, BenchFile
-from reseau.errors import BenchError, ConnectionLost, DeadlineError, ProtocolError, SettingError, StateError
+from reseau.core.errors import (
+    BenchError,
+    ConnectionLost,
+    DeadlineError,
+    ProtocolError,
+    SettingError,
+    StateError,
+)
 from reseau.instruments import UltrasonicScanner
 from reseau_drivers.codecs import bk
 from reseau_drivers.oscilloscope import oscilloscope

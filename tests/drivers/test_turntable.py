@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from reseau.errors import ConnectionLost, DeadlineError, SettingError, StateError, UsageError
+from reseau.core.errors import ConnectionLost, DeadlineError, SettingError, StateError, UsageError
 from reseau.instruments import Movable, Turntable
 from reseau_drivers.link import link_to
 from reseau_drivers.turntable import AxisPlan, Table, Zaber, smc100, zaber

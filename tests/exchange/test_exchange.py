@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Result, adjust_network
-from reseau.errors import FormatError, InputError
+from reseau.core.errors import FormatError, InputError
 from reseau.exchange import read_colmap, read_foreign
-from reseau.formats.network import Network1
+from reseau.io.network import Network1
 from reseau.optics import OpenCV
 from reseau.optics.poses import Pose, project
 

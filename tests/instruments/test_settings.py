@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reseau.errors import DeadlineError, SettingError, UsageError
+from reseau.core.errors import DeadlineError, SettingError, UsageError
 from reseau.instruments import Deadline, Settings, Status, choice, quantity, text
 
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 from reseau.optics import (
     Brown,
     BrownDistortion,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 from reseau.optics import Chain, Identity, RationalPolynomial, Similarity
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics import DecenteredDisplay, RationalPolynomial, wong_display
 
 SYMMETRIC = {"k0": 0.01, "k1": 8e-6, "k2": -2e-9, "k3": 1e-13}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reseau.errors import FormatError, UsageError
+from reseau.core.errors import FormatError, UsageError
 from reseau.optics import RationalPolynomial
 
 # Millimetres on a Polaroid, reseau system: tilt of some minutes, barrel distortion of 1 mm at the corner.

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics import RationalPolynomial
 from reseau.optics.formation import draw, mark_outline
 from reseau.optics.resampling import on_lattice, resample

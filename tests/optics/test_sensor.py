@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 from reseau.optics import Sensor, illumination, jpeg, sigma_of_snr, snr_db
 
 SIZE = 300  # 90 000 pixels: a variance is known to 0.5 %, a mean to σ/300

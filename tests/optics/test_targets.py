@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 from reseau.optics.targets import target_corners, target_outline
 
 AREAS = {"square": 1.0, "triangle": np.sqrt(3) / 4, "cross": 5 / 9, "circle": np.pi / 4}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Failure
-from reseau.data import Frame
-from reseau.errors import UsageError
+from reseau.core.data import Frame
+from reseau.core.errors import UsageError
+from reseau.measure.measured import Measured
 from reseau.procedures.calibration import Calibrated, CameraModel, calibrate_camera
-from reseau.refine.measured import Measured
 from reseau_sims import FieldBench, Station
 
 BENCH = FieldBench(seed=8, bend_mm=0.0)

@@ -7,17 +7,12 @@ import pytest
 
 from reseau.adjust import Failure
 from reseau.bundle import Result
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
+from reseau.core.errors import UsageError
 from reseau.designs import coded_testfield
-from reseau.errors import UsageError
 from reseau.optics import Brown, PixelGrid, Pose, project
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.procedures.calibration import (
-    Calibrated,
-    CalibrationOptions,
-    CameraModel,
-    calibrate_camera,
-)
+from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraModel, calibrate_camera
 from reseau.procedures.heights import Heights
 
 DESIGN = coded_testfield()

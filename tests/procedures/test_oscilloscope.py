@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Failure
-from reseau.data import Frame
+from reseau.core.data import Frame
 from reseau.designs import regular_reseau
-from reseau.formats import Mark
+from reseau.io import Mark
 from reseau.optics import RationalPolynomial
 from reseau.procedures.oscilloscope import PhotoI, photo_i
 from reseau.refine import correct_camera

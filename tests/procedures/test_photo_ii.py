@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
 from reseau.designs import standard_reseau
+from reseau.measure import measure_reseau
 from reseau.procedures.oscilloscope import PhotoI, PhotoII, photo_i, photo_ii, photo_iii, still_standard_in
-from reseau.refine import measure_reseau
 from reseau_sims import Faults, World, swapped
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.data import Frame
-from reseau.errors import UsageError
+from reseau.core.data import Frame
+from reseau.core.errors import UsageError
+from reseau.measure import TestfieldOptions
 from reseau.procedures.testfield import measure_recordings
-from reseau.refine import TestfieldOptions
 from reseau_sims import FieldBench, Station
 
 

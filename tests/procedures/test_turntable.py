@@ -7,7 +7,7 @@ import pytest
 
 from reseau.adjust import Failure
 from reseau.capture import paper_steps, spread
-from reseau.data import Array, ImagePoints
+from reseau.core.data import Array, ImagePoints
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import project
 from reseau.procedures.calibration import CameraModel, calibrate_camera

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reseau.data import Array, ImagePoints
-from reseau.formats import DesignPoint, Mark, ReseauDesign
+from reseau.core.data import Array, ImagePoints
+from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.optics import RationalPolynomial
 
 SIGMA_PX = 0.01

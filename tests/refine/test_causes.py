@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 from reseau.optics import wong_display
-from reseau.refine.correction import CAUSES, COEFFICIENTS, CONDITIONS, physical_causes
+from reseau.refine import CAUSES, COEFFICIENTS, CONDITIONS, physical_causes
 
 _TRUE = dict(zip(CAUSES, np.linspace(-0.02, 0.03, len(CAUSES)), strict=True))
 

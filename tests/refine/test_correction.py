@@ -6,16 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reseau.calibration.document.document import Calibration
 from scipy.stats import chi2
 
 from reseau.adjust import Failure, adjust
-from reseau.calibration import Calibration
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
+from reseau.core.errors import FormatError
 from reseau.designs import regular_reseau
-from reseau.errors import FormatError
-from reseau.formats import DesignPoint, Mark, ReseauDesign
+from reseau.io import DesignPoint, Mark, ReseauDesign
+from reseau.measure.fitting import mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import CameraCorrection, correct_camera, mapping_problem
+from reseau.refine import CameraCorrection, correct_camera
 
 GRID = regular_reseau(11, 9, 10.0, Mark(shape="disk", size=1.0), name="grid")
 SIGMA = 0.01

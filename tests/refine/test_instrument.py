@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reseau.calibration.document.document import Calibration
 
 from reseau.adjust import Failure
-from reseau.calibration import Calibration
-from reseau.data import ImagePoints
-from reseau.errors import FormatError
-from reseau.formats import DesignPoint
-from reseau.refine import correct_camera
-from reseau.refine.correction import InstrumentCorrection, correct_instrument
+from reseau.core.data import ImagePoints
+from reseau.core.errors import FormatError
+from reseau.io import DesignPoint
+from reseau.refine import InstrumentCorrection, correct_camera, correct_instrument
 
 from .oscilloscope import INSTRUMENT, RESEAU, RODS, SCALE, displayed, measured, pixels, reseau_marks
 

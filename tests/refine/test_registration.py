@@ -6,8 +6,7 @@ import numpy as np
 
 from reseau.adjust import Failure
 from reseau.optics import Similarity
-from reseau.refine import correct_camera
-from reseau.refine.correction import register
+from reseau.refine import correct_camera, register
 
 from .oscilloscope import RESEAU, SIGMA_PX, measured, pixels, reseau_marks
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from reseau.adjust import Failure
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
+from reseau.measure.fitting import fit_mapping
 from reseau.optics import RationalPolynomial, wong_display
-from reseau.refine import fit_mapping
-from reseau.refine.correction import leave_one_out, rivals
+from reseau.refine import leave_one_out, rivals
 
 _SIGMA = 0.05
 

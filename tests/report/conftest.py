@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from reseau.data import ImagePoints
+from reseau.core.data import ImagePoints
 from reseau.procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, photo_i, photo_ii, photo_iii
 from reseau.report.comparison import compare_with_truth
 from reseau.report.truth import Comparison, Known

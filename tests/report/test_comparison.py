@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from reseau.data import Array, ImagePoints
+from reseau.core.data import Array, ImagePoints
 from reseau.report.factors import FACTORS, factor_by_factor, identified
 from reseau.report.summary import comparison_table
 

@@ -8,9 +8,9 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from reseau.core.errors import UsageError
 from reseau.designs import coded_testfield, regular_reseau, standard_reseau
-from reseau.errors import UsageError
-from reseau.formats import Mark
+from reseau.io import Mark
 from reseau.report.drawing import design_pdf, design_svg
 
 SVG = "{http://www.w3.org/2000/svg}"

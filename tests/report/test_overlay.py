@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from reseau.data import Frame
+from reseau.core.data import Frame
 from reseau.report.overlay import Arcs, Marks, frame_overlay, preview
 
 FRAME = Frame(np.random.default_rng(2).integers(0, 4000, (60, 80)).astype(np.uint16), 65535.0)

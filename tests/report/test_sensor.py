@@ -11,9 +11,9 @@ import pytest
 from scipy.special import ndtr
 
 from reseau.adjust import Failure
-from reseau.provenance import Provenance
-from reseau.refine.sensor import EdgeSpread, Level, SensorResult, SensorSeries, calibrate_sensor, with_edge
+from reseau.core.provenance import Provenance
 from reseau.report.sensor import mtf_figure, sensor_report
+from reseau.sensor import EdgeSpread, Level, SensorResult, SensorSeries, calibrate_sensor, with_edge
 from reseau_sims.pixels import PixelSensor
 
 EXPOSURES = (100.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 12000.0, 17000.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau_sims import Reflectors, World
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.optics import PlaneMapping, RationalPolynomial
 from reseau_sims import Bending, Display, Instrument, Scanner, Screen, Video, World
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
 QUIET = FilmFrame(7, noise=0.0, grain=0.0, bow_mm=0.0)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.data import Array, Frame
-from reseau.errors import UsageError
+from reseau.core.data import Array, Frame
+from reseau.core.errors import UsageError
 from reseau_drivers.turntable import zaber
 from reseau_sims import FieldBench, World
 from reseau_sims.laboratory import Laboratory, Room

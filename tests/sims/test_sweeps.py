@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.data import Array, Frame
+from reseau.core.data import Array, Frame
+from reseau.core.errors import UsageError
 from reseau.designs import test_object
-from reseau.errors import UsageError
 from reseau.optics import RationalPolynomial
 from reseau_sims import Display, Faults, Reflectors, Scanner, Truth, World, swapped
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.data import Array
+from reseau.core.data import Array
 from reseau.designs import coded_testfield
 from reseau.optics import Sensor, project, rotation_matrix
 from reseau_sims import FieldBench, Stain, Station, paper_stations

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.data import Array, Frame
+from reseau.core.data import Array, Frame
+from reseau.core.errors import UsageError
 from reseau.designs import regular_reseau, standard_reseau
-from reseau.errors import UsageError
-from reseau.formats import Mark, ReseauDesign
+from reseau.io import Mark, ReseauDesign
 from reseau.optics.formation import coverage, mark_outline
 from reseau_sims import Faults, World, film
 

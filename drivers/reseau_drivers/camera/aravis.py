@@ -16,7 +16,7 @@ from operator import methodcaller
 from threading import Event, Thread
 from typing import Any
 
-from reseau.errors import ConnectionLost, InstrumentError, ProtocolError, RefusedError, UsageError
+from reseau.core.errors import ConnectionLost, InstrumentError, ProtocolError, RefusedError, UsageError
 from reseau.instruments import Deadline, Identity, choice, quantity, text
 
 from ..codecs.pixels import GENICAM, decode

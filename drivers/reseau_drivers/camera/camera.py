@@ -13,10 +13,10 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Frame
-from reseau.errors import DeadlineError, InstrumentError, RefusedError, StateError
+from reseau.core.data import Frame
+from reseau.core.errors import DeadlineError, InstrumentError, RefusedError, StateError
+from reseau.core.provenance import sha256_of
 from reseau.instruments import Deadline, Device, Identity, Limits, Settings, quantity
-from reseau.provenance import sha256_of
 
 from .clocks import Span, utc
 

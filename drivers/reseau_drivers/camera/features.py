@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Sequence
 
-from reseau.errors import RefusedError, SettingError
+from reseau.core.errors import RefusedError, SettingError
 
 __all__ = ["require_within", "same_value", "wanted_features"]
 

@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 
-from reseau.errors import ConnectionLost, RefusedError
+from reseau.core.errors import ConnectionLost, RefusedError
 from reseau.instruments import Deadline
 
 __all__ = ["HEARTBEAT_S", "controlled_elsewhere", "require_answer", "require_control"]

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from reseau.errors import ConnectionLost
+from reseau.core.errors import ConnectionLost
 
 __all__ = ["KernelNode", "Mapping", "Node", "OpenNode", "video_devices"]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reseau.errors import ConnectionLost, ProtocolError, RefusedError
+from reseau.core.errors import ConnectionLost, ProtocolError, RefusedError
 from reseau.instruments import Deadline, Identity, choice, quantity
 
 from ..codecs import v4l2 as uapi

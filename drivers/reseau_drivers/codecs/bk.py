@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 
 from .stream import Damaged, shown
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from reseau.errors import ProtocolError, SettingError
+from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import shown
 

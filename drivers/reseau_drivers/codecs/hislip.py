@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from reseau.errors import SettingError
+from reseau.core.errors import SettingError
 
 from .stream import Damaged
 

@@ -13,7 +13,7 @@ import re
 import struct
 from dataclasses import dataclass
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 
 from .stream import shown
 

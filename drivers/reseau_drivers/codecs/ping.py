@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass
 from typing import Self
 
-from reseau.errors import ProtocolError, SettingError
+from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import Damaged
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 
 __all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 
 from .stream import shown
 

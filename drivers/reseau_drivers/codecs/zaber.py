@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar
 
-from reseau.errors import ProtocolError, SettingError
+from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import Damaged, LineDecoder, shown
 

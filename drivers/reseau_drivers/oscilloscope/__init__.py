@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from reseau.errors import SettingError
+from reseau.core.errors import SettingError
 
 from ..link import Link
 from .dialects import DIALECTS, Dialect, dialect_of

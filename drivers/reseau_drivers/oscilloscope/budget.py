@@ -17,7 +17,7 @@ from typing import Any
 
 from pyvisa_py.protocols import hislip, rpc
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 
 __all__ = ["Account"]
 

@@ -16,8 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.data import Array
-from reseau.errors import ProtocolError
+from reseau.core.data import Array
+from reseau.core.errors import ProtocolError
 
 __all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of", "fields_of", "samples_of"]
 

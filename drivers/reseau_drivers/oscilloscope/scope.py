@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from reseau.errors import DeadlineError, ProtocolError, RefusedError
+from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline, Device, Identity, Limits, ScreenPicture, Settings, Waveform, quantity
 from reseau.instruments.values import now
 

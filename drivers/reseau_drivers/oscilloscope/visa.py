@@ -16,7 +16,7 @@ from typing import Any
 import pyvisa
 from pyvisa import constants
 
-from reseau.errors import ConnectionLost, DeadlineError, InstrumentError, UsageError
+from reseau.core.errors import ConnectionLost, DeadlineError, InstrumentError, UsageError
 from reseau.instruments import Deadline
 
 from ..link import Link, TcpLink, link_to

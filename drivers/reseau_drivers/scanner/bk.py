@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from reseau.errors import ProtocolError, RefusedError, SettingError
+from reseau.core.errors import ProtocolError, RefusedError, SettingError
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 from reseau.instruments.values import now
 

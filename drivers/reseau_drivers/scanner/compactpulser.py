@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from reseau.data import Array
-from reseau.errors import DeadlineError, SettingError, StateError
+from reseau.core.data import Array
+from reseau.core.errors import DeadlineError, SettingError, StateError
 from reseau.instruments import (
     BScan,
     Deadline,

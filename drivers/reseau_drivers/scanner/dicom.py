@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.errors import (
+from reseau.core.errors import (
     ConnectionLost,
     DeadlineError,
     InstrumentError,

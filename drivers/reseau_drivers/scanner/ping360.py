@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
-from reseau.errors import DeadlineError, ProtocolError, RefusedError, StateError
+from reseau.core.data import Array
+from reseau.core.errors import DeadlineError, ProtocolError, RefusedError, StateError
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 
 from ..codecs import ping

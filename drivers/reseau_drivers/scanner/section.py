@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
-from reseau.errors import ProtocolError
+from reseau.core.data import Array
+from reseau.core.errors import ProtocolError
 from reseau.instruments import Waveform
 
 __all__ = ["envelope", "section"]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, Self
 
-from reseau.errors import DeadlineError, ProtocolError, SettingError, StateError
+from reseau.core.errors import DeadlineError, ProtocolError, SettingError, StateError
 from reseau.instruments import AxisState, Deadline, Device, Identity, Limits, Settings, Status, quantity
 
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]

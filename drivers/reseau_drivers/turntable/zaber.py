@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from reseau.errors import ProtocolError, RefusedError, StateError
+from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import AxisState, Deadline, Identity
 
 from ..codecs.zaber import FAULTS, Command, Message, MessageDecoder, Reply, encode

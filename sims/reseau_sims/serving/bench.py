@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 from ..laboratory import AXES, Laboratory
 from ..testfield import FieldBench

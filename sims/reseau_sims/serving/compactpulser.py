@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.compactpulser import LETTERS, LIMIT, Setting, decode, encode_answer
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 

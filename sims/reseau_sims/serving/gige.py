@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 from reseau_drivers.codecs.pixels import GENICAM, encode
 
 from . import gige_door as door

@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array, Frame
+from reseau.core.data import Array, Frame
 
 from ..laboratory import Laboratory
 from ..pixels import PixelSensor

@@ -12,7 +12,7 @@ import struct
 import time
 from collections.abc import Callable
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import hislip, rpc, vxi11
 from reseau_drivers.codecs.stream import Damaged
 

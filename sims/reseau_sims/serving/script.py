@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 __all__ = ["DEVICE_KINDS", "KINDS", "LINE_KINDS", "Fault", "Kind", "Output", "Script"]
 

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Self
 
-from reseau.errors import ConnectionLost
+from reseau.core.errors import ConnectionLost
 from reseau.instruments import Deadline
 
 from .machine import Session

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.smc100 import LIMIT, Line, decode, encode
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 

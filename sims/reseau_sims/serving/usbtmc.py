@@ -18,7 +18,7 @@ import usb.backend
 import usb.backend.libusb1
 import usb.core
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import usbtmc
 
 from .machine import Machine

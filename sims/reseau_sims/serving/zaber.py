@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 from reseau_drivers.codecs.zaber import Command, Reply, decode_command, encode
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from numpy.typing import ArrayLike
 
+from ..core.threads import one_thread
 from .chord import Chord, ValuesFunction
 from .marquardt import BatchAdjustment, BatchFunction, BatchOptions, BatchReason, Marquardt
-from .threads import one_thread
 
 __all__ = ["BatchAdjustment", "BatchOptions", "BatchReason", "adjust_batch"]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from reseau.data import Array, Mask, Rows
-from reseau.errors import UsageError
+from reseau.core.data import Array, Mask, Rows
+from reseau.core.errors import UsageError
 
 from .marquardt import LEAST_DAMPING, Marquardt
 

@@ -9,8 +9,8 @@ from typing import Generic
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 
 from .engine import Options
 from .fitted import Adjustable, F, Failure

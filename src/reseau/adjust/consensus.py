@@ -9,8 +9,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.data import Array, Mask
-from reseau.errors import UsageError
+from reseau.core.data import Array, Mask
+from reseau.core.errors import UsageError
 
 from .result import Failure
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.errors import UsageError
+from reseau.core.errors import UsageError
 
 from .engine import Options, adjust
 from .problem import Problem

@@ -13,15 +13,15 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 
+from ..core.threads import one_thread
 from .checks import check_jacobian
 from .linear import Linearised, constraint_matrix, linearise
 from .models import Model, State, model_of
 from .problem import Problem
 from .result import Adjustment, Failure, NullVector, Solution
-from .threads import one_thread
 
 __all__ = ["Options", "adjust"]
 

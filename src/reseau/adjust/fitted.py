@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.data import Array, Mask
-from reseau.errors import EstimationError
+from reseau.core.data import Array, Mask
+from reseau.core.errors import EstimationError
 
+from ..core.threads import one_thread
 from .reliability import Standardised, Whitened, noncentrality
 from .significance import GlobalTest, global_test
 from .stochastic import Covariance
-from .threads import one_thread
 
 if TYPE_CHECKING:
     from .engine import Options

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reseau.data import Array, Mask
-from reseau.errors import UsageError
+from reseau.core.data import Array, Mask
+from reseau.core.errors import UsageError
 
 from .parameters import Constraint
 

@@ -12,8 +12,8 @@ from typing import Generic, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array, Mask
-from reseau.errors import UsageError
+from reseau.core.data import Array, Mask
+from reseau.core.errors import UsageError
 
 from .engine import Options
 from .fitted import Adjustable, F, Failure, Fitted

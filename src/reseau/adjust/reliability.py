@@ -15,8 +15,8 @@ import numpy as np
 import scipy.optimize
 import scipy.special
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 
 from .stochastic import Blocks
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 
 from .fitted import Failure, Fitted, NullVector
 from .parameters import Parameters
@@ -20,7 +20,7 @@ from .significance import CoefficientTest, coefficient_test
 
 if TYPE_CHECKING:
     from .engine import Options
-from .threads import one_thread
+from ..core.threads import one_thread
 
 __all__ = ["Adjustment", "Failure", "NullVector", "Solution"]
 

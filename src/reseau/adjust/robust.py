@@ -8,8 +8,8 @@ from typing import Generic, Literal
 
 import numpy as np
 
-from reseau.data import Array
-from reseau.errors import UsageError
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
 
 from .engine import Options
 from .fitted import Adjustable, F, Failure

@@ -7,7 +7,7 @@ from typing import Generic
 import numpy as np
 import scipy.special
 
-from reseau.data import Array, Mask
+from reseau.core.data import Array, Mask
 
 from .engine import Options
 from .fitted import Adjustable, F, Failure

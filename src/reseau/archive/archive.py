@@ -11,8 +11,8 @@ from typing import Any, Self
 import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
-from .. import __version__
-from ..errors import ArchiveError
+from ..core.errors import ArchiveError
+from ..core.version import __version__
 from . import schema
 from .objects import LocalObjects, Objects, objects_at
 from .records import SessionSummary, utc

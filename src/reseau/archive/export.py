@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import ArchiveError
-from ..provenance import canonical_json
+from ..core.errors import ArchiveError
+from ..core.provenance import canonical_json
 from .records import ArchivedFrame
 from .session import Session
 

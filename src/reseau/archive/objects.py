@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..errors import ArchiveError
-from ..provenance import sha256_of
+from ..core.errors import ArchiveError
+from ..core.provenance import sha256_of
 
 __all__ = ["LocalObjects", "Objects", "RemoteObjects", "objects_at"]
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Frame
-from ..errors import ArchiveError
-from ..provenance import sha256_of
+from ..core.data import Frame
+from ..core.errors import ArchiveError
+from ..core.provenance import sha256_of
 
 __all__ = ["frame_of", "tiff_of"]
 

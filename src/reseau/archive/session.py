@@ -10,9 +10,9 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
-from .. import __version__
-from ..data import Frame
-from ..errors import ArchiveError
+from ..core.data import Frame
+from ..core.errors import ArchiveError
+from ..core.version import __version__
 from . import schema
 from .objects import Objects
 from .picture import frame_of, tiff_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ..errors import ArchiveError
+from ..core.errors import ArchiveError
 from .archive import Archive
 
 __all__ = ["Verified", "verify"]

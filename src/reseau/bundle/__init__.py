@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from .adjustment import Options, adjust_network, problem_of
-from .approximate import Approximate, approximate
-from .between import sigma_between_images
-from .calibrated import UNITS, calibration_of
-from .components import Kind, estimate_components, reweighted
-from .document import searched_document, to_document
-from .fields import (
+from .diagnostics.between import sigma_between_images
+from .diagnostics.fields import (
     FieldDifference,
     ProjectionField,
     calibration_difference,
     projection_field,
     projection_field_at,
 )
-from .lens import Lens
-from .model_search import Searched, search_model
-from .network import Additional, Camera, Network
-from .patterns import CommonPattern, by_place, by_point, common_pattern
-from .problem import BundleFit, BundleProblem
-from .result import Result
-from .stage import Stage
+from .diagnostics.lens import Lens
+from .diagnostics.patterns import CommonPattern, by_place, by_point, common_pattern
+from .diagnostics.result import Result
+from .document import searched_document, to_document
+from .modelling.adjustment import Options, adjust_network, problem_of
+from .modelling.calibrated import UNITS, calibration_of
+from .modelling.components import Kind, estimate_components, reweighted
+from .modelling.model_search import Searched, search_model
+from .network import Additional, Camera, ControlPoints, Network
+from .network.stage import Stage
+from .solver.approximate import Approximate, approximate
+from .solver.problem import BundleFit, BundleProblem
 
 __all__ = [
     "UNITS",
@@ -31,6 +31,7 @@ __all__ = [
     "BundleProblem",
     "Camera",
     "CommonPattern",
+    "ControlPoints",
     "FieldDifference",
     "Kind",
     "Lens",

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Array
-from .between import sigma_between_images
-from .model_search import Searched
-from .network import finite
-from .result import Result
+from ..core.data import Array
+from .diagnostics.between import sigma_between_images
+from .diagnostics.result import Result
+from .modelling.model_search import Searched
+from .network.network import finite
 
 __all__ = ["SCHEMA", "searched_document", "to_document"]
 

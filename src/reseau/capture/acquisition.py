@@ -15,7 +15,7 @@ from typing import Any
 from bluesky import Msg
 from bluesky import plan_stubs as bps
 
-from ..errors import StateError, UsageError
+from ..core.errors import StateError, UsageError
 from ..instruments import Oscilloscope, Turntable
 from .step import Step
 from .work import Work

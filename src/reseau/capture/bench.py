@@ -26,9 +26,9 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 from pydantic import Field
 
-from ..errors import BenchError, FormatError, ReseauError, SettingError, UsageError
-from ..formats import Document, Strict, read_text
+from ..core.errors import BenchError, FormatError, ReseauError, SettingError, UsageError
 from ..instruments import Identity, Instrument
+from ..io import Document, Strict, read_text
 
 __all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
 

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import scipy.ndimage
 
-from ..data import Array, Frame
-from ..errors import UsageError
+from ..core.data import Array, Frame
+from ..core.errors import UsageError
 
 __all__ = ["Limits", "Readiness", "edge_sigma", "exposure_fault", "readiness", "shift_between"]
 

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Self
 
-from ..errors import UsageError
+from ..core.errors import UsageError
 
 __all__ = ["Goal"]
 

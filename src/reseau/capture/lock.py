@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Self
 
-from ..errors import StateError
+from ..core.errors import StateError
 
 __all__ = ["BenchLock"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from ..errors import EstimationError, StateError
+from ..core.errors import EstimationError, StateError
 from ..instruments import UltrasonicScanner
 from .acquisition import Acquisition, Plan
 from .goal import Goal

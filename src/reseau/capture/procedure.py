@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from ..archive import Verdict
-from ..data import Frame
-from ..errors import StateError
+from ..core.data import Frame
+from ..core.errors import StateError
 from .step import Step
 
 __all__ = ["Candidates", "Procedure", "Watch"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..adjust.threads import one_thread
 from ..archive import ArchivedResult, Session
+from ..core.threads import one_thread
 from .procedure import Procedure
 from .step import Step, as_taken
 

@@ -16,9 +16,9 @@ from bluesky import plan_stubs as bps
 from bluesky import preprocessors as bpp
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
-from ..adjust.threads import one_thread
 from ..archive import Session
-from ..errors import InstrumentError, ReseauError
+from ..core.errors import InstrumentError, ReseauError
+from ..core.threads import one_thread
 from .acquisition import Acquisition, Plan
 
 __all__ = ["Decision", "carry_out"]

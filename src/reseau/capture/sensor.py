@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from bluesky import preprocessors as bpp
 
-from ..errors import StateError
+from ..core.errors import StateError
 from .acquisition import Acquisition, Plan
 from .checks import Limits
 from .step import Step

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Frame
+from ..core.data import Frame
 from ..instruments import Camera, Exposure
 
 __all__ = ["clock_of", "following", "mean_frame", "told"]

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import FormatError
-from ..formats import read_text
+from ..core.errors import FormatError
+from ..io import read_text
 
 __all__ = ["Step", "as_taken", "at_heights", "paper_steps", "read_steps", "spread"]
 

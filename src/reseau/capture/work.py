@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from ..archive import ArchivedFrame, Session, Verdict
-from ..data import Frame
-from ..errors import (
+from ..core.data import Frame
+from ..core.errors import (
     ConnectionLost,
     DeadlineError,
     EstimationError,

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-from .. import __version__
-from ..errors import ReseauError
+from ..core.errors import ReseauError
+from ..core.version import __version__
 from . import (
     apply,
     archive,

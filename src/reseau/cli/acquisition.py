@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from ..errors import UsageError
+from ..core.errors import UsageError
 from .common import parsed_design, say
 from .events import Display
 from .sessions import ArchivePlace, ObjectsPlace, opened, procedure_of
@@ -30,8 +30,8 @@ __all__ = ["CameraName", "Where", "conduct", "in_session", "operator"]
 
 def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
     """Have a TOML file give the options that the command line does not."""
-    from ..errors import FormatError
-    from ..formats import read_text
+    from ..core.errors import FormatError
+    from ..io import read_text
 
     if path is None:
         return None
@@ -229,7 +229,7 @@ def _new(
 ) -> _Begun:
     """A new session, which has the files that it was given from the beginning."""
     from ..capture import Bench, BenchFile
-    from ..formats import read_text
+    from ..io import read_text
 
     texts = {}
     for role, path in inputs.items():
@@ -249,7 +249,7 @@ def _new(
 def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Begun:
     """A session that was begun before: all but the bench is as it was begun."""
     from ..capture import Bench, BenchFile
-    from ..formats import read_text
+    from ..io import read_text
 
     if not where.name:
         open_ = [s.name for s in archive.sessions() if s.plan == plan and s.status != "done"]

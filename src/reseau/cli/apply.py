@@ -39,7 +39,7 @@ def apply(
     as_json: AsJson = False,
 ) -> None:
     """Correct points, or resample an image into the corrected system."""
-    from ..calibration import Calibration
+    from ..calibration.document import Calibration
     from ..refine import CameraCorrection
 
     correction = CameraCorrection.from_calibration(Calibration.read(calibration))
@@ -50,8 +50,8 @@ def apply(
 
 
 def _points(correction: CameraCorrection, source: Path, out: Path | None, as_json: bool) -> None:
-    from ..formats import write_whole
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
+    from ..io import write_whole
 
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
     points = correction.apply(read_measurement(source).image_points())
@@ -74,11 +74,11 @@ def _image(
     scale: float | None,
     as_json: bool,
 ) -> None:
-    from ..calibration import Calibration
-    from ..errors import UsageError
-    from ..images import read_frame
-    from ..provenance import Provenance, canonical_json, sha256_of
-    from ..refine.correction import CorrectedImage, write_corrected
+    from ..calibration.document import Calibration
+    from ..core.errors import UsageError
+    from ..core.provenance import Provenance, canonical_json, sha256_of
+    from ..io.images import read_frame
+    from ..refine import CorrectedImage, write_corrected
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")

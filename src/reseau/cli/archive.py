@@ -21,7 +21,7 @@ app = typer.Typer(no_args_is_help=True, help="The archive: list, show, verify, e
 @app.command("list")
 def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
     """List the sessions."""
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
 
     with opened(archive, objects) as found:
         sessions = found.sessions()
@@ -44,8 +44,8 @@ def show(
 ) -> None:
     """Show a session: its frames with verdicts, its results and what they were made of."""
     from ..archive import described
-    from ..formats import write_whole
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
+    from ..io import write_whole
 
     with opened(archive, objects) as found:
         kept = found.session(session)
@@ -74,7 +74,7 @@ def _folder(path: Path) -> None:
     InputError
         When it cannot be made.
     """
-    from ..errors import InputError
+    from ..core.errors import InputError
 
     try:
         path.mkdir(exist_ok=True)
@@ -92,7 +92,7 @@ def _verdict(frame: ArchivedFrame) -> str:
 def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
     """Read every file again, and compare it with its hash."""
     from ..archive import verify as verified
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
 
     with opened(archive, objects) as found, progress("verifying", len(found.files())) as step:
         result = verified(found, step)
@@ -131,8 +131,8 @@ def rerun(
 ) -> None:
     """Compute the results of a session again, and say whether they are the same to the byte."""
     from ..capture import rerun as computed
-    from ..errors import UsageError
-    from ..provenance import canonical_json
+    from ..core.errors import UsageError
+    from ..core.provenance import canonical_json
 
     with opened(archive, objects) as found:
         kept = found.session(session)

@@ -21,7 +21,7 @@ BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="The bench, bench
 def list_(as_json: AsJson = False) -> None:
     """Discover instruments (cameras, VISA, serial ports), and name the drivers that are installed."""
     from ..capture import drivers, found_instruments
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
 
     found = found_instruments()
     if as_json:
@@ -46,7 +46,7 @@ def check(
 ) -> None:
     """Connect all instruments at once and have them test themselves; every failure is told."""
     from ..capture import Bench
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
 
     found = Bench.read(bench)
     try:
@@ -94,7 +94,7 @@ def sim(
     import threading
 
     from ..capture import plugin
-    from ..formats import write_whole
+    from ..io import write_whole
 
     if out is not None:
         writable(out)

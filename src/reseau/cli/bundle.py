@@ -44,8 +44,8 @@ def bundle(
 ) -> None:
     """Adjust a bundle: orientation, calibration and points from image coordinates, with all their quality."""
     from ..bundle import Options, search_model, searched_document, to_document
-    from ..formats import write_whole
-    from ..provenance import Provenance, canonical_json, sha256_of
+    from ..core.provenance import Provenance, canonical_json, sha256_of
+    from ..io import write_whole
 
     level_of(alpha, "--alpha")
     outputs(out, report)
@@ -80,7 +80,7 @@ def read_network(path: Path) -> Network:
     """A network from a file of ours, or of another program, told apart by what is in it."""
     from ..bundle import Network
     from ..exchange import read_foreign
-    from ..formats.network import Network1
+    from ..io.network import Network1
 
     if path.is_dir() or path.suffix.lower() != ".json":
         return read_foreign(path)

@@ -28,8 +28,8 @@ def compare(
 ) -> None:
     """Compare two calibrations as a field over the image, with its significance."""
     from ..bundle import calibration_difference
-    from ..formats import write_whole
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
+    from ..io import write_whole
 
     for path, suffixes in ((out, (".json",)), (figure, (".svg",))):
         if path is not None:
@@ -51,7 +51,7 @@ def compare(
 def read_lens(path: Path) -> Lens:
     """A camera from its calibration."""
     from ..bundle import Lens
-    from ..calibration import Calibration
+    from ..calibration.document import Calibration
 
     return Lens.of_calibration(Calibration.read(path))
 
@@ -60,7 +60,7 @@ def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, An
     """The field in rows of the image; null where no ray is imaged by both."""
     import numpy as np
 
-    from ..provenance import sha256_of
+    from ..core.provenance import sha256_of
 
     def rows(values: Any) -> list[list[float | None]]:
         return [[float(v) if np.isfinite(v) else None for v in row] for row in values]

@@ -70,7 +70,7 @@ def level_of(value: float | None, name: str) -> float | None:
     UsageError
         When it is not between 0 and 1.
     """
-    from ..errors import UsageError
+    from ..core.errors import UsageError
 
     if value is not None and not 0 < value < 1:
         raise UsageError(f"{value:g} is not between 0 and 1", where=name)
@@ -100,7 +100,7 @@ def positive(distances: list[float] | None) -> list[float]:
     UsageError
         When one is not above zero.
     """
-    from ..errors import UsageError
+    from ..core.errors import UsageError
 
     for distance in distances or []:
         if not distance > 0:

@@ -38,10 +38,10 @@ from .measure import Channel
 
 if TYPE_CHECKING:
     from ..bundle import FieldDifference, Kind, Lens
-    from ..calibration import Calibration
-    from ..data import Frame, ImagePoints
+    from ..calibration.document import Calibration
+    from ..core.data import Frame, ImagePoints
+    from ..core.provenance import Provenance
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraModel
-    from ..provenance import Provenance
 
 __all__ = ["calibrate"]
 
@@ -90,9 +90,9 @@ def calibrate(
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
     workers = _processes(images, jobs)
-    from ..formats import read_text
+    from ..io import read_text
+    from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
-    from ..refine import TestfieldOptions
 
     outputs(out, report)
     distance = positive(distance)
@@ -123,7 +123,7 @@ def calibrate(
 
 
 def _provenance(inputs: list[Path], **settings: Any) -> Provenance:
-    from ..provenance import Provenance, sha256_of
+    from ..core.provenance import Provenance, sha256_of
 
     return Provenance({path.name: sha256_of(path) for path in inputs}, settings)
 
@@ -139,7 +139,7 @@ def _options(
 ) -> CalibrationOptions:
     """The options as the procedure takes them."""
     from ..bundle import Options
-    from ..errors import UsageError
+    from ..core.errors import UsageError
     from ..exchange import read_control
     from ..procedures.calibration import CalibrationOptions
 
@@ -157,7 +157,7 @@ def _options(
 
 def _processes(images: list[Path], jobs: int | None) -> int:
     """Processes for the photographs, none for what was measured before; their imports begin at once."""
-    from ..processes import cores, start_early
+    from ..core.processes import cores, start_early
 
     count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
     if count > 1:
@@ -182,7 +182,7 @@ def _write_report(
     differences: dict[str, FieldDifference],
     distances: list[float] | None,
 ) -> None:
-    from ..formats import write_whole
+    from ..io import write_whole
     from ..report.bundle import bundle_report
 
     page = bundle_report(
@@ -195,7 +195,7 @@ def _frames(
     paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs one after the other, or what was measured in them."""
-    from ..images import read_frame
+    from ..io.images import read_frame
 
     for path in paths:
         step(f"measuring {path.name}")
@@ -206,7 +206,7 @@ def _frames(
 
 
 def _model(pitch: float | None, side: str, free: str) -> CameraModel:
-    from ..errors import UsageError
+    from ..core.errors import UsageError
     from ..procedures.calibration import CameraModel
 
     names = tuple(name.strip() for name in free.split(",") if name.strip())
@@ -218,7 +218,7 @@ def _model(pitch: float | None, side: str, free: str) -> CameraModel:
 
 
 def _size(text: str) -> tuple[int, int] | None:
-    from ..errors import UsageError
+    from ..core.errors import UsageError
 
     if not text:
         return None

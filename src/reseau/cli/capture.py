@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import UsageError
+from ..core.errors import UsageError
 from .acquisition import CameraName, Where, conduct, in_session
 from .sessions import model_of, steps_of
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import FormatError, UsageError
+from ..core.errors import FormatError, UsageError
 from .acquisition import CameraName, Where, conduct, in_session
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def own(
     """Carry out a plan of one's own: a generator in Python, kept with the session."""
     values = dict(_value(text) for text in given or ())
     if generator is not None:
-        from ..formats import read_text
+        from ..io import read_text
 
         _bound(_plan_of(read_text(generator), generator), values, generator)
 

@@ -13,7 +13,7 @@ from .common import say, writable
 
 if TYPE_CHECKING:
     from ..archive import Session
-    from ..calibration import Calibration
+    from ..calibration.document import Calibration
     from ..capture import Acquisition, Bench, Plan
 
 __all__ = ["sensor"]
@@ -81,9 +81,9 @@ def _told(kept: Session, out: Path | None, as_json: bool) -> None:
     EstimationError
         When an edge was shown in which there was nothing to measure; all else is kept and written.
     """
-    from ..calibration import Calibration
-    from ..errors import EstimationError
-    from ..formats import write_whole
+    from ..calibration.document import Calibration
+    from ..core.errors import EstimationError
+    from ..io import write_whole
 
     last = [result for result in kept.results() if result.name == CALIBRATION][-1]
     found = Calibration.parse(kept.content(last).decode("utf-8"), where=CALIBRATION)

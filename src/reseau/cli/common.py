@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from ..errors import EstimationError, InputError, UsageError
+from ..core.errors import EstimationError, InputError, UsageError
 
 if TYPE_CHECKING:
     from ..adjust import Failure
-    from ..data import Frame, ImagePoints
-    from ..formats import ReseauDesign, ReseauMeasurement, TestfieldDesign
-    from ..refine.sensor import SensorCorrection
+    from ..core.data import Frame, ImagePoints
+    from ..io import ReseauDesign, ReseauMeasurement, TestfieldDesign
+    from ..sensor import SensorCorrection
 
 T = TypeVar("T")
 
@@ -47,8 +47,8 @@ def corrected(frame: Frame, sensor: Path | None) -> Frame:
 @cache
 def _sensor_correction(path: Path) -> SensorCorrection:
     """Read once for all frames of a command."""
-    from ..calibration import Calibration
-    from ..refine.sensor import SensorCorrection
+    from ..calibration.document import Calibration
+    from ..sensor import SensorCorrection
 
     return SensorCorrection.from_calibration(Calibration.read(path))
 
@@ -60,8 +60,8 @@ def is_points(path: Path) -> bool:
 
 def read_measurement(path: Path) -> ReseauMeasurement:
     """Image coordinates from a ``reseau-measurement/1`` file or a CSV ``id,x,y[,sx,sy]``."""
-    from ..formats import ReseauMeasurement
-    from ..provenance import sha256_of
+    from ..core.provenance import sha256_of
+    from ..io import ReseauMeasurement
 
     if path.suffix.lower() == ".csv":
         return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
@@ -70,7 +70,7 @@ def read_measurement(path: Path) -> ReseauMeasurement:
 
 def parsed_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
     """A design, told apart by its schema; `where` names it in messages."""
-    from ..formats import ReseauDesign, TestfieldDesign
+    from ..io import ReseauDesign, TestfieldDesign
 
     kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
     return kind.parse(text, where=where)
@@ -78,7 +78,7 @@ def parsed_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
 
 def read_photo(path: Path) -> Frame | ImagePoints:
     """An image, or the image coordinates that were measured in one."""
-    from ..images import read_frame
+    from ..io.images import read_frame
 
     return read_measurement(path).image_points() if is_points(path) else read_frame(path)
 

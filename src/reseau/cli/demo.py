@@ -16,9 +16,9 @@ import typer
 from .common import AsJson, progress, say
 
 if TYPE_CHECKING:
-    from ..data import Frame
-    from ..formats import ReseauMeasurement
-    from ..provenance import Provenance
+    from ..core.data import Frame
+    from ..core.provenance import Provenance
+    from ..io import ReseauMeasurement
     from ..report.truth import Comparison
     from .simulated import OscilloscopeSession, TestfieldSession
 
@@ -34,9 +34,9 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Capture, refine and adjust on a simulated bench over its real protocols, and compare with the truth."""
-    from ..adjust.threads import one_thread
-    from ..errors import InputError
-    from ..provenance import canonical_json
+    from ..core.errors import InputError
+    from ..core.provenance import canonical_json
+    from ..core.threads import one_thread
     from ..report.summary import comparison_table
 
     if out.exists() and not out.is_dir():
@@ -113,7 +113,7 @@ def _documents(
     done: OscilloscopeSession, field: TestfieldSession, truth: Comparison, seed: int
 ) -> dict[str, str | bytes]:
     """All that is written beside the photographs, by the names of the files."""
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
     from ..report import oscilloscope_report
     from ..report.camera import camera_section
     from ..report.overview import overview_png
@@ -157,7 +157,7 @@ def _measurements(done: OscilloscopeSession) -> dict[str, ReseauMeasurement]:
     """Image coordinates of the marks in PHOTO I, the rods in PHOTO II and the points in PHOTO III."""
     import numpy as np
 
-    from ..formats import ReseauMeasurement
+    from ..io import ReseauMeasurement
 
     marks, rods, body = done.first.measured, done.second.measured, done.third.measured
     # From frames they were measured.
@@ -173,7 +173,7 @@ def _measurements(done: OscilloscopeSession) -> dict[str, ReseauMeasurement]:
 
 
 def _provenance(done: OscilloscopeSession, seed: int) -> Provenance:
-    from ..provenance import Provenance, sha256_of
+    from ..core.provenance import Provenance, sha256_of
 
     bench = done.world
     inputs = {frame.name: frame.sha256 for frame in done.frames}
@@ -192,7 +192,7 @@ def _draft_of(out: Path) -> Iterator[Path]:
     InputError
         When the place cannot be written to.
     """
-    from ..errors import InputError
+    from ..core.errors import InputError
 
     try:
         draft = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.absolute().parent))
@@ -206,8 +206,8 @@ def _draft_of(out: Path) -> Iterator[Path]:
 
 def _write_draft(draft: Path, frames: tuple[Frame, ...], documents: dict[str, str | bytes]) -> None:
     """Write all files."""
-    from ..formats import write_whole
-    from ..images import write_image
+    from ..io import write_whole
+    from ..io.images import write_image
 
     for number, frame in zip(("i", "ii", "iii"), frames, strict=True):
         write_image(draft / f"photo_{number}.png", frame.pixels)
@@ -224,7 +224,7 @@ def _put(draft: Path, out: Path) -> None:
     InputError
         When the place cannot be written to.
     """
-    from ..errors import InputError
+    from ..core.errors import InputError
 
     try:
         if not out.exists():

@@ -11,7 +11,7 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..formats import ReseauDesign, TestfieldDesign
+    from ..io import ReseauDesign, TestfieldDesign
 
 __all__ = ["app"]
 
@@ -67,7 +67,7 @@ def reseau(
 ) -> None:
     """Design a reseau: a regular grid of marks."""
     from ..designs import regular_reseau
-    from ..formats import Mark
+    from ..io import Mark
 
     lined = shape in (Shape.LINES, Shape.CROSS)
     diameter = None if shape is Shape.LINES else size or (pitch / 3 if shape is Shape.CROSS else pitch / 5)
@@ -153,7 +153,7 @@ def _write(
     design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
 ) -> None:
     """Write drawings and design where they are wanted, either all of them or none, and say so."""
-    from ..formats import write_whole
+    from ..io import write_whole
     from ..report.drawing import design_pdf, design_svg
 
     to_stdout = out is not None and str(out) == "-"

@@ -23,8 +23,8 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..data import Array
-    from ..formats import ReseauMeasurement
+    from ..core.data import Array
+    from ..io import ReseauMeasurement
 
 __all__ = ["app", "measurement_csv"]
 
@@ -60,9 +60,9 @@ def reseau(
     as_json: AsJson = False,
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
-    from ..formats import ReseauDesign
-    from ..images import read_frame
-    from ..refine import ReseauOptions, measure_reseau
+    from ..io import ReseauDesign
+    from ..io.images import read_frame
+    from ..measure import ReseauOptions, measure_reseau
 
     suffix = _suffix(out)
     target = ReseauDesign.read(design)
@@ -94,9 +94,9 @@ def pins(
     as_json: AsJson = False,
 ) -> None:
     """Measure the rods of an ultrasonic test object."""
-    from ..formats import ReseauDesign
-    from ..images import read_frame
-    from ..refine import PinOptions, measure_pins
+    from ..io import ReseauDesign
+    from ..io.images import read_frame
+    from ..measure import PinOptions, measure_pins
 
     suffix = _suffix(out)
     target = ReseauDesign.read(design)
@@ -127,9 +127,9 @@ def coded_field(
     as_json: AsJson = False,
 ) -> None:
     """Measure the targets of a coded testfield."""
-    from ..formats import TestfieldDesign
-    from ..images import read_frame
-    from ..refine import TestfieldOptions, measure_testfield
+    from ..io import TestfieldDesign
+    from ..io.images import read_frame
+    from ..measure import TestfieldOptions, measure_testfield
 
     suffix = _suffix(out)
     target = TestfieldDesign.read(design)
@@ -162,7 +162,7 @@ def _deliver(
     spread: str = "leave-one-out",
 ) -> None:
     """Write the measurement to its file, and say what was and was not measured."""
-    from ..formats import write_whole
+    from ..io import write_whole
 
     if out is not None:
         write_whole(out, measurement_csv(found) if suffix == ".csv" else found.to_json())

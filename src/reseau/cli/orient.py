@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import InputError, ReseauError, UsageError
+from ..core.errors import InputError, ReseauError, UsageError
 from .common import AsJson, progress, required, say
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..formats import FrameCorners, FrameOrientation
+    from ..io import FrameCorners, FrameOrientation
     from ..procedures.frame import FrameOptions, FrameResult, Roll
 
 __all__ = ["orient"]
@@ -80,7 +80,7 @@ def orient(
     as_json: AsJson = False,
 ) -> int:
     """Orient scanned film frames by their four edges."""
-    from ..formats import FrameCorners
+    from ..io import FrameCorners
 
     if corners is not None:
         FrameCorners.read(corners)  # a mistake in it is told before the work begins
@@ -160,9 +160,9 @@ def _options(job: _Job) -> FrameOptions:
 
 def _run(job: _Job, before: _Done | None = None) -> _Done:
     """Orient the frames of one image and write what came of them; in a process of its own."""
-    from ..formats import FrameCorners
+    from ..io import FrameCorners
+    from ..io.scans import open_scan
     from ..procedures.frame import described, helped, orient_scan
-    from ..scans import open_scan
 
     try:
         scan = open_scan(job.image)
@@ -184,9 +184,9 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
 
 def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
     """JSON, CSV, picture and marked copy; last the provenance, by which a run goes on after a break."""
-    from ..formats import write_whole
-    from ..images import write_image
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
+    from ..io import write_whole
+    from ..io.images import write_image
     from ..report.frames import frame_tile, write_marked
 
     assert job.out is not None
@@ -204,7 +204,7 @@ def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
 
 
 def _provenance(job: _Job) -> dict[str, Any]:
-    from ..provenance import Provenance, sha256_of
+    from ..core.provenance import Provenance, sha256_of
 
     inputs = {"image": sha256_of(job.image)}
     if job.corners is not None:
@@ -225,7 +225,7 @@ def _kept(job: _Job) -> _Done | None:
     """What an earlier run made of the same image with the same options."""
     import json
 
-    from ..formats import FrameOrientation
+    from ..io import FrameOrientation
 
     if job.out is None:
         return None
@@ -304,7 +304,7 @@ def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
 
 
 def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json: bool) -> None:
-    from ..provenance import canonical_json
+    from ..core.provenance import canonical_json
 
     failed = [item.failed for item in done.values() if item.failed]
     if as_json:

@@ -24,12 +24,12 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration
-    from ..data import Frame, ImagePoints
-    from ..formats import ReseauDesign
+    from ..calibration.document import Calibration
+    from ..core.data import Frame, ImagePoints
+    from ..core.provenance import Provenance
+    from ..io import ReseauDesign
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
-    from ..provenance import Provenance
-    from ..refine.correction import InstrumentCorrection
+    from ..refine import InstrumentCorrection
 
 __all__ = ["refine"]
 
@@ -50,7 +50,7 @@ class _Files:
 
     def provenance(self) -> Provenance:
         """Inputs by hash, and the options."""
-        from ..provenance import Provenance, sha256_of
+        from ..core.provenance import Provenance, sha256_of
 
         named = (self.photo_i, self.photo_ii, self.reseau, self.test_object, self.calibration, self.points)
         paths = [path for path in named if path is not None] + list(self.photo_iii)
@@ -59,7 +59,7 @@ class _Files:
 
     def frames(self) -> list[Frame | None]:
         """The photographs in their order; None for those that are given as coordinates."""
-        from ..images import read_frame
+        from ..io.images import read_frame
 
         paths = (self.photo_i, self.photo_ii, *self.photo_iii)
         return [None if path is None or is_points(path) else read_frame(path) for path in paths]
@@ -92,7 +92,7 @@ def refine(
     Every photograph is an image, or a file of the coordinates of its marks, rods and points, told apart by
     their names.
     """
-    from ..adjust.threads import one_thread
+    from ..core.threads import one_thread
 
     held = tuple(name for name in check.split(",") if name)
     files = _Files(
@@ -117,7 +117,7 @@ def _checked(files: _Files) -> None:
     UsageError
         With what is missing or too much.
     """
-    from ..errors import UsageError
+    from ..core.errors import UsageError
 
     if not 0 < files.alpha < 1:
         raise UsageError(f"{files.alpha:g} is not between 0 and 1", where="--alpha")
@@ -141,8 +141,8 @@ def _by_photographs(
     files: _Files, out: Path | None, true: Path | None, report: Path | None, as_json: bool
 ) -> None:
     """PHOTO I, and PHOTO II and III where they are given."""
-    from ..errors import UsageError
-    from ..formats import ReseauDesign, write_whole
+    from ..core.errors import UsageError
+    from ..io import ReseauDesign, write_whole
     from ..procedures.oscilloscope import photo_i
 
     assert files.photo_i is not None
@@ -200,7 +200,7 @@ def _split(points: ImagePoints, design: ReseauDesign) -> tuple[ImagePoints | Non
 
 
 def _second(files: _Files, design: ReseauDesign, rods: ReseauDesign, first: PhotoI) -> PhotoII:
-    from ..data import ImagePoints
+    from ..core.data import ImagePoints
     from ..procedures.oscilloscope import photo_ii
 
     assert files.photo_ii is not None
@@ -214,7 +214,7 @@ def _second(files: _Files, design: ReseauDesign, rods: ReseauDesign, first: Phot
 def _third(
     files: _Files, instrument: InstrumentCorrection, design: ReseauDesign, step: Any
 ) -> list[tuple[Path, PhotoIII]]:
-    from ..data import ImagePoints
+    from ..core.data import ImagePoints
     from ..procedures.oscilloscope import photo_iii
 
     body = None if files.points is None else read_measurement(files.points).image_points()
@@ -231,9 +231,9 @@ def _third(
 
 def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json: bool) -> None:
     """True coordinates by a stored calibration."""
-    from ..calibration import Calibration
-    from ..provenance import canonical_json
-    from ..refine.correction import InstrumentCorrection
+    from ..calibration.document import Calibration
+    from ..core.provenance import canonical_json
+    from ..refine import InstrumentCorrection
 
     stored: Calibration = Calibration.read(calibration)
     instrument, design, rods = InstrumentCorrection.from_calibration(stored)
@@ -262,8 +262,8 @@ def _again(
     files: _Files, path: Path, instrument: InstrumentCorrection, design: ReseauDesign, rods: ReseauDesign
 ) -> StillStandard:
     """The stored coefficients held against a new PHOTO II; --object names another test object."""
-    from ..data import ImagePoints
-    from ..formats import ReseauDesign
+    from ..core.data import ImagePoints
+    from ..io import ReseauDesign
     from ..procedures.oscilloscope import still_standard_in
 
     same = files.test_object is None
@@ -310,9 +310,9 @@ def _say_again(path: Path, again: StillStandard, unit: str) -> None:
 
 def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str | None) -> None:
     """Write true coordinates; of several photographs the names get that of their photograph before them."""
-    from ..data import ImagePoints
-    from ..formats import write_whole
-    from ..provenance import canonical_json
+    from ..core.data import ImagePoints
+    from ..core.provenance import canonical_json
+    from ..io import write_whole
 
     if true is None or not third or unit is None:
         return

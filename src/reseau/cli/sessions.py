@@ -15,7 +15,7 @@ from .common import parsed_design
 if TYPE_CHECKING:
     from ..archive import Archive, Session, Verdict
     from ..capture import Procedure, Step
-    from ..data import Frame
+    from ..core.data import Frame
     from ..procedures.calibration import CameraModel
     from ..procedures.live import LiveOscilloscope, LiveTestfield
     from ..procedures.live_sensor import LiveSensor
@@ -67,7 +67,7 @@ def procedure_of(kept: Session) -> Procedure | None:
 
 def oscilloscope_of(kept: Session) -> LiveOscilloscope:
     """The procedure of a session of `capture oscilloscope`."""
-    from ..formats import ReseauDesign
+    from ..io import ReseauDesign
     from ..procedures.live import LiveOscilloscope
 
     reseau, rods = (
@@ -81,9 +81,9 @@ def oscilloscope_of(kept: Session) -> LiveOscilloscope:
 
 def testfield_of(kept: Session) -> _Reported:
     """The procedure of a session of `capture testfield`."""
+    from ..measure import TestfieldOptions
     from ..procedures.live import LiveTestfield
     from ..procedures.measuring import measurer_of
-    from ..refine import TestfieldOptions
 
     given = kept.parameters
     design = parsed_design(kept.input("design.json"), "design.json")

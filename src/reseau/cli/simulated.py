@@ -7,15 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from ..errors import EstimationError
+from ..core.errors import EstimationError
 from .sessions import oscilloscope_of, testfield_of
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
     from ..capture import InstrumentEntry, Plan, Procedure
-    from ..data import Frame
-    from ..formats import ReseauDesign
+    from ..core.data import Frame
     from ..instruments import Instrument
+    from ..io import ReseauDesign
     from ..optics import PlaneMapping
     from ..procedures.calibration import Calibrated
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII

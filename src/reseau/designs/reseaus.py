@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..errors import UsageError
-from ..formats import DesignPoint, Mark, ReseauDesign, Rings
+from ..core.errors import UsageError
+from ..io import DesignPoint, Mark, ReseauDesign, Rings
 
 __all__ = ["coded_sheet", "regular_reseau", "standard_reseau", "test_object"]
 

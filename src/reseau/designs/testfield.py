@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..errors import UsageError
-from ..formats import SHAPES, FieldLines, FieldTargets, TestfieldDesign
+from ..core.errors import UsageError
+from ..io import SHAPES, FieldLines, FieldTargets, TestfieldDesign
 from .topology import words
 
 __all__ = ["coded_testfield"]

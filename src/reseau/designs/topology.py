@@ -22,8 +22,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UsageError
-from ..formats import TestfieldDesign
+from ..core.errors import UsageError
+from ..io import TestfieldDesign
 
 __all__ = ["HIDDEN", "Decoded", "TopologicalCode"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..bundle import Network
-from ..errors import FormatError, InputError
-from ..formats import read_text
+from ..core.errors import FormatError, InputError
+from ..io import read_text
 from .bal import read_bal
 from .colmap import read_colmap
 from .control import read_control

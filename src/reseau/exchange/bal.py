@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
-from ..errors import FormatError
-from ..formats import read_text
+from ..core.errors import FormatError
+from ..io import read_text
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from .lines import network_of
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
-from ..data import Array
-from ..errors import FormatError
-from ..formats import read_text
+from ..core.data import Array
+from ..core.errors import FormatError
+from ..io import read_text
 from ..optics.poses import matrix_to_vector
 from .lines import network_of, numbers
 

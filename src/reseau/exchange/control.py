@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import FormatError
-from ..formats import read_text
-from ..procedures.calibration import ControlPoints
+from ..bundle import ControlPoints
+from ..core.errors import FormatError
+from ..io import read_text
 
 __all__ = ["read_control"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
-from ..data import Array, Rows
-from ..errors import FormatError
+from ..core.data import Array, Rows
+from ..core.errors import FormatError
 
 __all__ = ["network_of", "numbers"]
 

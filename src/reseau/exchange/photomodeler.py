@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
-from ..errors import FormatError
-from ..formats import read_text
+from ..core.errors import FormatError
+from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
 from .lines import network_of, numbers
 

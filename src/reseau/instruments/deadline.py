@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from ..errors import UsageError
+from ..core.errors import UsageError
 
 __all__ = ["Deadline"]
 

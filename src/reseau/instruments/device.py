@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, Generic, Self, TypeVar
 
-from ..errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, StateError
+from ..core.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, StateError
 from .deadline import Deadline
 from .settings import Limits, Settings
 from .status import Status

@@ -1,8 +1,8 @@
 """What an instrument is, to those who use it; drivers keep to it without inheriting from it.
 
-Every call has a total deadline in seconds and raises an :class:`~reseau.errors.InstrumentError` when it was
-not done by then; `stop` works from any thread; `close` never raises. Besides, each is what bluesky's
-protocols of the same names ask for, so that its plans drive them as they are.
+Every call has a total deadline in seconds and raises an :class:`~reseau.core.errors.InstrumentError` when it
+was not done by then; `stop` works from any thread; `close` never raises. Each also satisfies bluesky's
+protocols of the same names, so that bluesky's plans drive them as they are.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Any, Protocol, runtime_checkable
 
-from ..data import Frame
+from ..core.data import Frame
 from .settings import Settings
 from .status import Status
 from .values import AxisState, BScan, Identity, ScreenPicture, Waveform

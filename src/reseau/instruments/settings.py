@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
-from ..errors import SettingError
+from ..core.errors import SettingError
 
 __all__ = ["Limits", "Settings", "choice", "quantity", "text"]
 
@@ -58,7 +58,7 @@ class Settings:
     {'voltage': 'V'}
     >>> Pulser(400.0)
     Traceback (most recent call last):
-    reseau.errors.SettingError: voltage: 400 V is beyond 40…300 V
+    reseau.core.errors.SettingError: voltage: 400 V is beyond 40…300 V
     """
 
     def __post_init__(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from ..errors import DeadlineError
+from ..core.errors import DeadlineError
 
 __all__ = ["Status"]
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Array, Frame
-from ..errors import ImageError
-from ..provenance import sha256_of
+from ..core.data import Array, Frame
+from ..core.errors import ImageError
+from ..core.provenance import sha256_of
 
 __all__ = ["AxisState", "BScan", "Identity", "ScreenPicture", "Waveform", "now"]
 

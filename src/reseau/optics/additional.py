@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array
-from ..errors import UsageError
+from ..core.data import Array
+from ..core.errors import UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 
 __all__ = ["EbnerCorrection"]

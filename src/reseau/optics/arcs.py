@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Array, Rows
+from ..core.data import Array, Rows
 
 __all__ = ["Arcs"]
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
-from ..errors import UsageError
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from .composition import Inverted
 from .distortions import BrownDistortion, Radial, first_root
 from .mapping import Derivatives, PlaneMapping, as_points, as_values

@@ -9,8 +9,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
-from ..errors import UsageError
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 from .newton import solve_2x2
 

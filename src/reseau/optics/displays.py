@@ -31,7 +31,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
+from ..core.data import Array, Mask
 from .mapping import Derivatives, PlaneMapping, as_values
 from .polynomials import RationalPolynomial
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
+from ..core.data import Array, Mask
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 
 __all__ = ["BrownDistortion"]

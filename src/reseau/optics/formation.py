@@ -24,8 +24,8 @@ from typing import cast
 import numpy as np
 from scipy.special import ndtr
 
-from ..data import Array
-from ..errors import UsageError
+from ..core.data import Array
+from ..core.errors import UsageError
 
 __all__ = [
     "Outline",

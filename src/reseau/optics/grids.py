@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data import Array, Mask
-from ..errors import UsageError
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from .formation import Outline, rectangles
 
 __all__ = ["LineGrid", "line_grid"]

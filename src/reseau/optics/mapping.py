@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_check
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
-from ..errors import UsageError
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from .newton import determinant, in_blocks, newton, solve_2x2
 
 __all__ = ["Derivatives", "Mapping", "PlaneMapping"]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..data import Array
+from ..core.data import Array
 
 __all__ = ["determinant", "in_blocks", "newton", "solve_2x2"]
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array, Mask
-from ..errors import FormatError, UsageError
+from ..core.data import Array, Mask
+from ..core.errors import FormatError, UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 
 __all__ = ["RationalPolynomial"]

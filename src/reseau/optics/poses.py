@@ -12,8 +12,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data import Array
-from ..errors import UsageError
+from ..core.data import Array
+from ..core.errors import UsageError
 from .mapping import PlaneMapping
 
 __all__ = [

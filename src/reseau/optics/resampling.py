@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
-from ..data import Array
+from ..core.data import Array
 
 __all__ = ["on_lattice", "resample"]
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data import Array
-from ..errors import UsageError
+from ..core.data import Array
+from ..core.errors import UsageError
 
 __all__ = ["Sensor", "illumination", "jpeg", "sigma_of_snr", "snr_db"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..data import Array
-from ..errors import UsageError
+from ..core.data import Array
+from ..core.errors import UsageError
 from .formation import Outline
 
 __all__ = ["target_corners", "target_outline"]

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from ..adjust import Failure
-from ..bundle import Camera, Kind, Network, Options, Result, Searched, search_model
-from ..data import Array, Frame, ImagePoints
-from ..errors import UsageError
-from ..formats.network import CAMERA_PARAMETERS
+from ..bundle import Camera, ControlPoints, Kind, Network, Options, Result, Searched, search_model
+from ..core.data import Array, Frame, ImagePoints
+from ..core.errors import UsageError
+from ..io.network import CAMERA_PARAMETERS
 from .heights import Heights
 from .measuring import Measurer, measured_in_order, measurer_of
 
@@ -27,7 +27,6 @@ __all__ = [
     "Calibrated",
     "CalibrationOptions",
     "CameraModel",
-    "ControlPoints",
     "Measurer",
     "calibrate_camera",
     "first_camera",
@@ -93,25 +92,6 @@ class CameraModel:
             "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
         }
         return self.free or usual[self.model]
-
-
-@dataclass(frozen=True, eq=False)
-class ControlPoints:
-    """Points of the target whose coordinates are known.
-
-    Parameters
-    ----------
-    names : tuple of str (k,)
-        Names, as in the design.
-    xyz : ndarray (k, 3)
-        Coordinates.
-    sigma : ndarray (k, 3)
-        0 holds a coordinate, NaN leaves it free, otherwise it is an observation.
-    """
-
-    names: tuple[str, ...]
-    xyz: Array
-    sigma: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..adjust import Failure
-from ..formats import FrameCorners, FrameOrientation
-from ..refine.frame import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
-from ..scans import Scan
+from ..io import FrameCorners, FrameOrientation
+from ..io.scans import Scan
+from ..measure.frame import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
 
 __all__ = ["FrameOptions", "FrameResult", "Roll", "described", "helped", "orient_scan", "roll_of"]
 

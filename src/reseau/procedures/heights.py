@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from ..bundle import Network, Stage
-from ..data import Array, Rows
-from ..errors import UsageError
+from ..core.data import Array, Rows
+from ..core.errors import UsageError
 
 __all__ = ["Heights"]
 

@@ -15,12 +15,12 @@ import numpy as np
 from ..adjust import Failure
 from ..archive import Verdict
 from ..bundle import Lens, Network, Result, adjust_network, calibration_of
-from ..data import Frame, ImagePoints
-from ..errors import EstimationError
-from ..formats import ReseauDesign
+from ..core.data import Frame, ImagePoints
+from ..core.errors import EstimationError
+from ..core.provenance import Provenance
+from ..io import ReseauDesign
 from ..optics import Pose, project
 from ..optics.poses import matrix_to_vector, rotation_matrix
-from ..provenance import Provenance
 from .calibration import Calibrated, CalibrationOptions, CameraModel, PlaneDesign, calibrate_camera
 from .heights import Heights
 from .measuring import Measurer

@@ -7,10 +7,10 @@ from typing import Any, Protocol, TypeVar
 
 from ..adjust import Failure
 from ..archive import Verdict
-from ..data import Frame
-from ..errors import EstimationError, UsageError
-from ..provenance import Provenance
-from ..refine.sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
+from ..core.data import Frame
+from ..core.errors import EstimationError, UsageError
+from ..core.provenance import Provenance
+from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
 
 __all__ = ["Exposed", "LiveSensor"]
 

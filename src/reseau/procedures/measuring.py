@@ -11,13 +11,13 @@ from functools import partial
 import cv2
 
 from ..adjust import Failure
-from ..adjust.threads import always_one_thread, one_thread
-from ..data import Frame, ImagePoints
-from ..errors import EstimationError
-from ..formats import ReseauDesign, TestfieldDesign
-from ..processes import process_context
-from ..refine import TestfieldOptions, measure_reseau, measure_testfield
-from ..refine.measured import Measured
+from ..core.data import Frame, ImagePoints
+from ..core.errors import EstimationError
+from ..core.processes import process_context
+from ..core.threads import always_one_thread, one_thread
+from ..io import ReseauDesign, TestfieldDesign
+from ..measure import TestfieldOptions, measure_reseau, measure_testfield
+from ..measure.measured import Measured
 
 __all__ = ["Measurer", "measured_in_order", "measurer_of"]
 

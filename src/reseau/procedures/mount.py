@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array
+from ..core.data import Array
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
 

@@ -15,32 +15,32 @@ from typing import Literal, Self
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Frame, ImagePoints
-from ..formats import ReseauDesign
-from ..optics import RationalPolynomial
-from ..refine import (
-    CameraCorrection,
+from ..core.data import Frame, ImagePoints
+from ..io import ReseauDesign
+from ..measure import (
     PinDetections,
     PinOptions,
     PinResult,
     ReseauOptions,
     ReseauResult,
-    correct_camera,
     find_pins,
     measure_pins,
     measure_reseau,
 )
-from ..refine.correction import (
+from ..optics import RationalPolynomial
+from ..refine import (
+    CameraCorrection,
     Causes,
     InstrumentCorrection,
     Registration,
     StandardTest,
     causes_of,
+    correct_camera,
     correct_instrument,
     register,
     still_standard,
 )
-from ..refine.correction.remarks import of_the_camera, of_the_change, of_the_object
+from ..refine.remarks import of_the_camera, of_the_change, of_the_object
 
 __all__ = [
     "PhotoI",
@@ -211,7 +211,7 @@ def photo_ii(
     options, pins
         How reseau and pins are measured.
     model, alpha, criterion, check
-        As in :func:`reseau.refine.correction.correct_instrument`; by default equations (7a, b) with F-tests
+        As in :func:`reseau.refine.correct_instrument`; by default equations (7a, b) with F-tests
         at 0.05.
 
     Returns

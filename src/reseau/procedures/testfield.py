@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from ..adjust import Failure
-from ..data import Frame, ImagePoints
-from ..errors import UsageError
-from ..formats import TestfieldDesign
-from ..refine import TestfieldOptions, TestfieldResult, measure_testfield
+from ..core.data import Frame, ImagePoints
+from ..core.errors import UsageError
+from ..io import TestfieldDesign
+from ..measure import TestfieldOptions, TestfieldResult, measure_testfield
 
 __all__ = ["Recordings", "measure_recordings"]
 

@@ -1,47 +1,34 @@
-"""From one frame to refined image coordinates."""
+"""Errors taken out of image coordinates: the camera's (group A), and those of what it looks at (group B)."""
 
-from .correction import CameraCorrection, CorrectionFit, correct_camera
-from .field import SmoothField
-from .fitting import fit_mapping, mapping_problem, reduce_mapping
-from .matching import Matches, MatchOptions, match
-from .pins import (
-    Layout,
-    LayoutOptions,
-    PinDetections,
-    PinOptions,
-    PinResult,
-    Wires,
-    find_pins,
-    lay_wires,
-    measure_pins,
-)
-from .reseau import ReseauOptions, ReseauResult, measure_reseau
-from .testfield import TestfieldOptions, TestfieldResult, measure_testfield
+from .camera import CameraCorrection, CorrectionFit, correct_camera, unit_of
+from .causes import CAUSES, COEFFICIENTS, CONDITIONS, Causes, causes_of, physical_causes
+from .instrument import InstrumentCorrection, InstrumentFit, correct_instrument
+from .registration import Registration, register
+from .resampled import CorrectedImage, write_corrected
+from .rivals import Rivalry, leave_one_out, rivals
+from .standard import StandardTest, still_standard
 
 __all__ = [
+    "CAUSES",
+    "COEFFICIENTS",
+    "CONDITIONS",
     "CameraCorrection",
+    "Causes",
+    "CorrectedImage",
     "CorrectionFit",
-    "Layout",
-    "LayoutOptions",
-    "MatchOptions",
-    "Matches",
-    "PinDetections",
-    "PinOptions",
-    "PinResult",
-    "ReseauOptions",
-    "ReseauResult",
-    "SmoothField",
-    "TestfieldOptions",
-    "TestfieldResult",
-    "Wires",
+    "InstrumentCorrection",
+    "InstrumentFit",
+    "Registration",
+    "Rivalry",
+    "StandardTest",
+    "causes_of",
     "correct_camera",
-    "find_pins",
-    "fit_mapping",
-    "lay_wires",
-    "mapping_problem",
-    "match",
-    "measure_pins",
-    "measure_reseau",
-    "measure_testfield",
-    "reduce_mapping",
+    "correct_instrument",
+    "leave_one_out",
+    "physical_causes",
+    "register",
+    "rivals",
+    "still_standard",
+    "unit_of",
+    "write_corrected",
 ]

@@ -17,8 +17,8 @@ from ..bundle import (
     projection_field_at,
     sigma_between_images,
 )
-from ..data import Rows
-from ..provenance import Provenance
+from ..core.data import Rows
+from ..core.provenance import Provenance
 from .bundle_figures import distortion_figure, network_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, uncertainty_figure

@@ -8,7 +8,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..bundle import Lens, Result
-from ..data import Array, Rows
+from ..core.data import Array, Rows
 from .figures import nice
 from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..bundle import Result, Searched
-from ..data import Array
+from ..core.data import Array
 
 __all__ = ["components_table", "dropped_table", "images_table", "left_out_table", "worst_points"]
 

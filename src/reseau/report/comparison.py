@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..data import Array, ImagePoints
-from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..core.data import Array, ImagePoints
+from ..core.errors import UsageError
+from ..io import ReseauDesign
+from ..measure.fitting import fit_mapping
 from ..optics import PlaneMapping
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
-from ..refine import fit_mapping
 from .factors import best_similarity, factor_by_factor, identified
 from .tables import rms_pair
 from .truth import BodyComparison, CameraComparison, Comparison, Known, KnownPoints, RodComparison, Stage

@@ -12,9 +12,9 @@ from html import escape
 
 import numpy as np
 
-from ..data import Array
-from ..errors import UsageError
-from ..formats import ReseauDesign, TestfieldDesign
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..io import ReseauDesign, TestfieldDesign
 from ..optics.targets import target_corners
 from .style import drawing as house_style
 

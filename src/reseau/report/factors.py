@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..adjust import Failure
-from ..data import Array, ImagePoints
-from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..core.data import Array, ImagePoints
+from ..core.errors import UsageError
+from ..io import ReseauDesign
+from ..measure.fitting import fit_mapping
 from ..optics import PlaneMapping, RationalPolynomial
 from ..procedures.oscilloscope import PhotoII, PhotoIII
-from ..refine import fit_mapping
-from ..refine.correction import InstrumentCorrection, correct_instrument
+from ..refine import InstrumentCorrection, correct_instrument
 from .tables import rms_pair
 from .truth import Factor, Known, KnownPoints
 

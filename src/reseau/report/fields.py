@@ -8,7 +8,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from ..bundle import FieldDifference, ProjectionField
-from ..data import Array
+from ..core.data import Array
 from .figures import nice
 from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 

@@ -10,7 +10,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from ..data import Array
+from ..core.data import Array
 from ..optics import PlaneMapping
 from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 

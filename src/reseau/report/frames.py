@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Array
-from ..errors import InputError
-from ..formats import FrameOrientation
-from ..images import write_image
-from ..scans import Scan
+from ..core.data import Array
+from ..core.errors import InputError
+from ..io import FrameOrientation
+from ..io.images import write_image
+from ..io.scans import Scan
 
 __all__ = ["contact_sheet", "frame_tile", "write_marked"]
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
-from ..data import Array, ImagePoints
+from ..core.data import Array, ImagePoints
 from .figures import Panel, length, nice, plane_axes
 from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 

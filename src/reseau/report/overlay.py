@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Array, Frame, Mask
+from ..core.data import Array, Frame, Mask
 from .style import ACCENT
 
 __all__ = ["Arcs", "Marks", "frame_overlay", "preview"]

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..data import Array, Frame
-from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..core.data import Array, Frame
+from ..core.errors import UsageError
+from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
-from ..refine.correction import CorrectionFit
+from ..refine import CorrectionFit
 from .figures import Panel, draw_distortion, draw_vectors, length
 from .maps import draw_body
 from .overlay import preview

@@ -7,11 +7,11 @@ from itertools import zip_longest
 
 import numpy as np
 
-from ..data import Frame
-from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..core.data import Frame
+from ..core.errors import UsageError
+from ..core.provenance import Provenance
+from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
-from ..provenance import Provenance
 from .factors import FACTORS, factor_by_factor
 from .numbers import aligned
 from .photo_i import photo_i_section

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from ..bundle import CommonPattern, Result, by_place, by_point, common_pattern
-from ..errors import UsageError
+from ..core.errors import UsageError
 from .figures import nice
 from .style import ACCENT, FAINT, INK, drawing, to_svg
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ..data import Array, Frame, ImagePoints
-from ..errors import UsageError
-from ..formats import ReseauDesign
+from ..core.data import Array, Frame, ImagePoints
+from ..core.errors import UsageError
+from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI
-from ..refine.correction import CorrectionFit
+from ..refine import CorrectionFit
 from .comparison import similarity_residuals
 from .figures import Panel, distortion_figure, residual_figure
 from .numbers import aligned

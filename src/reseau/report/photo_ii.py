@@ -8,11 +8,11 @@ import numpy as np
 import scipy.special
 from markupsafe import Markup
 
-from ..data import Array, Frame
-from ..formats import ReseauDesign
+from ..core.data import Array, Frame
+from ..io import ReseauDesign
 from ..optics import RationalPolynomial, wong_display
 from ..procedures.oscilloscope import PhotoII
-from ..refine.correction import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalry, unit_of
+from ..refine import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalry, unit_of
 from .equations import equations
 from .factors import FACTORS, correctors, rods_of
 from .figures import Panel, distortion_figure, residual_figure

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 from markupsafe import Markup
 
-from ..data import Array, Frame
-from ..formats import ReseauDesign
+from ..core.data import Array, Frame
+from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoIII
 from .maps import PROBABILITY, body_map
 from .numbers import aligned

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..adjust import Failure
-from ..data import Array
-from ..provenance import Provenance
-from ..refine.sensor import EdgeSpread, FreeCurve, Linearity, SensorResult
+from ..core.data import Array
+from ..core.provenance import Provenance
+from ..sensor import EdgeSpread, FreeCurve, Linearity, SensorResult
 from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 from .template import rendered
 

@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 
 from ..adjust import Adjustment, Elimination
-from ..data import Array, Mask
-from ..refine import SmoothField
+from ..core.data import Array, Mask
+from ..optics.field import SmoothField
 from .numbers import aligned, grouped, power
 
 __all__ = [

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
-from ..data import Array
+from ..core.data import Array
 from ..optics import PlaneMapping
 
 __all__ = [

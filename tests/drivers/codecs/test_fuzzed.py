@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 

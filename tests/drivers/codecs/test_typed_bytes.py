@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from reseau.errors import ProtocolError, SettingError
+from reseau.core.errors import ProtocolError, SettingError
 from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
 from reseau_drivers.codecs.stream import Damaged
 

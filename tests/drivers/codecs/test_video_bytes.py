@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import v4l2 as uapi
 from reseau_drivers.codecs.pixels import GENICAM, VIDEO, decode, encode, size_of
 

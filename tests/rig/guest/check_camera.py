@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.errors import InstrumentError, ProtocolError, RefusedError
+from reseau.core.errors import InstrumentError, ProtocolError, RefusedError
 from reseau_drivers.camera import v4l2, video_devices
 
 from .gadget import settle
@@ -139,7 +139,7 @@ def test_faults_of_the_driver_are_said_and_survived(grey: str, button: str) -> N
 def test_a_second_process_is_refused_and_disturbs_nothing(grey: str) -> None:
     program = (
         "from reseau_drivers.camera import v4l2\n"
-        "from reseau.errors import RefusedError\n"
+        "from reseau.core.errors import RefusedError\n"
         f"try: v4l2('other', {grey!r}).connect()\n"
         "except RefusedError as error: print(error)\n"
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from reseau.errors import InstrumentError
+from reseau.core.errors import InstrumentError
 from reseau_drivers.link import serial_ports
 from reseau_drivers.scanner import compact_pulser, ping360
 from reseau_drivers.turntable import smc100, zaber

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from reseau.errors import InstrumentError
+from reseau.core.errors import InstrumentError
 from reseau_drivers.oscilloscope import oscilloscope
 
 from .gadget import appeared, settle

@@ -93,7 +93,7 @@ class Lab:
 
     def _sight(self, shift: int) -> Any:
         """Stripes; below 0 what the host drew of the world."""
-        from reseau.data import Frame
+        from reseau.core.data import Frame
         from reseau_sims.serving import Pattern, Still
 
         if shift >= 0:

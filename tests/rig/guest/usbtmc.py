@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from reseau.errors import ProtocolError
+from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import usbtmc
 from reseau_sims.serving import Machine, Script
 from reseau_sims.serving.scpi import AnswerQueue

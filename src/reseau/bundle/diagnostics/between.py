@@ -1,0 +1,72 @@
+"""Uncertainty of cameras by the scatter between their images: errors within one need not be independent.
+
+Each image i moves the estimates by dxᵢ = Q Aᵢᵀ Pᵢ vᵢ, and these sum to zero. Where errors are independent
+from one image to another, whatever they are within an image, Σ dxᵢ dxᵢᵀ estimates the covariance of the
+estimates (Huber 1967; Liang & Zeger 1986, *Biometrika* 73). It tells a camera that changes, or marks that are
+off in common, from noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.data import Array
+from ..solver.normal import SEGMENTS
+from .result import Result
+
+__all__ = ["sigma_between_images"]
+
+# Images worked on at once, and the least number that says anything of the scatter between them.
+_AT_ONCE, LEAST_IMAGES = 64, 6
+
+
+def sigma_between_images(result: Result, c: int) -> Array:
+    """Standard deviations of what was estimated of a camera, by the scatter between its images.
+
+    Parameters
+    ----------
+    result : Result
+        Of the adjustment.
+    c : int
+        Row of the camera.
+
+    Returns
+    -------
+    ndarray (k,)
+        In the order of :meth:`Result.camera_columns`; NaN where less than six images say something.
+
+    Notes
+    -----
+    The residuals of an image are too small by what its own unknowns take up of them: its part is divided by
+    its mean redundancy number, and the whole multiplied by m/(m − 1) of m images.
+    """
+    network, fit = result.network, result.fit
+    _, columns, _ = result.camera_columns(c)
+    images = np.flatnonzero(fit.usable.images & (network.camera_of == c))
+    if len(images) < LEAST_IMAGES or not len(columns):
+        return np.full(len(columns), np.nan)
+    linear, cofactors = fit.linear, fit.cofactors
+    pattern, seen, last = linear.system.pattern, linear.system.seen, linear.rows.shape[2] - 3
+    pulled = (np.swapaxes(linear.rows, 1, 2) @ linear.misfits[:, :, None])[:, :, 0]
+    r = np.nan_to_num(result.redundancy_numbers).sum(axis=1)
+    kept = fit.usable.observations & ~result.rejected
+    count = np.bincount(network.image_of[kept], minlength=len(network.images))
+    share = np.bincount(network.image_of[kept], r[kept], len(count)) / np.maximum(2 * count, 1)
+    moved = np.zeros((len(columns), len(images)))
+    for begin in range(0, len(images), _AT_ONCE):
+        some = images[begin : begin + _AT_ONCE]
+        place = np.full(len(network.images), -1)
+        place[some] = np.arange(len(some))
+        of = place[seen.image]
+        side, sums = np.zeros((len(linear.prior), 3, len(some))), np.zeros((fit.unknowns.size, len(some)))
+        k = np.flatnonzero((of >= 0) & (pattern.eliminated[seen.point] == 1))
+        side[seen.point[k], :, of[k]] += pulled[k, last:]
+        for s in range(SEGMENTS):
+            for i in range(int(pattern.width[:, s].max(initial=0))):
+                k = np.flatnonzero((of >= 0) & (pattern.width[:, s] > i))
+                np.add.at(sums, (pattern.start[k, s] + i, of[k]), pulled[k, pattern.column[k, s] + i])
+        sums += cofactors.normal.reduced_sides(side)
+        moved[:, begin : begin + len(some)] = cofactors.reduced[columns] @ sums / np.maximum(share[some], 0.1)
+    m = len(images)
+    sigma: Array = np.sqrt((moved**2).sum(axis=1) * m / (m - 1))
+    return sigma

@@ -1,0 +1,299 @@
+"""What deserves attention in an adjustment: each remark names what it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import scipy.special
+
+from ...adjust import critical_w
+from ...core.data import Rows
+from ...core.errors import UsageError
+from ..network.network import Network
+from ..solver.problem import BundleFit
+from .between import sigma_between_images
+from .patterns import by_place, common_pattern
+from .result import Result
+
+__all__ = ["LISTED", "gaps", "listed", "remarks"]
+
+LISTED = 8
+_CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
+# Corrections still to come that are none, in standard deviations.
+_NEAR = 1e-3
+# Redundancy from which on the scatter of an image is compared with that of the others.
+_LEAST = 5.0
+# Uncertainty between images over that of independent errors that is remarked; by noise alone it is 1.1 or so.
+_SCATTERED = 2.0
+# Images of a camera from which on they are asked for what they have in common.
+_IN_COMMON = 3
+# A corner is this part of width and height.
+_CORNER = 0.2
+
+
+def listed(names: Iterable[object]) -> str:
+    """Names, the first few of many."""
+    every = [str(name) for name in names]
+    more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
+    return ", ".join(every[:LISTED]) + more
+
+
+def gaps(network: Network, fit: BundleFit) -> list[str]:
+    """Points, images and cameras that were left out, and why."""
+    found = []
+    part, rays = fit.usable.points, network.rays
+    lost = ~part & ~network.held.all(axis=1)
+    nowhere = np.flatnonzero(lost & (rays == 0))
+    if len(nowhere):
+        defect = int((~network.held & ~network.observed)[nowhere].sum())
+        found.append(f"rank defect {defect}: {_points(network, nowhere)} in no image; left out")
+    single = np.flatnonzero(lost & (rays == 1))
+    if len(single):
+        of = {int(j): network.images[i] for i, j in zip(network.image_of, network.point_of, strict=True)}
+        where = [f"{network.points[j]} (image {of[int(j)]})" for j in single]
+        found.append(
+            f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
+            f"{listed(where)}; left out"
+        )
+    lit = np.bincount(network.point_of[fit.usable.images[network.image_of]], minlength=len(part))
+    parallel = np.flatnonzero(lost & (rays > 1) & (lit > 1))
+    if len(parallel):
+        names = listed(network.points[j] for j in parallel)
+        found.append(f"{_plural('point', parallel)} {names} left out: rays are parallel, or blunders")
+    few = np.flatnonzero(lost & (rays > 1) & (lit <= 1))
+    if len(few):
+        found.append(f"{_points(network, few)} not seen by two images that are oriented; left out")
+    images = np.flatnonzero(~fit.usable.images)
+    for i in images[:LISTED]:
+        name, seen = network.images[i], int(network.seen[i])
+        why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
+        enough = "three are needed" if seen < 3 else "no position could be computed from them"
+        found.append(f"image {name} has {why}; {enough}; left out")
+    if len(images) > LISTED:
+        found.append(f"{len(images) - LISTED} more images are left out")
+    used = np.bincount(network.camera_of[fit.usable.images], minlength=len(network.cameras))
+    for c in np.flatnonzero(used == 0):
+        found.append(f"{network.cameras[c].label} has no image; its parameters stay as they are given")
+    return found
+
+
+def remarks(result: Result) -> list[str]:
+    """Correlations, weak points, uncovered corners, test values, and the global test."""
+    network, fit = result.network, result.fit
+    return [
+        *gaps(network, fit),
+        *_creeping(result),
+        *_global(result),
+        *_large(result),
+        *_correlations(result),
+        *_weak(result),
+        *_datum(result),
+        *_scatter(result),
+        *_patterns(result),
+        *_between(result),
+        *_behind(network, fit),
+        *_corners(network, fit),
+    ]
+
+
+def _plural(word: str, rows: Rows) -> str:
+    return word if len(rows) == 1 else f"{word}s"
+
+
+def _points(network: Network, rows: Rows) -> str:
+    verb = "is" if len(rows) == 1 else "are"
+    return f"{_plural('point', rows)} {listed(network.points[int(j)] for j in rows)} {verb}"
+
+
+def _global(result: Result) -> list[str]:
+    test = result.global_test()
+    if test is None:
+        return ["no observation is redundant: nothing is checked, and sigmas are a priori"]
+    if test.passed:
+        return []
+    side = "larger" if test.statistic > test.upper else "smaller"
+    return [
+        f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
+        "the sigmas of the observations are not true, or the model is not"
+    ]
+
+
+def _creeping(result: Result) -> list[str]:
+    if result.fit.offset < _NEAR:
+        return []
+    return [f"the adjustment creeps: corrections of {result.fit.offset:.2g} standard deviations were to come"]
+
+
+def _large(result: Result) -> list[str]:
+    """Image points whose test value is too large for the best of so many."""
+    w = np.nan_to_num(result.test_values).max(axis=1)
+    critical = critical_w(_ALPHA / max(1, 2 * len(w)))
+    rows = np.flatnonzero(w > critical)
+    if not len(rows):
+        return []
+    rows = rows[np.argsort(-w[rows], kind="stable")]
+    network = result.network
+    names = [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]} (w {w[k]:.1f})"
+        for k in rows
+    ]
+    return [
+        f"{len(rows)} image {_plural('point', rows)} with test values above {critical:.1f}: {listed(names)}"
+    ]
+
+
+def _correlations(result: Result) -> list[str]:
+    found = []
+    for c, camera in enumerate(result.network.cameras):
+        names, _, _ = result.camera_columns(c)
+        if not names:
+            continue
+        q = result.camera_covariance(c)
+        size = np.sqrt(np.diag(q))
+        size = np.where(size > 0, size, 1.0)
+        r = q / np.outer(size, size)
+        for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
+            found.append(f"{camera.label}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}")
+    if len(found) > LISTED:
+        found = [
+            *found[:LISTED],
+            f"{len(found) - LISTED} more camera parameters correlate above {_CORRELATED}",
+        ]
+    q = result.pose_covariance[result.fit.usable.images]
+    size = np.sqrt(np.maximum(np.diagonal(q, axis1=1, axis2=2), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    r = np.abs(np.tril(q / (size[:, :, None] * size[:, None, :]), -1)).max(axis=(1, 2), initial=0.0)
+    images = np.flatnonzero(result.fit.usable.images)[r > _CORRELATED]
+    if len(images):
+        names_of = listed(result.network.images[i] for i in images)
+        found.append(
+            f"position and rotation correlate above {_CORRELATED} in {_plural('image', images)} {names_of}"
+        )
+    return found
+
+
+def _weak(result: Result) -> list[str]:
+    """Points much less certain than the others."""
+    network = result.network
+    free = result.fit.usable.points & ~network.held.all(axis=1)
+    sigma = np.sqrt((result.point_sigma**2).sum(axis=1))
+    if not free.any():
+        return []
+    median = float(np.median(sigma[free]))
+    rows = np.flatnonzero(free & (sigma > _WEAK * median))
+    if not len(rows) or median == 0:
+        return []
+    rows = rows[np.argsort(-sigma[rows], kind="stable")]
+    names = [f"{network.points[j]} ({sigma[j]:.3g} {network.unit}, {network.rays[j]} rays)" for j in rows]
+    return [f"weak {_plural('point', rows)}, sigma above {_WEAK:g} times the median: {listed(names)}"]
+
+
+def _datum(result: Result) -> list[str]:
+    """Points that inner constraints over all do not hold for."""
+    network, fit = result.network, result.fit
+    if fit.datum is None or not network.datum_points.all():
+        return []
+    rows = np.flatnonzero(fit.usable.points & ~fit.datum)
+    if not len(rows):
+        return []
+    names = listed(network.points[j] for j in rows)
+    return [f"{len(rows)} weak {_plural('point', rows)} left out of the datum: {names}"]
+
+
+def _scatter(result: Result) -> list[str]:
+    """Images, and axes, whose coordinates scatter more than the others."""
+    if not result.redundancy > 0 or not result.sigma0 > 0:
+        return []
+    squares, number = result.scatter
+    own, r = squares.sum(axis=1), number.sum(axis=1)
+    others, rest = own.sum() - own, r.sum() - r
+    rows = np.flatnonzero(result.fit.usable.images & (r > _LEAST) & (rest > _LEAST) & (others > 0))
+    ratio = own[rows] / r[rows] / (others[rows] / rest[rows])
+    more = scipy.special.fdtrc(r[rows], rest[rows], ratio) < _ALPHA / max(1, len(rows))
+    rows, size = rows[more], np.sqrt(ratio[more])
+    order, found = np.argsort(-size, kind="stable"), []
+    names = [f"{result.network.images[i]} ({s:.2g})" for i, s in zip(rows[order], size[order], strict=True)]
+    if names:
+        found.append(
+            f"image coordinates scatter more than those of the other images, by the factor in brackets, in "
+            f"{_plural('image', rows)} {listed(names)}"
+        )
+    total, count = squares.sum(axis=0), number.sum(axis=0)
+    if count.min() > _LEAST and total.min() > 0:
+        mean = total / count
+        a = int(mean.argmax())
+        times = mean[a] / mean[1 - a]
+        if scipy.special.fdtrc(count[a], count[1 - a], times) < _ALPHA:
+            found.append(
+                f"{'xy'[a]} scatters {np.sqrt(times):.2f} times as much as {'xy'[1 - a]}, by the sigmas given"
+            )
+    return found
+
+
+def _patterns(result: Result) -> list[str]:
+    """Cameras whose residuals have a pattern in common, by place in the image."""
+    network, found = result.network, []
+    images = np.bincount(network.camera_of[result.fit.usable.images], minlength=len(network.cameras))
+    for c in np.flatnonzero(images >= _IN_COMMON)[:LISTED]:
+        try:
+            pattern = common_pattern(result, by_place(result, int(c)))
+        except UsageError:
+            continue
+        if pattern.p < _ALPHA:
+            found.append(
+                f"{network.cameras[c].label}: residuals of its images have a pattern in common by place "
+                f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
+                "sigmas do not cover"
+            )
+    return found
+
+
+def _between(result: Result) -> list[str]:
+    """Parameters that differ between the images of a camera by more than their sigmas."""
+    found = []
+    for c, camera in enumerate(result.network.cameras):
+        names, _, _ = result.camera_columns(c)
+        sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+        ratio = np.nan_to_num(sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf))
+        rows = np.flatnonzero(ratio > _SCATTERED)
+        if len(rows):
+            said = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
+            found.append(
+                f"{camera.label}: by the scatter between its images parameters are less certain than their "
+                f"sigmas say, by the factor: {said}; the camera may not be the same in all of them"
+            )
+    return found[:LISTED]
+
+
+def _behind(network: Network, fit: BundleFit) -> list[str]:
+    rows = np.flatnonzero(fit.usable.observations)
+    i, j = network.image_of[rows], network.point_of[rows]
+    depth = np.einsum("nk,nk->n", fit.values.rotation[i, 2], fit.values.xyz[j] - fit.values.x0[i])
+    wrong = rows[depth <= 0]
+    if not len(wrong):
+        return []
+    names = [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in wrong
+    ]
+    return [f"{_plural('point', wrong)} behind the camera: {listed(names)}"]
+
+
+def _corners(network: Network, fit: BundleFit) -> list[str]:
+    """Corners of the image in which a camera to be calibrated has no points."""
+    found, used = [], fit.usable.observations
+    for c, camera in enumerate(network.cameras):
+        rows = used & (network.camera_of[network.image_of] == c)
+        if not camera.free or not rows.any():
+            continue
+        x, y = (network.xy[rows] / [camera.width, camera.height]).T
+        corners = {
+            "upper left": (x < _CORNER) & (y < _CORNER),
+            "upper right": (x > 1 - _CORNER) & (y < _CORNER),
+            "lower left": (x < _CORNER) & (y > 1 - _CORNER),
+            "lower right": (x > 1 - _CORNER) & (y > 1 - _CORNER),
+        }
+        empty = [name for name, inside in corners.items() if not inside.any()]
+        if empty:
+            found.append(f"{camera.label}: no points in the {', '.join(empty)} of its images")
+    return found[:LISTED]

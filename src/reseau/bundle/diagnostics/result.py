@@ -1,0 +1,302 @@
+"""The result of a bundle adjustment: estimates with their covariances and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ...adjust.rejection import SnoopingStep
+from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
+from ...core.data import Array, Mask, Rows
+from ...core.errors import UsageError
+from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
+from ..network.network import Network
+from ..solver.imaging import EBNER
+from ..solver.problem import BundleFit
+
+__all__ = ["Result"]
+
+_STEP = 1e-6
+# Redundancy below which an image says nothing of its own scatter.
+_UNCONTROLLED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A bundle adjustment with everything known of its quality; truthy.
+
+    Standard deviations and covariances are a posteriori, multiplied with the estimated variance factor;
+    without redundancy a priori. What was not determined is NaN.
+
+    Parameters
+    ----------
+    network : Network
+        What was adjusted.
+    fit : BundleFit
+        The adjustment.
+    rejected : ndarray of bool (n,)
+        Image points left out by data snooping.
+    steps : tuple of SnoopingStep
+        How that came about, by the numbers of :class:`~reseau.bundle.solver.problem.BundleProblem`.
+    warnings : tuple of str
+        What deserves attention; each names what it is about.
+    """
+
+    network: Network
+    fit: BundleFit
+    rejected: Mask
+    steps: tuple[SnoopingStep, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return True
+
+    def required(self) -> Result:
+        """The result itself; see :meth:`~reseau.adjust.Failure.required`."""
+        return self
+
+    @property
+    def sigma0(self) -> float:
+        """Standard deviation of unit weight; NaN without redundancy."""
+        return self.fit.sigma0
+
+    @property
+    def redundancy(self) -> int:
+        """Observations less unknowns, plus datum constraints."""
+        return self.fit.redundancy
+
+    def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
+        """Test of the variance factor against one; None without redundancy."""
+        return self.fit.global_test(alpha) if self.redundancy > 0 else None
+
+    # -- cameras
+
+    def camera_columns(self, c: int) -> tuple[tuple[str, ...], Rows, Array]:
+        """Names, columns among the reduced unknowns and values of what was estimated of a camera.
+
+        Sets of additional parameters are named ``b1`` … ``b12``; where a camera has several, with the group
+        or image they belong to.
+        """
+        unknowns, values = self.fit.unknowns, self.fit.values
+        camera, names, columns, found = self.network.cameras[c], [], [], []
+        if unknowns.camera[c] >= 0:
+            count = len(camera.free)
+            names += list(camera.free)
+            columns += list(unknowns.camera[c] + np.arange(count))
+            found += values.cameras[c, unknowns.free[c, :count]].tolist()
+        for e, (owner, label) in enumerate(unknowns.extra_names):
+            if owner == c and unknowns.extra[e] >= 0 and camera.additional is not None:
+                names += [camera.additional.name(i, label) for i in range(EBNER)]
+                columns += list(unknowns.extra[e] + np.arange(EBNER))
+                found += values.extra[e].tolist()
+        return tuple(names), np.array(columns, dtype=np.intp), np.array(found)
+
+    def camera_covariance(self, c: int) -> Array:
+        """Covariance of what was estimated of a camera, in the order of :meth:`camera_columns`."""
+        _, columns, _ = self.camera_columns(c)
+        covariance: Array = self.fit.cofactors.reduced[np.ix_(columns, columns)] * self.fit.variance
+        return covariance
+
+    def camera_tests(self, c: int, alpha: float = 0.05) -> tuple[CoefficientTest, ...]:
+        """Whether each distortion and each additional parameter of a camera differs from zero."""
+        names, columns, values = self.camera_columns(c)
+        size = np.sqrt(np.diag(self.fit.cofactors.reduced)[columns])
+        sigma0 = self.sigma0 if self.redundancy > 0 else None
+        return tuple(
+            ratio_test(name, float(value / s), sigma0, self.redundancy, alpha)
+            for name, value, s in zip(names, values, size, strict=True)
+            if s > 0 and name not in ("c", "x0", "y0", "fx", "fy", "cx", "cy")
+        )
+
+    # -- images
+
+    @cached_property
+    def rotation(self) -> Array:
+        """Rotation vectors (m, 3), rad."""
+        return self._of_images(matrix_to_vector)
+
+    @cached_property
+    def angles(self) -> Array:
+        """Omega, phi, kappa (m, 3), rad; see :func:`~reseau.optics.poses.angles_to_matrix`."""
+        return self._of_images(matrix_to_angles)
+
+    def _of_images(self, function: Callable[[Array], Array]) -> Array:
+        part, rotation = self.fit.usable.images, self.fit.values.rotation
+        found = np.full((len(part), 3), np.nan)
+        found[part] = function(rotation[part])
+        return found
+
+    @cached_property
+    def pose_covariance(self) -> Array:
+        """Covariances (m, 6, 6) of rotation vector and projection centre; NaN where an image has no pose."""
+        return self._pose_covariance(matrix_to_vector)
+
+    @cached_property
+    def angle_sigma(self) -> Array:
+        """Standard deviations (m, 3) of omega, phi, kappa, rad."""
+        return np.sqrt(np.diagonal(self._pose_covariance(matrix_to_angles), axis1=1, axis2=2)[:, :3])
+
+    def _pose_covariance(self, parameters: Callable[[Array], Array]) -> Array:
+        """Carried from rotations about the camera's axes to other parameters of the rotation."""
+        unknowns, cofactor = self.fit.unknowns, self.fit.cofactors.reduced
+        images = np.flatnonzero(unknowns.pose >= 0)
+        at = unknowns.pose[images, None] + np.arange(6)
+        block = cofactor[at[:, :, None], at[:, None, :]] * self.fit.variance
+        turn = np.tile(np.eye(6), (len(images), 1, 1))
+        rotation = self.fit.values.rotation[images]
+        for axis in range(3):
+            small = rotation_matrix(_STEP * np.eye(3)[axis])
+            change = parameters(small @ rotation) - parameters(small.T @ rotation)
+            # Where an angle passes ±π the change does not.
+            turn[:, :3, axis] = ((change + np.pi) % (2 * np.pi) - np.pi) / (2 * _STEP)
+        full = np.full((len(unknowns.pose), 6, 6), np.nan)
+        full[images] = turn @ block @ np.swapaxes(turn, 1, 2)
+        return full
+
+    # -- points
+
+    @cached_property
+    def point_covariance(self) -> Array:
+        """Covariances (p, 3, 3) of the points; zero for held coordinates, NaN where not determined."""
+        part = self.fit.usable.points[:, None, None]
+        return np.where(part, self.fit.cofactors.points * self.fit.variance, np.nan)
+
+    @cached_property
+    def point_sigma(self) -> Array:
+        """Standard deviations (p, 3) of the points."""
+        return np.sqrt(np.maximum(np.diagonal(self.point_covariance, axis1=1, axis2=2), 0.0))
+
+    @cached_property
+    def check_points(self) -> tuple[Rows, Array]:
+        """Rows of the check points, and their differences, computed less given (k, 3)."""
+        rows = np.flatnonzero([role == "check" for role in self.network.role])
+        rows = rows[self.fit.usable.points[rows]]
+        return rows, self.fit.values.xyz[rows] - self.network.xyz[rows]
+
+    # -- anything with anything
+
+    def covariance_of(self, *names: str) -> Array:
+        """Joint covariance of any unknowns.
+
+        Parameters
+        ----------
+        *names : str
+            ``c of camera C``, ``X0 of image I`` (or Y0, Z0), ``dx of image I`` (or dy, dz: rotations about
+            the axes of its camera, rad), ``X of point P`` (or Y, Z), ``b1 of group G``.
+
+        Returns
+        -------
+        ndarray (k, k)
+            In the order of the names; zero for held coordinates.
+
+        Raises
+        ------
+        UsageError
+            For a name of nothing that was estimated.
+        """
+        unknowns, network = self.fit.unknowns, self.network
+        column_of = {name: k for k, name in enumerate(unknowns.names)}
+        point_row = {name: j for j, name in enumerate(network.points)}
+        columns, points, places = list[int](), list[int](), list[tuple[bool, int, int]]()
+        for name in names:
+            axis, _, label = name.partition(" of point ")
+            if name in column_of:
+                places.append((False, len(columns), 0))
+                columns.append(column_of[name])
+            elif label in point_row and axis in "XYZ" and self.fit.usable.points[point_row[label]]:
+                j = point_row[label]
+                points += [j] if j not in points else []
+                places.append((True, points.index(j), "XYZ".index(axis)))
+            else:
+                raise UsageError("is none of the unknowns that were estimated", where=name)
+        joint = self.fit.cofactors.joint(np.array(columns, dtype=np.intp), np.array(points, dtype=np.intp))
+        at = [len(columns) + 3 * k + axis if of_point else k for of_point, k, axis in places]
+        covariance: Array = joint[np.ix_(at, at)] * self.fit.variance
+        return covariance
+
+    # -- observations
+
+    @property
+    def residuals(self) -> Array:
+        """v (n, 2) of the image coordinates, px; NaN where not determined."""
+        return self._of_image_points(self.fit.residuals)
+
+    @cached_property
+    def redundancy_numbers(self) -> Array:
+        """Redundancy numbers (n, 2) of the image coordinates."""
+        return self._of_image_points(self.fit.redundancy_numbers)
+
+    @cached_property
+    def test_values(self) -> Array:
+        """w = |v|/(sigma0·σ·√r) of the image coordinates (n, 2); NaN for those left out."""
+        sigma0 = self.sigma0 if self.redundancy > 0 and self.sigma0 > 0 else 1.0
+        return self._of_image_points(np.abs(self.fit.w)) / sigma0
+
+    def minimal_detectable_errors(self, alpha: float = 0.001, power: float = 0.8) -> Array:
+        """Errors of single image coordinates (n, 2) that the test finds with this power, px."""
+        return self._of_image_points(self.fit.minimal_detectable_errors(alpha, power))
+
+    def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> Array:
+        """What errors that are just not found do at most to any result (n, 2), in its standard deviations."""
+        return self._of_image_points(self.fit.external_lengths(alpha, power))
+
+    @cached_property
+    def scatter(self) -> tuple[Array, Array]:
+        """Sums of v²/σ² of x and y in each image (m, 2), and what is expected of them with true sigmas.
+
+        That is the sum of the variances of the residuals over σ²: of the redundancy numbers, where x and y
+        are not correlated.
+        """
+        cov = self.network.cov
+        variance = np.diagonal(cov, axis1=1, axis2=2)
+        kept = (self.fit.usable.observations & ~self.rejected)[:, None]
+        hat = next(iter(self.fit.solution.hats()))
+        left = np.diagonal(cov - cov @ hat @ cov, axis1=1, axis2=2) / variance
+        squares = np.nan_to_num(self.residuals) ** 2 / variance
+        sums = np.zeros((2, len(self.network.images), 2))
+        for total, values in zip(sums, (squares, left), strict=True):
+            np.add.at(total, self.network.image_of, np.where(kept, values, 0.0))
+        return sums[0], sums[1]
+
+    @cached_property
+    def variance_factors(self) -> Array:
+        """By what the sigmas given are too small, of x and y in each image (m, 2); NaN without redundancy.
+
+        To first order: :func:`~reseau.bundle.modelling.components.estimate_components` iterates.
+        """
+        return _factors(*self.scatter)
+
+    @property
+    def axis_factors(self) -> Array:
+        """The same of all images together, x and y (2,)."""
+        squares, expected = self.scatter
+        return _factors(squares.sum(axis=0), expected.sum(axis=0))
+
+    def rejected_names(self) -> tuple[list[str], list[str]]:
+        """Images and points of the image points that data snooping left out."""
+        rows = np.flatnonzero(self.rejected)
+        images = [self.network.images[i] for i in self.network.image_of[rows]]
+        return images, [self.network.points[j] for j in self.network.point_of[rows]]
+
+    @cached_property
+    def rejected_tests(self) -> Array:
+        """Test values of the image points left out, when they were, and their bounds (n, 2), or NaN."""
+        tests = np.full((len(self.network.xy), 2), np.nan)
+        for step in self.steps:
+            row = step.index[0] // 2
+            if row < len(tests):
+                tests[row] = step.statistic, step.critical
+        tests[~self.rejected] = np.nan
+        return tests
+
+    def _of_image_points(self, flat: Array) -> Array:
+        n = len(self.network.xy)
+        return flat[: 2 * n].reshape(n, 2)
+
+
+def _factors(squares: Array, expected: Array) -> Array:
+    known = expected > _UNCONTROLLED
+    return np.sqrt(np.divide(squares, expected, out=np.full_like(squares, np.nan), where=known))

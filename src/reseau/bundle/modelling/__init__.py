@@ -1,0 +1,1 @@
+"""From a network to its result: blunders, weights, and the parameters that the observations ask for."""

@@ -1,0 +1,202 @@
+"""From a network to its result: approximate values, adjustment, search for blunders, remarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ...adjust import Failure, data_snooping, robust
+from ...adjust.rejection import SnoopingStep
+from ...core.errors import UsageError
+from ..diagnostics.control import doubtful_control
+from ..diagnostics.remarks import listed, remarks
+from ..diagnostics.result import Result
+from ..network.network import Network, finite
+from ..solver.approximate import approximate
+from ..solver.problem import BundleFit, BundleProblem
+from ..solver.unknowns import Unknowns
+from ..solver.values import Values
+
+__all__ = ["Options", "adjust_network", "problem_of"]
+
+# Weight below which a robust adjustment takes an observation for a blunder, and how exactly it is settled.
+_BLUNDER, _SETTLED = 0.2, 0.05
+# Sigma0 above which the control is asked whether it agrees with itself.
+_DOUBT = 3.0
+# With more observations than this the search for what may be wrong takes too long to do unasked.
+_MANY = 50_000
+# Image points further off than this many times the median wait, and how often they are looked at again.
+_FAR_OFF, _TRIMS = 5.0, 5
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to adjust a network.
+
+    Parameters
+    ----------
+    outliers : {"keep", "reject"}
+        Whether image points are left out by data snooping, after a robust start. What is kept is named in the
+        warnings where its test values are too large.
+    alpha : float
+        Level of the single test of data snooping.
+    max_fraction : float
+        Part of the observations that may be left out.
+    max_iterations : int
+        Corrections tried at most in one adjustment.
+    tolerance : float
+        Relative offset at which the iteration has converged.
+    watch : callable, optional
+        Told the number of corrections and vᵀPv after each.
+    """
+
+    outliers: Literal["keep", "reject"] = "keep"
+    alpha: float = 0.001
+    max_fraction: float = 0.25
+    max_iterations: int = 200
+    tolerance: float = 1e-6
+    watch: Callable[[int, float], None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.outliers not in ("keep", "reject"):
+            raise UsageError(f"is neither keep nor reject: {self.outliers!r}", where="Options.outliers")
+        if not 0 < self.alpha < 1 or not 0 < self.max_fraction < 1:
+            raise UsageError("must be between 0 and 1", where="alpha and max_fraction")
+
+
+def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[str, ...]]:
+    """The network with approximate values, as a problem of :mod:`reseau.adjust`; and notes about them."""
+    options = options or Options()
+    found = approximate(network)
+    unknowns = Unknowns.of(network, finite(found.x0))
+    start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
+    if network.stage is not None:
+        moved, rotation, x0 = network.stage.begun(start.rotation, start.x0)
+        start = replace(start, rotation=rotation, x0=x0, stage=moved)
+    problem = BundleProblem(
+        network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
+    )
+    return problem, found.notes
+
+
+def adjust_network(network: Network, options: Options | None = None) -> Result | Failure:
+    """Adjust a network of images.
+
+    Parameters
+    ----------
+    network : Network
+        Cameras, images, points, observations.
+    options : Options, optional
+        How.
+
+    Returns
+    -------
+    Result or Failure
+        A failure is falsy and says what the network lacks.
+
+    Notes
+    -----
+    Self-calibrating bundle adjustment (Brown 1971; Förstner & Wrobel 2016, ch. 15); see
+    ``docs/mathematics/bundle.md``.
+    """
+    options = options or Options()
+    problem, notes = problem_of(network, options)
+    steps: tuple[SnoopingStep, ...] = ()
+    if options.outliers == "reject":
+        found = _without_blunders(problem, options)
+        if isinstance(found, Failure):
+            return _explained(found, problem)
+        fit, steps = found
+    else:
+        plain = problem.adjusted()
+        if isinstance(plain, Failure):
+            return _explained(plain, problem)
+        fit = plain
+    n = len(network.xy)
+    rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
+    bare = Result(network, fit, rejected, steps)
+    doubts = _doubts(problem) if fit.sigma0 > _DOUBT else []
+    return Result(network, fit, rejected, steps, (*notes, *doubts, *remarks(bare)))
+
+
+def _doubts(problem: BundleProblem) -> list[str]:
+    """What may be wrong with the observations where they fit badly."""
+    doubts = [doubtful_control(problem.network)] if problem.network.datum == "control" else []
+    if len(problem.observations) <= _MANY:
+        names = _suspects(problem)
+        if names:
+            doubts.append(f"gross errors are likely in {listed(names)}")
+    return [doubt for doubt in doubts if doubt]
+
+
+def _suspects(problem: BundleProblem) -> list[str]:
+    """Image points to which a robust adjustment gives next to no weight, the worst first."""
+    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
+    if isinstance(off, Failure):
+        return []
+    network = problem.network
+    n = len(network.xy)
+    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
+    rows = np.argsort(weight, kind="stable")
+    rows = rows[weight[rows] < _BLUNDER]
+    return [
+        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
+    ]
+
+
+def _without_blunders(
+    problem: BundleProblem, options: Options
+) -> tuple[BundleFit, tuple[SnoopingStep, ...]] | Failure:
+    """Robust start, then data snooping with what leaves and comes back."""
+    problem = _trimmed(problem)
+    begun = robust(problem, "huber", max_iterations=50, tolerance=_SETTLED)
+    if not isinstance(begun, Failure):
+        start = problem.continued(begun.adjustment)
+        heavy = np.where(begun.factors < _BLUNDER, 0.0, 1.0)
+        first = start.with_weights(heavy).adjusted()
+        problem = start if isinstance(first, Failure) else start.continued(first)
+    found = data_snooping(problem, options.alpha, "tau", options.max_fraction, groups=problem.groups)
+    if isinstance(found, Failure):
+        return found
+    return found.adjustment, found.steps
+
+
+def _trimmed(problem: BundleProblem) -> BundleProblem:
+    """The problem begun at the estimates of those image points that most others agree with.
+
+    Least squares of all observations may not converge at all where a fifth of them is wrong. The approximate
+    values come from the largest sets that agree: those far off them wait until the estimates are better.
+    """
+    n = len(problem.network.xy)
+    out = np.ones(n, dtype=bool)
+    for _ in range(_TRIMS):
+        v = problem.misfits_at_start()
+        size = np.sqrt((v**2).sum(axis=1))
+        if not np.isfinite(size).any():
+            break
+        limit = _FAR_OFF * float(np.nanmedian(size))
+        further = ~(size <= limit)
+        if (further == out).all():
+            break
+        out, weights = further, np.ones(len(problem.observations))
+        weights[: 2 * n] = np.repeat(~out, 2)
+        fit = problem.with_weights(weights).adjusted()
+        if isinstance(fit, Failure):
+            break
+        problem = problem.continued(fit)
+    return problem
+
+
+def _explained(failure: Failure, problem: BundleProblem) -> Failure:
+    """A failure to converge, with the observations that look like blunders."""
+    if "nothing determines" in failure.reason:
+        return failure
+    doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""
+    if doubt:
+        return Failure(f"{failure.reason}; {doubt}", failure.values, failure.iterations, failure.costs)
+    names = _suspects(problem)
+    hint = f"; gross errors are likely in {listed(names)}" if names else ""
+    return Failure(failure.reason + hint, failure.values, failure.iterations, failure.costs)

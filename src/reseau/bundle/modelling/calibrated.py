@@ -1,0 +1,101 @@
+"""The calibration of a camera, from a bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...calibration.document import Calibration, Covariance, Quantity
+from ...core.errors import UsageError
+from ..diagnostics.between import sigma_between_images
+from ..diagnostics.result import Result
+from ..network.network import Camera
+
+__all__ = ["UNITS", "calibration_of"]
+
+UNITS = {
+    "c": "mm", "x0": "mm", "y0": "mm", "K1": "mm^-2", "K2": "mm^-4", "K3": "mm^-6", "P1": "mm^-1",
+    "P2": "mm^-1", "fx": "px", "fy": "px", "cx": "px", "cy": "px",
+}  # fmt: skip
+"""Of a camera's parameters; those that are not here have none."""
+
+
+def calibration_of(
+    result: Result,
+    camera: str,
+    *,
+    name: str,
+    provenance: Mapping[str, Any] | None = None,
+    times: Mapping[str, str] | None = None,
+) -> Calibration:
+    """The calibration of one camera: ``reseau-calibration/1``.
+
+    Parameters
+    ----------
+    result : Result
+        Of the adjustment.
+    camera : str
+        Its id in the network.
+    name : str
+        What the calibration is called.
+    provenance, times : mapping, optional
+        How it came about, and when.
+
+    Raises
+    ------
+    UsageError
+        When there is no such camera, or nothing of it was estimated.
+    """
+    ids = [entry.id for entry in result.network.cameras]
+    if camera not in ids:
+        raise UsageError(f"is none of the cameras {', '.join(ids[:8])}", where=camera)
+    c = ids.index(camera)
+    entry = result.network.cameras[c]
+    names, _, values = result.camera_columns(c)
+    if not names:
+        raise UsageError("was not estimated", where=f"camera {camera}")
+    covariance = result.camera_covariance(c)
+    sigma = np.sqrt(np.diag(covariance))
+    parameters = {
+        key: Quantity(value=value, sigma=0.0, unit=UNITS.get(key, ""))
+        for key, value in entry.parameters.items()
+    } | {
+        key: Quantity(value=float(value), sigma=float(s), unit=UNITS.get(key, ""))
+        for key, value, s in zip(names, values, sigma, strict=True)
+    }
+    between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
+    used = result.fit.usable.observations & ~result.rejected
+    xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
+    return Calibration(
+        kind="camera",
+        name=name,
+        model=_model(entry),
+        parameters=parameters,
+        covariance=Covariance(names=names, matrix=tuple(tuple(row) for row in covariance.tolist())),
+        sigma0=result.sigma0 if result.redundancy > 0 else None,
+        redundancy=result.redundancy,
+        tests=tuple(vars(test) for test in result.camera_tests(c)),
+        validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
+                  "sigma_between_images": {key: s for key, s in between if np.isfinite(s)},
+                  "warnings": list(result.warnings)},
+        provenance=dict(provenance or {}),
+        times=dict(times or {}),
+    )  # fmt: skip
+
+
+def _model(camera: Camera) -> dict[str, Any]:
+    """What the parameters are parameters of."""
+    model: dict[str, Any] = {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "pitch_mm": list(camera.pitch_mm),
+    }
+    if camera.model == "brown":
+        model |= {"side": camera.side, "balance_radius_mm": camera.balance_radius_mm}
+    extra = camera.additional
+    if extra is not None:
+        model["additional"] = {"model": "ebner12", "base_mm": extra.base_mm, "per": extra.per}
+    return model

@@ -1,0 +1,1 @@
+"""How a network is adjusted: normal equations with the points eliminated, iteration, cofactors, datum."""

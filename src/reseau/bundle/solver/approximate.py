@@ -1,0 +1,233 @@
+"""Approximate values by themselves: resection, relative orientation, and growing of the block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from ...core.data import Array, Mask, Rows
+from ...optics.poses import rotation_matrix
+from ..network.network import Network, finite
+from .datum import similarity_onto
+from .spatial import directions, intersect, relative_orientation, resect
+from .values import Values
+
+__all__ = ["Approximate", "approximate"]
+
+# Misfit of an ideal direction that is no blunder while distortion and principal distance are hardly known.
+_LOOSE = 0.03
+# Angle (rad) at which rays must cut before their point helps to orient another image.
+_CUT = 0.03
+_PAIRS = 12
+# A ray this many times further off than most is a blunder.
+_FAR = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Approximate:
+    """Approximate poses and points.
+
+    Parameters
+    ----------
+    rotation : ndarray (m, 3, 3)
+        Rotations, NaN where none was found.
+    x0 : ndarray (m, 3)
+        Projection centres, NaN likewise.
+    xyz : ndarray (p, 3)
+        Points, NaN likewise.
+    notes : tuple of str
+        How they were found, where that matters.
+    """
+
+    rotation: Array
+    x0: Array
+    xyz: Array
+    notes: tuple[str, ...] = ()
+
+
+def approximate(network: Network) -> Approximate:
+    """Approximate values of all poses and points that can be had.
+
+    Parameters
+    ----------
+    network : Network
+        With what is known of poses and coordinates.
+
+    Returns
+    -------
+    Approximate
+        Poses as given, or by resection from known points and points intersected before, or, where nothing is
+        known, grown from the pair of images with the most points at the best angles and carried onto the
+        control by a similarity.
+    """
+    return _Block(network).grown()
+
+
+class _Block:
+    """A block that grows image by image."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.uv = directions(network)
+        self.known = finite(network.xyz)
+        self.xyz = network.xyz.copy()
+        self.rotation = np.full((len(network.images), 3, 3), np.nan)
+        self.x0 = network.x0.copy()
+        posed = network.posed
+        self.rotation[posed] = rotation_matrix(network.rotation[posed])
+        self.x0[~posed] = np.nan
+        self.refused: set[int] = set()
+
+    @property
+    def posed(self) -> Mask:
+        """Images that have a pose (m,)."""
+        return finite(self.x0)
+
+    def grown(self) -> Approximate:
+        """The block as far as it grows."""
+        known, notes = self.known.copy(), []
+        if not self.posed.any():
+            self._resect_all()
+        if self.posed.sum() < 2 and not self.posed.all():
+            control = self.xyz.copy()
+            self.rotation[:], self.x0[:], self.xyz[:] = np.nan, np.nan, np.nan
+            self.known = np.zeros(len(self.xyz), dtype=bool)
+            if self._begin_with_a_pair():
+                self._grow()
+                notes.append(self._onto(control, known))
+            else:
+                self.known, self.xyz = known, control
+        self._grow()
+        given = finite(self.network.xyz)
+        xyz = np.where(given[:, None], self.network.xyz, self.xyz)
+        return Approximate(self.rotation, self.x0, xyz, tuple(note for note in notes if note))
+
+    def _grow(self) -> None:
+        """Intersect points and resect images in turn, until neither gives more."""
+        while True:
+            self._intersect_all()
+            if self.posed.all() or not self._resect_all():
+                return
+
+    def _intersect_all(self) -> None:
+        """Points of two oriented images or more, those with known coordinates apart."""
+        network = self.network
+        rows = self.posed[network.image_of] & ~self.known[network.point_of] & finite(self.uv)
+        image, point = network.image_of[rows], network.point_of[rows]
+        uv = self.uv[rows]
+        for _ in range(3):
+            xyz, angle = intersect(image, point, uv, self.rotation, self.x0, len(self.xyz))
+            off = self._misfit(image, point, uv, xyz)
+            worst = np.zeros(len(xyz))
+            np.maximum.at(worst, point, np.nan_to_num(off, posinf=1e9))
+            count = np.bincount(point, minlength=len(xyz))
+            limit = max(_LOOSE, _FAR * float(np.median(off))) if len(off) else _LOOSE
+            bad = (off >= worst[point]) & (off > limit) & (count[point] > 2)
+            if not bad.any():
+                break
+            image, point, uv = image[~bad], point[~bad], uv[~bad]
+        free = ~self.known
+        self.xyz[free] = xyz[free]
+        self.angle = np.where(self.known, np.pi / 2, angle)
+
+    def _misfit(self, image: Rows, point: Rows, uv: Array, xyz: Array) -> Array:
+        """Distance of the directions of points from those measured; infinite behind the camera."""
+        x = np.einsum("nij,nj->ni", self.rotation[image], xyz[point] - self.x0[image])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off: Array = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
+        return np.where(x[:, 2] > 0, off, np.inf)
+
+    def _resect_all(self) -> bool:
+        """Orient every image that sees four known points; whether any was."""
+        network, before = self.network, int(self.posed.sum())
+        usable = finite(self.xyz)
+        if before:
+            usable &= self.angle > _CUT
+        # Those with the most points first, and only those near as good: the next round has better points.
+        count = np.bincount(network.image_of[usable[network.point_of]], minlength=len(network.images))
+        waiting = np.flatnonzero(~self.posed & (count >= 4))
+        waiting = waiting[count[waiting] >= 0.5 * count[waiting].max(initial=0)]
+        for i in waiting:
+            rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
+            found = resect(self.xyz[network.point_of[rows]], self.uv[rows], _LOOSE)
+            if found is not None and found.agree.sum() >= max(4, 0.5 * rows.sum()):
+                self.rotation[i], self.x0[i] = found.rotation, found.x0
+        if (
+            int(self.posed.sum()) == before
+            and len(waiting)
+            and waiting.size < (~self.posed & (count >= 4)).sum()
+        ):
+            return self._resect_one_by_one(usable, count)
+        return int(self.posed.sum()) > before
+
+    def _resect_one_by_one(self, usable: Mask, count: Rows) -> bool:
+        """When the best images fail: the others."""
+        network = self.network
+        for i in np.flatnonzero(~self.posed & (count >= 4)):
+            rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
+            found = resect(self.xyz[network.point_of[rows]], self.uv[rows], _LOOSE)
+            if found is not None and found.agree.sum() >= max(4, 0.5 * rows.sum()):
+                self.rotation[i], self.x0[i] = found.rotation, found.x0
+                return True
+        return False
+
+    def _begin_with_a_pair(self) -> bool:
+        """Orient two images relative to each other; those of many points that cut at the widest angles."""
+        network = self.network
+        n = len(network.image_of)
+        sees = scipy.sparse.csr_array(
+            (np.ones(n, np.int32), (network.image_of, network.point_of)),
+            shape=(len(network.images), len(network.points)),
+        )
+        common = scipy.sparse.triu(scipy.sparse.coo_array(sees @ sees.T), k=1)
+        order = np.argsort(-common.data, kind="stable")
+        # Neighbours share the most points and have the shortest bases: look further down the list too.
+        good = order[: max(1, int((common.data >= 0.3 * common.data.max(initial=0)).sum()))]
+        picked = good[np.unique(np.linspace(0, len(good) - 1, _PAIRS).astype(int))] if len(good) else good
+        best, score = None, 0.0
+        for k in picked:
+            a, b = int(common.row[k]), int(common.col[k])
+            found = self._pair(a, b)
+            if found is not None and found[0] > score:
+                score, best = found[0], (a, b, found[1], found[2])
+        if best is None:
+            return False
+        a, b, rotation, x0 = best
+        self.rotation[a], self.x0[a] = np.eye(3), np.zeros(3)
+        self.rotation[b], self.x0[b] = rotation, x0
+        return True
+
+    def _pair(self, a: int, b: int) -> tuple[float, Array, Array] | None:
+        """How good a pair is, and its relative orientation."""
+        network = self.network
+        in_a, in_b = np.flatnonzero(network.image_of == a), np.flatnonzero(network.image_of == b)
+        _, left, right = np.intersect1d(
+            network.point_of[in_a], network.point_of[in_b], assume_unique=True, return_indices=True
+        )
+        first, second = self.uv[in_a[left]], self.uv[in_b[right]]
+        found = relative_orientation(first, second, 0.2 * _LOOSE)
+        if found is None:
+            return None
+        k = len(first)
+        poses = np.stack([np.eye(3), found.rotation]), np.stack([np.zeros(3), found.x0])
+        rays = np.concatenate([np.zeros(k, np.intp), np.ones(k, np.intp)])
+        points = np.concatenate([np.arange(k), np.arange(k)])
+        _, angle = intersect(rays, points, np.concatenate([first, second]), *poses, k)
+        agree = found.agree
+        score = float(agree.sum()) * min(float(np.median(angle[agree])), 0.5) if agree.any() else 0.0
+        return score, found.rotation, found.x0
+
+    def _onto(self, control: Array, known: Mask) -> str:
+        """Carry the block onto the known points; says so where it cannot be."""
+        common = known & finite(self.xyz)
+        if common.sum() < 3:
+            self.known = np.zeros(len(known), dtype=bool)
+            return "" if not known.any() else "too few known points in the block to place it in their system"
+        nothing = np.zeros((1, 12))
+        values = Values(self.rotation, self.x0, self.xyz, nothing, nothing)
+        moved = similarity_onto(values, control, common, scaled=True)(values)
+        self.rotation, self.x0, self.xyz = moved.rotation, moved.x0, moved.xyz
+        self.xyz[known], self.known = control[known], known
+        return ""

@@ -1,0 +1,71 @@
+"""Loops over observations, compiled, and spread over the processors.
+
+Whole-array NumPy makes a new array for every product; over a hundred thousand image points that costs ten
+times the arithmetic (``docs/decisions/0002-numba.md``).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+from ...core.data import Rows
+
+__all__ = ["chunks_of", "compiled", "in_parallel"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# Sums are formed in this many parts whatever the number of processors, so that results do not depend on it.
+_PARTS = 4
+# Below this many observations a part is not worth a thread.
+_LEAST = 2000
+
+
+def compiled(function: F) -> F:
+    """A function compiled at its first call, kept on disk, that does not hold the interpreter's lock."""
+    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def chunks_of(starts: Rows) -> list[tuple[int, int]]:
+    """Ranges of groups of about as many observations each.
+
+    Parameters
+    ----------
+    starts : ndarray of int (g + 1,)
+        Where the observations of each group begin.
+    """
+    groups, total = len(starts) - 1, int(starts[-1])
+    parts = min(_PARTS, max(1, total // _LEAST))
+    bounds = np.searchsorted(starts, np.linspace(0, total, parts + 1)[1:-1])
+    edges = [0, *bounds.tolist(), groups]
+    return [(a, b) for a, b in pairwise(edges) if b > a]
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=processors(), thread_name_prefix="reseau-bundle")
+
+
+def processors() -> int:
+    """Processors this process may use, eight at most."""
+    return max(
+        1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    )
+
+
+def in_parallel(function: Callable[[int, int, int], None], chunks: Sequence[tuple[int, int]]) -> None:
+    """Call `function(part, begin, end)` for every chunk, on several threads where there is more than one."""
+    if len(chunks) == 1 or processors() == 1:
+        for part, (begin, end) in enumerate(chunks):
+            function(part, begin, end)
+        return
+    jobs = [_pool().submit(function, part, begin, end) for part, (begin, end) in enumerate(chunks)]
+    for job in jobs:
+        job.result()

@@ -1,0 +1,185 @@
+"""The datum: which similarities a network leaves free, and how estimates and cofactors are referred to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from ...core.data import Array, Mask, Rows
+from .system import System
+from .unknowns import Unknowns
+from .values import Values
+
+__all__ = ["Freedom", "Similarity", "freedom_of", "held_for", "held_minimally", "similarity_onto"]
+
+# What the seven parameters are called.
+_NAMES = ("position in X", "position in Y", "position in Z", "rotation about X", "rotation about Y",
+          "rotation about Z", "scale")  # fmt: skip
+
+
+class Similarity(NamedTuple):
+    """X' = scale · turn · X + shift."""
+
+    scale: float
+    turn: Array
+    shift: Array
+
+    def __call__(self, values: Values) -> Values:
+        """Poses and points carried along; images stay as they are."""
+        return Values(
+            values.rotation @ self.turn.T,
+            self.scale * values.x0 @ self.turn.T + self.shift,
+            self.scale * values.xyz @ self.turn.T + self.shift,
+            values.cameras,
+            values.extra,
+            None if values.stage is None else values.stage.turned(self.turn),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """Directions in which position, orientation and scale may change without any observation noticing.
+
+    Parameters
+    ----------
+    reduced : ndarray (u, d)
+        Changes of the reduced unknowns.
+    points : ndarray (p, 3, d)
+        Changes of the eliminated points.
+    names : tuple of str
+        What may change.
+    """
+
+    reduced: Array
+    points: Array
+    names: tuple[str, ...]
+
+    @property
+    def defect(self) -> int:
+        """Number of directions."""
+        return int(self.reduced.shape[1])
+
+
+def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -> tuple[Array, Array]:
+    """Changes of reduced unknowns (u, 7) and points (p, 3, 7) by a small similarity: shift, rotation, scale.
+
+    X' = X + t + ω × X + μX; a camera that turns with it turns by −R ω about its own axes.
+    """
+
+    def moved(x: Array) -> Array:
+        d = np.zeros((*x.shape, 7))
+        d[:, :, :3] = np.eye(3)
+        d[:, 0, 4], d[:, 0, 5] = x[:, 2], -x[:, 1]
+        d[:, 1, 5], d[:, 1, 3] = x[:, 0], -x[:, 2]
+        d[:, 2, 3], d[:, 2, 4] = x[:, 1], -x[:, 0]
+        d[:, :, 6] = x
+        return d
+
+    reduced = np.zeros((unknowns.size, 7))
+    images = np.flatnonzero(unknowns.pose >= 0)
+    at = unknowns.pose[images, None] + np.arange(3)
+    reduced[at, 3:6] = -values.rotation[images]
+    reduced[at + 3] = moved(values.x0[images])
+    points = moved(values.xyz)
+    points[~taking_part] = 0.0
+    kept = np.flatnonzero(unknowns.kept >= 0)
+    reduced[unknowns.kept[kept, None] + np.arange(3)] = points[kept]
+    points[kept] = 0.0
+    return reduced, points
+
+
+def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
+    """The similarities that held and observed coordinates, distances and a stage's readings leave free.
+
+    Parameters
+    ----------
+    taking_part : ndarray of bool (p,)
+        Points that are adjusted.
+    """
+    unknowns, network = system.unknowns, system.unknowns.network
+    reduced, points = _similarity_changes(unknowns, values, taking_part)
+    whole = points.copy()
+    kept = np.flatnonzero(unknowns.kept >= 0)
+    whole[kept] = reduced[unknowns.kept[kept, None] + np.arange(3)]
+    counted = np.zeros(network.sigma.shape, dtype=bool)
+    at = system.further.slices[1]
+    j, axis = system.further.coordinate[system.sigma_root[at] > 0].T
+    counted[j, axis] = True
+    rows = [whole[(network.held | counted) & taking_part[:, None]]]
+    for a, b in system.further.ends[system.sigma_root[system.further.slices[0]] > 0]:
+        along = values.xyz[b] - values.xyz[a]
+        rows.append(along[None] @ (whole[b] - whole[a]))
+    if network.stage is not None:
+        rows.append(np.eye(7)[6:])
+    size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
+    scale = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size, 1 / size])
+    fixed = np.concatenate(rows) * scale
+    length = np.linalg.norm(fixed, axis=1, keepdims=True)
+    fixed = fixed / np.where(length > 0, length, 1.0)
+    _, singular, vt = np.linalg.svd(np.vstack([fixed, np.zeros((7, 7))]))
+    free = vt[singular < 1e-6 * max(1.0, singular[0])].T
+    names = tuple(
+        name for name, part in zip(_NAMES, free, strict=True) if np.abs(part).max(initial=0.0) > 0.1
+    )
+    basis = scale[:, None] * free
+    points *= system.movable[:, :, None]
+    return Freedom(reduced @ basis, points @ basis, names)
+
+
+def held_for(freedom: Freedom, unknowns: Unknowns, diagonal: Array) -> Rows:
+    """As many reduced unknowns as there is freedom, which held take it away; well-conditioned ones.
+
+    Parameters
+    ----------
+    diagonal : ndarray (u,)
+        Of the normal equations, to compare unknowns of different units.
+    """
+    if not freedom.defect:
+        return np.zeros(0, dtype=np.intp)
+    scaled = freedom.reduced * np.sqrt(diagonal)[:, None]
+    scaled = scaled / np.linalg.norm(scaled, axis=0)
+    # Orthogonal directions first: of those at hand some may be nearly the same.
+    basis, _ = np.linalg.qr(scaled)
+    _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
+    return np.sort(order[: freedom.defect]).astype(np.intp)
+
+
+def similarity_onto(values: Values, reference: Array, chosen: Mask, *, scaled: bool) -> Similarity:
+    """The similarity of least squares from the points (p, 3) onto others (Horn 1987; Umeyama 1991).
+
+    Parameters
+    ----------
+    reference : ndarray (p, 3)
+        Where the points should be.
+    chosen : ndarray of bool (p,)
+        Which points count.
+    scaled : bool
+        Whether the scale is free.
+    """
+    a, b = values.xyz[chosen], reference[chosen]
+    centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
+    u, s, vt = np.linalg.svd((b - centre_b).T @ (a - centre_a))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = (u * sign) @ vt
+    spread = float(((a - centre_a) ** 2).sum())
+    scale = float(s @ sign) / spread if scaled and spread > 0 else 1.0
+    return Similarity(scale, turn, centre_b - scale * turn @ centre_a)
+
+
+def held_minimally(freedom: Freedom, unknowns: Unknowns, values: Values) -> Rows:
+    """Minimal constraints: the pose of the first image, and the largest part of a base from it.
+
+    Where less than that is free, as many unknowns as there is freedom.
+    """
+    images = np.flatnonzero(unknowns.pose >= 0)
+    first: Rows = np.asarray(unknowns.pose[images[0]] + np.arange(6), dtype=np.intp)
+    if freedom.defect < 6 or len(images) < 2:
+        return held_for(freedom, unknowns, np.ones(unknowns.size))
+    if freedom.defect == 6:
+        return first
+    base = np.abs(values.x0[images] - values.x0[images[0]])
+    far, axis = np.unravel_index(int(np.argmax(base)), base.shape)
+    return np.concatenate([first, [unknowns.pose[images[far]] + 3 + int(axis)]])

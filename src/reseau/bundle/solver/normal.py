@@ -1,0 +1,354 @@
+"""Normal equations with the points eliminated: compiled loops over points and their rays.
+
+Of every point j with rays k the blocks V = Σ BᵀB, W = Σ AᵀB and the right-hand side are formed and its part
+of the reduced normal equations S = Σ AᵀA − Σ W V⁻¹ Wᵀ is added at once (Brown 1958; Kraus, *Photogrammetry*;
+Förstner & Wrobel 2016, sect. 15.3.3). A ray touches at most four *segments* of the reduced unknowns: pose,
+interior orientation, additional parameters, and the point itself where it is kept among them.
+
+S is an arrow: a band of `bands` unknowns, lower triangle, column by column, and full rows below it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.data import Array, Rows
+from .compiled import compiled
+
+__all__ = ["SEGMENTS", "Pattern", "Sums", "assemble", "locals_of", "posterior", "reduce_sides", "substitute"]
+
+SEGMENTS = 4
+
+
+class Pattern(NamedTuple):
+    """Who touches what, in columns over points (p), rays (n) and local segments.
+
+    Rays `first[j]:first[j+1]` see point j. `start`, `width`, `column`, `place` (n, 4) say for each segment of
+    a ray where it begins among the reduced unknowns, how wide it is, where it begins in the ray's row of
+    derivatives, and where among the unknowns its point touches. These are the segments
+    `local[j]:local[j+1]` of `at`, `size`, `offset`, by ascending place; `eliminated` (p,) is 1 for points
+    that are.
+    """
+
+    first: Rows
+    start: Rows
+    width: Rows
+    column: Rows
+    place: Rows
+    local: Rows
+    at: Rows
+    size: Rows
+    offset: Rows
+    eliminated: Rows
+
+
+class Sums(NamedTuple):
+    """Arrow of S, right-hand sides (u,) before and after elimination, diagonal (u,) before elimination."""
+
+    band: Array
+    border: Array
+    gradient: Array
+    reduced: Array
+    diagonal: Array
+
+
+@compiled
+def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, count: Rows) -> int:
+    """Distinct segments of each point by ascending start, into `out` (n·4, 3) and `place`; their number."""
+    total = 0
+    for j in range(len(first) - 1):
+        base = total
+        for k in range(first[j], first[j + 1]):
+            for a in range(SEGMENTS):
+                if width[k, a] == 0:
+                    continue
+                q = base
+                while q < total and out[q, 0] != start[k, a]:
+                    q += 1
+                if q == total:
+                    out[q, 0], out[q, 1] = start[k, a], width[k, a]
+                    total += 1
+        for a in range(base + 1, total):
+            s, w, b = out[a, 0], out[a, 1], a
+            while b > base and out[b - 1, 0] > s:
+                out[b, 0], out[b, 1] = out[b - 1, 0], out[b - 1, 1]
+                b -= 1
+            out[b, 0], out[b, 1] = s, w
+        offset = 0
+        for q in range(base, total):
+            out[q, 2] = offset
+            offset += out[q, 1]
+        for k in range(first[j], first[j + 1]):
+            for a in range(SEGMENTS):
+                for q in range(base, total):
+                    if width[k, a] > 0 and out[q, 0] == start[k, a]:
+                        place[k, a] = out[q, 2]
+        count[j] = total - base
+    return total
+
+
+@compiled
+def _inverse(j: int, v: Array, out: Array) -> float:
+    """Inverse of a symmetric positive definite 3×3 matrix; the least pivot of the matrix scaled to ones."""
+    s0, s1, s2 = 1.0 / np.sqrt(v[0, 0]), 1.0 / np.sqrt(v[1, 1]), 1.0 / np.sqrt(v[2, 2])
+    a, b, c = v[1, 0] * s0 * s1, v[2, 0] * s0 * s2, v[2, 1] * s1 * s2
+    d1 = 1.0 - a * a
+    e = (c - a * b) / d1
+    d2 = 1.0 - b * b - e * e * d1
+    # L⁻¹ of the unit triangle L: rows (1), (−a, 1), (a·e − b, −e, 1).
+    f = a * e - b
+    out[j, 2, 2] = s2 * s2 / d2
+    out[j, 2, 1] = -e * s1 * s2 / d2
+    out[j, 2, 0] = f * s0 * s2 / d2
+    out[j, 1, 1] = (1.0 / d1 + e * e / d2) * s1 * s1
+    out[j, 1, 0] = (-a / d1 - e * f / d2) * s0 * s1
+    out[j, 0, 0] = (1.0 + a * a / d1 + f * f / d2) * s0 * s0
+    out[j, 0, 1], out[j, 0, 2], out[j, 1, 2] = out[j, 1, 0], out[j, 2, 0], out[j, 2, 1]
+    return float(min(d1, d2))
+
+
+@compiled
+def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -> None:
+    """AᵀA and Aᵀr of one ray, added to the arrow and the right-hand side."""
+    start, width, column, border = pattern.start, pattern.width, pattern.column, sums.border
+    bands, r0, r1 = len(sums.band), misfits[k, 0], misfits[k, 1]
+    for a in range(SEGMENTS):
+        sa, ca = start[k, a], column[k, a]
+        for i in range(width[k, a]):
+            x0, x1, at = rows[k, 0, ca + i], rows[k, 1, ca + i], sa + i
+            sums.diagonal[at] += x0 * x0 + x1 * x1
+            sums.gradient[at] += x0 * r0 + x1 * r1
+            for b in range(SEGMENTS):
+                sb, cb = start[k, b], column[k, b]
+                if width[k, b] == 0 or sb > sa:
+                    continue
+                if at >= bands:
+                    for j in range(width[k, b]):
+                        border[at - bands, sb + j] += x0 * rows[k, 0, cb + j] + x1 * rows[k, 1, cb + j]
+                else:
+                    for j in range(min(width[k, b], at - sb + 1)):
+                        sums.band[sb + j, at - sb - j] += x0 * rows[k, 0, cb + j] + x1 * rows[k, 1, cb + j]
+
+
+@compiled
+def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None:
+    """− T Wᵀ of one point, added to the arrow."""
+    bands, border, first = len(sums.band), sums.border, pattern.local[j]
+    for a in range(first, pattern.local[j + 1]):
+        sa, oa = pattern.at[a], pattern.offset[a]
+        for i in range(pattern.size[a]):
+            t0, t1, t2, at = t[oa + i, 0], t[oa + i, 1], t[oa + i, 2], sa + i
+            for b in range(first, a + 1):
+                sb, ob = pattern.at[b], pattern.offset[b]
+                if at >= bands:
+                    for q in range(pattern.size[b]):
+                        border[at - bands, sb + q] -= (
+                            t0 * w[0, ob + q] + t1 * w[1, ob + q] + t2 * w[2, ob + q]
+                        )
+                else:
+                    for q in range(min(pattern.size[b], at - sb + 1)):
+                        sums.band[sb + q, at - sb - q] -= (
+                            t0 * w[0, ob + q] + t1 * w[1, ob + q] + t2 * w[2, ob + q]
+                        )
+
+
+@compiled
+def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
+    """W of one point (3, m): its derivatives against those of the unknowns it touches."""
+    end = rows.shape[2]
+    for q in range(3):
+        for i in range(_touched(j, pattern)):
+            w[q, i] = 0.0
+    for k in range(pattern.first[j], pattern.first[j + 1]):
+        for a in range(SEGMENTS):
+            place, column = pattern.place[k, a], pattern.column[k, a]
+            for i in range(pattern.width[k, a]):
+                x0, x1 = rows[k, 0, column + i], rows[k, 1, column + i]
+                for q in range(3):
+                    w[q, place + i] += x0 * rows[k, 0, end - 3 + q] + x1 * rows[k, 1, end - 3 + q]
+
+
+@compiled
+def _touched(j: int, pattern: Pattern) -> int:
+    last = pattern.local[j + 1] - 1
+    return pattern.offset[last] + pattern.size[last] if last >= pattern.local[j] else 0
+
+
+@compiled
+def assemble(
+    begin: int, end: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float,
+    sums: Sums, inverse: Array, side: Array, diagonal: Array,
+) -> float:  # fmt: skip
+    """Normal equations of the points begin…end, reduced to the other unknowns.
+
+    `prior` (p, 3, 2) holds weights of observed coordinates (1 for held ones, so that they can be divided by)
+    and their weighted misfits. Into `inverse` (p, 3, 3) goes V⁻¹ of the damped V, into `side` (p, 3) the
+    right-hand side, into `diagonal` (p, 3) the undamped diagonal of V. Returns the least scaled pivot of V.
+    """
+    most = 1
+    for j in range(begin, end):
+        most = max(most, _touched(j, pattern))
+    w, t, v, least = np.empty((3, most)), np.empty((most, 3)), np.empty((3, 3)), 1.0
+    last = rows.shape[2] - 3
+    for j in range(begin, end):
+        for k in range(pattern.first[j], pattern.first[j + 1]):
+            _blocks(k, rows, misfits, pattern, sums)
+        if not pattern.eliminated[j]:
+            continue
+        for q in range(3):
+            v[q, 0], v[q, 1], v[q, 2] = 0.0, 0.0, 0.0
+            v[q, q], side[j, q] = prior[j, q, 0], prior[j, q, 1]
+        for k in range(pattern.first[j], pattern.first[j + 1]):
+            for q in range(3):
+                b0, b1 = rows[k, 0, last + q], rows[k, 1, last + q]
+                side[j, q] += b0 * misfits[k, 0] + b1 * misfits[k, 1]
+                for s in range(q + 1):
+                    v[q, s] += b0 * rows[k, 0, last + s] + b1 * rows[k, 1, last + s]
+        for q in range(3):
+            diagonal[j, q] = v[q, q]
+            v[q, q] *= 1.0 + damping
+        least = min(least, _inverse(j, v, inverse))
+        _cross(j, rows, pattern, w)
+        for i in range(_touched(j, pattern)):
+            for q in range(3):
+                t[i, q] = w[0, i] * inverse[j, 0, q] + w[1, i] * inverse[j, 1, q] + w[2, i] * inverse[j, 2, q]
+        for a in range(pattern.local[j], pattern.local[j + 1]):
+            for i in range(pattern.size[a]):
+                o = pattern.offset[a] + i
+                part = t[o, 0] * side[j, 0] + t[o, 1] * side[j, 1] + t[o, 2] * side[j, 2]
+                sums.reduced[pattern.at[a] + i] -= part
+        _eliminate(j, w, t, pattern, sums)
+    return least
+
+
+@compiled
+def substitute(
+    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, side: Array, y: Array, out: Array
+) -> None:
+    """Points (p, 3, s) of the right-hand sides `side` (p, 3, s) and the reduced unknowns y (u, s)."""
+    last, sides = rows.shape[2] - 3, y.shape[1]
+    h, step = np.empty(3), np.empty(2)
+    for j in range(begin, end):
+        if not pattern.eliminated[j]:
+            continue
+        for c in range(sides):
+            for q in range(3):
+                h[q] = side[j, q, c]
+            for k in range(pattern.first[j], pattern.first[j + 1]):
+                step[:] = 0.0
+                for a in range(SEGMENTS):
+                    at, column = pattern.start[k, a], pattern.column[k, a]
+                    for i in range(pattern.width[k, a]):
+                        step[0] += rows[k, 0, column + i] * y[at + i, c]
+                        step[1] += rows[k, 1, column + i] * y[at + i, c]
+                for q in range(3):
+                    h[q] -= rows[k, 0, last + q] * step[0] + rows[k, 1, last + q] * step[1]
+            for q in range(3):
+                out[j, q, c] = inverse[j, q, 0] * h[0] + inverse[j, q, 1] * h[1] + inverse[j, q, 2] * h[2]
+
+
+@compiled
+def reduce_sides(
+    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, side: Array, out: Array
+) -> None:
+    """− W V⁻¹ times right-hand sides (p, 3, s) of the points, added to `out` (u, s)."""
+    last, sides = rows.shape[2] - 3, side.shape[2]
+    h = np.empty(3)
+    for j in range(begin, end):
+        if not pattern.eliminated[j]:
+            continue
+        for c in range(sides):
+            for q in range(3):
+                h[q] = (
+                    inverse[j, q, 0] * side[j, 0, c]
+                    + inverse[j, q, 1] * side[j, 1, c]
+                    + inverse[j, q, 2] * side[j, 2, c]
+                )
+            for k in range(pattern.first[j], pattern.first[j + 1]):
+                x0 = rows[k, 0, last] * h[0] + rows[k, 0, last + 1] * h[1] + rows[k, 0, last + 2] * h[2]
+                x1 = rows[k, 1, last] * h[0] + rows[k, 1, last + 1] * h[1] + rows[k, 1, last + 2] * h[2]
+                for a in range(SEGMENTS):
+                    at, column = pattern.start[k, a], pattern.column[k, a]
+                    for i in range(pattern.width[k, a]):
+                        out[at + i, c] -= rows[k, 0, column + i] * x0 + rows[k, 1, column + i] * x1
+
+
+@compiled
+def posterior(
+    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, z: Array, points: Array, seen: Array
+) -> None:
+    """Cofactors after the adjustment, from the inverse z (u, u) of the reduced normal equations.
+
+    Of the points Q = V⁻¹ + Tᵀ Z T, T = W V⁻¹, into `points` (p, 3, 3); of the adjusted image coordinates,
+    whitened, A Z Aᵀ − A Z T Bᵀ − B Tᵀ Z Aᵀ + B Q Bᵀ into `seen` (n, 2, 2).
+    """
+    most = 1
+    for j in range(begin, end):
+        most = max(most, _touched(j, pattern))
+    w, t, y, index = np.empty((3, most)), np.zeros((most, 3)), np.zeros((most, 3)), np.empty(most, np.int64)
+    for j in range(begin, end):
+        m = _touched(j, pattern) if pattern.eliminated[j] else 0
+        if pattern.eliminated[j]:
+            _cross(j, rows, pattern, w)
+            for a in range(pattern.local[j], pattern.local[j + 1]):
+                for i in range(pattern.size[a]):
+                    index[pattern.offset[a] + i] = pattern.at[a] + i
+            for i in range(m):
+                for s in range(3):
+                    t[i, s] = (
+                        w[0, i] * inverse[j, 0, s] + w[1, i] * inverse[j, 1, s] + w[2, i] * inverse[j, 2, s]
+                    )
+            for i in range(m):
+                y0, y1, y2 = 0.0, 0.0, 0.0
+                for o in range(m):
+                    x = z[index[i], index[o]]
+                    y0 += x * t[o, 0]
+                    y1 += x * t[o, 1]
+                    y2 += x * t[o, 2]
+                y[i, 0], y[i, 1], y[i, 2] = y0, y1, y2
+            for s in range(3):
+                for c in range(3):
+                    x = inverse[j, s, c]
+                    for i in range(m):
+                        x += t[i, s] * y[i, c]
+                    points[j, s, c] = x
+        for k in range(pattern.first[j], pattern.first[j + 1]):
+            _hat(j, k, rows, pattern, z, y, points, seen)
+
+
+@compiled
+def _hat(j: int, k: int, rows: Array, pattern: Pattern, z: Array, y: Array, q: Array, out: Array) -> None:
+    """Cofactor (2, 2) of the adjusted coordinates of one ray."""
+    eliminated, last = pattern.eliminated[j], rows.shape[2] - 3
+    h00, h01, h11 = 0.0, 0.0, 0.0
+    cross = np.zeros((2, 3))
+    for a in range(SEGMENTS):
+        for i in range(pattern.width[k, a]):
+            at, x0, x1 = pattern.start[k, a] + i, 0.0, 0.0
+            for b in range(SEGMENTS):
+                sb, cb = pattern.start[k, b], pattern.column[k, b]
+                for o in range(pattern.width[k, b]):
+                    x0 += z[at, sb + o] * rows[k, 0, cb + o]
+                    x1 += z[at, sb + o] * rows[k, 1, cb + o]
+            a0, a1 = rows[k, 0, pattern.column[k, a] + i], rows[k, 1, pattern.column[k, a] + i]
+            h00 += a0 * x0
+            h01 += a0 * x1
+            h11 += a1 * x1
+            if eliminated:
+                place = pattern.place[k, a] + i
+                for s in range(3):
+                    cross[0, s] += a0 * y[place, s]
+                    cross[1, s] += a1 * y[place, s]
+    if eliminated:
+        for s in range(3):
+            b0, b1 = rows[k, 0, last + s], rows[k, 1, last + s]
+            h00 -= 2.0 * cross[0, s] * b0
+            h11 -= 2.0 * cross[1, s] * b1
+            h01 -= cross[0, s] * b1 + cross[1, s] * b0
+            for c in range(3):
+                h00 += b0 * q[j, s, c] * rows[k, 0, last + c]
+                h01 += b0 * q[j, s, c] * rows[k, 1, last + c]
+                h11 += b1 * q[j, s, c] * rows[k, 1, last + c]
+    out[k, 0, 0], out[k, 0, 1], out[k, 1, 0], out[k, 1, 1] = h00, h01, h01, h11

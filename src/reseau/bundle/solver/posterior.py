@@ -1,0 +1,341 @@
+"""Cofactors after the adjustment: of all unknowns, of all adjusted observations, in any datum.
+
+With Q⁻ of any datum, that of inner constraints over chosen unknowns is S Q⁻ Sᵀ,
+S = I − G (GᵀEG)⁻¹ Gᵀ E (Baarda 1973), of which every block needs only G, Q⁻EG and Q⁻ of the block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...adjust.reliability import Whitened
+from ...adjust.stochastic import Blocks, Weighting
+from ...core.data import Array, Mask, Rows
+from .arrow import Arrow, Singular
+from .careful import careful_inverse, is_small
+from .compiled import in_parallel
+from .datum import Freedom, held_for
+from .normal import posterior
+from .rank import PARALLEL
+from .system import Linear, Normal
+from .ties import Ties
+
+__all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
+
+# Least pivot of the normal equations scaled to ones that is no rounding.
+_RANK = 1e-14
+# How far the cofactors of the adjusted observations may be from summing to the number of unknowns.
+_EXACT, _INEXACT = 1e-7, 1e-6
+# The same where a stage ties images: frontal views leave the normal equations half of their digits.
+_TIED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSolution(Whitened):
+    """Whitened residuals, and the cofactors of the adjusted observations in blocks.
+
+    Parameters
+    ----------
+    whitened : ndarray (N,)
+        Weighted residuals.
+    influence, cofactors : tuple of Blocks
+        See :class:`~reseau.adjust.reliability.Whitened`.
+    adjusted : tuple of ndarray (b, k, k)
+        Cofactors of the adjusted observations, whitened, of the same blocks.
+    """
+
+    whitened: Array
+    influence: tuple[Blocks, ...]
+    cofactors: tuple[Blocks, ...]
+    adjusted: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, weightings: list[Weighting], whitened: Array, adjusted: list[Array]) -> BlockSolution:
+        """From the weights of image coordinates and of further observations, one after the other."""
+        influence, cofactors, start = [], [], 0
+        for weighting in weightings:
+            for root, cofactor in zip(weighting.roots, weighting.cofactors, strict=True):
+                turned = np.swapaxes(root.matrices, 1, 2)
+                influence.append(Blocks(start + root.row, start + root.column, turned))
+                cofactors.append(Blocks(start + root.row, start + root.row, cofactor.matrices))
+            start += weighting.n
+        return cls(whitened, tuple(influence), tuple(cofactors), tuple(adjusted))
+
+    def hats(self) -> Iterator[Array]:
+        """See :meth:`Whitened.hats`."""
+        for turn, block in zip(self.influence, self.adjusted, strict=True):
+            t = turn.matrices
+            yield t @ block @ np.swapaxes(t, 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Referral:
+    """What refers cofactors to inner constraints: Q = Q⁻ − G N Hᵀ − H N Gᵀ + G M Gᵀ.
+
+    N = (GᵀEG)⁻¹ (d, d) is `weight`; H = Q⁻EG of reduced unknowns (u, d) and points (p, 3, d); M = N GᵀE H N
+    is `m`; `before` is Q⁻ of the reduced unknowns.
+    """
+
+    freedom: Freedom
+    before: Array
+    weight: Array
+    h: Array
+    h_points: Array
+    m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cofactors:
+    """Cofactors after the adjustment.
+
+    Parameters
+    ----------
+    reduced : ndarray (u, u)
+        Of the reduced unknowns.
+    points : ndarray (p, 3, 3)
+        Of the points; zero for those held or not adjusted.
+    seen : ndarray (n, 2, 2)
+        Of the adjusted image coordinates, whitened, by points.
+    further : ndarray
+        Of the further adjusted observations, over their variances.
+    normal : Normal
+        Undamped normal equations, which joint cofactors are made of.
+    referral : Referral, optional
+        How cofactors come into the datum of inner constraints.
+    """
+
+    reduced: Array
+    points: Array
+    seen: Array
+    further: Array
+    normal: Normal
+    referral: Referral | None = None
+
+    def joint(self, columns: Rows, points: Rows) -> Array:
+        """Joint cofactor matrix of some reduced unknowns and of all coordinates of some points.
+
+        Parameters
+        ----------
+        columns : ndarray of int (k,)
+            Reduced unknowns.
+        points : ndarray of int (q,)
+            Eliminated points.
+
+        Returns
+        -------
+        ndarray (k + 3q, k + 3q)
+            In this order; zero for coordinates that are held.
+        """
+        linear, inverse = self.normal.linear, self.normal.inverse
+        system, k, size = linear.system, len(columns), len(columns) + 3 * len(points)
+        through = np.zeros((size, system.unknowns.size))
+        through[np.arange(k), columns] = 1.0
+        for q, j in enumerate(points):
+            through[k + 3 * q : k + 3 * q + 3] = -(_cross(linear, int(j)) @ inverse[j]).T
+        z = self.reduced if self.referral is None else self.referral.before
+        joint = through @ z @ through.T
+        for q, j in enumerate(points):
+            own = slice(k + 3 * q, k + 3 * q + 3)
+            joint[own, own] += inverse[j]
+        if self.referral is not None:
+            r = self.referral
+            g = np.concatenate([r.freedom.reduced[columns], *r.freedom.points[points]])
+            h = np.concatenate([r.h[columns], *r.h_points[points]])
+            one = g @ r.weight @ h.T
+            joint = joint - one - one.T + g @ r.m @ g.T
+        free = np.concatenate([np.ones(k), system.movable[points].ravel()])
+        covariance: Array = joint * np.outer(free, free)
+        return covariance
+
+
+def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_part: Mask) -> Cofactors:
+    """Cofactors of everything, at the estimates.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem there.
+    freedom : Freedom
+        Similarities that no observation opposes.
+    datum : ndarray of bool (p,), optional
+        Points over which inner constraints hold; by default the held unknowns of the system are the datum.
+    taking_part : ndarray of bool (p,)
+        Points that are adjusted.
+
+    Raises
+    ------
+    Singular
+        When the observations leave more undetermined than the datum.
+    """
+    system = linear.system
+    normal = linear.normal(0.0)
+    diagonal = normal.sums.diagonal.copy()
+    held = system.held.copy()
+    ends = np.flatnonzero(system.unknowns.kept >= 0)
+    still = system.unknowns.kept[ends, None] + np.arange(3)
+    held[still[system.movable[ends] == 0]] = True
+    if system.ties is not None:
+        z, points, seen, further = _tied(linear, normal, system.ties, held, taking_part)
+    else:
+        if datum is not None:
+            held[held_for(freedom, system.unknowns, diagonal)] = True
+            normal.hold(held)
+        z, points, seen, further = _marginal(linear, normal, held, taking_part)
+    kept = np.flatnonzero(system.unknowns.kept >= 0)
+    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    referral = None
+    if datum is not None and freedom.defect:
+        referral = _referral(normal, freedom, datum & taking_part, z)
+        z, points = _in_datum(referral, points)
+        points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    return Cofactors(z, points, seen, further, normal, referral)
+
+
+def _marginal(
+    linear: Linear, normal: Normal, held: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """Cofactors of reduced unknowns, points, image coordinates and further observations in some datum.
+
+    Those of the adjusted observations sum to the number of unknowns. Where they do not, the normal equations
+    have lost digits, and the inverse is had from the rows of the observations instead.
+
+    Raises
+    ------
+    Singular
+        When the observations do not determine the unknowns.
+    """
+    system = linear.system
+    free = int((~held).sum()) + _free_coordinates(linear, taking_part)
+    try:
+        arrow = normal.factorise()
+        if normal.least < PARALLEL:
+            raise Singular
+        z = arrow.inverse()
+        found = _with_inverse(linear, normal, z, held, taking_part)
+        missing = abs(_total(found) - free)
+        if arrow.weakest >= _RANK and missing < _EXACT:
+            return found
+    except Singular:
+        missing = np.inf
+    if normal.least < PARALLEL:
+        raise Singular
+    if is_small(linear):
+        found = _with_inverse(linear, normal, careful_inverse(normal, held), held, taking_part)
+        missing = abs(_total(found) - free)
+    if not missing < _INEXACT * max(1.0, system.unknowns.size / 1000.0):
+        raise Singular
+    return found
+
+
+def _tied(
+    linear: Linear, normal: Normal, ties: Ties, columns: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """The same where a stage ties images.
+
+    Raises
+    ------
+    Singular
+        When the observations do not determine the unknowns.
+    """
+    held = ties.held(columns)
+    tied = normal.tied(ties, held)
+    arrow = Arrow.factorise(np.zeros((0, 1)), tied.matrix)
+    q = arrow.inverse()
+    q[held], q[:, held] = 0.0, 0.0
+    found = _with_inverse(linear, normal, tied.back @ q @ tied.back.T, columns, taking_part)
+    slopes = normal.stage_slopes(ties)
+    found[3][-len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
+    missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
+    if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _TIED:
+        raise Singular
+    return found
+
+
+def _total(found: tuple[Array, Array, Array, Array]) -> float:
+    """Sum of the cofactors of the adjusted observations, whitened."""
+    _, _, seen, further = found
+    return float(np.trace(seen, axis1=1, axis2=2).sum() + further.sum())
+
+
+def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
+    """Number of unknown coordinates of eliminated points."""
+    eliminated = linear.system.pattern.eliminated == 1
+    return int(linear.system.movable[eliminated & taking_part].sum())
+
+
+def _with_inverse(
+    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """Cofactors from the inverse of the reduced normal equations."""
+    system = linear.system
+    z[held] = 0.0
+    z[:, held] = 0.0
+    points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
+
+    def work(_: int, a: int, b: int) -> None:
+        posterior(a, b, linear.rows, system.pattern, normal.inverse, z, points, seen)
+
+    in_parallel(work, system.chunks)
+    points *= system.movable[:, :, None] * system.movable[:, None, :]
+    points[~taking_part] = 0.0
+    kept = np.flatnonzero(system.unknowns.kept >= 0)
+    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    return z, points, seen, _further(linear, z, points)
+
+
+def _further(linear: Linear, z: Array, points: Array) -> Array:
+    """Cofactors of distances, observed coordinates and interior orientation, over their variances."""
+    system = linear.system
+    hats = np.zeros(len(system.sigma_root))
+    j, axis = system.further.coordinate.T
+    _, coordinates, _ = system.further.slices
+    hats[coordinates] = points[j, axis, axis]
+    _, _, rows, columns = system.prior_column
+    hats[rows] = z[columns, columns]
+    hats *= system.sigma_root**2
+    for k, column, slope in linear.distance_slopes():
+        hats[k] = slope @ z[np.ix_(column, column)] @ slope
+    return hats
+
+
+def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Referral:
+    """What refers cofactors to inner constraints over the chosen points."""
+    system = normal.linear.system
+    unknowns, d = system.unknowns, freedom.defect
+    g = np.where(chosen[:, None, None], freedom.points, 0.0)
+    g_reduced = np.zeros((unknowns.size, d))
+    kept = np.flatnonzero((unknowns.kept >= 0) & chosen)
+    columns = unknowns.kept[kept, None] + np.arange(3)
+    g_reduced[columns] = freedom.reduced[columns]
+    h = z @ (g_reduced + normal.reduced_sides(g))
+    h_points = normal.points(g, h) * system.movable[:, :, None]
+    inner = g.reshape(-1, d).T @ g.reshape(-1, d) + g_reduced.T @ g_reduced
+    weight = np.asarray(np.linalg.inv(inner), dtype=np.float64)
+    m = weight @ (np.einsum("pad,pae->de", g, h_points) + g_reduced.T @ h) @ weight
+    return Referral(freedom, z, weight, h, h_points, m)
+
+
+def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:
+    """Cofactors of the reduced unknowns and of the points, referred."""
+    freedom, weight, m = referral.freedom, referral.weight, referral.m
+    one = freedom.reduced @ weight @ referral.h.T
+    z = referral.before - one - one.T + freedom.reduced @ m @ freedom.reduced.T
+    cross = np.einsum("pad,de,pbe->pab", freedom.points, weight, referral.h_points, optimize=True)
+    points = points - cross - np.swapaxes(cross, 1, 2)
+    points += np.einsum("pad,de,pbe->pab", freedom.points, m, freedom.points, optimize=True)
+    return z, points
+
+
+def _cross(linear: Linear, point: int) -> Array:
+    """W of one point (u, 3): derivatives by the reduced unknowns against those by the point."""
+    pattern, last = linear.system.pattern, linear.rows.shape[2] - 3
+    w = np.zeros((linear.system.unknowns.size, 3))
+    for k in range(pattern.first[point], pattern.first[point + 1]):
+        b = linear.rows[k, :, last:]
+        for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
+            w[start : start + width] += linear.rows[k, :, column : column + width].T @ b
+    return w

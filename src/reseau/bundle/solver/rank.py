@@ -1,0 +1,137 @@
+"""What the observations do not determine, by name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...adjust import Failure
+from ...core.data import Array, Mask, Rows
+from .arrow import full
+from .datum import Freedom, held_for
+from .system import Linear
+
+__all__ = ["PARALLEL", "creeping_points", "steady_points", "undetermined", "weak_points"]
+
+# Eigenvalues of the scaled normal equations that count as zero.
+_ZERO = 1e-11
+# Of the scaled normal equations of a point whose rays are parallel: they cut at less than 3e-5 rad.
+PARALLEL = 1e-9
+_LISTED = 8
+# A point this many times as uncertain as the median is hardly determined.
+_CREEPING = 50.0
+# A point of a datum may be this many times as uncertain, by its own rays, as the median of all.
+_UNSTEADY = 5.0
+
+
+def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> Failure:
+    """A failure that names points, or combinations of the other unknowns, that nothing determines.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem at the estimates.
+    freedom : Freedom
+        Similarities that the datum takes care of.
+    costs : tuple of float
+        vᵀPv on the way.
+    """
+    weak = [linear.system.unknowns.network.points[j] for j in weak_points(linear)]
+    if weak:
+        listed = ", ".join(weak[:_LISTED]) + (" …" if len(weak) > _LISTED else "")
+        return Failure(f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}", costs=costs)
+    # Without what a stage ties, more would look undetermined than is.
+    vectors = _null_vectors(linear, freedom) if linear.system.ties is None else []
+    if not vectors:
+        return Failure("the normal equations are singular to rounding", costs=costs)
+    listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
+    reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
+    return Failure(reason, costs=costs, null_space=tuple(vectors))
+
+
+def weak_points(linear: Linear) -> Rows:
+    """Points whose own normal equations are singular: rays along one line."""
+    v = _own_normals(linear)
+    size = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
+    known = (size > 0).all(axis=1) & (linear.system.pattern.eliminated == 1)
+    scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
+    least = np.linalg.eigvalsh(scaled[known])[:, 0]
+    return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
+
+
+def steady_points(linear: Linear, chosen: Mask) -> Mask:
+    """Those of the chosen points (p,) that are fit to carry a datum.
+
+    A point that its rays hardly determine is no place to refer others to: inner constraints over it make all
+    of them as uncertain as itself. What its rays say with the images held does not depend on any datum.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linear problem at the estimates.
+    chosen : ndarray of bool (p,)
+        Points that are determined.
+    """
+    return chosen & ~_unsteady(linear, chosen, _UNSTEADY)
+
+
+def creeping_points(linear: Linear) -> Rows:
+    """Points that their rays, all but parallel, hardly determine: too little to come to an end with."""
+    every = np.ones(len(linear.prior), dtype=bool)
+    return np.asarray(np.flatnonzero(_unsteady(linear, every, _CREEPING)), dtype=np.intp)
+
+
+def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
+    """Which points (p,), images held, are so many times as uncertain as the median of the chosen ones."""
+    v, movable = _own_normals(linear), linear.system.movable > 0
+    # Held coordinates are as certain as can be: they must not count as what no ray determines.
+    largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
+    j, axis = np.nonzero(~movable)
+    v[j, axis, axis] = largest[j]
+    rows = np.flatnonzero(chosen & movable.any(axis=1) & (linear.system.pattern.eliminated == 1))
+    size = np.zeros(len(chosen))
+    size[rows] = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(v[rows])[:, 0], np.finfo(float).tiny))
+    median = float(np.median(size[rows])) if len(rows) else 0.0
+    return np.asarray(size > times * median) if median > 0 else np.zeros(len(chosen), dtype=bool)
+
+
+def _own_normals(linear: Linear) -> Array:
+    """Normal equations (p, 3, 3) of each point by itself, the images held."""
+    system = linear.system
+    last = linear.rows.shape[2] - 3
+    b = linear.rows[:, :, last:]
+    v = np.zeros((len(linear.prior), 3, 3))
+    rays = np.diff(system.unknowns.first)
+    lit = np.flatnonzero(rays)
+    if len(lit):
+        v[lit] = np.add.reduceat(np.swapaxes(b, 1, 2) @ b, system.unknowns.first[lit])
+    v[:, np.arange(3), np.arange(3)] += linear.prior[:, :, 0]
+    return v
+
+
+def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
+    """A basis of what is left undetermined among the reduced unknowns, with as many zeros as may be."""
+    system = linear.system
+    normal = linear.normal(0.0)
+    held = system.held.copy()
+    held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
+    diagonal = normal.sums.diagonal
+    normal.hold(held)
+    s = full(normal.sums.band, normal.sums.border)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = s * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(scaled)
+    null = vectors[:, values < _ZERO * max(values[-1], 1.0)]
+    count = null.shape[1]
+    for column in range(count):
+        rest = null[:, column:]
+        row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
+        null[:, [column, column + pick]] = null[:, [column + pick, column]]
+        null[:, column] /= null[row, column]
+        others = np.arange(count) != column
+        null[:, others] -= np.outer(null[:, column], null[row, others])
+    named = []
+    for vector in null.T:
+        strong = np.flatnonzero(np.abs(vector) > 1e-3)
+        strong = strong[np.argsort(-np.abs(vector[strong]))]
+        named.append({system.unknowns.names[i]: float(vector[i] * scale[i]) for i in strong})
+    return named

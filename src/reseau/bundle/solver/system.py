@@ -1,0 +1,394 @@
+"""The adjustment's observations made ready: misfits, normal equations and corrections at any values."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ...adjust.stochastic import Weighting
+from ...core.data import Array, Mask, Rows
+from ...optics import PlaneMapping
+from ..network.network import Network
+from .arrow import Arrow, full
+from .compiled import chunks_of, in_parallel
+from .further import Further
+from .imaging import BROWN_IMAGE, BROWN_OBJECT, MAPPING, OPENCV, Interior, Seen, derive, mapped, misfit
+from .normal import Sums, assemble, reduce_sides, substitute
+from .ties import Tied, Ties
+from .unknowns import Unknowns
+from .values import Correction, Values
+
+__all__ = ["Linear", "Normal", "System", "residuals"]
+
+# The sums of one part need as much memory as the matrix: a large one is formed in one part.
+_LARGE = 2000
+# Of an image coordinate computed from its unknowns, relative.
+_ROUNDING = 1e-14
+
+
+class System:
+    """All observations of an adjustment with their weights.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+        Columns.
+    further : Further
+        Observations other than image coordinates.
+    weighting : Weighting
+        Of the image coordinates, in the order of the network.
+    factors : ndarray
+        On the weights of the further observations.
+    held : ndarray of bool (u,)
+        Reduced unknowns that are held.
+    """
+
+    def __init__(
+        self, unknowns: Unknowns, further: Further, weighting: Weighting, factors: Array, held: Mask
+    ) -> None:
+        network, order = unknowns.network, unknowns.order
+        self.unknowns, self.further, self.held = unknowns, further, held
+        image = network.image_of[order]
+        extra = unknowns.extra_of[image]
+        roots = weighting.roots[0].matrices
+        self.seen = Seen(
+            image, network.point_of[order], network.camera_of[image], extra,
+            np.ascontiguousarray(network.xy[order]), np.ascontiguousarray(roots[order]),
+        )  # fmt: skip
+        self.sigma_root = np.sqrt(factors) / further.sigma
+        self.movable = np.where(network.held, 0.0, 1.0)
+        self.pattern = unknowns.pattern
+        self.ties = None if network.stage is None else Ties(unknowns, network.stage)
+        self.chunks = chunks_of(unknowns.first)
+        self.interior = _interior(network, unknowns)
+
+    @cached_property
+    def floor(self) -> float:
+        """A sum of squares that is no more than the rounding of the image coordinates."""
+        seen = np.einsum("nij,nj->ni", self.seen.root, self.seen.xy)
+        return float(_ROUNDING**2 * (seen**2).sum())
+
+    def cameras(self, values: Values) -> Interior:
+        """What the compiled loops take."""
+        return self.interior._replace(values=values.cameras, extra=values.extra)
+
+    def misfits(self, values: Values) -> tuple[Array, Array]:
+        """Weighted misfits of the image coordinates (n, 2), by points, and of the further observations."""
+        out = np.empty((len(self.seen.image), 2))
+        at, cameras, first = values.orientation, self.cameras(values), self.unknowns.first
+        in_parallel(
+            lambda _, a, b: misfit(int(first[a]), int(first[b]), self.seen, at, cameras, out), self.chunks
+        )
+        for mapping, _, rows in self.mappings(values):
+            xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows])
+            out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
+        return out, (self.further.computed(values) - self.further.value) * self.sigma_root
+
+    def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
+        """Cameras that are not compiled, their numbers, and the rows of their observations."""
+        found = []
+        for c, camera in enumerate(self.unknowns.network.cameras):
+            if camera.mapping is not None:
+                mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
+                found.append((mapping, c, np.flatnonzero(self.seen.camera == c).astype(np.intp)))
+        return found
+
+    def _weighted(self, rows: Rows, matrix: Array) -> Array:
+        weighted: Array = self.seen.root[rows] @ matrix
+        return weighted
+
+    def linearise(self, values: Values) -> Linear:
+        """Misfits and derivatives at some values."""
+        unknowns, n = self.unknowns, len(self.seen.image)
+        rows, out = np.zeros((n, 2, unknowns.width)), np.empty((n, 2))
+        at, cameras, first = values.orientation, self.cameras(values), unknowns.first
+        a_out, b_out = rows[:, :, :-3], rows[:, :, -3:]
+
+        def work(_: int, a: int, b: int) -> None:
+            derive(
+                int(first[a]), int(first[b]), self.seen, at, cameras, unknowns.free, unknowns.count,
+                self.movable, out, a_out, b_out,
+            )  # fmt: skip
+
+        in_parallel(work, self.chunks)
+        for mapping, c, own in self.mappings(values):
+            image, point, count = self.seen.image[own], self.seen.point[own], unknowns.count[c]
+            xy, by_pose, by_camera, by_point = mapped(mapping, at, image, point)
+            free = by_camera[:, :, unknowns.free[c, :count]]
+            b = by_point * self.movable[point][:, None, :]
+            out[own] = self._weighted(own, (xy - self.seen.xy[own])[:, :, None])[:, :, 0]
+            rows[own, :, : 6 + count] = self._weighted(own, np.concatenate([by_pose, free], axis=2))
+            rows[own, :, -3:] = self._weighted(own, b)
+        further = (self.further.computed(values) - self.further.value) * self.sigma_root
+        return Linear(self, values, rows, out, further)
+
+    @cached_property
+    def prior_column(self) -> tuple[Rows, Rows, Rows, Rows]:
+        """Where further observations act on reduced unknowns.
+
+        Rows of observed coordinates of kept points, their columns; rows of observed interior orientation,
+        their columns.
+        """
+        unknowns, (_, coordinates, interior) = self.unknowns, self.further.slices
+        kept = unknowns.kept[self.further.coordinate[:, 0]]
+        rows = np.flatnonzero(kept >= 0)
+        c, parameter = self.further.interior.T
+        place = [int(np.flatnonzero(unknowns.free[i] == p)[0]) for i, p in zip(c, parameter, strict=True)]
+        used = unknowns.camera[c] >= 0
+        return (
+            coordinates.start + rows,
+            kept[rows] + self.further.coordinate[rows, 1],
+            interior.start + np.flatnonzero(used),
+            (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
+        )
+
+
+class Linear:
+    """The linear problem at some values.
+
+    Parameters
+    ----------
+    rows : ndarray (n, 2, w)
+        Weighted derivatives of the image coordinates, by points; those by the point in the last three.
+    misfits : ndarray (n, 2)
+        Weighted misfits.
+    further : ndarray
+        Weighted misfits of the further observations.
+    """
+
+    def __init__(self, system: System, values: Values, rows: Array, misfits: Array, further: Array) -> None:
+        self.system, self.values, self.rows, self.misfits, self.further = (
+            system,
+            values,
+            rows,
+            misfits,
+            further,
+        )
+
+    @property
+    def cost(self) -> float:
+        """vᵀPv."""
+        return float((self.misfits**2).sum() + self.further @ self.further)
+
+    @cached_property
+    def prior(self) -> Array:
+        """Weights of observed coordinates of eliminated points, and weighted misfits (p, 3, 2)."""
+        network, further = self.system.unknowns.network, self.system.further
+        prior = np.zeros((len(network.points), 3, 2))
+        untouched = (network.rays == 0)[:, None] & ~network.observed
+        prior[..., 0] = np.where((self.system.movable == 0) | untouched, 1.0, 0.0)
+        at = further.slices[1]
+        j, axis = further.coordinate.T
+        root = self.system.sigma_root[at]
+        prior[j, axis, 0] += root**2
+        # An observed coordinate that was left out of a point that nothing else holds.
+        prior[j, axis, 0] = np.where(
+            (prior[j, axis, 0] == 0) & (network.rays[j] == 0), 1.0, prior[j, axis, 0]
+        )
+        prior[j, axis, 1] = root * self.further[at]
+        return prior
+
+    def _add_further(self, sums: Sums) -> None:
+        """Distances, and coordinates and parameters observed among the reduced unknowns."""
+        system = self.system
+        bands, kept = len(sums.band), system.unknowns.kept
+        rows, columns, rows_interior, columns_interior = system.prior_column
+        for row, column in zip([*rows, *rows_interior], [*columns, *columns_interior], strict=True):
+            _add(sums, int(column), system.sigma_root[row], float(self.further[row]), bands)
+        for k, column, slope in self.distance_slopes():
+            gradient = slope * self.further[k]
+            sums.gradient[column] += gradient
+            sums.diagonal[column] += slope**2
+            sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
+        held = np.flatnonzero(kept >= 0)
+        for j in held:
+            for axis in np.flatnonzero(system.movable[j] == 0):
+                _hold(sums, int(kept[j] + axis))
+
+    def distance_slopes(self) -> list[tuple[int, Rows, Array]]:
+        """For each distance its number, the six columns it touches, and its weighted derivatives (6,)."""
+        system, slopes = self.system, []
+        for k, (a, b) in enumerate(system.further.ends):
+            along = self.values.xyz[b] - self.values.xyz[a]
+            along = along / np.linalg.norm(along) * system.sigma_root[k]
+            slope = np.concatenate([-along * system.movable[a], along * system.movable[b]])
+            column = np.concatenate([system.unknowns.kept[e] + np.arange(3) for e in (a, b)])
+            slopes.append((k, column, slope))
+        return slopes
+
+    def normal(self, damping: float) -> Normal:
+        """The normal equations reduced to the unknowns other than points, damped."""
+        system, unknowns = self.system, self.system.unknowns
+        p, u, bands = len(self.prior), unknowns.size, unknowns.bands
+        inverse, side, diagonal = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
+        chunks = system.chunks if u < _LARGE or bands else [(0, p)]
+        parts = [
+            Sums(
+                np.zeros((bands, unknowns.bandwidth + 1)), np.zeros((u - bands, u)), np.zeros(u), np.zeros(u),
+                np.zeros(u),
+            )
+            for _ in chunks
+        ]  # fmt: skip
+        least = np.ones(len(chunks))
+
+        def work(part: int, a: int, b: int) -> None:
+            least[part] = assemble(
+                a, b, self.rows, self.misfits, system.pattern, self.prior, damping, parts[part], inverse,
+                side, diagonal,
+            )  # fmt: skip
+
+        in_parallel(work, chunks)
+        sums = parts[0]
+        for other in parts[1:]:
+            for mine, theirs in zip(sums, other, strict=True):
+                mine += theirs
+        self._add_further(sums)
+        sums.reduced[:] += sums.gradient
+        for column in np.flatnonzero(system.held):
+            _hold(sums, int(column))
+        if damping:
+            extra = damping * np.where(sums.diagonal > 0, sums.diagonal, 1.0)
+            sums.band[:, 0] += extra[:bands]
+            corner = np.arange(u - bands)
+            sums.border[corner, bands + corner] += extra[bands:]
+        return Normal(self, sums, inverse, side, diagonal, damping, float(least.min(initial=1.0)))
+
+
+class Normal:
+    """Reduced normal equations, ready to be solved."""
+
+    def __init__(
+        self, linear: Linear, sums: Sums, inverse: Array, side: Array, diagonal: Array, damping: float,
+        least: float,
+    ) -> None:  # fmt: skip
+        self.linear, self.sums, self.inverse, self.side = linear, sums, inverse, side
+        self.diagonal, self.damping, self.least = diagonal, damping, least
+
+    def hold(self, held: Mask) -> None:
+        """Hold reduced unknowns (u,)."""
+        for column in np.flatnonzero(held):
+            _hold(self.sums, int(column))
+
+    def factorise(self) -> Arrow:
+        """Cholesky factors; the sums are overwritten.
+
+        Raises
+        ------
+        Singular
+            When they have no positive definite solution.
+        """
+        return Arrow.factorise(self.sums.band, self.sums.border)
+
+    def tied(self, ties: Ties, held: Mask | None = None) -> Tied:
+        """The same in the unknowns proper, of which some (size,) may be held."""
+        linear, slopes = self.linear, self.stage_slopes(ties)
+        matrix, last = full(self.sums.band, self.sums.border), linear.further[-len(slopes) :]
+        return ties.tied(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
+
+    def stage_slopes(self, ties: Ties) -> Array:
+        """Weighted derivatives of a stage's readings and axis, the last of the further observations."""
+        system, further = self.linear.system, self.linear.system.further
+        root = system.sigma_root[further.readings.start :]
+        return ties.slopes(self.linear.values.stage, further.across, root)
+
+    def correction(self) -> Correction:
+        """The correction the normal equations give; raises Singular."""
+        ties, q, by_stage = self.linear.system.ties, None, 0.0
+        if ties is None:
+            y = self.factorise().solve(-self.sums.reduced)
+        else:
+            tied = self.tied(ties)
+            q = Arrow.factorise(np.zeros((0, 1)), tied.matrix).solve(-tied.gradient)
+            y, by_stage = tied.back @ q, float(tied.own @ q)
+        points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
+        gradient = self.sums.gradient @ y + float((self.side * points).sum()) + by_stage
+        bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
+        return Correction(y, points, float(-gradient + self.damping * bent), q)
+
+    def points(self, side: Array, y: Array) -> Array:
+        """Points (p, 3, s) for right-hand sides (p, 3, s) and reduced unknowns (u, s)."""
+        linear, out = self.linear, np.zeros(side.shape)
+
+        def work(_: int, a: int, b: int) -> None:
+            substitute(a, b, linear.rows, linear.system.pattern, self.inverse, side, y, out)
+
+        in_parallel(work, linear.system.chunks)
+        return out
+
+    def reduced_sides(self, side: Array) -> Array:
+        """− W V⁻¹ of right-hand sides (p, 3, s) of the points, (u, s)."""
+        linear = self.linear
+        out = np.zeros((linear.system.unknowns.size, side.shape[2]))
+        reduce_sides(0, len(side), linear.rows, linear.system.pattern, self.inverse, side, out)
+        return out
+
+
+def _add(sums: Sums, column: int, root: float, misfit_: float, bands: int) -> None:
+    sums.gradient[column] += root * misfit_
+    sums.diagonal[column] += root**2
+    if column < bands:
+        sums.band[column, 0] += root**2
+    else:
+        sums.border[column - bands, column] += root**2
+
+
+def _hold(sums: Sums, column: int) -> None:
+    """Leave an unknown as it is."""
+    bands = len(sums.band)
+    if column < bands:
+        sums.band[column] = 0.0
+        reach = min(column, sums.band.shape[1] - 1)
+        back = np.arange(1, reach + 1)
+        sums.band[column - back, back] = 0.0
+        sums.band[column, 0] = 1.0
+    else:
+        sums.border[column - bands] = 0.0
+    sums.border[:, column] = 0.0
+    if column >= bands:
+        sums.border[column - bands, column] = 1.0
+    sums.gradient[column] = sums.reduced[column] = sums.diagonal[column] = 0.0
+
+
+def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) -> Array:
+    """v (px) of some image observations of a network, adjusted or not, (len(rows), 2)."""
+    image = network.image_of[rows]
+    unit = np.tile(np.eye(2), (len(rows), 1, 1))
+    seen = Seen(
+        image,
+        network.point_of[rows],
+        network.camera_of[image],
+        unknowns.extra_of[image],
+        network.xy[rows],
+        unit,
+    )
+    cameras = _interior(network, unknowns)._replace(values=values.cameras, extra=values.extra)
+    out = np.empty((len(rows), 2))
+    misfit(0, len(rows), seen, values.orientation, cameras, out)
+    for c, camera in enumerate(network.cameras):
+        if camera.mapping is not None:
+            own = np.flatnonzero(seen.camera == c)
+            mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
+            xy, *_ = mapped(mapping, values.orientation, image[own], seen.point[own])
+            out[own] = xy - seen.xy[own]
+    return out
+
+
+def _interior(network: Network, unknowns: Unknowns) -> Interior:
+    """Cameras in columns, their values still to come."""
+    cameras = network.cameras
+    brown = {"object": BROWN_OBJECT, "image": BROWN_IMAGE}
+    kinds = {"opencv": OPENCV, "mapping": MAPPING}
+    kind = [kinds.get(c.model, brown[c.side]) for c in cameras]
+    balance = np.array([c.balance_radius_mm for c in cameras])[:, None] ** [2.0, 4.0, 6.0]
+    grid = np.array([((c.width - 1) / 2, (c.height - 1) / 2, *c.pitch_mm) for c in cameras])
+    base = [network.cameras[c].additional.base_mm for c, _ in unknowns.extra_names]  # type: ignore[union-attr]
+    nothing = np.zeros((0, 12))
+    return Interior(
+        np.array(kind, dtype=np.intp),
+        nothing,
+        balance,
+        grid,
+        nothing,
+        np.array(base or [0.0], dtype=np.float64),
+    )

@@ -1,0 +1,217 @@
+"""Where each unknown of a network stands in the normal equations, and which rays touch it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from ...core.data import Mask, Rows
+from ..network.network import Network
+from .imaging import CAMERA_WIDTH, EBNER
+from .normal import SEGMENTS, Pattern, locals_of
+
+__all__ = ["Unknowns"]
+
+# Fewer unknowns than this are factorised as a full matrix, whatever their pattern.
+_DENSE = 1500
+_POINT = ("X", "Y", "Z")
+_POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Columns of the reduced normal equations: images with what is theirs alone, then what they share.
+
+    Parameters
+    ----------
+    network : Network
+        Whose unknowns.
+    active : ndarray of bool (m,)
+        Images that take part.
+    pose : ndarray of int (m,)
+        First of the six columns of each image: rotation about the axes of the camera, projection centre.
+    camera : ndarray of int (c,)
+        First column of each camera's free parameters.
+    extra : ndarray of int (e,)
+        First of the twelve columns of each set of additional parameters; −1 for a set that is held.
+    extra_of : ndarray of int (m,)
+        Set of each image, −1 for none.
+    extra_names : tuple of (int, str) (e,)
+        Camera and label of each set.
+    kept : ndarray of int (p,)
+        First of three columns of points that are not eliminated, −1 for the others.
+    size, bands, bandwidth : int
+        Number of columns, those of the band, and how many places below the diagonal it reaches.
+    """
+
+    network: Network
+    active: Mask
+    pose: Rows
+    camera: Rows
+    extra: Rows
+    extra_of: Rows
+    extra_names: tuple[tuple[int, str], ...]
+    kept: Rows
+    size: int
+    bands: int
+    bandwidth: int
+
+    @classmethod
+    def of(cls, network: Network, active: Mask) -> Unknowns:
+        """The unknowns of a network of which some images take part."""
+        extra_of, extra_names = _extra_sets(network, active)
+        users = np.bincount(network.camera_of[active], minlength=len(network.cameras))
+        extra_users = np.bincount(extra_of[active & (extra_of >= 0)], minlength=len(extra_names))
+        counts = np.array([len(camera.free) for camera in network.cameras])
+        sets = [network.cameras[c].additional for c, _ in extra_names]
+        free_extra: Mask = np.array([a is not None and a.free for a in sets], dtype=np.bool_)
+        order, reach = _ordered(network, active)
+        m = len(network.images)
+        pose, camera = np.full(m, -1), np.full(len(users), -1)
+        extra, at, ends = np.full(len(extra_names), -1), 0, []
+        for i in order:
+            pose[i] = at
+            at += 6
+            c, e = network.camera_of[i], extra_of[i]
+            if users[c] == 1:
+                camera[c] = at
+                at += counts[c]
+            if e >= 0 and extra_users[e] == 1 and free_extra[e]:
+                extra[e] = at
+                at += EBNER
+            ends.append(at)
+        begins = np.array([0, *ends[:-1]])
+        bandwidth = int(max((ends[b] - 1 - begins[a] for a, b in enumerate(reach)), default=0))
+        bands = at if at > _DENSE and 4 * bandwidth < at else 0
+        for c in np.flatnonzero(users > 1):
+            camera[c] = at
+            at += counts[c]
+        for e in np.flatnonzero((extra_users > 1) & free_extra):
+            extra[e] = at
+            at += EBNER
+        kept = np.full(len(network.points), -1)
+        for j in np.unique(network.distance_of):
+            kept[j] = at
+            at += 3
+        return cls(
+            network, active, pose, camera, extra, extra_of, extra_names, kept, int(at), int(bands),
+            bandwidth if bands else 0,
+        )  # fmt: skip
+
+    @cached_property
+    def order(self) -> Rows:
+        """Observations in the order of their points (n,)."""
+        return np.argsort(self.network.point_of, kind="stable")
+
+    @cached_property
+    def first(self) -> Rows:
+        """Where the rays of each point begin (p + 1,)."""
+        return np.concatenate([[0], np.cumsum(self.network.rays)])
+
+    @cached_property
+    def free(self) -> Rows:
+        """Rows of the free parameters of each camera (c, 12 or more), padded with zeros."""
+        widest = max(CAMERA_WIDTH, *(len(camera.names) for camera in self.network.cameras))
+        rows = np.zeros((len(self.network.cameras), widest), dtype=np.intp)
+        for row, camera in zip(rows, self.network.cameras, strict=True):
+            row[: len(camera.free)] = [camera.names.index(name) for name in camera.free]
+        return rows
+
+    @cached_property
+    def count(self) -> Rows:
+        """Number of the free parameters of each camera (c,)."""
+        return np.array([len(camera.free) for camera in self.network.cameras], dtype=np.intp)
+
+    @cached_property
+    def dropped(self) -> Mask:
+        """Columns (u,) of additional parameters that stay zero."""
+        held = np.zeros(self.size, dtype=bool)
+        for (c, label), at in zip(self.extra_names, self.extra, strict=True):
+            extra = self.network.cameras[c].additional
+            if at >= 0 and extra is not None and extra.dropped:
+                held[at : at + EBNER] = [extra.name(k, label) in extra.dropped for k in range(EBNER)]
+        return held
+
+    @property
+    def width(self) -> int:
+        """Entries in a ray's row of derivatives."""
+        return 6 + int(self.count.max()) + (EBNER if self.extra_names else 0) + 3
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Which unknowns each ray touches, in the order of points."""
+        image, point = self.network.image_of[self.order], self.network.point_of[self.order]
+        camera, extra = self.network.camera_of[image], self.extra_of[image]
+        n = len(image)
+        start, width = np.full((n, SEGMENTS), -1, dtype=np.intp), np.zeros((n, SEGMENTS), dtype=np.intp)
+        column = np.zeros((n, SEGMENTS), dtype=np.intp)
+        start[:, 0], width[:, 0] = self.pose[image], 6
+        start[:, 1], width[:, 1], column[:, 1] = self.camera[camera], self.count[camera], 6
+        if self.extra_names:
+            start[:, 2] = np.where(extra >= 0, self.extra[extra], -1)
+            width[:, 2], column[:, 2] = np.where(start[:, 2] >= 0, EBNER, 0), self.width - 3 - EBNER
+        start[:, 3] = self.kept[point]
+        width[:, 3], column[:, 3] = np.where(start[:, 3] >= 0, 3, 0), self.width - 3
+        place = np.zeros_like(start)
+        table = np.zeros((n * SEGMENTS, 3), dtype=np.intp)
+        number = np.zeros(len(self.first) - 1, dtype=np.intp)
+        total = locals_of(self.first, start, width, place, table, number)
+        at, size, offset = (np.ascontiguousarray(table[:total, i]) for i in range(3))
+        local = np.concatenate([[0], np.cumsum(number)])
+        eliminated = (self.kept < 0).astype(np.intp)
+        return Pattern(self.first, start, width, column, place, local, at, size, offset, eliminated)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What each column is, as it is named in messages."""
+        names = [""] * self.size
+        for i, at in enumerate(self.pose):
+            if at >= 0:
+                names[at : at + 6] = [f"{name} of image {self.network.images[i]}" for name in _POSE]
+        for camera, at in zip(self.network.cameras, self.camera, strict=True):
+            if at >= 0:
+                names[at : at + len(camera.free)] = [f"{name} of camera {camera.id}" for name in camera.free]
+        for (_, label), at in zip(self.extra_names, self.extra, strict=True):
+            if at >= 0:
+                names[at : at + EBNER] = [f"b{i + 1} of {label}" for i in range(EBNER)]
+        for j in np.flatnonzero(self.kept >= 0):
+            at = self.kept[j]
+            names[at : at + 3] = [f"{name} of point {self.network.points[j]}" for name in _POINT]
+        return tuple(names)
+
+
+def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, str], ...]]:
+    """The set of additional parameters of each image, and what each set is called."""
+    sets: dict[tuple[int, str], int] = {}
+    rows = np.full(len(network.images), -1)
+    for i in np.flatnonzero(active):
+        camera = network.cameras[network.camera_of[i]]
+        if camera.additional is None:
+            continue
+        label = {
+            "camera": f"camera {camera.id}",
+            "group": f"group {network.groups[i]}",
+            "image": f"image {network.images[i]}",
+        }[camera.additional.per]
+        rows[i] = sets.setdefault((int(network.camera_of[i]), label), len(sets))
+    return rows, tuple(sets)
+
+
+def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
+    """Active images in an order that keeps neighbours together, and how far down each reaches in it."""
+    images = np.flatnonzero(active)
+    if 6 * len(images) <= _DENSE:
+        return images, np.full(len(images), len(images) - 1)
+    n = len(network.image_of)
+    shape = (len(network.images), len(network.points))
+    sees = scipy.sparse.csr_array((np.ones(n, np.int32), (network.image_of, network.point_of)), shape=shape)
+    common = scipy.sparse.csr_array(sees @ sees.T)[images][:, images]
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(scipy.sparse.csr_matrix(common), symmetric_mode=True)
+    turned = scipy.sparse.coo_array(common[order][:, order])
+    reach = np.arange(len(images))
+    np.maximum.at(reach, turned.col, turned.row)
+    return images[order], reach

@@ -1,0 +1,111 @@
+"""Values of all unknowns of a network, and how a correction changes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.data import Array, Rows
+from ...optics.poses import rotation_matrix
+from ..network.stage import Moved
+from .imaging import EBNER, Orientation
+from .ties import Ties
+from .unknowns import Unknowns
+
+__all__ = ["Correction", "Values"]
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """A correction of the unknowns, and what it promises.
+
+    Parameters
+    ----------
+    reduced : ndarray (u,)
+        Of the reduced unknowns.
+    points : ndarray (p, 3)
+        Of the eliminated points.
+    predicted : float
+        Decrease of the weighted sum of squares, to first order.
+    tied : ndarray, optional
+        Of the unknowns proper, where a stage ties images.
+    """
+
+    reduced: Array
+    points: Array
+    predicted: float
+    tied: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Values of the unknowns.
+
+    Parameters
+    ----------
+    rotation : ndarray (m, 3, 3)
+        Rotations from object to camera.
+    x0 : ndarray (m, 3)
+        Projection centres.
+    xyz : ndarray (p, 3)
+        Object points.
+    cameras : ndarray (c, 12)
+        Parameters of the cameras, padded.
+    extra : ndarray (e, 12)
+        Sets of additional parameters; one row at least.
+    stage : Moved, optional
+        Readings of a stage, and its axis.
+    """
+
+    rotation: Array
+    x0: Array
+    xyz: Array
+    cameras: Array
+    extra: Array
+    stage: Moved | None = None
+
+    @classmethod
+    def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
+        """Values with the cameras as the network gives them."""
+        network = unknowns.network
+        cameras = np.zeros(unknowns.free.shape)
+        for row, camera in zip(cameras, network.cameras, strict=True):
+            row[: len(camera.values)] = camera.values
+        return cls(rotation, x0, xyz, cameras, np.zeros((max(1, len(unknowns.extra)), EBNER)))
+
+    @property
+    def orientation(self) -> Orientation:
+        """What the compiled loops take."""
+        return Orientation(self.rotation, self.x0, self.xyz)
+
+    def beyond(self, radius: float) -> Rows:
+        """Points further than this from the origin."""
+        return np.flatnonzero(~(np.linalg.norm(self.xyz, axis=1) <= radius)).astype(np.intp)
+
+    def confined(self, points: Rows, radius: float) -> Values:
+        """The same with these points brought back to a distance from the origin."""
+        xyz = self.xyz.copy()
+        xyz[points] *= radius / np.linalg.norm(xyz[points], axis=1, keepdims=True)
+        return replace(self, xyz=xyz)
+
+    def moved(self, unknowns: Unknowns, step: Correction, ties: Ties | None = None) -> Values:
+        """The values after a correction; rotations turn about the axes of their camera."""
+        y = step.reduced
+        images = unknowns.pose >= 0
+        pose = np.zeros((len(images), 6))
+        pose[images] = y[unknowns.pose[images, None] + np.arange(6)]
+        rotation = self.rotation.copy()
+        rotation[images] = rotation_matrix(pose[images, :3]) @ self.rotation[images]
+        cameras, extra, xyz = self.cameras.copy(), self.extra.copy(), self.xyz + step.points
+        for c in np.flatnonzero(unknowns.camera >= 0):
+            count = unknowns.count[c]
+            cameras[c, unknowns.free[c, :count]] += y[unknowns.camera[c] : unknowns.camera[c] + count]
+        for e in np.flatnonzero(unknowns.extra >= 0):
+            extra[e] += y[unknowns.extra[e] : unknowns.extra[e] + EBNER]
+        kept = np.flatnonzero(unknowns.kept >= 0)
+        xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
+        x0, stage = self.x0 + pose[:, 3:], self.stage
+        if ties is not None and stage is not None and step.tied is not None:
+            stage, x0 = ties.stepped(stage, self.x0, y, step.tied)
+        return Values(rotation, x0, xyz, cameras, extra, stage)

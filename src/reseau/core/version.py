@@ -1,0 +1,5 @@
+"""The version, as every document's provenance states it."""
+
+__all__ = ["__version__"]
+
+__version__ = "0.1.0"

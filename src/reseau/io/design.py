@@ -1,0 +1,130 @@
+"""``reseau-design/1``: a reseau, or the rods of a test object."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..core.data import Array
+from .document import Document, Strict
+
+__all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
+
+
+class Mark(Strict):
+    """What every mark of a design looks like, in the unit of the design."""
+
+    shape: Literal["cross", "disk", "square", "line-grid", "rod"]
+    size: float | None = Field(default=None, gt=0)
+    line_width: float | None = Field(default=None, gt=0)
+
+
+class DesignPoint(Strict):
+    """One mark of a design: coordinates in its plane, and where in the image it may be expected."""
+
+    id: str = Field(min_length=1)
+    x: float | None
+    y: float | None
+    sigma: float | None = Field(default=None, ge=0)
+    nominal_px: tuple[float, float] | None = None
+
+
+class Rings(Strict):
+    """Coded rings around some of the disks of a sheet, which tell these from all others.
+
+    Parameters
+    ----------
+    inner, outer : float
+        Diameters of the rings in the unit of the design.
+    sectors : dict of str to tuple of (float, float)
+        For each coded point the parts of its ring that are of the marks' polarity: from one angle to another,
+        degrees from x towards y.
+    """
+
+    inner: float = Field(gt=0)
+    outer: float = Field(gt=0)
+    sectors: dict[str, tuple[tuple[float, float], ...]] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.inner < self.outer:
+            raise ValueError(f"rings reach from {self.inner} to {self.outer}")
+        for name, sectors in self.sectors.items():
+            if not all(start < end <= start + 360 for start, end in sectors):
+                raise ValueError(f"a sector of {name!r} does not go from an angle to a greater one")
+        return self
+
+
+class ReseauDesign(Document):
+    """``reseau-design/1``: a reseau, a sheet of targets, or the rods of a test object."""
+
+    SCHEMA: ClassVar[str] = "reseau-design/1"
+    name: str
+    unit: str
+    mark: Mark
+    polarity: Literal["dark", "bright"]
+    origin: str | None = None
+    axis: str | None = None
+    points: tuple[DesignPoint, ...]
+    rings: Rings | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.points:
+            raise ValueError("the design has no points")
+        names = set()
+        for point in self.points:
+            if point.id in names:
+                raise ValueError(f"the id {point.id!r} stands twice among the points")
+            names.add(point.id)
+            if (point.x is None) != (point.y is None):
+                raise ValueError(f"point {point.id!r} has only one of its two coordinates")
+        for role in ("origin", "axis"):
+            named = getattr(self, role)
+            if named is not None and named not in names:
+                raise ValueError(f"`{role}` names {named!r}, which is none of the points")
+        if self.origin is not None and self.origin == self.axis:
+            raise ValueError(f"`origin` and `axis` both name {self.origin!r}; they must differ")
+        if self.rings is not None:
+            self._check_rings(self.rings, names)
+        return self
+
+    def _check_rings(self, rings: Rings, names: set[str]) -> None:
+        for name in rings.sectors:
+            if name not in names:
+                raise ValueError(f"`rings` names {name!r}, which is none of the points")
+        if self.mark.shape != "disk" or self.mark.size is None or self.mark.size >= rings.inner:
+            raise ValueError("`rings` stand around disks of a size that is less than theirs")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file; without coded rings there is no key for them."""
+        content = super().to_dict()
+        if self.rings is None:
+            del content["rings"]
+        return content
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the points."""
+        return tuple(point.id for point in self.points)
+
+    @property
+    def xy(self) -> Array:
+        """Coordinates in the plane of the design, (n, 2); NaN where unknown."""
+        return np.array([(p.x, p.y) for p in self.points], dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def nominal_px(self) -> Array:
+        """Prior positions in the image, (n, 2); NaN where there is none."""
+        return np.array([p.nominal_px or (np.nan, np.nan) for p in self.points], dtype=np.float64)
+
+    def expected_at(self, nominal_px: Array) -> Self:
+        """The same design with prior positions in an image (n, 2); NaN where a mark has none."""
+        places = [(float(x), float(y)) if np.isfinite([x, y]).all() else None for x, y in nominal_px]
+        points = [
+            point.model_copy(update={"nominal_px": place})
+            for point, place in zip(self.points, places, strict=True)
+        ]
+        return self.model_copy(update={"points": tuple(points)})

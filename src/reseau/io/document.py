@@ -1,0 +1,141 @@
+"""The one way in which documents are read and written: strictly, and whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ..core.errors import FormatError, InputError
+from ..core.provenance import canonical_json
+
+__all__ = ["Document", "Strict", "read_text", "write_whole"]
+
+
+class Strict(BaseModel):
+    """A part of a document: no unknown key, no coercion of types, no NaN."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+def read_text(path: Path) -> str:
+    """Text of a UTF-8 file of less than 1 GB.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, is too large or is no UTF-8.
+    """
+    try:
+        if path.stat().st_size > 1_000_000_000:
+            raise InputError("is larger than 1 GB", where=path)
+        return path.read_text("utf-8")
+    except UnicodeDecodeError:
+        raise InputError("is no UTF-8 text", where=path, do="is this the file you meant?") from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file that appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist or cannot be written to.
+    """
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with draft.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise InputError(f"cannot be written ({error.strerror})", where=path) from None
+
+
+def _one_line(error: ValidationError) -> str:
+    """Say the first complaint of pydantic in one line, and how many more there are."""
+    complaints = error.errors(include_url=False, include_context=False)
+    first = complaints[0]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    text = {
+        "extra_forbidden": f"unknown key `{key}`",
+        "missing": f"missing key `{key}`",
+    }.get(first["type"])
+    if text is None:
+        message = first["msg"].removeprefix("Value error, ")
+        text = f"`{key}`: {message}" if key else message
+    more = len(complaints) - 1
+    return text + (f" (and {more} more)" if more else "")
+
+
+class Document(Strict):
+    """A JSON file with a ``schema`` key first.
+
+    Subclasses set `SCHEMA`, as in ``reseau-design/1``.
+    """
+
+    SCHEMA: ClassVar[str]
+
+    @classmethod
+    def parse(cls, text: str, *, where: object) -> Self:
+        """Read a document from JSON text; `where` names it in messages.
+
+        Raises
+        ------
+        FormatError
+            When it is no JSON, or not this document.
+        """
+        try:
+            content = json.loads(text)
+        except (json.JSONDecodeError, RecursionError) as error:
+            raise FormatError(f"is no JSON ({error})", where=where) from None
+        found = content.pop("schema", None) if isinstance(content, dict) else None
+        if found != cls.SCHEMA:
+            kind = "has no key `schema`" if found is None else f"has the schema {found!r}"
+            raise FormatError(f"{kind}; {cls.SCHEMA!r} was expected", where=where)
+        try:
+            # As JSON again: pydantic's strict mode takes a JSON array for a tuple, but not a Python list.
+            return cls.model_validate_json(json.dumps(content))
+        except ValidationError as error:
+            raise FormatError(_one_line(error), where=where) from None
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a document from a file.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read.
+        FormatError
+            When it is not this document.
+        """
+        return cls.parse(read_text(Path(path)), where=path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file, ``schema`` first."""
+        return {"schema": self.SCHEMA} | self.model_dump(mode="json")
+
+    def to_json(self) -> str:
+        """The file's text: same content, same bytes."""
+        return canonical_json(self.to_dict())
+
+    def write(self, path: Path | str) -> None:
+        """Write the document, whole or not at all.
+
+        Raises
+        ------
+        InputError
+            When the place cannot be written to.
+        """
+        write_whole(Path(path), self.to_json())

@@ -1,0 +1,160 @@
+"""``frame-corners/1`` and ``reseau-orientation/1``: the frame of a camera, and a scan oriented by it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..core.data import Array, ImagePoints
+from .document import Document, Strict
+
+__all__ = [
+    "CORNERS",
+    "EDGES",
+    "CornerPositions",
+    "FrameCorners",
+    "FrameOrientation",
+    "FrameTransform",
+    "MeasuredCorner",
+    "MeasuredEdge",
+]
+
+CORNERS = ("ul", "ur", "lr", "ll")
+"""Upper left, upper right, lower right, lower left: once around, as the frame is seen."""
+EDGES = ("upper", "right", "lower", "left")
+"""In the same order: an edge begins at the corner that stands at its place in `CORNERS`."""
+
+Pair = tuple[float, float]
+
+
+class CornerPositions(Strict):
+    """Millimetres in the photo-coordinate system, x right, y up."""
+
+    ul: Pair
+    ur: Pair
+    lr: Pair
+    ll: Pair
+
+
+class FrameCorners(Document):
+    """``frame-corners/1``: the corners of a camera's frame as calibrated."""
+
+    SCHEMA: ClassVar[str] = "frame-corners/1"
+    unit: Literal["mm"] = "mm"
+    corners: CornerPositions
+    sigma: Pair | None = None
+
+    @model_validator(mode="after")
+    def _around(self) -> Self:
+        xy = self.xy()
+        side, following = np.roll(xy, -1, axis=0) - xy, np.roll(xy, -2, axis=0) - np.roll(xy, -1, axis=0)
+        # With y up, upper left to upper right to lower right turns clockwise at each corner.
+        if not (side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] < 0).all():
+            raise ValueError("`corners` do not go around a frame with y up: ul, ur, lr, ll")
+        if self.sigma is not None and min(self.sigma) < 0:
+            raise ValueError("`sigma` is below zero")
+        return self
+
+    def xy(self) -> Array:
+        """The corners in the order of `CORNERS`, (4, 2)."""
+        return np.array([getattr(self.corners, name) for name in CORNERS], dtype=np.float64)
+
+    @classmethod
+    def from_xy(cls, xy: Array, sigma: Pair | None = None) -> Self:
+        """From corners (4, 2) in the order of `CORNERS`."""
+        named = {name: (float(x), float(y)) for name, (x, y) in zip(CORNERS, xy, strict=True)}
+        return cls(corners=CornerPositions(**named), sigma=sigma)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file; without sigmas where none are known."""
+        content = super().to_dict()
+        return content if self.sigma is not None else {k: v for k, v in content.items() if k != "sigma"}
+
+
+class MeasuredCorner(Strict):
+    """A point in the scan, pixels, with its standard deviations and correlation."""
+
+    x: float
+    y: float
+    sx: float = Field(ge=0)
+    sy: float = Field(ge=0)
+    rho: float = Field(ge=-1, le=1)
+
+    @classmethod
+    def from_columns(cls, xy: Array, cov: Array) -> Self:
+        """From coordinates (2,) and covariance (2, 2)."""
+        sx, sy = (float(s) for s in np.sqrt(np.maximum(np.diagonal(cov), 0.0)))
+        rho = float(np.clip(cov[0, 1] / (sx * sy), -1, 1)) if sx * sy > 0 else 0.0
+        return cls(x=float(xy[0]), y=float(xy[1]), sx=sx, sy=sy, rho=rho)
+
+
+class MeasuredEdge(Strict):
+    """How well an edge was found: profiles used and rejected, their scatter, how far it bows."""
+
+    found: bool
+    points: int
+    rejected: int
+    rms_px: float | None
+    curvature_px: float | None
+    why: str = ""
+
+
+class FrameTransform(Strict):
+    """Transformation of the scan to calibrated corners.
+
+    `sigma_mm` and the parameters' sigmas are null where four corners leave no redundancy.
+    """
+
+    kind: Literal["similarity", "affine", "projective", "bilinear"]
+    parameters: dict[str, dict[str, float | None]]
+    residuals_mm: dict[str, Pair]
+    sigma_mm: Pair | None
+
+
+class FrameOrientation(Document):
+    """``reseau-orientation/1``: the inner orientation of one scanned frame, or why there is none.
+
+    Of a frame that was declined the numbers are null. `angle_deg` is the direction of the photo x-axis, which
+    runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-orientation/1"
+    image: str
+    status: Literal["oriented", "three-edges", "declined"]
+    why: str
+    format_mm: Pair | None
+    channel: str | None
+    corners: dict[Literal["ul", "ur", "lr", "ll"], MeasuredCorner] | None
+    principal_point: MeasuredCorner | None
+    angle_deg: float | None
+    angle_sigma_deg: float | None
+    px_per_mm: Pair | None
+    edges: dict[Literal["upper", "right", "lower", "left"], MeasuredEdge]
+    transform: FrameTransform | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        numbers = (self.corners, self.principal_point, self.angle_deg, self.angle_sigma_deg)
+        if self.status == "declined":
+            if not self.why:
+                raise ValueError("a frame that was declined says `why`")
+        elif any(n is None for n in numbers) or set(self.corners or ()) != set(CORNERS):
+            raise ValueError(f"a frame that is {self.status!r} has four corners, principal point and angle")
+        return self
+
+    def image_points(self) -> ImagePoints:
+        """The corners in the scan with their covariances; none of a frame that was declined."""
+        corners = self.corners or {}
+        found = [(name, corners[name]) for name in CORNERS if name in corners]
+        xy = np.array([(c.x, c.y) for _, c in found], dtype=np.float64).reshape(-1, 2)
+        cov = np.array(
+            [[[c.sx**2, c.rho * c.sx * c.sy], [c.rho * c.sx * c.sy, c.sy**2]] for _, c in found]
+        ).reshape(-1, 2, 2)
+        return ImagePoints(tuple(name for name, _ in found), xy, cov)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content as it stands in the file; `transform` only where there is one."""
+        content = super().to_dict()
+        return content if self.transform else {k: v for k, v in content.items() if k != "transform"}

@@ -1,0 +1,144 @@
+"""``reseau-measurement/1``: image coordinates of marks, measured by us or by others."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+
+from ..core.data import Array, ImagePoints, Mask
+from ..core.errors import FormatError
+from .document import Document, Strict, read_text
+
+__all__ = ["MeasuredPoint", "ReseauMeasurement"]
+
+
+class MeasuredPoint(Strict):
+    """One mark as it was, or was not, measured; sigmas in pixels."""
+
+    id: str
+    x: float | None = None
+    y: float | None = None
+    sx: float | None = None
+    sy: float | None = None
+    rho: float | None = None
+    ok: bool
+    why: str = ""
+
+
+class ReseauMeasurement(Document):
+    """``reseau-measurement/1``: image coordinates of marks, and why some have none."""
+
+    SCHEMA: ClassVar[str] = "reseau-measurement/1"
+    image: str
+    sha256: str
+    unit: Literal["px"] = "px"
+    points: tuple[MeasuredPoint, ...]
+    found: int
+    expected: int
+
+    def image_points(self) -> ImagePoints:
+        """The marks that were measured.
+
+        A point without sigmas gets those of a coordinate known to one pixel.
+        """
+        ok = [p for p in self.points if p.ok and p.x is not None and p.y is not None]
+        xy = np.array([(p.x, p.y) for p in ok], dtype=np.float64).reshape(-1, 2)
+        s = np.array([(p.sx or 1.0, p.sy or 1.0) for p in ok], dtype=np.float64).reshape(-1, 2)
+        cov = np.zeros((len(ok), 2, 2))
+        cov[:, 0, 0], cov[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
+        cov[:, 0, 1] = cov[:, 1, 0] = np.array([p.rho or 0.0 for p in ok]) * s[:, 0] * s[:, 1]
+        return ImagePoints(tuple(p.id for p in ok), xy, cov)
+
+    @classmethod
+    def from_columns(
+        cls,
+        image: str,
+        sha256: str,
+        ids: Sequence[str],
+        xy: Array,
+        cov: Array,
+        ok: Mask,
+        why: Sequence[str],
+    ) -> Self:
+        """Marks as columns: those that are not `ok` have the reason and no coordinates."""
+        points = []
+        for i, name in enumerate(ids):
+            if not ok[i]:
+                points.append(MeasuredPoint(id=name, ok=False, why=why[i]))
+                continue
+            sx, sy = np.sqrt(np.diagonal(cov[i]))
+            points.append(
+                MeasuredPoint(
+                    id=name,
+                    x=float(xy[i, 0]),
+                    y=float(xy[i, 1]),
+                    sx=float(sx),
+                    sy=float(sy),
+                    rho=float(cov[i, 0, 1] / (sx * sy)),
+                    ok=True,
+                )
+            )
+        return cls(
+            image=image, sha256=sha256, points=tuple(points), found=int(ok.sum()), expected=len(points)
+        )
+
+    @classmethod
+    def from_image_points(cls, points: ImagePoints, *, image: str, sha256: str) -> Self:
+        """Points that were all measured, by us or by another."""
+        s = points.sigma
+        rho = points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])
+        measured = tuple(
+            MeasuredPoint(id=name, x=float(x), y=float(y), sx=float(a), sy=float(b), rho=float(r), ok=True)
+            for name, (x, y), (a, b), r in zip(points.names, points.xy, s, rho, strict=True)
+        )
+        return cls(image=image, sha256=sha256, points=measured, found=len(measured), expected=len(measured))
+
+    @classmethod
+    def read_csv(cls, path: Path | str, *, sha256: str = "") -> Self:
+        """Read ``id,x,y[,sx,sy]``: coordinates measured by hand or by another program.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read.
+        FormatError
+            When a column or a number is missing; the message names the line.
+        """
+        lines = csv.reader(read_text(Path(path)).splitlines())
+        header = [column.strip() for column in next(lines, [])]
+        if header not in (["id", "x", "y"], ["id", "x", "y", "sx", "sy"]):
+            raise FormatError("the first line must be `id,x,y` or `id,x,y,sx,sy`", where=path)
+        points: list[MeasuredPoint] = []
+        for number, cells in enumerate(lines, start=2):
+            if not cells:
+                continue
+            try:
+                x, y, *sigma = (float(cell) for cell in cells[1:])
+                if (
+                    len(cells) != len(header)
+                    or not np.isfinite([x, y, *sigma]).all()
+                    or min([1.0, *sigma]) <= 0
+                ):
+                    raise ValueError
+            except ValueError:
+                raise FormatError(
+                    f"line {number}: `{','.join(cells)[:60]}` is not `{','.join(header)}`", where=path
+                ) from None
+            name = cells[0].strip()
+            if any(p.id == name for p in points):
+                raise FormatError(f"line {number}: the id {name!r} stands twice", where=path)
+            sx, sy = sigma or (None, None)
+            points.append(MeasuredPoint(id=name, x=x, y=y, sx=sx, sy=sy, ok=True))
+        if not points:
+            raise FormatError("holds no points", where=path)
+        return cls(
+            image=Path(path).name,
+            sha256=sha256,
+            points=tuple(points),
+            found=len(points),
+            expected=len(points),
+        )

@@ -1,0 +1,128 @@
+"""``testfield-design/1``: a coded testfield of targets in squares bounded by straight lines."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from ..core.data import Array
+from .document import Document, Strict
+
+__all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign"]
+
+TargetShape = Literal["square", "triangle", "cross", "circle"]
+SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
+"""Shapes of targets, in the order by which they are numbered."""
+Positive = Annotated[float, Field(gt=0)]
+
+
+class FieldLines(Strict):
+    """The straight lines: their width, where they stand, and the rectangle that they fill."""
+
+    width: Positive
+    vertical_x: Annotated[tuple[float, ...], Field(min_length=2)]
+    horizontal_y: Annotated[tuple[float, ...], Field(min_length=2)]
+    extent: tuple[float, float, float, float]
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        for name in ("vertical_x", "horizontal_y"):
+            gaps = np.diff(getattr(self, name))
+            if not (gaps > self.width).all():
+                raise ValueError(f"`{name}` must ascend by more than the width of the lines")
+        x0, y0, x1, y1 = self.extent
+        if not (x0 <= self.vertical_x[0] < self.vertical_x[-1] <= x1):
+            raise ValueError("`extent` does not reach from the first to the last of `vertical_x`")
+        if not (y0 <= self.horizontal_y[0] < self.horizontal_y[-1] <= y1):
+            raise ValueError("`extent` does not reach from the first to the last of `horizontal_y`")
+        return self
+
+
+class FieldTargets(Strict):
+    """The targets, in columns."""
+
+    id: tuple[Annotated[str, Field(min_length=1)], ...]
+    square: tuple[Annotated[int, Field(ge=1)], ...]
+    shape: tuple[TargetShape, ...]
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    size: tuple[Positive, ...]
+    angle: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _columns(self) -> Self:
+        for name in ("square", "shape", "x", "y", "size", "angle"):
+            if len(getattr(self, name)) != len(self.id):
+                raise ValueError(f"`{name}` has {len(getattr(self, name))} entries for {len(self.id)} ids")
+        if len(set(self.id)) != len(self.id):
+            twice = next(name for i, name in enumerate(self.id) if name in self.id[:i])
+            raise ValueError(f"the id {twice!r} stands twice among the targets")
+        return self
+
+
+class TestfieldDesign(Document):
+    """``testfield-design/1``: millimetres, right-handed, y up; squares numbered in rows from the upper left.
+
+    `size` is the side of a square and of an equilateral triangle, the tip-to-tip length of a cross, whose
+    arms are a third of that wide, and the diameter of a circle; x, y its centroid. `angle` (degrees,
+    counter-clockwise) turns it from upright: the triangle with its apex up.
+    """
+
+    __test__: ClassVar[bool] = False  # not one for pytest, which collects what is named so
+    SCHEMA: ClassVar[str] = "testfield-design/1"
+    name: str
+    unit: Literal["mm"]
+    squares: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    pitch: Positive
+    lines: FieldLines
+    targets: FieldTargets
+    polarity: Literal["dark", "bright"]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        columns, rows = self.squares
+        found = (len(self.lines.vertical_x) - 1, len(self.lines.horizontal_y) - 1)
+        if found != (columns, rows):
+            raise ValueError(f"the lines bound {found[0]} × {found[1]} squares, not {columns} × {rows}")
+        if not self.targets.id:
+            raise ValueError("the design has no targets")
+        if max(self.targets.square) > columns * rows:
+            raise ValueError(f"there is no square {max(self.targets.square)} among {columns} × {rows}")
+        return self
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the targets."""
+        return self.targets.id
+
+    @property
+    def xy(self) -> Array:
+        """Centroids of the targets, (n, 2)."""
+        return np.stack([self.targets.x, self.targets.y], axis=1).astype(np.float64)
+
+    @property
+    def centres(self) -> Array:
+        """Centres of the squares, (columns·rows, 2), in the order of their numbers."""
+        x, y = (np.asarray(at) for at in (self.lines.vertical_x, self.lines.horizontal_y))
+        across, up = (x[1:] + x[:-1]) / 2, ((y[1:] + y[:-1]) / 2)[::-1]
+        return np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
+
+    @property
+    def large(self) -> NDArray[np.bool_]:
+        """Which targets (n,) are of the larger of the two sizes of their shape."""
+        size, shape = np.array(self.targets.size), np.array(self.targets.shape)
+        large = np.zeros(len(size), dtype=bool)
+        for name in SHAPES:
+            of = shape == name
+            if of.any():
+                large[of] = size[of] > (size[of].min() + size[of].max()) / 2
+        return large
+
+    @property
+    def symbols(self) -> NDArray[np.intp]:
+        """What the targets (n,) are: twice the number of their shape, one more where they are large."""
+        shape = np.array([SHAPES.index(name) for name in self.targets.shape], dtype=np.intp)
+        return 2 * shape + self.large

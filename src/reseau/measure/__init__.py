@@ -1,0 +1,41 @@
+"""One frame to image coordinates: marks of a reseau, a testfield or a sheet, pins, edges of film frames."""
+
+from .fitting import fit_mapping, mapping_problem, reduce_mapping
+from .matching import Matches, MatchOptions, match
+from .pins import (
+    Layout,
+    LayoutOptions,
+    PinDetections,
+    PinOptions,
+    PinResult,
+    Wires,
+    find_pins,
+    lay_wires,
+    measure_pins,
+)
+from .reseau import ReseauOptions, ReseauResult, measure_reseau
+from .testfield import TestfieldOptions, TestfieldResult, measure_testfield
+
+__all__ = [
+    "Layout",
+    "LayoutOptions",
+    "MatchOptions",
+    "Matches",
+    "PinDetections",
+    "PinOptions",
+    "PinResult",
+    "ReseauOptions",
+    "ReseauResult",
+    "TestfieldOptions",
+    "TestfieldResult",
+    "Wires",
+    "find_pins",
+    "fit_mapping",
+    "lay_wires",
+    "mapping_problem",
+    "match",
+    "measure_pins",
+    "measure_reseau",
+    "measure_testfield",
+    "reduce_mapping",
+]

@@ -1,0 +1,225 @@
+"""Fit a mapping of `optics` to measured points: plane transformations, polynomials, models of displays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..adjust import Adjustment, Elimination, Failure, GaussHelmert, Options, Parameters, adjust, eliminate
+from ..core.data import Array, ImagePoints
+from ..core.errors import UsageError
+from ..optics import PlaneMapping, RationalPolynomial
+from ..optics.field import SmoothField
+
+__all__ = [
+    "carried",
+    "fit_mapping",
+    "is_mirrored",
+    "mapping_problem",
+    "reduce_mapping",
+    "residual_field",
+    "tests_of",
+]
+
+
+def mapping_problem(
+    model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
+) -> GaussHelmert:
+    """Write down the conditions model(point) = target for points that carry the errors.
+
+    Parameters
+    ----------
+    model : PlaneMapping
+        Model with approximate values.
+    points : ImagePoints
+        Measured points (n) with covariances: the observations.
+    target : array_like (n, 2)
+        What they are to be mapped to.
+    target_sigma : array_like, optional
+        Standard deviation of the target's coordinates, a number or (n, 2). It is carried to the points
+        through the model's derivatives at the approximate values.
+
+    Raises
+    ------
+    UsageError
+        When target and points differ in number.
+    """
+    goal = np.asarray(target, dtype=np.float64)
+    if goal.shape != (len(points), 2):
+        raise UsageError(f"{len(points)} points with targets of shape {goal.shape}")
+    covariance = points.cov
+    spread = np.broadcast_to(np.asarray(target_sigma, dtype=np.float64), goal.shape)
+    if spread.any():
+        back = np.linalg.inv(model.derivatives(points.xy).d_xy)
+        covariance = covariance + np.einsum("nij,nj,nkj->nik", back, spread**2, back)
+
+    def conditions(xy: Array, values: Array) -> Array:
+        return model.with_values(values)(xy) - goal
+
+    def jacobians(xy: Array, values: Array) -> tuple[Array, Array]:
+        found = model.with_values(values).derivatives(xy)
+        return found.d_parameters, found.d_xy
+
+    parameters = Parameters(model.names, model.values)
+    return GaussHelmert(conditions, points.xy, covariance, parameters, jacobians)
+
+
+def fit_mapping(
+    model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
+) -> Adjustment | Failure:
+    """Adjust all parameters of a model; see `mapping_problem`.
+
+    A rational polynomial needs no approximate values: it begins from a linear solution where that is nearer.
+    """
+    shortage = _shortage(model, points)
+    if shortage is not None:
+        return shortage
+    return adjust(mapping_problem(_begun(model, points, target), points, target, target_sigma))
+
+
+def reduce_mapping(
+    model: PlaneMapping,
+    points: ImagePoints,
+    target: ArrayLike,
+    target_sigma: ArrayLike = 0.0,
+    *,
+    alpha: float = 0.05,
+    criterion: Literal["t", "chi2", "F"] = "chi2",
+    keep: Iterable[str] = (),
+    options: Options | None = None,
+) -> Elimination | Failure:
+    """Adjust a model and drop its insignificant parameters one by one; see `mapping_problem`.
+
+    Parameters
+    ----------
+    alpha : float
+        Level of the tests.
+    criterion : {"t", "chi2", "F"}
+        The test; χ² takes the points' covariances at their word.
+    keep : iterable of str
+        Parameters that are not dropped.
+    options : Options, optional
+        How to adjust.
+    """
+    shortage = _shortage(model, points)
+    if shortage is not None:
+        return shortage
+    problem = mapping_problem(_begun(model, points, target), points, target, target_sigma)
+    return eliminate(problem, alpha, criterion, keep, options=options)
+
+
+def _begun(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:
+    """The model at values that take the points nearer to the target, if a linear solution has such.
+
+    N/(1 + D) + P = T is linear in the parameters of N, D and P when it is multiplied with 1 + D and D·P is
+    left out, the product of two small things.
+    """
+    goal = np.asarray(target, dtype=np.float64)
+    if not isinstance(model, RationalPolynomial) or goal.shape != points.xy.shape:
+        return model
+    if set(model.fixed) - {"X", "Y"} or on_one_line(points.xy):
+        return model
+    at_zero = model.with_values(np.zeros(len(model.names))).derivatives(points.xy)
+    columns = np.array(at_zero.d_parameters)
+    for k, name in enumerate(model.names):
+        text = model.terms[name].get("D")
+        if text is not None:
+            term = {name: {"X": text, "Y": text}}
+            sums = RationalPolynomial(term, np.ones(1), offset=model.offset, scale=model.scale)
+            columns[:, :, k] -= goal * sums(points.xy)
+    matrix = columns.reshape(-1, len(model.names))
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1.0
+    found = np.linalg.lstsq(matrix / size, (goal - at_zero.value).ravel(), rcond=1e-12)[0] / size
+    linear = model.with_values(found)
+    with np.errstate(invalid="ignore"):
+        nearer = np.square(linear(points.xy) - goal).sum() < np.square(model(points.xy) - goal).sum()
+    return linear if nearer else model
+
+
+def on_one_line(xy: Array) -> bool:
+    """Whether points (n, 2) lie on one line, to rounding."""
+    spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+    return len(xy) < 3 or bool(spread[1] <= 1e-9 * spread[0])
+
+
+def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
+    """A failure where there are fewer coordinates than parameters."""
+    if 2 * len(points) < len(model.names):
+        return Failure(
+            f"{len(points)} points give {2 * len(points)} coordinates, "
+            f"fewer than the {len(model.names)} parameters of the model"
+        )
+    return None
+
+
+def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
+    """Tests of every coefficient, dropped ones first in their order, as in a calibration file."""
+    dropped = [(step.test, "dropped") for step in elimination.steps]
+    kept = [(test, "kept") for test in elimination.kept]
+    return tuple(
+        {
+            "parameter": test.name,
+            "distribution": test.distribution,
+            "statistic": float(test.statistic),
+            "critical": float(test.critical),
+            "p": float(test.p),
+            "verdict": verdict,
+        }
+        for test, verdict in dropped + kept
+    )
+
+
+def residual_field(
+    model: PlaneMapping,
+    points: ImagePoints,
+    target: Array,
+    residuals: Array,
+    target_sigma: ArrayLike = 0.0,
+    trials: int = 499,
+) -> SmoothField | None:
+    """What a fitted model leaves, as a smooth field on top of it, and the test whether it is needed.
+
+    Parameters
+    ----------
+    model : PlaneMapping
+        The model at its estimates.
+    points, target, target_sigma
+        What it was fitted to.
+    residuals : ndarray (n, 2)
+        Mapped minus target.
+    trials : int
+        Simulated sets of residuals: what the adjustment leaves of the points' errors alone.
+
+    Returns
+    -------
+    SmoothField or None
+        Over the targets; its `need` is the probability, per axis, that errors alone would ask as much for a
+        field. None with fewer than 20 points.
+    """
+    if len(points) < 20:
+        return None
+    _, slope, by_parameter = model.derivatives(points.xy)
+    spread = np.broadcast_to(np.asarray(target_sigma, dtype=np.float64), target.shape)
+    cov = slope @ points.cov @ np.swapaxes(slope, 1, 2) + spread[:, :, None] ** 2 * np.eye(2)
+    root = np.linalg.cholesky(cov)
+    taken, _ = np.linalg.qr(np.linalg.solve(root, by_parameter).reshape(2 * len(points), -1))
+    white = np.random.default_rng(0).standard_normal((trials, 2 * len(points)))
+    white -= (white @ taken) @ taken.T
+    null = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(points), 2))
+    return SmoothField.fit(target, residuals, degree=0, null=null)
+
+
+def carried(mapping: PlaneMapping, points: ImagePoints) -> ImagePoints:
+    """Points carried through a mapping with their covariances; the mapping itself counts as free of error."""
+    value, slope, _ = mapping.derivatives(points.xy)
+    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
+
+
+def is_mirrored(first: Array, second: Array) -> bool:
+    """Whether two sets of the same points (n, 2) differ in handedness, by the affinity between them."""
+    affine = np.linalg.lstsq(first - first.mean(axis=0), second - second.mean(axis=0), rcond=None)[0]
+    return bool(np.linalg.det(affine) < 0)

@@ -1,0 +1,323 @@
+"""Where unexposed film ends: the straight line beyond which there is film alone, and within it a picture.
+
+The strongest gradient is not the edge of a frame where something bright runs along it within the picture
+(Cruz et al., fig. 7B). What tells the edge is what is *beyond* it: film of one tone. Each place along and
+across gets the logarithm of how much more likely it belongs to a picture than to unexposed film; the edge is
+the line for which their sum within it is greatest. Both likelihoods have broad tails: dust and scratches on
+the film cost little, and so do dark parts of the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from ...core.data import Array, Mask, Rows
+from .band import Band
+
+__all__ = ["Border", "Film", "best_line", "binned", "border_of", "likelihood", "row_median"]
+
+_PICTURE, _FILM = 2.3, 0.65
+"""Log-likelihood of a place that differs from film, and the loss by one that does not: half of a picture's
+edge may be as dark as film, one place in twenty of film may be dust."""
+_BINS = 72
+"""Places across at which the search for the border looks, at most."""
+_ALONG = 24
+"""Columns over which tones are smoothed before they are compared with film."""
+_SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.12
+"""In noise, and of the contrast along the edge: what differs from film by less is film."""
+_STRIPE, _LIT, _DETACHED = 8, 0.06, 3
+"""Places within a line at which film may part it from the picture, the part of an edge that differs from film
+at least where there is a picture, and how often such a thing is passed."""
+_RUNNING = 101
+"""Profiles over which the tone of film along an edge is taken."""
+_SHALLOW = 0.2
+"""Part of the picture's contrast by which the middle of a narrow strip may differ from film: what differs by
+more is none, or so narrow that blur has filled it."""
+_NARROW = 0.25
+"""Part of the usual gap that film has at least where it is known by its tone."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Unexposed film as other edges of the frame show it, where there is little of it beyond an edge.
+
+    Parameters
+    ----------
+    tone, noise : float
+        Grey value, times the polarity, and the scatter of smoothed ones.
+    """
+
+    tone: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """Film and picture of one channel along an edge, before the steps are located.
+
+    Parameters
+    ----------
+    level : ndarray (n,)
+        Tone of film beside each profile.
+    noise, spread : float
+        Of a pixel of film; of film smoothed along the edge.
+    contrast : float
+        Of the picture against film.
+    start : ndarray (n,)
+        Approximate distance of the step.
+    outermost : ndarray (n,)
+        Distance to which film reaches outwards at least.
+    clean : float
+        Part of the places beyond the edge that are film.
+    """
+
+    level: Array
+    noise: float
+    spread: float
+    contrast: float
+    start: Array
+    outermost: Array
+    clean: float
+
+    @property
+    def film(self) -> Film:
+        """What lies beyond the edge."""
+        return Film(float(np.median(self.level)), self.spread)
+
+
+def likelihood(departure: Array, known: Array, start: int, gap: int) -> Array:
+    """How much more likely places belong to the picture than to film.
+
+    Parameters
+    ----------
+    departure : ndarray (n, s)
+        By how much n profiles differ from film, in the sense of the picture, over the least difference that
+        is significant; s places from the outside to the inside.
+    known : ndarray of bool (n, s)
+        Which places are in the scan at all.
+    start : int
+        A column that is surely not far outside the edge. What lies further out behind `gap` columns of film,
+        as perforations and neighbours do, counts as film.
+    """
+    ratio = np.clip((departure - 0.5) / 0.5, 0.0, 1.0) * known
+    differs = ratio > 0.5
+    run, beyond = np.zeros(len(ratio)), np.zeros(len(ratio), dtype=bool)
+    for column in range(start, -1, -1):
+        run = np.where(differs[:, column], 0.0, run + 1)
+        ratio[beyond, column] = 0.0
+        beyond |= run >= gap
+    found = np.where(known, -_FILM + (_PICTURE + _FILM) * ratio, 0.0)
+    # A profile that differs nowhere tells nothing about where its picture begins.
+    lit = (ratio > 0.5).any(axis=1, keepdims=True)
+    return np.asarray(np.where(lit, found, 0.0))
+
+
+def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> tuple[float, float]:
+    """Straight line of the greatest sum within it.
+
+    Parameters
+    ----------
+    found : ndarray (n, s)
+        As from :func:`likelihood`.
+    along : ndarray (n,)
+        Places of the profiles, −1 to 1.
+    first, last : int
+        Range of the column at which the line may stand at either end.
+    tilt : int
+        Columns by which its ends may differ at most.
+
+    Returns
+    -------
+    (float, float)
+        Columns before which the inside begins at the places −1 and 1; the line is half a column before.
+    """
+    within = np.cumsum(found[:, ::-1], axis=1)[:, ::-1]
+    within = np.concatenate([within, np.zeros((len(found), 1))], axis=1)
+    ends = np.arange(first, last + 1)
+    start, stop = (e.ravel() for e in np.meshgrid(ends, ends, indexing="ij"))
+    near = np.abs(stop - start) <= tilt
+    start, stop = start[near], stop[near]
+    share = (along + 1) / 2
+    column = np.rint(start[:, None] * (1 - share) + stop[:, None] * share).astype(np.intp)
+    total = within[np.arange(len(found)), np.clip(column, 0, found.shape[1])].sum(axis=1)
+    best = int(np.argmax(total))
+    # Lines as good as the best are one with it: take their middle.
+    alike = total > total[best] - 0.5
+    alike &= (np.abs(start - start[best]) <= 1) & (np.abs(stop - stop[best]) <= 1)
+    return float(start[alike].mean()), float(stop[alike].mean())
+
+
+def _detached(found: Array, line: Array) -> bool:
+    """Whether film all along parts what a line begins with from the picture: then that counts as film, too.
+
+    It is a scratch beside the edge, or print: of a picture's edge some part is always brighter than film.
+    """
+    column = np.rint(line).astype(np.intp)[:, None] + np.arange(_STRIPE)
+    seen = np.take_along_axis(found, np.clip(column, 0, found.shape[1] - 1), axis=1) > 0
+    lit = seen.mean(axis=0)
+    dark = np.flatnonzero(lit < _LIT)
+    if not len(dark) or lit[: dark[0] + 1].max() < _LIT:
+        return False
+    found[np.arange(found.shape[1]) <= column[:, dark[-1]][:, None]] = -_FILM
+    return True
+
+
+def first_departure(found: Array, middle: Array, reach: int) -> Array:
+    """For each profile the column at which its inside begins, within `reach` of the given columns (n,)."""
+    within = np.cumsum(found[:, ::-1], axis=1)[:, ::-1]
+    columns = np.rint(middle).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
+    columns = np.clip(columns, 0, found.shape[1] - 1)
+    value = np.take_along_axis(within, columns, axis=1)
+    return np.asarray(np.take_along_axis(columns, value.argmax(axis=1)[:, None], axis=1)[:, 0], dtype=float)
+
+
+def binned(grey: Array, distance: Array, low: float, size: float, count: int) -> Array:
+    """Means of the pixels of each profile in bins of distance (n, count); NaN where there are none."""
+    column = np.floor((distance - low) / size).astype(np.intp)
+    used = (column >= 0) & (column < count) & np.isfinite(grey)
+    flat = (np.arange(len(grey))[:, None] * count + column)[used]
+    total = np.bincount(flat, grey[used], minlength=len(grey) * count)
+    number = np.bincount(flat, minlength=len(grey) * count)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((total / np.where(number > 0, number, np.nan)).reshape(len(grey), count))
+
+
+def row_median(values: Array) -> Array:
+    """Medians of rows, NaN left out; NaN for a row that has nothing else."""
+    empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
+    filled = np.where(empty[:, None], 0.0, values)
+    return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
+
+
+def _running(values: Array) -> Array:
+    """Median along the edge: dust, print and scratches do not move it. NaN where there is nothing at all."""
+    if not np.isfinite(values).any():
+        return values
+    filled = np.where(np.isfinite(values), values, np.nanmedian(values))
+    return np.asarray(median_filter(filled, size=_RUNNING, mode="nearest"))
+
+
+def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | None = None) -> Border | None:
+    """Tone of film along an edge, and the line where film ends; None where nothing differs from film.
+
+    Parameters
+    ----------
+    grey : ndarray (n, s)
+        Pixels of one channel, times the polarity, so that film is darker.
+    band : Band
+        Where they are.
+    reach : float
+        How far the edge may be from the approximate one, pixels.
+    gap : float
+        Width of film, pixels, beyond which things have nothing to do with the edge.
+    film : Film, optional
+        Film as other edges show it; else it is what lies beyond the reach.
+    """
+    low, high = float(band.distance.min(axis=1).max()), float(band.distance.max(axis=1).min())
+    size = max(1.0, (high - low) / _BINS)
+    count = int((high - low) / size)
+    tones = binned(grey, band.distance, low, size, count)
+    known, beyond = np.isfinite(tones), low + (np.arange(count) + 0.5) * size
+    first, last = (int(np.clip((r - low) / size, 1, count - 2)) for r in (-reach, reach))
+    outer: Mask = np.asarray(known & (beyond < -0.4 * reach))
+    if known.mean() < 0.5 or (film is None and outer.sum() < 3 * len(tones)):
+        return None
+    ground = _ground(tones, outer, band, film, (first, last))
+    contrast = float(np.quantile(ground.smooth[:, beyond > 0], 0.85))
+    least = max(_SIGNIFICANT * ground.spread, _LEAST_CONTRAST * contrast, 1e-9)
+    if contrast < 1.5 * least:
+        return None
+    start = int(np.clip((0.3 * reach - low) / size, 1, count - 1))
+    narrow, parted = film is not None, gap if film is None else _NARROW * gap
+    found = likelihood(ground.smooth / least, known, start, max(2, round(parted / size)))
+    found[ground.foreign] = -_FILM
+    for _ in range(_DETACHED):
+        begin, end = best_line(found, band.place, first, last, max(2, (last - first) // 2))
+        line = begin * (1 - band.place) / 2 + end * (1 + band.place) / 2
+        if not _detached(found, line):
+            break
+        narrow = True
+    near = first_departure(found, line, max(2, round(0.1 * gap / size)))
+    away = np.arange(count) - line[:, None] + 2
+    outside = (away < 0) & (away > -parted / size) & known
+    differs = found > 0 if film is None else (ground.smooth > least) & ~ground.foreign
+    clean = 1.0 - float((differs & outside).sum()) / max(float(outside.sum()), 1.0)
+    level, outermost, beside = ground.level, np.full(len(near), -np.inf), band.distance < -0.5 * reach
+    if narrow:
+        level, column = _strip(tones, line, _NARROW * gap / size)
+        outermost = low + size * column
+        beside = np.abs(band.distance - outermost[:, None]) < size
+    rest = np.abs((grey - level[:, None])[beside])
+    if not np.isfinite(rest).any():
+        return None
+    raw = 1.4826 * float(np.nanmedian(rest))
+    return Border(level, max(raw, 1e-6), ground.spread, contrast, low + size * near, outermost, clean)
+
+
+class _Ground(NamedTuple):
+    """Tone of film beside each profile (n,), smoothed departures from it (n, s), their scatter in film; and
+    which places lie beyond a strip of film, and are none of the frame's."""
+
+    level: Array
+    smooth: Array
+    spread: float
+    foreign: Mask
+
+
+def _ground(tones: Array, outer: Mask, band: Band, film: Film | None, between: tuple[int, int]) -> _Ground:
+    """Film beyond an edge: what lies beyond the reach, or a strip as dark as that of other edges."""
+    foreign = np.zeros(tones.shape, dtype=bool)
+    if film is None:
+        level = _running(row_median(np.where(outer, tones, np.nan)))
+    else:
+        level = np.full(len(tones), film.tone)
+        # Perforations of a negative differ from film in the other sense: they are none either.
+        strip = _alike(np.abs(tones - film.tone) / max(film.noise, 1e-6), band.place, *between)
+        darkest = _running(row_median(_beside(tones, strip, [-1, 0, 1])))
+        bright = float(np.nanquantile(tones, 0.85)) - film.tone
+        if abs(np.median(darkest) - film.tone) < _SHALLOW * bright:
+            level, foreign = darkest, np.asarray(np.arange(tones.shape[1]) <= strip[:, None])
+    over = max(1, round(_ALONG / band.columns))
+    # Medians: a scratch that crosses the edge is a few columns wide.
+    rest = np.where(np.isfinite(tones), tones - level[:, None], 0.0)
+    smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
+    return _Ground(level, smooth, _spread(smooth, outer) if film is None else film.noise, foreign)
+
+
+def _spread(smooth: Array, outer: Mask) -> float:
+    """Scatter of film, within each profile: perforations and the scanner's light change between profiles."""
+    own = row_median(np.where(outer, smooth, np.nan))
+    return 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
+
+
+def _alike(departure: Array, along: Array, first: int, last: int) -> Array:
+    """Columns (n,) of the straight line of a narrow strip of film: what departs least from its tone."""
+    step = np.diff(np.where(np.isfinite(departure), departure, np.nanmax(departure)), axis=1, append=0.0)
+    step[:, -1] = 0.0
+    # The sum of these steps from a column on is the last departure less that of the column.
+    begin, end = best_line(step, along, first, last, max(2, (last - first) // 4))
+    return np.asarray(begin * (1 - along) / 2 + end * (1 + along) / 2)
+
+
+def _beside(tones: Array, line: Array, away: Sequence[int] | Rows) -> Array:
+    """Tones (n, m) of the columns so far inside a line."""
+    column = np.clip(np.rint(line[:, None] + np.asarray(away)).astype(np.intp), 0, tones.shape[1] - 1)
+    return np.take_along_axis(tones, column, axis=1)
+
+
+def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
+    """Tone of a narrow strip of film beyond a line, and the column in its middle: the darkest one.
+
+    Blur fills the strip from both sides; only its middle is film.
+    """
+    away = np.arange(1, max(3, round(2.5 * width)) + 1)
+    values = _beside(tones, line, -away)
+    middle = row_median(values.T)
+    best = int(np.argmin(np.where(np.isfinite(middle), middle, np.inf)))
+    around = values[:, max(best - 1, 0) : best + 2]
+    return _running(row_median(around)), np.asarray(line - away[best])

@@ -1,0 +1,190 @@
+"""From the corners of frames to the camera: photo-coordinates, transformations, calibrated corners, rolls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ...adjust import Failure
+from ...core.data import Array, ImagePoints
+from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
+from ...optics import RationalPolynomial
+from ..fitting import fit_mapping
+from .lines import FrameShape, shape_of
+from .orientation import FrameOptions, FrameResult
+
+__all__ = ["KINDS", "Roll", "photo_coordinates", "roll_of", "transformed"]
+
+Kind = Literal["similarity", "affine", "projective", "bilinear"]
+
+KINDS: tuple[Kind, ...] = ("similarity", "affine", "projective", "bilinear")
+_LEAST_FRAMES = 4
+"""Frames from which a roll knows its camera."""
+_LEAST_ASPECT, _LEAST_ANGLE = 2e-4, 2e-4
+"""What film and scanner change from frame to frame at least: relative, and radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class Roll:
+    """What the frames of one roll have in common.
+
+    Parameters
+    ----------
+    corners : FrameCorners
+        Calibrated corners of the camera: means over the frames with their standard deviations.
+    shape : FrameShape
+        The frame's shape with the scatter from frame to frame, for a doubtful frame of the same roll.
+    px_per_mm : float
+        Mean scale of the scans.
+    frames : int
+        How many took part.
+    scatter_mm : (float, float)
+        Standard deviation of one frame's corners about the mean.
+    """
+
+    corners: FrameCorners
+    shape: FrameShape
+    px_per_mm: float
+    frames: int
+    scatter_mm: tuple[float, float]
+
+    def options(self, before: FrameOptions) -> FrameOptions:
+        """How to orient a doubtful frame of this roll."""
+        dpi = self.px_per_mm * 25.4
+        return FrameOptions((), dpi, before.near, max_tilt_deg=before.max_tilt_deg, shape=self.shape)
+
+
+def photo_coordinates(corners: Array, px_per_mm: tuple[float, float]) -> Array:
+    """Corners (4, 2) in millimetres: origin at the intersection of the diagonals, x along the lower edge.
+
+    The y-axis points to the upper edge, also of a scan from the wrong side (Cruz et al., fig. 1).
+
+    Parameters
+    ----------
+    corners : ndarray (4, 2)
+        ul, ur, lr, ll in pixels.
+    px_per_mm : (float, float)
+        Along x and along y of the frame.
+    """
+    ul, ur, lr, ll = corners
+    crossing = np.cross(np.cross([*ul, 1.0], [*lr, 1.0]), np.cross([*ur, 1.0], [*ll, 1.0]))
+    along = (lr - ll) / np.hypot(*(lr - ll))
+    up = np.array([along[1], -along[0]])
+    if (ul - ll) @ up < 0:
+        up = -up
+    rest = corners - crossing[:2] / crossing[2]
+    return np.stack([rest @ along / px_per_mm[0], rest @ up / px_per_mm[1]], axis=1)
+
+
+def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -> FrameTransform | Failure:
+    """Transform the photo-coordinates of a frame's corners to the calibrated ones.
+
+    All corners count alike: what parts them is film, scanner and gate, not the measurement.
+
+    Parameters
+    ----------
+    found : FrameOrientation
+        A frame that was oriented.
+    calibrated : FrameCorners
+        Corners of the camera.
+    kind : {"similarity", "affine", "projective", "bilinear"}
+        With 4, 6, 8 and 8 parameters; the last two fit four corners without redundancy.
+    """
+    points = found.image_points()
+    if not len(points) or found.px_per_mm is None:
+        return Failure("a frame that was declined has no corners to transform")
+    xy = photo_coordinates(points.xy, found.px_per_mm)
+    model = {
+        "similarity": RationalPolynomial.similarity,
+        "affine": RationalPolynomial.affine,
+        "projective": RationalPolynomial.projective,
+        "bilinear": RationalPolynomial.bilinear,
+    }[kind]()
+    # A hundredth of a millimetre: only its being alike for all counts.
+    fit = fit_mapping(model, ImagePoints.with_sigma(CORNERS, xy, 0.01), calibrated.xy())
+    if isinstance(fit, Failure):
+        return fit
+    left = model.with_values(fit.values)(xy) - calibrated.xy()
+    free = 8 - len(model.names)
+    sigma = np.sqrt((left**2).sum(axis=0) / (free / 2)) if free else None
+    spread = fit.sigma if free else [None] * len(model.names)
+    return FrameTransform(
+        kind=kind,
+        parameters={
+            name: {"value": float(value), "sigma": None if s is None else float(s)}
+            for name, value, s in zip(model.names, fit.values, spread, strict=True)
+        },
+        residuals_mm={name: (float(x), float(y)) for name, (x, y) in zip(CORNERS, left, strict=True)},
+        sigma_mm=None if sigma is None else (float(sigma[0]), float(sigma[1])),
+    )
+
+
+def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | Failure:
+    """What the frames of one roll, taken by one camera and scanned alike, have in common.
+
+    Parameters
+    ----------
+    results : sequence of FrameResult
+        Frames of the roll; those that were oriented and lie like most of them take part.
+    dpi : float, optional
+        Resolution, where it is known better than the format: then the camera's corners have its scale, else
+        the mean sides of the frame are those of the format.
+
+    Returns
+    -------
+    Roll or Failure
+        A failure with fewer than four frames.
+    """
+    sure = [r for r in results if r.status == "oriented" and r.lines is not None]
+    lying = [r.format_mm for r in sure]
+    most = max(set(lying), key=lying.count) if lying else None
+    sure = [r for r in sure if r.format_mm == most]
+    if len(sure) < _LEAST_FRAMES or most is None:
+        return Failure(f"{len(sure)} oriented frames do not make a roll; it takes {_LEAST_FRAMES}")
+    nominal = FrameShape(*most)
+    corners = np.array([r.lines.corners for r in sure if r.lines is not None])
+    scale = np.array([np.mean(r.px_per_mm or (1.0, 1.0)) for r in sure])
+    known = scale if dpi is None else np.full(len(sure), dpi / 25.4)
+    placed = np.array([photo_coordinates(c, (s, s)) for c, s in zip(corners, known, strict=True)])
+    keep = np.ones(len(sure), dtype=bool)
+    for _ in range(3):
+        placed = _turned(placed, placed[keep].mean(axis=0))
+        left = placed - placed[keep].mean(axis=0)
+        spread = np.sqrt(np.mean(left[keep] ** 2))
+        # A frame unlike the others is not left to move their mean.
+        keep = np.abs(left).max(axis=(1, 2)) < max(5 * spread, 1e-6)
+    n = int(keep.sum())
+    mean, scatter = placed[keep].mean(axis=0), np.sqrt((left[keep] ** 2).sum(axis=(0, 1)) / (4 * (n - 1)))
+    mean = photo_coordinates(mean * [1.0, -1.0], (1.0, 1.0))
+    shapes = np.array([shape_of(c, nominal) for c in corners[keep]])
+    own = shapes.std(axis=0, ddof=1)
+    deviation = tuple(float(v) for v in shapes.mean(axis=0))
+    shape = FrameShape(
+        *most,
+        max(float(own[3]), _LEAST_ASPECT),
+        max(float(own[:3].max()), _LEAST_ANGLE),
+        deviation,  # type: ignore[arg-type]
+    )
+    sigma = (float(scatter[0] / np.sqrt(n)), float(scatter[1] / np.sqrt(n)))
+    return Roll(
+        FrameCorners.from_xy(mean, sigma),
+        shape,
+        float(scale[keep].mean()),
+        n,
+        (float(scatter[0]), float(scatter[1])),
+    )
+
+
+def _turned(placed: Array, mean: Array) -> Array:
+    """Frames (n, 4, 2) shifted and turned onto their mean, without a change of size (Procrustes)."""
+    centred = placed - placed.mean(axis=1, keepdims=True)
+    goal = mean - mean.mean(axis=0)
+    dot = (centred * goal).sum(axis=(1, 2))
+    cross = (centred[..., 0] * goal[:, 1] - centred[..., 1] * goal[:, 0]).sum(axis=1)
+    angle = np.arctan2(cross, dot)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], axis=1)
+    return np.asarray(centred @ turn + mean.mean(axis=0))

@@ -1,0 +1,227 @@
+"""The four edges of a frame in one channel of a scan: which profiles agree, or why it is not found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from ...core.data import Array, Mask
+from .band import Band
+from .border import Film
+from .companion import Companion, edge_beside_line
+from .edges import EdgeProfiles, measure_profiles, merged
+from .lines import EdgeData, robust_line, shared_error
+from .sharpness import FEW_DRAWN, Sharp, common_widths, drawn_by_lines, sharp_steps
+
+__all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
+
+_NEIGHBOURHOOD_PX = 0.05
+"""What unevenness of the gate and the picture's own forms add to a profile's standard deviation at least."""
+_TONE = 0.12
+"""Standard deviation of the tone of film along an edge, over that of the noise of a pixel."""
+_FEW_GOOD, FAR = 0.2, 2.5
+"""Part of an edge's profiles that show a step, below which the edge is looked for so much further away."""
+_FOREIGN = 0.25
+"""Part of the picture's contrast by which what lies beyond an edge differs from film beyond the others."""
+_UNEVEN = 0.45
+"""Part of its own tone by which film may differ between edges: the scanner's light is uneven."""
+_CLEAR = 0.6
+"""Part of its profiles that show a step where nothing disturbs."""
+_ENDS = 2.0
+"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths."""
+_TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
+"""Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
+take, and that which is left out besides."""
+_LEAST_AGREE = 0.45
+"""Part of an edge's profiles that agree with a line at least."""
+_BOWED, _OUTWARDS = 0.6, 0.1
+"""Bow inwards, pixels, of which a thing in the picture may be the cause; part of the profiles off a straight
+edge that lie outwards at most then."""
+_CHORD = 30
+"""Points by which an edge is given that is known by its ends."""
+_OTHER_WIDTH = 0.12
+"""Logarithm by which an edge's width of the step differs from that of all, to be measured with theirs."""
+_MOST_GOOD = 0.85
+"""Part of an edge's profiles that show a step, from which no wide ones are needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One channel measured: of each edge the profiles kept, how many were not, why it was not found."""
+
+    name: str
+    data: list[EdgeData | None]
+    rejected: list[int]
+    why: list[str]
+
+
+def channels_by_contrast(bands: Sequence[Band | None], count: int, reach: float) -> list[int]:
+    """Channels by the contrast of the picture along the edges against the noise of film, the best first."""
+    total = np.zeros(count)
+    for band in bands:
+        if band is None or count == 1:
+            continue
+        far = band.distance[::4] < -0.5 * reach
+        near = band.distance[::4] > 0.5 * reach
+        for c in range(count):
+            grey = band.grey[::4, :, c]
+            film, picture = grey[far & np.isfinite(grey)], grey[near & np.isfinite(grey)]
+            if film.size and picture.size:
+                noise = 0.5 + float(np.median(np.abs(film - np.median(film))))
+                total[c] += abs(float(np.median(picture)) - float(np.median(film))) / noise
+    return [int(c) for c in np.argsort(-total, kind="stable")]
+
+
+def measure_channel(
+    name: str,
+    band: Callable[[int, bool, bool], Band | None],
+    channel: int,
+    polarity: int,
+    reach: float,
+    gap: float,
+) -> Channel:
+    """Profiles of the four edges in one channel, each edge's own line, and what agrees with it."""
+
+    far: list[bool] = [False] * 4
+    films: list[Film | None] = [None] * 4
+
+    def measured(k: int, wide: bool, width: float | None = None) -> EdgeProfiles | None:
+        pixels, reached = band(k, wide, far[k]), FAR * reach if far[k] else reach
+        if pixels is None:
+            return None
+        return measure_profiles(pixels, channel, polarity, reached, gap, width, films[k])
+
+    profiles = [measured(k, False) for k in range(4)]
+    for k, found in enumerate(profiles):
+        if found is None or found.good.mean() < _FEW_GOOD:
+            # What voted may have been a scratch beside the edge.
+            far[k] = True
+            again = measured(k, False)
+            if again is not None and (found is None or again.good.mean() > found.good.mean()):
+                profiles[k] = again
+            else:
+                far[k] = False
+    for k, film in enumerate(_foreign(profiles)):
+        if film is not None:
+            films[k] = film
+            profiles[k] = measured(k, False)
+    for k, (found, width) in enumerate(zip(profiles, common_widths(profiles), strict=True)):
+        if found is None or width is None:
+            continue
+        if abs(np.log(found.width / width)) > _OTHER_WIDTH:
+            found = measured(k, False, width) or found
+        if found.good.mean() < _MOST_GOOD:
+            more = measured(k, True, width)
+            found = found if more is None else merged(found, more)
+        profiles[k] = found
+    edges = [
+        _edge(band(k, False, far[k]), found, sharp, channel, polarity)
+        for k, (found, sharp) in enumerate(zip(profiles, sharp_steps(profiles), strict=True))
+    ]
+    data, rejected, why = (list(column) for column in zip(*edges, strict=True))
+    return Channel(name, data, rejected, why)
+
+
+def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
+    """The film of the other edges, for those beyond which there is something else."""
+    seen = [p for p in profiles if p is not None]
+    if len(seen) < 2:
+        return [None] * len(profiles)
+    # Film is darker than anything: the second darkest of the edges is not by chance.
+    film = sorted((p.border.film for p in seen), key=lambda f: f.tone)[1]
+    contrast = max(p.border.contrast for p in seen if p.border.film.tone <= film.tone)
+    most = _FOREIGN * contrast + _UNEVEN * abs(film.tone)
+    return [film if p is None or p.border.film.tone - film.tone > most else None for p in profiles]
+
+
+def _edge(
+    band: Band | None, found: EdgeProfiles | None, sharp: Sharp, channel: int, polarity: int
+) -> tuple[EdgeData | None, int, str]:
+    """The profiles of an edge that agree with its line; or why it is not found."""
+    if band is None:
+        return None, 0, "is not in the scan, or nothing parts it from the picture"
+    if found is None:
+        return None, 0, "no contrast between film and picture"
+    drawn, part = drawn_by_lines(found, sharp)
+    place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
+    line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
+    sigma = np.hypot(sigma, drawn[found.good])
+    rejected = int((~found.good).sum())
+    if line is None:
+        return None, rejected, f"no line through {len(place)} of {len(found.place)} profiles show a step"
+    (start, stop, bow), agree = line
+    if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
+        return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
+    border = found.border
+    if border.clean < 0.6:
+        return None, rejected, "there is no unexposed film beyond it; do frames overlap?"
+    # An error of the film's tone moves a step by √(2π) of its width for each part of the contrast.
+    common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
+    hidden = False
+    if part > (FEW_DRAWN if found.good.mean() > _CLEAR else FEW_DRAWN / 5):
+        grey = band.grey[:, :, channel].astype(np.float64) * polarity
+        # A line draws an edge by its width at most: a greater bow is the edge's own.
+        own = bow if abs(bow) > 2 * found.width else 0.0
+        fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
+        two, hidden = edge_beside_line(grey, band, fitted, border.level, border.noise, sharp.width)
+        if two is not None:
+            return _along_chord(band, two, own + two.bow, common), rejected, ""
+    residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+    total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
+    agree &= _straight(place, residuals / total)
+    scale = shared_error(place[agree], residuals[agree], total[agree])
+    # Steps sharper than any are those of a scratch, and tell as little.
+    hidden |= sharp.beyond(found)
+    ends = _ENDS * sharp.width * part if hidden else 0.0
+    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
+    return data, rejected + int((~agree).sum()), ""
+
+
+def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
+    """Chord and bow of an edge, and which profiles agree; `own` sigmas are without what may draw the steps.
+
+    A thing in the picture that bends away from a dark edge is no bow of it: those profiles that do not agree
+    with a straight one all lie inwards.
+    """
+    found = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
+    if found is None or found[0][2] > -_BOWED:
+        return found
+    straight = robust_line(place, offset, own, _NEIGHBOURHOOD_PX, bow=_BOWED / 3)
+    if straight is None:
+        return found
+    (start, stop, bow), agree = straight
+    inward = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+    outside = np.count_nonzero(inward[~agree] < 0)
+    alone = agree.mean() > _LEAST_AGREE and outside < _OUTWARDS * np.count_nonzero(~agree)
+    return straight if alone else found
+
+
+def _straight(place: Array, inward: Array) -> Mask:
+    """Which profiles are not where corners are rounded: there an edge turns inwards, by so many sigmas."""
+    turned = median_filter(inward, size=min(9, len(inward)), mode="nearest") > _TURNED
+    keep = np.ones(len(place), dtype=bool)
+    for order in (np.arange(len(place)), np.arange(len(place))[::-1]):
+        straight = np.flatnonzero(~turned[order])
+        begin = place[order[straight[0]]] if len(straight) else 0.0
+        if len(straight) and straight[0] > 0 and abs(begin) > 1 - _ROUNDED:
+            keep &= np.abs(place - place[order[0]]) > abs(begin - place[order[0]]) + _MARGIN
+    return keep
+
+
+def _points(band: Band, place: Array, offset: Array) -> Array:
+    along = (band.stop - band.start) * ((place + 1) / 2)[:, None]
+    return np.asarray(band.start + along + offset[:, None] * band.normal)
+
+
+def _along_chord(band: Band, found: Companion, bow: float, common: float) -> EdgeData:
+    """An edge that is known by its two ends, as points of a line as precise in its middle and at the ends."""
+    middle = float(found.covariance.sum() / 4)
+    slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
+    place = np.linspace(-1, 1, _CHORD)
+    # The line through n points of sigma s has the variance s²/n in its middle, s²/Σt² of its slope.
+    place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
+    offset = (found.ends[0] * (1 - place) + found.ends[1] * (1 + place)) / 2 - bow * (1 - place**2)
+    return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

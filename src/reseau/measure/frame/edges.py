@@ -1,0 +1,333 @@
+"""One edge of a frame at full resolution: profiles across it, and where each steps from film to picture.
+
+All four edges are one case (Cruz et al., sect. 2.2): places are distances from an approximate line, positive
+towards the picture. Nothing is rotated or resampled for it; pixels keep their exact distances. A profile is
+film, a step blurred by a Gaussian, and a picture whose tone may change once more close behind it:
+
+.. math:: g(d) = b + A\\,\\Phi(u) + c\\,\\Phi(u - 3), \\qquad u = (d - p)/w .
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.special import ndtr
+
+from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
+from ...core.data import Array, Mask, Rows
+from .band import Band
+from .border import Border, Film, binned, border_of, row_median
+
+__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_function"]
+
+_SHIFTS, _CHANGE = (3.0,), 0.15
+"""Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
+contrast, one sigma."""
+_INWARD, _OUTWARD = 2.0, 4.0
+"""How far behind the edge, in widths of the step, its picture is looked at, no further than it takes; and how
+far beyond it film."""
+NEIGHBOURS = 15
+"""Profiles that tell one another how well a step is determined."""
+_BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("danish", 2.5))
+_FREE, _HELD = 0.5, (0.02, 0.12)
+"""Logarithms by which the width of a step may differ from the expected one: at first; then, where that is of
+other edges, and where it is of this one."""
+_MODEL = 0.012, 0.05
+"""Part of the picture's contrast to which the model describes a profile: more where the width is yet unknown,
+lest what it does not describe be taken for blunders."""
+_ROUNDS, _LEAST_PIXELS = 2, 100
+"""How often the common width is looked for, and pixels of a section that tells it."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeProfiles:
+    """What the profiles of an edge in one channel tell, in columns over the n profiles.
+
+    Parameters
+    ----------
+    place : ndarray (n,)
+        Along the approximate edge, −1 to 1.
+    offset, sigma : ndarray (n,)
+        Of the step, inwards from the approximate edge, and its standard deviation, pixels.
+    good : ndarray of bool (n,)
+        Which show a step that can be located.
+    blur : ndarray (2, n)
+        Logarithm of the width that a profile and its neighbours show by themselves, and its variance.
+    width : float
+        Of the blurred step, one sigma, pixels.
+    border : Border
+        Film and picture along the edge.
+    """
+
+    place: Array
+    offset: Array
+    sigma: Array
+    good: Mask
+    blur: Array
+    width: float
+    border: Border
+
+
+def measure_profiles(
+    band: Band,
+    channel: int,
+    polarity: int,
+    reach: float,
+    gap: float,
+    width: float | None = None,
+    film: Film | None = None,
+) -> EdgeProfiles | None:
+    """Locate the step from film to picture in every profile of one channel.
+
+    Parameters
+    ----------
+    band : Band
+        The pixels.
+    channel : int
+        Which of its channels.
+    polarity : int
+        1 where film is darker than the picture.
+    reach : float
+        How far the edge may be from the approximate one, pixels.
+    gap : float
+        Width of film, pixels, beyond which things have nothing to do with the edge.
+    width : float, optional
+        Of the blurred step, one sigma, where it is known from other edges; then the picture may have a step
+        of its own near the edge.
+    film : Film, optional
+        Film as other edges show it, where little of it lies beyond this one.
+
+    Returns
+    -------
+    EdgeProfiles or None
+        None where nothing differs from film.
+    """
+    grey = band.grey[:, :, channel].astype(np.float64) * polarity
+    border = border_of(grey, band, reach, gap, film)
+    if border is None:
+        return None
+    found = _fitted(grey, band, border, width)
+    if found is None:
+        return None
+    steps, width = found
+    place, sigma = np.where(steps.good, steps.place, 0.0), np.where(steps.good, steps.sigma, 1.0)
+    return EdgeProfiles(band.place, place, sigma, steps.good, steps.blur, width, border)
+
+
+def _width(grey: Array, band: Band, border: Border) -> float:
+    """Width of the blurred step from the mean of all profiles, each over its own contrast."""
+    at = band.distance - border.start[:, None]
+    rest = grey - border.level[:, None]
+    place = np.arange(-12.0, 12.0, 0.5)
+    tones = binned(rest, at, -12.0, 0.5, len(place))
+    inside = row_median(np.where((place > 1) & (place < 6), tones, np.nan))
+    lit = inside[np.isfinite(inside) & (inside > 0)]
+    if not len(lit):
+        return 1.0
+    strong = np.asarray(inside > 0.5 * float(np.median(lit)))
+    with warnings.catch_warnings():  # where no profile has a pixel there is no mean, and none is needed
+        warnings.simplefilter("ignore", RuntimeWarning)
+        mean = np.nanmedian(tones[strong] / inside[strong][:, None], axis=0)
+    top = max(float(np.nanmax(mean[(place > 0) & (place < 6)])), 0.1)
+    crossing = []
+    for share in (0.16, 0.5):
+        above = np.flatnonzero((mean > share * top) & (place > -10))
+        crossing.append(float(place[above[0]]) if len(above) else 0.0)
+    return float(np.clip(crossing[1] - crossing[0], 0.8, 4.0))
+
+
+class _Steps(NamedTuple):
+    """Steps of n profiles: distances, contrasts, standard deviations of the distances, which are good, and as
+    in :class:`EdgeProfiles` their own widths.
+    """
+
+    place: Array
+    contrast: Array
+    sigma: Array
+    good: Mask
+    blur: Array
+
+
+def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tuple[_Steps, float] | None:
+    """Step of every profile, and the common width."""
+    width = _width(grey, band, border) if known is None else known
+    # Where the border puts them is good to a pixel or two, too little for a narrow window.
+    first = _one_by_one(grey, band, border, border.start, width, _FREE)
+    if first is None:
+        return None
+    start = _smoothed(first.place, first.good)
+    if known is None:
+        width = float(np.clip(np.exp(np.median(first.blur[0][first.good])), 0.4, 6.0))
+        for _ in range(_ROUNDS):
+            width = _common_width(grey, band, border, start, first, width)
+    steps = _one_by_one(grey, band, border, start, width, _HELD[known is None])
+    return None if steps is None else (steps, width)
+
+
+def _one_by_one(
+    grey: Array, band: Band, border: Border, start: Array, width: float, spread: float
+) -> _Steps | None:
+    """Step of every profile, its width held to the common one by so much; None where none is good."""
+    near = _OUTWARD * width + 2.0 if spread == _FREE else _INWARD * width
+    window = _window(grey, band, border, start, width, near)
+    if window is None:
+        return None
+    value, distance, weight = window
+    fit = _fit(value, distance, weight, border, start, border.level, width, spread)
+    p, step = fit.estimates[:, 0], fit.estimates[:, 3]
+    scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
+    own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
+    told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
+    # By neighbours: a profile with a step too high by chance lies too far in, and would weigh more.
+    sigma = _along(np.where(told, own, np.inf))
+    ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
+    good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
+    good &= np.abs(p - start) < 2.5 * width + 1.5
+    if not good.any():
+        return None
+    blur = _own_width(fit.estimates[:, 2], fit.cofactor[:, 2, 2], np.log(width), spread, good)
+    return _Steps(p, step, sigma, good, blur)
+
+
+def _fit(
+    value: Array,
+    distance: Array,
+    weight: Array,
+    border: Border,
+    start: Array,
+    level: Array,
+    width: float,
+    spread: float,
+) -> BatchAdjustment:
+    """Profiles adjusted, from the parameters that they are expected to have."""
+    one = np.ones(len(value))
+    none = [0 * one] * len(_SHIFTS)
+    initial = np.stack([start, level, np.log(width) * one, border.contrast * one, *none], axis=1)
+    # Film is known from its surroundings; that the picture changes at once is an exception.
+    changes = [_CHANGE * border.contrast] * len(_SHIFTS)
+    prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
+    return adjust_batch(
+        profile_function(distance),
+        initial,
+        value,
+        weights=weight / (border.noise**2 + (_MODEL[spread == _FREE] * border.contrast) ** 2),
+        prior=(initial, prior),
+        options=_BATCH,
+    )
+
+
+def _smoothed(place: Array, good: Mask) -> Array:
+    """Steps of profiles by those of their neighbours: whose noise is not that of a profile's own pixels."""
+    index = np.arange(len(place))
+    return _along(np.interp(index, index[good], place[good]))
+
+
+def _common_width(
+    grey: Array, band: Band, border: Border, start: Array, steps: _Steps, width: float
+) -> float:
+    """Width of the step by sections of neighbouring profiles, each fitted as one profile: their median.
+
+    Of single profiles in noise it comes out too small, since each has unknowns of its own (Neyman and Scott
+    1948), and with a step too wide or too sharp all places lie to one side.
+    """
+    contrast = _along(np.where(steps.good, steps.contrast, np.inf))
+    lit = steps.good & np.isfinite(contrast) & (contrast > 0)
+    window = _window(grey, band, border, start, width, _INWARD * width)
+    if window is None:
+        return width
+    value, distance, weight = window
+    part = np.where(lit, contrast, border.contrast)[:, None] / border.contrast
+    value, distance = (value - border.level[:, None]) / part, distance - start[:, None]
+    each = min(NEIGHBOURS, len(value))
+    sections = len(value) // each
+    value, distance, weight = (
+        values[: sections * each].reshape(sections, -1)
+        for values in (value, distance, weight * lit[:, None] * part**2)
+    )
+    told = (weight > 0).sum(axis=1) > _LEAST_PIXELS
+    if not told.any():
+        return width
+    none = np.zeros(int(told.sum()))
+    fit = _fit(value[told], distance[told], weight[told], border, none, none, width, _FREE)
+    found = fit.estimates[fit.converged, 2]
+    # Where something else runs along the edge few sections come to an end.
+    return float(np.clip(np.exp(np.median(found)), 0.4, 6.0)) if len(found) > 0.5 * sections else width
+
+
+def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
+    """Logarithm of the width without the prior that held it, mean over neighbours, and variance (2, n)."""
+    share = np.clip(1 - cofactor / spread**2, 1e-3, 1.0)
+    weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
+    alone = np.where(good, np.clip((found - known) / share, -1.0, 1.0), 0.0)
+    size = min(NEIGHBOURS, len(found))
+    total = np.maximum(uniform_filter1d(weight, size, mode="nearest"), 1e-9)
+    mean = uniform_filter1d(weight * alone, size, mode="nearest") / total
+    return np.stack([known + mean, 1 / (size * total)])
+
+
+def _along(values: Array) -> Array:
+    """Running median over neighbouring profiles."""
+    return np.asarray(median_filter(values, size=min(NEIGHBOURS, len(values)), mode="nearest"))
+
+
+def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
+    """The profiles of an edge, and wide ones where no other near them shows a step."""
+    half = 0.5 * float(np.median(np.diff(wide.place))) if len(wide.place) > 1 else 1.0
+    at = fine.place[fine.good]
+    if len(at):
+        after = np.searchsorted(at, wide.place)
+        nearest = np.minimum(
+            np.abs(at[np.minimum(after, len(at) - 1)] - wide.place), np.abs(at[after - 1] - wide.place)
+        )
+        lone = wide.good & (nearest > half)
+    else:
+        lone = wide.good
+    place = np.concatenate([fine.place, wide.place[lone]])
+    order = np.argsort(place, kind="stable")
+    offset, sigma, good = (
+        np.concatenate([a, b[lone]])[order]
+        for a, b in ((fine.offset, wide.offset), (fine.sigma, wide.sigma), (fine.good, wide.good))
+    )
+    blur = np.concatenate([fine.blur, wide.blur[:, lone]], axis=1)[:, order]
+    return replace(fine, place=place[order], offset=offset, sigma=sigma, good=good, blur=blur)
+
+
+def _window(
+    grey: Array, band: Band, border: Border, start: Array, width: float, high: float
+) -> tuple[Array, Array, Array] | None:
+    """Pixels of profiles from film to so far inwards of their starts: values, distances, weights (n, s)."""
+    low = np.maximum(-_OUTWARD * width - 2.0, border.outermost - start)
+    at = band.distance - start[:, None]
+    used = (at > low[:, None]) & (at < high) & np.isfinite(grey)
+    size = int(used.sum(axis=1).max(initial=0))
+    if size < 8:
+        return None
+    # Those used first, in their order; the rest have no weight.
+    order: Rows = np.argsort(~used, axis=1, kind="stable")[:, :size]
+    value, place, weight = (
+        np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used.astype(np.float64))
+    )
+    return np.where(weight > 0, value, 0.0), place, weight
+
+
+def profile_function(distance: Array) -> Any:
+    """The model of a profile and its derivatives by p, b, log w, A and the c, for :func:`adjust_batch`."""
+    shifts = np.array([0.0, *_SHIFTS])
+
+    def function(x: Array, rows: Rows) -> tuple[Array, Array]:
+        p, b, w, steps = x[:, 0, None], x[:, 1, None], np.exp(x[:, 2, None]), x[:, None, 3:]
+        u = ((distance[rows] - p) / w)[:, :, None] - shifts
+        phi, bell = ndtr(u), np.exp(-0.5 * u * u) / np.sqrt(2 * np.pi)
+        jacobian = np.empty((*u.shape[:2], 3 + len(shifts)))
+        jacobian[..., 0] = -(steps * bell).sum(axis=2) / w
+        jacobian[..., 1] = 1.0
+        # The steps behind the first move with the width; u + shift is where they were without it.
+        jacobian[..., 2] = -(steps * bell * (u + shifts)).sum(axis=2)
+        jacobian[..., 3:] = phi
+        return b + (steps * phi).sum(axis=2), jacobian
+
+    return function

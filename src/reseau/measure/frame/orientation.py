@@ -1,0 +1,339 @@
+"""The inner orientation of scanned film frames from their four edges, with an uncertainty, or declined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from ...adjust import Failure
+from ...core.data import Array
+from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
+from ...io.scans import Scan
+from .band import Band, read_band
+from .channel import FAR, Channel, channels_by_contrast, measure_channel
+from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
+from .outline import FrameGuess
+from .search import search_frames
+
+__all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
+
+FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
+"""Formats that are tried where none is given: 35 mm, 6×6, 6×4.5, 6×7."""
+
+_OVERVIEWS = ((500, 60), (1000, 300))
+"""Longer side of the overviews, pixels, and how many combinations of lines are looked at in each."""
+_SURE = 3.0
+"""Score of a frame from which no finer overview is looked at."""
+_REACH = 4.0
+"""Pixels of the overview by which an approximate edge may be off."""
+_FILM_MM, _GAP_MM = 0.25, 0.2
+"""Width of film that is looked at beyond an edge, and that which parts the frame from anything else."""
+_MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
+"""Standard deviation of a corner's coordinate from which on a frame is not called oriented: what is greater,
+so that a scan finer than its film is not asked for more than the film shows."""
+_STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
+"""Order of what a frame may be."""
+_SLANT = float(np.deg2rad(0.7))
+"""Standard deviation of an angle that a copying camera may have turned, radians."""
+_MOST_W = 4.0
+"""Test value from which on the shape of a frame contradicts its format."""
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """What is known of the frames beforehand.
+
+    Parameters
+    ----------
+    formats : tuple of (width, height)
+        Formats that may be, mm, each tried upright and lying.
+    dpi : float, optional
+        Resolution of the scan, where the file does not say it or says it wrongly.
+    near : ndarray (4, 2), optional
+        Approximate corners ul, ur, lr, ll in pixels: where to search.
+    aspect_sigma : float
+        Relative standard deviation of a frame's proportions.
+    angle_sigma_deg : float
+        Standard deviation of its right angles.
+    max_tilt_deg : float
+        Largest tilt.
+    shape : FrameShape, optional
+        Format and shape of the camera's frame as others of its roll show them; instead of the formats.
+    """
+
+    formats: tuple[tuple[float, float], ...] = FORMATS
+    dpi: float | None = None
+    near: Array | None = None
+    aspect_sigma: float = 0.007
+    angle_sigma_deg: float = 0.25
+    max_tilt_deg: float = 16.0
+    shape: FrameShape | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """One frame oriented, or the reason why not; falsy when declined.
+
+    Parameters
+    ----------
+    image : str
+        Name of the scan.
+    status : {"oriented", "three-edges", "declined"}
+        With three edges the fourth is where the format says, and the covariance says how uncertain that is.
+    why : str
+        What was wrong, and what would help.
+    format_mm : (float, float) or None
+        Width and height as they lie in the scan.
+    channel : str or None
+        The channel that was kept.
+    lines : Lines or None
+        The adjusted edges.
+    edges : dict
+        How each edge was found.
+    """
+
+    image: str
+    status: Literal["oriented", "three-edges", "declined"]
+    why: str
+    format_mm: tuple[float, float] | None
+    channel: str | None
+    lines: Lines | None
+    edges: dict[str, MeasuredEdge]
+
+    def __bool__(self) -> bool:
+        return self.status != "declined"
+
+    @property
+    def px_per_mm(self) -> tuple[float, float] | None:
+        """Pixels in a millimetre along x and y, by the mean sides of the frame and its format."""
+        if self.lines is None or self.format_mm is None:
+            return None
+        side = np.roll(self.lines.corners, -1, axis=0) - self.lines.corners
+        length = np.hypot(*side.T)
+        w, h = self.format_mm
+        return float((length[0] + length[2]) / (2 * w)), float((length[1] + length[3]) / (2 * h))
+
+    def document(self) -> FrameOrientation:
+        """As ``reseau-orientation/1``, without a transformation."""
+        common = {
+            "image": self.image,
+            "status": self.status,
+            "why": self.why,
+            "format_mm": self.format_mm,
+            "channel": self.channel,
+            "edges": self.edges,
+        }
+        if self.lines is None or not self:
+            none = dict.fromkeys(
+                ("corners", "principal_point", "angle_deg", "angle_sigma_deg", "px_per_mm"), None
+            )
+            return FrameOrientation(**common, **none)  # type: ignore[arg-type]
+        corners, cov = self.lines.corners, self.lines.covariance
+        point, point_cov, angle, angle_sigma = derived(corners, cov)
+        named = {
+            name: MeasuredCorner.from_columns(corners[k], cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])
+            for k, name in enumerate(CORNERS)
+        }
+        return FrameOrientation(
+            **common,  # type: ignore[arg-type]
+            corners=named,  # type: ignore[arg-type]
+            principal_point=MeasuredCorner.from_columns(point, point_cov),
+            angle_deg=float(np.rad2deg(angle)),
+            angle_sigma_deg=float(np.rad2deg(angle_sigma)),
+            px_per_mm=self.px_per_mm,
+        )
+
+
+def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[FrameResult]:
+    """Orient the frames of a scan.
+
+    Parameters
+    ----------
+    scan : Scan
+        The scan, opened; only an overview and the bands along the edges are read.
+    options : FrameOptions, optional
+        What is known beforehand.
+
+    Returns
+    -------
+    list of FrameResult
+        One for each frame, in the order of reading; one that is declined where none was found.
+    """
+    options = options or FrameOptions()
+    guesses, reduction = _found(scan, options)
+    if isinstance(guesses, Failure):
+        return [_declined(scan, guesses.reason)]
+    results = [_oriented(scan, guess, reduction, options) for guess in guesses]
+    good = [result for result in results if result]
+    return sorted(good or results[:1], key=_reading)
+
+
+def _reading(result: FrameResult) -> tuple[float, float]:
+    if result.lines is None:
+        return 0.0, 0.0
+    x, y = result.lines.corners.mean(axis=0)
+    size = float(np.ptp(result.lines.corners[:, 1]))
+    return float(np.rint(y / size)), float(x)
+
+
+def _declined(scan: Scan, why: str, edges: dict[str, MeasuredEdge] | None = None) -> FrameResult:
+    lost = {
+        name: MeasuredEdge(found=False, points=0, rejected=0, rms_px=None, curvature_px=None)
+        for name in EDGES
+    }
+    return FrameResult(scan.name, "declined", why, None, None, None, edges or lost)
+
+
+def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failure, float]:
+    """Frames in an overview; a finer one is looked at where the first is not sure of any."""
+    best: list[FrameGuess] = []
+    reduction, dark = 1.0, True
+    for longest, tried in _OVERVIEWS:
+        overview, r = scan.overview(longest)
+        if longest > _OVERVIEWS[0][0] and r == reduction:
+            break
+        dark = float(np.ptp(np.quantile(overview, [0.01, 0.99]))) < 0.01 * scan.full_scale
+        if dark:
+            break
+        near = None if options.near is None else (options.near + 0.5) / r - 0.5
+        found = search_frames(
+            overview,
+            options.formats if options.shape is None else [(options.shape.width, options.shape.height)],
+            max_tilt_deg=options.max_tilt_deg,
+            px_per_mm=None if options.dpi is None else options.dpi / 25.4 / r,
+            hint=None if scan.dpi is None else scan.dpi / 25.4 / r,
+            tried=tried,
+            near=near,
+        )
+        if found and (not best or _rank(found) > _rank(best)):
+            best, reduction = found, r
+        if best and all(best[0].supported) and best[0].score > _SURE:
+            break
+        reduction = reduction if best else r
+    if best:
+        return best, reduction
+    if dark:
+        return Failure("shows nothing: it is of one tone; scan it with more exposure"), reduction
+    formats = ", ".join(f"{w:g}x{h:g}" for w, h in options.formats)
+    return Failure(
+        f"no frame of the format {formats} stands out from unexposed film on at least three sides; scan it "
+        "with a margin of film around, or say its --frame, --dpi or where it is (frames that overlap cannot "
+        "be told apart)"
+    ), reduction
+
+
+def _rank(found: list[FrameGuess]) -> float:
+    return found[0].score + (2.0 if all(found[0].supported) else 0.0)
+
+
+def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions) -> FrameResult:
+    """Measure the edges of one frame in all channels, adjust, and keep the best."""
+    corners = (guess.corners + 0.5) * reduction - 0.5
+    side = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
+    scale = float((side[0] + side[2]) / (2 * guess.format_mm[0]))
+    reach = max(_REACH * reduction, 6.0)
+
+    @cache
+    def band(k: int, wide: bool, far: bool = False) -> Band | None:
+        ends = corners[k], corners[(k + 1) % 4]
+        beside = (FAR * reach if far else reach) + _FILM_MM * scale
+        return read_band(scan, *ends, beside, beside + 8, wide=wide) if guess.supported[k] else None
+
+    shape = options.shape
+    if shape is None or guess.format_mm != (shape.width, shape.height):
+        shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
+    best: FrameResult | None = None
+    for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
+        name = scan.channels[c]
+        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
+        result = _judged(scan, guess, measured, corners, shape)
+        # Channels come by their contrast: a later one has to see more, or better.
+        if best is None or _seen(result) > _seen(best):
+            best = result
+        if best.status == "oriented":  # the others show the same edges with less contrast
+            break
+    assert best is not None
+    return best
+
+
+def _seen(result: FrameResult) -> tuple[int, float]:
+    """How many edges, and how well."""
+    return _STATUS[result.status], -np.inf if result.lines is None else -float(
+        np.trace(result.lines.covariance)
+    )
+
+
+def _judged(
+    scan: Scan, guess: FrameGuess, measured: Channel, corners: Array, shape: FrameShape
+) -> FrameResult:
+    """Adjust the edges that were found; what contradicts the format is declined."""
+    missing = [EDGES[k] for k in range(4) if measured.data[k] is None]
+    base = FrameResult(scan.name, "declined", "", guess.format_mm, measured.name, None, {})
+    if len(missing) > 1:
+        why = "; ".join(f"{EDGES[k]} edge: {measured.why[k]}" for k in range(4) if measured.why[k])
+        return replace(base, why=why, edges=_reports(measured, None))
+    lines = adjust_lines(corners, measured.data, shape, measured.rejected)
+    if isinstance(lines, Failure):
+        return replace(base, why=lines.reason, edges=_reports(measured, None))
+    worst, slant = np.abs(np.nan_to_num(lines.shape_w)).max(), ""
+    if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
+        lines, converging = seen
+        worst, slant = 0.0, f"seen at a slant: opposite edges converge by {np.rad2deg(converging):.1f}°"
+    base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant)
+    if worst > _MOST_W:
+        w, h = guess.format_mm
+        return replace(
+            base,
+            lines=None,
+            why=f"the four edges do not make a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
+            "may be a line of the picture: say where the edges are, or the right --frame",
+        )
+    sigma = np.sqrt(np.diag(lines.covariance))
+    if missing:
+        reason = measured.why[EDGES.index(missing[0])]
+        why = f"{missing[0]} edge: {reason}; it is where the format has it"
+        return replace(base, status="three-edges", why=why)
+    scale = max(base.px_per_mm or (0.0, 0.0))
+    if (most := float(sigma.max())) > max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale):
+        why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
+        return replace(base, lines=None, why=why)
+    return replace(base, status="oriented")
+
+
+def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
+    """Four edges as a tilted copying camera sees them, and by how much opposite ones converge, radians.
+
+    A perspective turns opposite edges towards one another; a single edge that is wrong makes opposite angles
+    both greater or both smaller, too.
+    """
+    free = replace(shape, angle_sigma=_SLANT, aspect_sigma=3 * shape.aspect_sigma)
+    lines = adjust_lines(corners, measured.data, free, measured.rejected)
+    if isinstance(lines, Failure):
+        return None
+    ur, lr, ll, aspect = shape_of(lines.corners, shape) - np.array(shape.deviation)
+    converging = max(abs(ur + lr), abs(lr + ll))
+    alike = abs(ur + ll) / 2 < _MOST_W * shape.angle_sigma / np.sqrt(2)
+    alike &= abs(aspect) < _MOST_W * shape.aspect_sigma and converging < _MOST_W * _SLANT
+    return (lines, float(converging)) if alike else None
+
+
+def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
+    reports = {}
+    for k, name in enumerate(EDGES):
+        found = measured.data[k] is not None
+        # A bow that is not significant is none.
+        bow = 0.0
+        if lines is not None and found and abs(lines.bow[k]) > 3 * lines.bow_sigma[k]:
+            bow = float(lines.bow[k])
+        reports[name] = MeasuredEdge(
+            found=found,
+            points=int(lines.used[k]) if lines is not None and found else 0,
+            rejected=int(lines.rejected[k]) if lines is not None else measured.rejected[k],
+            rms_px=float(lines.rms[k]) if lines is not None and found else None,
+            curvature_px=bow if found else None,
+            why=measured.why[k],
+        )
+    return reports

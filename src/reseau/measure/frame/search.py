@@ -1,0 +1,303 @@
+"""Where a scan shows frames: four straight edges of one polarity around a rectangle of known proportions.
+
+Gradients of a small overview vote for directed lines (Hough 1962; Ballard 1981): each edge of a frame on dark
+film has its normal towards the inside, on bright film towards the outside, so that four edges once around
+differ in direction from two lines of the picture, and from the edges of a neighbour. Proportions choose among
+the combinations; what is beyond the edges, unexposed film of one tone, decides.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.data import Array
+from .outline import FrameGuess, judged, lies_in, settled, size_of
+
+__all__ = ["search_frames"]
+
+Plane = NDArray[np.float32]
+
+_BIN = np.deg2rad(0.5)
+"""Step of the directions; that of the distances is a pixel of the overview."""
+_SPREAD = 16
+"""Steps to either side of a gradient's own direction for which it votes: texture at an edge turns it."""
+_PEAKS = 8
+"""Lines of each direction that are combined with those of the others."""
+_LEAST_SIDE = 0.15
+"""Part of the overview's longer side that a frame's side takes at least."""
+
+
+class _Lines(NamedTuple):
+    """Peaks of the votes of one direction: distances from the centre and shares of votes."""
+
+    at: Array
+    votes: Array
+
+
+def search_frames(
+    overview: NDArray[np.float32],
+    formats: Sequence[tuple[float, float]],
+    *,
+    max_tilt_deg: float = 16.0,
+    tolerance: float = 0.05,
+    px_per_mm: float | None = None,
+    hint: float | None = None,
+    tried: int = 60,
+    near: Array | None = None,
+) -> list[FrameGuess]:
+    """Find frames in an overview; the best first, and none that overlap.
+
+    Parameters
+    ----------
+    overview : ndarray (h, w, c)
+        The scan, its longer side some hundred pixels.
+    formats : sequence of (width, height)
+        Formats that may be, in mm, each tried upright and lying.
+    max_tilt_deg : float
+        Largest tilt.
+    tolerance : float
+        By how much, relatively, a frame's proportions may differ from its format's.
+    px_per_mm : float, optional
+        Pixels of the overview in a millimetre, where the resolution is known.
+    hint : float, optional
+        The same where it is what the file says, which may be wrong: for frames of which an edge is missing.
+    tried : int
+        Combinations of lines whose surroundings are looked at.
+    near : ndarray (4, 2), optional
+        Approximate corners, good to a tenth of the frame's size: no other frames are looked for.
+    """
+    grey, gradient = _gradients(overview)
+    votes, reach = _votes(*gradient, grey.shape, max_tilt_deg)
+    shapes = list(dict.fromkeys([f for w, h in formats for f in ((w, h), (h, w))]))
+    for missing in (False, True):
+        scale = (px_per_mm or hint) if missing else px_per_mm
+        found = [
+            guess
+            for turn in _turns(max_tilt_deg)
+            for guess in _combined(votes, reach, turn, shapes, tolerance, scale, grey.shape, missing)
+        ]
+        if near is not None:
+            most = 0.1 * float(size_of(near).max())
+            found = [guess for guess in found if np.abs(guess.corners - near).max() < most]
+        found.sort(key=lambda guess: -guess.score)
+        with warnings.catch_warnings():  # an edge beyond the scan has no tones; it is left out later
+            warnings.simplefilter("ignore", RuntimeWarning)
+            scored = [judged(guess, grey) for guess in _distinct(found, tried)]
+            good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
+            found = [settled(guess, grey) for guess in _apart(good)]
+        if found:
+            return found
+    return []
+
+
+def _far(guess: FrameGuess, near: Array | None) -> float:
+    """What the distance from where a frame was said to be counts against it, at most one edge."""
+    if near is None:
+        return 0.0
+    return float(np.abs(guess.corners - near).max() / (0.1 * size_of(near).max()))
+
+
+def _gradients(overview: NDArray[np.float32]) -> tuple[Plane, tuple[Array, Array, Array, Array]]:
+    """Grey values of most contrast, and of each pixel with a gradient: x, y, direction, weight."""
+    spread = np.ptp(np.quantile(overview, [0.02, 0.98], axis=(0, 1)), axis=0)
+    best = int(np.argmax(spread))
+    grey = np.ascontiguousarray(overview[:, :, best])
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) / 8 for order in ((1, 0), (0, 1)))
+    size = np.hypot(gx, gy)
+    noise = float(np.quantile(size, 0.25))
+    least = max(2.0 * noise, 0.004 * float(spread[best]), 1e-6)
+    size[[0, 1, -2, -1]] = 0
+    size[:, [0, 1, -2, -1]] = 0
+    row, column = np.nonzero(size > least)
+    s = size[row, column].astype(np.float64)
+    # A faint edge shall count nearly as much as a strong one in the picture.
+    weight = s / (s + 2 * least)
+    direction = np.arctan2(gy[row, column], gx[row, column]).astype(np.float64)
+    return grey, (column.astype(np.float64), row.astype(np.float64), direction, weight)
+
+
+def _turns(max_tilt_deg: float) -> range:
+    most = int(np.ceil(np.deg2rad(max_tilt_deg) / _BIN))
+    return range(-most, most + 1)
+
+
+def _votes(
+    x: Array, y: Array, direction: Array, weight: Array, shape: tuple[int, int], max_tilt_deg: float
+) -> tuple[Plane, int]:
+    """Votes (directions, distances), distances from the centre along the direction, and that of nought."""
+    reach = int(np.hypot(*shape) / 2) + 3
+    turns, width = round(2 * np.pi / _BIN), 2 * reach + 1
+    own = np.rint(direction / _BIN).astype(np.intp)
+    quarter = turns // 4
+    near = np.abs((own + quarter // 2) % quarter - quarter // 2) <= len(_turns(max_tilt_deg)) // 2 + _SPREAD
+    own, weight = own[near], weight[near]
+    x, y = x[near] - (shape[1] - 1) / 2, y[near] - (shape[0] - 1) / 2
+    cosine, sine = np.cos(np.arange(turns) * _BIN), np.sin(np.arange(turns) * _BIN)
+    total = np.zeros(turns * width)
+    for step in range(-_SPREAD, _SPREAD + 1, 2):
+        k = (own + step) % turns
+        rho = np.rint(x * cosine[k] + y * sine[k]).astype(np.intp) + reach
+        part = weight * np.exp(-0.5 * (step / (0.6 * _SPREAD)) ** 2)
+        total += np.bincount(k * width + rho, part, minlength=total.size)
+    votes = total.reshape(turns, width).astype(np.float32)
+    votes = np.asarray(votes + np.roll(votes, 1, 0) + np.roll(votes, -1, 0), dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(votes, (5, 1), 1.0), dtype=np.float32), reach
+
+
+def _lines(votes: Plane, reach: int, direction: int, sign: float) -> _Lines:
+    """The best lines of a direction; distances along `sign` times it."""
+    row = votes[direction % len(votes)]
+    peak = row >= cv2.dilate(row[None], np.ones((1, 7), np.uint8))[0]
+    at = np.flatnonzero(peak & (row > 0))
+    at = at[np.argsort(-row[at], kind="stable")[:_PEAKS]]
+    return _Lines((sign * (at - reach)).astype(np.float64), row[at].astype(np.float64))
+
+
+def _combined(
+    votes: Plane,
+    reach: int,
+    turn: int,
+    shapes: Sequence[tuple[float, float]],
+    tolerance: float,
+    px_per_mm: float | None,
+    shape: tuple[int, int],
+    missing: bool,
+) -> Iterator[FrameGuess]:
+    """Rectangles of one direction; `missing`: those of which one edge is not seen."""
+    quarter = len(votes) // 4
+    for polarity in (1, -1):
+        base = turn if polarity > 0 else turn + 2 * quarter
+        # Normals point from dark to bright; distances are along the frame's own axes.
+        signs = (polarity, -polarity, -polarity, polarity)
+        upper, right, lower, left = (
+            _lines(votes, reach, base + quarter * k, float(sign))
+            for k, sign in zip((1, 2, 3, 0), signs, strict=True)
+        )
+        for w, h in shapes:
+            across, a_seen = _pairs(left, right, missing)
+            down, d_seen = _pairs(upper, lower, missing)
+            size_x, size_y = across[:, 1] - across[:, 0], down[:, 1] - down[:, 0]
+            aspect = (size_x[:, None] * h) / np.where(size_y != 0, size_y * w, 1.0)
+            whole = np.outer(a_seen.all(axis=1), d_seen.all(axis=1))
+            good = (np.abs(np.log(np.maximum(aspect, 1e-9))) < tolerance) & whole
+            good &= (size_x[:, None] > _LEAST_SIDE * max(shape)) & (size_y > _LEAST_SIDE * max(shape))
+            if missing:
+                yield from _completed(across, down, a_seen, d_seen, (w, h), turn, polarity, shape, px_per_mm)
+                continue
+            if px_per_mm is not None:
+                good &= np.abs(np.log(np.maximum(size_x, 1e-9)[:, None] / (w * px_per_mm))) < 2 * tolerance
+            i, j = np.nonzero(good)
+            # Votes of an edge over its length: neighbours in line with it do not make it better.
+            share = np.minimum(across[i, 2:] / size_y[j, None], 1.5).sum(axis=1)
+            share += np.minimum(down[j, 2:] / size_x[i, None], 1.5).sum(axis=1)
+            for n in np.argsort(-share, kind="stable")[:40]:
+                box = (across[i[n], 0], down[j[n], 0], across[i[n], 1], down[j[n], 1])
+                corners = _rectangle(box, turn * _BIN, shape)
+                yield FrameGuess(corners, polarity, (w, h), (True,) * 4, float(share[n]))
+
+
+def _pairs(first: _Lines, second: _Lines, missing: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Pairs of opposite lines (k, 4): places and votes; and which are seen. With `missing`, one alone too."""
+    i, j = (part.ravel() for part in np.meshgrid(np.arange(len(first.at)), np.arange(len(second.at))))
+    both = np.stack([first.at[i], second.at[j], first.votes[i], second.votes[j]], axis=1)
+    seen = np.ones((len(both), 2), dtype=bool)
+    if missing:
+        for lines, place in ((first, 0), (second, 1)):
+            one = np.full((len(lines.at), 4), np.nan)
+            one[:, place], one[:, 2 + place], one[:, 3 - place] = lines.at, lines.votes, 0.0
+            both = np.concatenate([both, one])
+            alone = np.zeros((len(one), 2), dtype=bool)
+            alone[:, place] = True
+            seen = np.concatenate([seen, alone])
+    return both, seen
+
+
+def _completed(
+    across: Array,
+    down: Array,
+    a_seen: NDArray[np.bool_],
+    d_seen: NDArray[np.bool_],
+    size: tuple[float, float],
+    turn: int,
+    polarity: int,
+    shape: tuple[int, int],
+    px_per_mm: float | None,
+) -> Iterator[FrameGuess]:
+    """Rectangles of three lines and the format."""
+    for lying in (True, False):
+        pairs, ones = (down, across) if lying else (across, down)
+        p_seen, o_seen = (d_seen, a_seen) if lying else (a_seen, d_seen)
+        pairs, ones, alone = pairs[p_seen.all(axis=1)], ones[~o_seen.all(axis=1)], o_seen[~o_seen.all(axis=1)]
+        span = pairs[:, 1] - pairs[:, 0]
+        ratio = size[0] / size[1] if lying else size[1] / size[0]
+        length = np.maximum(span * ratio, 1.0)
+        good = span > _LEAST_SIDE * max(shape)
+        if px_per_mm is not None:
+            good &= np.abs(np.log(np.maximum(span, 1) / (size[1 if lying else 0] * px_per_mm))) < 0.06
+        i, j = np.nonzero(good[:, None] & np.ones(len(ones), dtype=bool))
+        share = np.minimum(pairs[i, 2:] / length[i, None], 1.5).sum(axis=1)
+        share += np.minimum(ones[j, 2:].max(axis=1) / np.maximum(span[i], 1), 1.5)
+        for n in np.argsort(-share, kind="stable")[:6]:
+            p, o, first = pairs[i[n]], ones[j[n]], bool(alone[j[n], 0])
+            low = o[0] if first else o[1] - length[i[n]]
+            high = low + length[i[n]]
+            box = (low, p[0], high, p[1]) if lying else (p[0], low, p[1], high)
+            gone = (1 if first else 3) if lying else (2 if first else 0)
+            seen = tuple(k != gone for k in range(4))
+            corners = _rectangle(box, turn * _BIN, shape)
+            # An edge that is in the scan and is not seen is believed in only at a scale that is known.
+            if px_per_mm is not None or not lies_in(corners[[gone, (gone + 1) % 4]].mean(axis=0), shape):
+                yield FrameGuess(corners, polarity, size, seen, float(share[n]))  # type: ignore[arg-type]
+
+
+def _rectangle(box: Sequence[float], angle: float, shape: tuple[int, int]) -> Array:
+    """Corners of a box (x0, y0, x1, y1) in axes turned about the centre of the overview."""
+    x0, y0, x1, y1 = box
+    at = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    c, s = np.cos(angle), np.sin(angle)
+    centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    return np.asarray(at @ np.array([[c, s], [-s, c]]) + centre)
+
+
+def _distinct(guesses: list[FrameGuess], most: int) -> list[FrameGuess]:
+    """The best of each group that is nearly the same."""
+    kept: list[FrameGuess] = []
+    corners = np.zeros((0, 8))
+    for guess in guesses:
+        flat = guess.corners.ravel()
+        if not len(corners) or np.abs(corners - flat).max(axis=1).min() > 2.5:
+            kept.append(guess)
+            corners = np.concatenate([corners, flat[None]])
+        if len(kept) >= most:
+            break
+    return kept
+
+
+def _apart(guesses: list[FrameGuess]) -> list[FrameGuess]:
+    """The best, and others like it that do not overlap with it: frames of one strip."""
+    if not guesses:
+        return []
+    best = guesses[0]
+    size = size_of(best.corners)
+    kept: list[FrameGuess] = []
+    for guess in guesses:
+        alike = guess.polarity == best.polarity and all(guess.supported) == all(best.supported)
+        alike &= bool(np.abs(size_of(guess.corners) / size - 1).max() < 0.04)
+        if kept and not alike:
+            continue
+        if all(_overlap(guess.corners, other.corners) < 0.05 for other in kept):
+            kept.append(guess)
+    return kept
+
+
+def _overlap(first: Array, second: Array) -> float:
+    """Common area over that of the first."""
+    common: Any = cv2.intersectConvexConvex(first.astype(np.float32), second.astype(np.float32))[0]
+    return float(common) / float(np.prod(size_of(first)))

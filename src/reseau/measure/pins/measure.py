@@ -1,0 +1,251 @@
+"""The rods of a design, measured in one frame: the echoes found, told apart by the pattern, judged by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...adjust import Failure
+from ...core.data import Array, Frame, Mask, Rows
+from ...core.errors import UsageError
+from ...io import ReseauDesign
+from ...optics.field import SmoothField, trend_degree
+from ..measured import Measured
+from .detection import PinDetections, PinOptions, find_pins
+from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
+
+__all__ = ["PinResult", "measure_pins"]
+
+_AMBIGUOUS = "the design is symmetric and fits in more than one way: taken upright, y up, as far as that goes"
+_BESIDE_PX = 3.0
+"""How far from the middle line of an echo, at least, another rod's place counts as covered by it."""
+_ROUNDS = 3
+"""Times that the field is fitted and the pattern laid again by it; the second settles it as a rule."""
+_COLUMNS = (
+    "contrast",
+    "t",
+    "noise",
+    "correlation",
+    "strength",
+    "length",
+    "thickness",
+    "curvature",
+    "tilt",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PinResult(Measured):
+    """The rods of a design in one frame: y on the line, x in its middle.
+
+    `deviation` is from what all *other* rods predict (leave-one-out).
+
+    Parameters
+    ----------
+    correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
+        As in :class:`reseau.refine.PinDetections`; NaN where not measured.
+    detections : PinDetections
+        All spots of the frame.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    correlation: Array
+    strength: Array
+    length: Array
+    thickness: Array
+    curvature: Array
+    tilt: Array
+    detections: PinDetections
+    notes: tuple[str, ...] = ()
+
+
+def measure_pins(
+    frame: Frame,
+    design: ReseauDesign,
+    options: PinOptions | None = None,
+    others: Sequence[Frame] = (),
+    hidden: Mask | None = None,
+) -> PinResult | Failure:
+    """Measure every rod of a test object that can be measured.
+
+    Parameters
+    ----------
+    frame : Frame
+        A frame that shows the echoes of the rods, bright on a dark ground.
+    design : ReseauDesign
+        The rods, with or without nominal positions in the image.
+    options : PinOptions, optional
+        How.
+    others : sequence of Frame
+        Further frames of the sequence, see :func:`reseau.refine.find_pins`.
+    hidden : ndarray (h, w) of bool, optional
+        Pixels that wires of a reseau cover, where they are known.
+
+    Returns
+    -------
+    PinResult or Failure
+        A failure (falsy) when the rods' pattern is not to be found among the echoes.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+    UsageError
+        When the design is not one of rods, or tells the places of fewer than four.
+    """
+    o = options or PinOptions()
+    if design.mark.shape != "rod":
+        raise UsageError(
+            f"has marks of the shape {design.mark.shape!r}",
+            where=f"design {design.name}",
+            do="give one of rods",
+        )
+    source = design.xy
+    known = np.flatnonzero(np.isfinite(source).all(axis=1))
+    if len(known) < 4:
+        raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
+    seen = find_pins(frame, o, others, hidden)
+    echoes = np.flatnonzero(seen.ok)
+    layout = _laid(design, known, seen.xy[echoes], o)
+    if isinstance(layout, Failure):
+        return Failure(
+            f"{frame.name}: the rods of design {design.name!r} are not to be found: {layout.reason}"
+        )
+    names = tuple(design.ids[i] for i in known)
+    work = _Rods(frame, source[known], names, seen, echoes, layout)
+    return work.result(design.ids, known)
+
+
+def _laid(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
+    """The pattern over the echoes, by nominal positions where the design has them."""
+    ids = tuple(design.ids[i] for i in known)
+    wires = Wires.of_points(ids, design.xy[known])
+    nominal = design.nominal_px[known]
+    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), o.mirrored)
+    start = nominal if np.isfinite(nominal).all() else None
+    return lay_wires(wires, seen, options, start)
+
+
+class _Rods:
+    """Rods and echoes of one frame, and the field between them."""
+
+    def __init__(
+        self,
+        frame: Frame,
+        source: Array,
+        ids: tuple[str, ...],
+        seen: PinDetections,
+        echoes: Rows,
+        layout: Layout,
+    ) -> None:
+        self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
+        self.row, self.gate_px = layout.row, layout.gate_px
+        self.notes = (_AMBIGUOUS,) if layout.ambiguous else ()
+        self.predicted = layout(source)
+        self.why = np.full(len(source), "", dtype=object)
+        self.deviation = np.full(source.shape, np.nan)
+        self.ids = ids
+        self._settle()
+        self._separate()
+
+    def _settle(self) -> None:
+        """Fit a field through rods and echoes, assign by it, take out what the others do not bear out."""
+        for _ in range(_ROUNDS):
+            field = self._field()
+            if field is None:
+                break
+            self.predicted = field(self.source)
+            mine, theirs = nearest_pairs(self.predicted, self.seen.xy[self.echoes], self.gate_px)
+            row = np.full(len(self.source), -1)
+            row[mine] = theirs
+            if (row == self.row).all():
+                break
+            self.row = row
+        while (field := self._field()) is not None:
+            has = np.flatnonzero(self.row >= 0)
+            self.predicted = field(self.source)
+            self.deviation[:] = np.nan
+            self.deviation[has], _ = field.leave_one_out()
+            off = np.hypot(*self.deviation[has].T)
+            worst = int(off.argmax())
+            if off[worst] <= self.gate_px:
+                break
+            self.why[has[worst]] = f"{off[worst]:.1f} px off the prediction of its neighbours"
+            self.row[has[worst]] = -1
+        self.deviation[self.row < 0] = np.nan
+
+    def _separate(self) -> None:
+        """Decline an echo that another rod, which has none, should have a share in."""
+        has, without = np.flatnonzero(self.row >= 0), np.flatnonzero(self.row < 0)
+        if not len(has) or not len(without):
+            return
+        seen, at = self.seen, self.echoes[self.row[has]]
+        offset = self.predicted[without][:, None] - seen.xy[at]
+        c, s = np.cos(seen.tilt[at]), np.sin(seen.tilt[at])
+        along = np.abs(c * offset[..., 0] + s * offset[..., 1])
+        across = np.abs(c * offset[..., 1] - s * offset[..., 0])
+        shared = (along < 0.5 * seen.length[at]) & (across < np.maximum(seen.thickness[at], _BESIDE_PX))
+        for i, k in zip(*np.nonzero(shared), strict=True):
+            one, other = has[k], without[i]
+            self.why[one] = f"its echo touches that of {self.ids[other]}"
+            self.why[other] = f"its echo touches that of {self.ids[one]}"
+            self.row[one] = -1
+            self.deviation[one] = np.nan
+
+    def _field(self) -> SmoothField | None:
+        """From the design to the image; None where too few rods were found to test one."""
+        has = np.flatnonzero(self.row >= 0)
+        if len(has) < 5:
+            return None
+        degree = max(1, min(3, trend_degree(len(has))))
+        return SmoothField.fit(
+            self.source[has], self.seen.xy[self.echoes[self.row[has]]], degree=degree, local=len(has) >= 20
+        )
+
+    def result(self, ids: tuple[str, ...], known: Rows) -> PinResult:
+        """Spread over all rods of the design, those without coordinates among them."""
+        n, found = len(ids), self.row >= 0
+        at = self.echoes[self.row[found]]
+        why = np.full(n, "the design does not say where", dtype=object)
+        why[known] = [self._reason(i) for i in range(len(known))]
+
+        def spread(values: Array) -> Array:
+            full = np.full((n, *values.shape[1:]), np.nan)
+            full[known[found]] = values
+            return full
+
+        ok = np.zeros(n, dtype=bool)
+        ok[known] = found
+        predicted = np.full((n, 2), np.nan)
+        predicted[known] = self.predicted
+        return PinResult(
+            image=self.frame.name,
+            sha256=self.frame.sha256,
+            ids=ids,
+            xy=spread(self.seen.xy[at]),
+            cov=spread(self.seen.cov[at]),
+            ok=ok,
+            why=tuple(why),
+            predicted=predicted,
+            deviation=spread(self.deviation[found]),
+            **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
+            detections=self.seen,
+            notes=self.notes,
+        )
+
+    def _reason(self, rod: int) -> str:
+        """Why a rod was not measured; empty where it was."""
+        if self.row[rod] >= 0 or self.why[rod]:
+            return str(self.why[rod])
+        x, y = self.predicted[rod]
+        if not (0 <= x <= self.frame.width - 1 and 0 <= y <= self.frame.height - 1):
+            return "outside the frame"
+        distance = np.hypot(*(self.seen.xy - self.predicted[rod]).T)
+        distance[self.seen.ok] = np.inf
+        nearest = int(distance.argmin()) if len(distance) else -1
+        if nearest >= 0 and distance[nearest] < self.gate_px:
+            return self.seen.why[nearest]
+        return "no echo where the others have it"

@@ -1,0 +1,273 @@
+"""Which echo is which wire: a pattern of points and segments laid over detections, mirrored or turned.
+
+A rod parallel to the scanner's normal is cut by every image plane at the same place of the pattern; one that
+runs askew (the diagonal of an N) is cut somewhere on a segment. The points decide how the pattern lies: two
+of them and two detections make a similarity, and the one most others agree with is refined to an affinity,
+which takes up different scales in depth and across. The segments are read off then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from ...adjust import Failure
+from ...core.data import Array, Mask, Rows
+
+__all__ = ["Layout", "LayoutOptions", "Wires", "lay_wires", "nearest_pairs"]
+
+_BASES = 30
+"""Pairs of wires far apart that are tried as a base."""
+_FOLLOWED = 40
+"""Best similarities that are refined."""
+_LEAST = 4
+"""Fewest points that an affinity is tested by: three make one."""
+_ANISOTROPY = 1.4
+"""Greatest ratio of the scales in two directions."""
+_ALIKE = 0.1
+"""Wires found, less half the scatter over the gate, by which two ways to lay a pattern must differ."""
+_BEYOND = 0.15
+"""Share of a segment's length by which a wire may be seen beyond its ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wires:
+    """Where wires cut the plane of the pattern, in columns.
+
+    Parameters
+    ----------
+    ids : tuple of str (n,)
+        Names.
+    start, end : ndarray (n, 2)
+        Ends of the segment on which each is cut; the same point for a wire normal to the plane.
+    """
+
+    ids: tuple[str, ...]
+    start: Array
+    end: Array
+
+    @classmethod
+    def of_points(cls, ids: tuple[str, ...], xy: Array) -> Wires:
+        """Wires that are all normal to the plane."""
+        return cls(ids, xy, xy)
+
+    @property
+    def fixed(self) -> Mask:
+        """Which are points."""
+        return np.asarray((self.start == self.end).all(axis=1))
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of a point to its nearest neighbour."""
+        points = self.start[self.fixed]
+        return float(np.median(KDTree(points).query(points, k=2)[0][:, 1]))
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """What is known of a pattern in the image.
+
+    Parameters
+    ----------
+    gate : float
+        How far a wire may lie from where the others have it, in the pattern's spacing.
+    max_rotation : float
+        Largest rotation (rad) against the image, or against the image turned by half a turn.
+    mirrored : bool, optional
+        Whether the image has the other handedness; None: to be found out.
+    """
+
+    gate: float = 0.15
+    max_rotation: float = np.deg2rad(12.0)
+    mirrored: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A pattern laid over detections.
+
+    Parameters
+    ----------
+    row : ndarray of int (n,)
+        Detection of each wire, -1 where there is none.
+    matrix : ndarray (2, 2)
+        From the pattern to the image, linear part.
+    shift : ndarray (2,)
+        … and the image of the pattern's origin.
+    gate_px : float
+        How far a point may lie from its prediction.
+    rms_px : float
+        Root mean square of the points' distances from the affinity.
+    ambiguous : bool
+        Whether the pattern can be laid in another way as well: it is symmetric.
+    """
+
+    row: Rows
+    matrix: Array
+    shift: Array
+    gate_px: float
+    rms_px: float
+    ambiguous: bool = False
+
+    def __call__(self, xy: Array) -> Array:
+        """Image of points (n, 2) of the pattern."""
+        return xy @ self.matrix.T + self.shift
+
+    def inverse(self, xy: Array) -> Array:
+        """Points of the pattern (n, 2) seen at `xy`."""
+        return np.asarray(np.linalg.solve(self.matrix, (xy - self.shift).T).T)
+
+
+def lay_wires(
+    wires: Wires, seen: Array, options: LayoutOptions | None = None, start: Array | None = None
+) -> Layout | Failure:
+    """Find the pattern among detections.
+
+    Parameters
+    ----------
+    wires : Wires
+        The pattern, four points or more among it.
+    seen : ndarray (m, 2)
+        Detections in pixels, false ones among them.
+    options : LayoutOptions, optional
+        What is known.
+    start : ndarray (n, 2), optional
+        Approximate positions of all wires in pixels, to half their spacing; nothing else is tried then.
+
+    Returns
+    -------
+    Layout or Failure
+        A failure when fewer than four points lie as the pattern has them.
+    """
+    o = options or LayoutOptions()
+    points = wires.start[wires.fixed]
+    if len(points) < _LEAST:
+        return Failure(f"the pattern has {len(points)} points; {_LEAST} are needed to find it")
+    if len(seen) < _LEAST:
+        return Failure(
+            f"{len(seen)} echoes of {len(wires.ids)} wires; {_LEAST} are needed to tell which is which"
+        )
+    if start is not None:
+        near = _refined(wires, seen, *_affinity(points, start[wires.fixed]), o)
+        return near or Failure("the nominal positions have fewer than four echoes about them")
+    tried: list[tuple[float, bool, Layout]] = []
+    for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
+        linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+        layout = _refined(wires, seen, linear @ np.diag([1.0, -1.0 if mirror else 1.0]), shift, o)
+        if layout is None:
+            continue
+        found = int((layout.row >= 0).sum())
+        score = found - 0.5 * layout.rms_px / layout.gate_px
+        # Upright with y up is what is meant where the pattern does not tell: first so, then in any other way.
+        tried.append((score, not mirror or factor.real < 0, layout))
+    if not tried:
+        return Failure(f"none of the ways to lay the {len(wires.ids)} wires over {len(seen)} echoes fits")
+    highest = max(score for score, _, _ in tried)
+    alike = sorted((one for one in tried if one[0] > highest - _ALIKE), key=lambda one: (one[1], -one[0]))
+    chosen = alike[0][2]
+    there = chosen(points)
+    rivals = any(np.abs(one[2](points) - there).max() > chosen.gate_px for one in alike[1:])
+    return replace(chosen, ambiguous=rivals)
+
+
+def _hypotheses(
+    points: Array, seen: Array, spacing: float, o: LayoutOptions
+) -> list[tuple[complex, Array, bool]]:
+    """Similarities with which most points find a detection, as complex factor, shift and handedness."""
+    first, second = np.triu_indices(len(points), 1)
+    far = np.argsort(-np.hypot(*(points[first] - points[second]).T), kind="stable")[:_BASES]
+    first, second = first[far], second[far]
+    i, j = np.nonzero(~np.eye(len(seen), dtype=bool))
+    z, tree = seen[:, 0] + 1j * seen[:, 1], KDTree(seen)
+    found: list[tuple[float, complex, Array, bool]] = []
+    for mirror in (True, False) if o.mirrored is None else (o.mirrored,):
+        p = points[:, 0] + (-1j if mirror else 1j) * points[:, 1]
+        factor = (z[j] - z[i])[:, None] / (p[second] - p[first])
+        turn = np.abs(np.angle(factor**2)) / 2  # against either way up
+        pair, base = np.nonzero(turn <= o.max_rotation)
+        a = factor[pair, base]
+        b = z[i[pair]] - a * p[first[base]]
+        placed = a[:, None] * p + b[:, None]
+        distance, _ = tree.query(np.stack([placed.real, placed.imag], axis=-1))
+        off = distance / (np.abs(a)[:, None] * spacing)
+        votes = np.clip(1 - (off / (2 * o.gate)) ** 2, 0, None).sum(axis=1)
+        for k in np.argsort(-votes, kind="stable")[:_FOLLOWED]:
+            found.append((float(votes[k]), complex(a[k]), np.array([b[k].real, b[k].imag]), mirror))
+    found.sort(key=lambda item: -item[0])
+    return [item[1:] for item in found[:_FOLLOWED]]
+
+
+def _refined(wires: Wires, seen: Array, matrix: Array, shift: Array, o: LayoutOptions) -> Layout | None:
+    """The affinity through points and their detections, the gate narrowing; then the segments."""
+    points, fixed = wires.start[wires.fixed], np.flatnonzero(wires.fixed)
+    for factor in (2.0, 1.5, 1.0, 1.0):
+        scale = np.sqrt(abs(np.linalg.det(matrix)))
+        gate = factor * o.gate * scale * wires.spacing
+        mine, theirs = nearest_pairs(points @ matrix.T + shift, seen, gate)
+        if len(mine) < _LEAST:
+            return None
+        design = np.column_stack([points[mine], np.ones(len(mine))])
+        if np.linalg.matrix_rank(design, tol=1e-6 * np.abs(design).max()) < 3:
+            return None
+        matrix, shift = _affinity(points[mine], seen[theirs])
+        large, small = np.linalg.svd(matrix, compute_uv=False)
+        if large > _ANISOTROPY * small:
+            return None
+    rest = points[mine] @ matrix.T + shift - seen[theirs]
+    row = np.full(len(wires.ids), -1)
+    row[fixed[mine]] = theirs
+    rms = float(np.sqrt((rest**2).sum(axis=1).mean()))
+    layout = Layout(row, matrix, shift, float(gate), rms)
+    _read_segments(wires, seen, layout)
+    return layout
+
+
+def _affinity(points: Array, seen: Array) -> tuple[Array, Array]:
+    """Linear part and shift of the affinity that fits best."""
+    design = np.column_stack([points, np.ones(len(points))])
+    solved = np.asarray(np.linalg.lstsq(design, seen, rcond=None)[0], dtype=np.float64)
+    return solved[:2].T, solved[2]
+
+
+def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Rows]:
+    """Pair points and detections one to one within a gate; the sum of squared distances is least.
+
+    Parameters
+    ----------
+    predicted, seen : ndarray (n, 2), (m, 2)
+        Where they should be, where they are.
+    gate : float
+        Greatest distance.
+
+    Returns
+    -------
+    mine, theirs : ndarray of int (k,)
+        Rows of the one and of the other.
+    """
+    distance = np.hypot(*np.moveaxis(predicted[:, None] - seen[None], -1, 0))
+    cost = np.minimum(distance / gate, 1.0) ** 2
+    mine, theirs = linear_sum_assignment(cost)
+    near = distance[mine, theirs] < gate
+    return mine[near], theirs[near]
+
+
+def _read_segments(wires: Wires, seen: Array, layout: Layout) -> None:
+    """Give the segments the detections that lie on them and serve no point."""
+    askew = np.flatnonzero(~wires.fixed)
+    free = np.setdiff1d(np.arange(len(seen)), layout.row)
+    if not len(askew) or not len(free):
+        return
+    start, end = layout(wires.start[askew]), layout(wires.end[askew])
+    along = end - start
+    offset = seen[free][None] - start[:, None]
+    share = (offset * along[:, None]).sum(axis=-1) / (along**2).sum(axis=-1)[:, None]
+    foot = np.clip(share, 0, 1)[..., None] * along[:, None]
+    distance = np.hypot(*np.moveaxis(offset - foot, -1, 0))
+    beyond = np.abs(share - np.clip(share, 0, 1)) > _BEYOND
+    cost = np.where(beyond, 2.0, np.minimum(distance / layout.gate_px, 2.0))
+    mine, theirs = linear_sum_assignment(cost)
+    good = cost[mine, theirs] < 1
+    layout.row[askew[mine[good]]] = free[theirs[good]]

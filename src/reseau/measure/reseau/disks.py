@@ -1,0 +1,127 @@
+"""Disks seen in any perspective: dark or bright ellipses of a frame, whatever their size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Mask
+
+__all__ = ["Disks", "find_disks"]
+
+_SIDES_PX = (25, 51, 101)
+"""Sides of the squares in which half way between the darkest and the brightest is the threshold."""
+_SMALL = 8000
+"""Sums of so large whole numbers, and their doubles, are whole numbers of 16 bits."""
+_LEAST_AREA = 30
+_LEAST_CONTRAST = 10.0
+"""Contrast in standard deviations of the noise from which on a square holds anything."""
+_ELLIPTIC = 0.97
+"""Least area over that of the ellipse of the same second moments: 1 for ellipses, 0.955 for squares."""
+_NARROWEST = 0.2
+"""Least ratio of the axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Disks:
+    """Ellipses in a frame, in columns.
+
+    Parameters
+    ----------
+    xy : ndarray (m, 2)
+        Centres in pixels, good to about 0.3 px.
+    form : ndarray (m, 2, 2)
+        Symmetric matrices that carry the unit circle to each ellipse.
+    t : ndarray (m,)
+        Contrast times the root of the number of pixels over the noise: the strongest come first.
+    """
+
+    xy: Array
+    form: Array
+    t: Array
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def strongest(self, count: int) -> Disks:
+        """So many of them at most."""
+        return Disks(self.xy[:count], self.form[:count], self.t[:count])
+
+
+def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
+    """Find the dark ellipses of a frame.
+
+    In squares of several sizes the frame is cut half way between what is darkest and brightest there. Of all
+    connected parts those stay whose area is that of the ellipse of their second moments, which of all plane
+    figures have the largest: moments tell a disk in perspective from arcs, letters and crossings.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w)
+        Grey values; negative ones where the disks are bright.
+    valid : ndarray (h, w) of bool
+        Pixels that carry an image.
+    noise : float
+        Standard deviation of the grey values.
+    """
+    found, values, before = [], _compact(grey), 1
+    low = high = values
+    for side in _SIDES_PX:
+        square = np.ones((side - before + 1,) * 2, np.uint8)  # what is darkest in a square of squares
+        low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
+        contrast = high - low
+        dark = (values + values < low + high) & (contrast > _LEAST_CONTRAST * noise) & valid
+        found.append(_parts(dark, contrast, side))
+    xy, moments, quality, t = (np.concatenate(column) for column in zip(*found, strict=True))
+    if not len(xy):
+        return Disks(np.empty((0, 2)), np.empty((0, 2, 2)), t)
+    value, vector = np.linalg.eigh(moments)
+    form = np.einsum("kij,kj,klj->kil", vector, 2 * np.sqrt(value), vector)
+    keep, t = np.flatnonzero(_once(xy, 2 * np.sqrt(value[:, 0]), quality)), t / noise
+    keep = keep[np.argsort(-t[keep], kind="stable")]
+    return Disks(xy[keep], form[keep], t[keep])
+
+
+def _compact(grey: NDArray[Any]) -> NDArray[Any]:
+    """Grey values as small whole numbers where they are such: what follows is then three times as fast."""
+    if not max(-grey.min(), grey.max()) <= _SMALL:
+        return grey
+    whole = grey.astype(np.int16)
+    return whole if np.array_equal(whole, grey) else grey
+
+
+def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
+    """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic parts."""
+    from .parts import part_sums  # takes half a second, which not every command needs
+
+    h, w = mask.shape
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    sums, (left, right, top, bottom) = part_sums(labels, count)
+    keep = (sums[0] >= _LEAST_AREA) & (np.maximum(right - left, bottom - top) < side - 1)
+    keep &= (left > 0) & (top > 0) & (right < w - 1) & (bottom < h - 1)
+    area = sums[0, keep]
+    x, y, xx, xy, yy = sums[1:, keep] / area
+    centre = np.stack([x, y], axis=1)
+    moments = np.stack([xx - x * x, xy - x * y, xy - x * y, yy - y * y], axis=1).reshape(-1, 2, 2)
+    axes = np.linalg.eigvalsh(moments)
+    quality = area / (4 * np.pi * np.sqrt(np.maximum(axes.prod(axis=1), 1e-9)))
+    good = (quality > _ELLIPTIC) & (axes[:, 0] > _NARROWEST**2 * axes[:, 1])
+    at = np.rint(centre).astype(np.intp)
+    t = contrast[at[:, 1], at[:, 0]] * np.sqrt(area)
+    return centre[good], moments[good], quality[good], t[good]
+
+
+def _once(xy: Array, radius: Array, quality: Array) -> Mask:
+    """Of parts found in squares of several sizes the most elliptic."""
+    keep = np.ones(len(xy), dtype=bool)
+    near = KDTree(xy).query_ball_point(xy, 0.5 * radius)
+    for k in np.argsort(-quality, kind="stable"):
+        if keep[k]:
+            keep[near[k]] = False
+            keep[k] = True
+    return keep

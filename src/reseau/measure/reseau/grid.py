@@ -1,0 +1,375 @@
+"""Which candidate is which mark: the design laid over the candidates, with or without prior positions.
+
+With prior positions only a common shift is voted for. Without them, pairs of neighbours vote for scale,
+rotation and handedness, and pairs of candidate and mark for the shift. From there both go the same way: a
+polynomial from the design to the image grows in degree, and outwards from where it is sure, while the gate
+narrows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Mask, Rows
+from ...optics.field import SmoothField, trend_degree
+from .candidates import Candidates
+
+__all__ = ["Assignment", "GridOptions", "assign", "lay_out"]
+
+_NEIGHBOURS = 6
+_NEARLY = 0.75
+"""Share of the marks from which a layout is the right one but for a step of the grid."""
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """What is known of the grid in the image.
+
+    Parameters
+    ----------
+    max_rotation : float
+        Largest rotation of the design against the image (rad).
+    mirrored : bool, optional
+        Whether the design has the handedness of the image (x right, y down; False) or the other (True); None:
+        to be found out. A grid symmetric in itself does not tell; then the handedness of nominal positions is
+        taken, and without them that of a design with y up.
+    hypotheses : int
+        So many peaks of the vote for scale and rotation are followed.
+    """
+
+    max_rotation: float = np.deg2rad(12.0)
+    mirrored: bool | None = None
+    hypotheses: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """Marks with their candidates.
+
+    Parameters
+    ----------
+    field : SmoothField
+        From the design to the image.
+    predicted : ndarray (n, 2)
+        Where the field has each mark.
+    candidate : ndarray of int (n,)
+        Row of the candidate of each mark, -1 where there is none.
+    at : ndarray (n, 2)
+        Position of that candidate, NaN where there is none.
+    missed : int
+        Marks that should be in sight and have no candidate.
+    """
+
+    field: SmoothField
+    predicted: Array
+    candidate: Rows
+    at: Array
+    missed: int
+
+    @property
+    def score(self) -> float:
+        """Marks found, less half of those missed."""
+        return int((self.candidate >= 0).sum()) - 0.5 * self.missed
+
+
+def spacing(xy: Array) -> float:
+    """Median distance of a point to its nearest neighbour."""
+    return float(np.median(KDTree(xy).query(xy, k=2)[0][:, 1]))
+
+
+def assign(
+    source: Array,
+    start: Array,
+    candidates: Candidates,
+    valid: Mask,
+    shifts: int = 4,
+    within_px: float | None = None,
+) -> Assignment | None:
+    """Give marks their candidates, beginning from approximate positions.
+
+    Parameters
+    ----------
+    source : ndarray (n, 2)
+        Design coordinates.
+    start : ndarray (n, 2)
+        Approximate positions in pixels: any smooth distortion and a common shift of up to one pitch away.
+    candidates : Candidates
+        What looks like a mark.
+    valid : ndarray (h, w) of bool
+        Pixels that carry an image; a mark is missed only there.
+    shifts : int
+        At most so many common shifts are tried: a grid that lies half a pitch away or more agrees almost as
+        well with one of its neighbours in the place of each mark, but misses those at its border.
+    within_px : float, optional
+        How far the approximate positions may be off at most, where that is known; no shift is tried then.
+
+    Returns
+    -------
+    Assignment or None
+        None when too few marks found a candidate.
+    """
+    if len(candidates) < 4:
+        return None
+    pitch, best = spacing(start), None
+    if within_px is not None:
+        return _assigned(source, start, candidates, valid, pitch, min(within_px, 0.2 * pitch))
+    for shift in _common_shifts(start, candidates, pitch, shifts):
+        found = _assigned(source, start + shift, candidates, valid, pitch, 0.2 * pitch)
+        if found is None:
+            continue
+        # Half a pitch off, wires have something of a crossing everywhere, but nothing strong.
+        strength = found.score + float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
+        if best is None or strength > best[0] + 0.75:
+            best = strength, found
+    return None if best is None else best[1]
+
+
+def _assigned(
+    source: Array, start: Array, candidates: Candidates, valid: Mask, pitch: float, widest: float
+) -> Assignment | None:
+    """Give marks their candidates, beginning from positions that a smooth distortion alone makes wrong."""
+    centre = _densest(start, candidates, pitch)
+    far = np.hypot(*(start - centre).T)
+    tree, predicted, gate = KDTree(candidates.xy), start, widest
+    field: SmoothField | None = None
+    rows = np.full(len(start), -1)
+    for step, most in enumerate((1, 1, 2, 3, 3, 5, 5, 5)):
+        reached = far <= max(3.5 * pitch, np.quantile(far, min(1.0, 0.35 + 0.13 * step)))
+        rows = _nearest(tree, candidates, predicted, gate, reached)
+        fitted = _robust_field(
+            source, rows, candidates, min(most, max(1, trend_degree(int((rows >= 0).sum()))))
+        )
+        if fitted is None:
+            break
+        field, scatter = fitted
+        predicted = field(source)
+        gate = float(np.clip(4 * scatter, min(max(2.0, 0.03 * pitch), widest), widest))
+    if field is None:
+        return None
+    rows = _nearest(tree, candidates, predicted, gate, np.ones(len(start), dtype=bool))
+    missed = (rows < 0) & _in_sight(predicted, valid)
+    at = np.where(rows[:, None] >= 0, candidates.xy[rows], np.nan)
+    return Assignment(field, predicted, rows, at, int(missed.sum()))
+
+
+def _in_sight(xy: Array, valid: Mask) -> Mask:
+    """Which positions lie on pixels that carry an image, two pixels from the border at least."""
+    limits = np.array(valid.shape[::-1])
+    inside = ((xy > 1) & (xy < limits - 2)).all(axis=1)
+    column, row = np.clip(np.rint(np.nan_to_num(xy)), 0, limits - 1).astype(np.intp).T
+    seen: Mask = inside & valid[row, column]
+    return seen
+
+
+def _common_shifts(start: Array, candidates: Candidates, pitch: float, count: int) -> Iterator[Array]:
+    """Shifts, of at most a pitch, on which most pairs of start and candidate agree, the likeliest first."""
+    offset = (candidates.xy[None] - start[:, None]).reshape(-1, 2)
+    weight = np.broadcast_to(np.minimum(candidates.t, 15.0), (len(start), len(candidates))).ravel()
+    near = (np.abs(offset) < pitch).all(axis=1)
+    votes, (x, y) = _vote(offset[near], weight[near], [(-pitch, pitch)] * 2, max(1.0, pitch / 40), 2.0)
+    # Of two shifts with like support the smaller is meant: a grid agrees with itself at every pitch.
+    votes *= 1 - 0.3 * np.hypot(x[:, None], y[None]) / (1.5 * pitch)
+    most = votes.max()
+    for _ in range(count):
+        i, j = np.unravel_index(votes.argmax(), votes.shape)
+        if not votes[i, j] > 0.5 * most:
+            return
+        yield np.array([x[i], y[j]])
+        votes[np.hypot(x[:, None] - x[i], y[None] - y[j]) < 0.3 * pitch] = 0
+
+
+def _vote(
+    values: Array,
+    weight: Array,
+    limits: list[tuple[float, float]],
+    width: float | tuple[float, float],
+    blur: float,
+) -> tuple[Array, tuple[Array, Array]]:
+    """A smoothed two-dimensional histogram and the centres of its bins."""
+    widths = (width, width) if isinstance(width, float) else width
+    bins = [max(3, int((high - low) / w)) for (low, high), w in zip(limits, widths, strict=True)]
+    votes, x, y = np.histogram2d(values[:, 0], values[:, 1], bins=bins, range=limits, weights=weight)
+    smooth: Array = gaussian_filter(votes, blur, mode="constant")
+    return smooth, ((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+
+
+def _densest(start: Array, candidates: Candidates, pitch: float) -> Array:
+    """A mark around which most of its fellows have a candidate where they should."""
+    has = KDTree(candidates.xy).query(start)[0] < 0.2 * pitch
+    near = KDTree(start).query(start, k=min(9, len(start)))[1]
+    score = has[near].sum(axis=1) - 1e-3 * np.hypot(*(start - start.mean(axis=0)).T) / pitch
+    centre: Array = start[score.argmax()]
+    return centre
+
+
+def _nearest(tree: KDTree, candidates: Candidates, predicted: Array, gate: float, reached: Mask) -> Rows:
+    """The likeliest candidate within the gate of each mark: strong, and near."""
+    distance, row = tree.query(predicted, k=min(4, len(candidates)), distance_upper_bound=gate)
+    likely = np.append(candidates.t, 0.0)[row] / (
+        1 + 3 * (np.where(np.isfinite(distance), distance, 0) / gate) ** 2
+    )
+    best = likely.argmax(axis=1)
+    each = np.arange(len(predicted))
+    rows = np.where((likely[each, best] > 0) & reached, row[each, best], -1)
+    # No candidate serves two marks: the nearer one keeps it.
+    order = np.lexsort((distance[each, best], rows))
+    again = np.append(False, (rows[order][1:] == rows[order][:-1]) & (rows[order][1:] >= 0))
+    rows[order[again]] = -1
+    return rows
+
+
+def _robust_field(
+    source: Array, rows: Rows, candidates: Candidates, degree: int
+) -> tuple[SmoothField, float] | None:
+    """A polynomial through marks and their candidates, blunders left out, and its scatter in pixels."""
+    has = np.flatnonzero(rows >= 0)
+    least = (degree + 1) * (degree + 2) // 2 + 3
+    if len(has) < least:
+        return None
+    image, kept = candidates.xy[rows[has]], np.ones(len(has), dtype=bool)
+    for _ in range(6):
+        try:
+            field = SmoothField.fit(source[has[kept]], image[kept], degree=degree, local=False)
+        except np.linalg.LinAlgError:  # marks of one row alone
+            return None
+        distance = np.hypot(*(field(source[has]) - image).T)
+        scatter = max(float(np.median(distance[kept])) / 1.18, 0.15)
+        closer = distance < 3 * scatter
+        if closer.sum() < least or (closer == kept).all():
+            break
+        kept = closer
+    return field, scatter
+
+
+def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOptions) -> Assignment | None:
+    """Find the design among candidates without prior positions.
+
+    Parameters
+    ----------
+    source : ndarray (n, 2)
+        Design coordinates.
+    candidates : Candidates
+        What looks like a mark; false ones may outnumber the marks three to one.
+    valid : ndarray (h, w) of bool
+        Pixels that carry an image.
+    options : GridOptions
+        What is known.
+
+    Returns
+    -------
+    Assignment or None
+        The one with the highest score; None when no hypothesis gathers marks.
+    """
+    strong = _strongest(candidates, 4 * len(source))
+    if len(strong) < 8 or len(source) < 8:
+        return None
+    # Along a wire much looks a little like a crossing: where all vote, that may outvote the crossings; where
+    # the strongest alone do, a scene behind the marks may. So the ones first and then the others.
+    electorates = (_strongest(candidates, 3 * len(source) // 2), strong)
+    best: Assignment | None = None
+    # y up first: where both explain the image alike, the first is kept.
+    for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
+        plane = source * [1, -1 if mirrored else 1]
+        for start in chain.from_iterable(_starts(plane, voters, options) for voters in electorates):
+            found = assign(source, start, strong, valid, shifts=1)
+            if found is None:
+                continue
+            if found.score > _NEARLY * len(source):
+                found = _climbed(found, source, strong, valid)
+            if best is None or found.score > best.score + 0.75:
+                best = found
+            # What no step of the grid betters, and nearly all marks bear out, is not bettered elsewhere.
+            if found.score > _NEARLY * len(source):
+                break
+    return best
+
+
+def _climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
+    """The design moved by steps of its grid as long as that gathers more marks.
+
+    A regular design laid one pitch off finds a candidate for all marks but those of a row.
+    """
+    offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
+    grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
+    steps, count = np.unique(np.round(offset.reshape(-1, 2) / grain), axis=0, return_counts=True)
+    steps = steps[count > 0.2 * len(source)] * grain
+    for _ in range(len(source)):
+        moved = (assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps)
+        better = max((m for m in moved if m is not None), key=lambda m: m.score, default=found)
+        if better.score <= found.score:
+            break
+        found = better
+    return found
+
+
+def _strongest(candidates: Candidates, count: int) -> Candidates:
+    return replace(candidates, xy=candidates.xy[:count], t=candidates.t[:count])
+
+
+def _starts(plane: Array, voters: Candidates, options: GridOptions) -> Iterator[Array]:
+    """Positions of the marks to begin from, the likeliest first."""
+    for similarity in _similarities(plane, voters, options):
+        yield from _shifted(plane, similarity, voters)
+
+
+def _complex(xy: Array) -> NDArray[np.complex128]:
+    z: NDArray[np.complex128] = xy[:, 0] + 1j * xy[:, 1]
+    return z
+
+
+def _similarities(plane: Array, candidates: Candidates, options: GridOptions) -> list[complex]:
+    """Scales and rotations, as complex factors, that turn neighbours of the design into neighbours seen."""
+
+    def steps(xy: Array, count: int) -> NDArray[np.complex128]:
+        z = _complex(xy)
+        row = KDTree(xy).query(xy, k=min(count + 1, len(xy)))[1]
+        vectors: NDArray[np.complex128] = (z[row[:, 1:]] - z[:, None]).ravel()
+        return vectors
+
+    designed, seen = steps(plane, _NEIGHBOURS), steps(candidates.xy, _NEIGHBOURS)
+    # Equal steps of a regular design vote with their number, once.
+    grain = np.abs(designed).min() / 50
+    designed, weight = np.unique(np.round(designed / grain), return_counts=True)
+    ratio = (seen[:, None] / (designed * grain)).ravel()
+    weights = np.broadcast_to(weight, (len(seen), len(weight))).ravel()
+    angle = np.angle(ratio)
+    keep = (np.abs(angle) < options.max_rotation) & (np.abs(ratio) > 0)
+    logs = np.log(np.abs(ratio[keep]))
+    limits = [
+        (float(logs.min()) - 0.1, float(logs.max()) + 0.1),
+        (-options.max_rotation, options.max_rotation),
+    ]
+    values = np.stack([logs, angle[keep]], axis=1)
+    votes, (x, y) = _vote(values, weights[keep].astype(float), limits, (0.01, 0.01), 2.0)
+    found = []
+    for _ in range(options.hypotheses):
+        i, j = np.unravel_index(votes.argmax(), votes.shape)
+        found.append(complex(np.exp(x[i] + 1j * y[j])))
+        votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
+    return found
+
+
+def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[Array]:
+    """Positions of the marks for the shifts on which most pairs of mark and candidate agree."""
+    turned = similarity * _complex(plane)
+    offset = (_complex(candidates.xy)[:, None] - turned).ravel()
+    pitch = abs(similarity) * spacing(plane)
+    values = np.stack([offset.real, offset.imag], axis=1)
+    limits = [
+        (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
+    votes, (x, y) = _vote(values, np.ones(len(values)), limits, pitch / 10, 2.0)
+    starts = []
+    for _ in range(5):
+        i, j = np.unravel_index(votes.argmax(), votes.shape)
+        moved = turned + complex(x[i], y[j])
+        starts.append(np.stack([moved.real, moved.imag], axis=1))
+        votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
+    return starts

@@ -1,0 +1,291 @@
+"""Two rounds of matching for the marks of a frame, and the verdict on every one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.data import Array, Frame, Mask, Rows
+from ...io import ReseauDesign
+from ...optics.field import SmoothField
+from ...optics.formation import Outline, PixelResponse, mark_outline
+from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
+from .placing import Placement
+
+__all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
+
+_UNMODELLED_PX = 0.07
+"""What positions scatter beyond their own sigmas in real frames; balances the weights of a field's points."""
+_LEARN_FROM = 50
+"""So many of the strongest marks tell what a mark of this frame looks like."""
+_SEEN = 0.1
+"""Share of a mark that must lie on pixels that carry an image."""
+_BLURRED = 1.55
+"""Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
+_LIKE_OTHERS = 4.0
+"""Spreads by which the contrast of a mark may differ from that of the others."""
+
+
+@dataclass(frozen=True)
+class ReseauOptions:
+    """How a reseau is measured.
+
+    Parameters
+    ----------
+    nominal : bool
+        Whether the design's nominal positions are used, where it has them.
+    nominal_within_px : float, optional
+        How far they may be off, where that is known; by default by any smooth distortion and up to a pitch.
+    mirrored : bool, optional
+        See :class:`reseau.refine.grid.GridOptions`.
+    max_rotation_deg : float
+        Largest rotation of the design in the image, where there are no nominal positions.
+    mark_px : float, optional
+        Size of a mark in the image (width of the line for a line grid); by default from the design.
+    psf_px : float
+        First guess of the width (one sigma) of the point-spread function; estimated.
+    row_jitter_px : float
+        Standard deviation of the shift of single rows, where known.
+    fill : float
+        Light-sensitive part of the pitch of the pixels along either axis, 0 to 1, where known.
+    least_t : float
+        Least contrast of a mark in units of its standard deviation.
+    most_sigma_px : float
+        Largest standard deviation of a coordinate that still counts as measured.
+    neighbour_px : float
+        Largest deviation, per axis, from what the neighbours predict.
+    """
+
+    nominal: bool = True
+    nominal_within_px: float | None = None
+    mirrored: bool | None = None
+    max_rotation_deg: float = 12.0
+    mark_px: float | None = None
+    psf_px: float = 0.6
+    row_jitter_px: float = 0.0
+    fill: float = 1.0
+    least_t: float = 3.5
+    most_sigma_px: float = 0.5
+    neighbour_px: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Positions, covariances, reasons against, leave-one-out deviations, predictions of all marks."""
+
+    xy: Array
+    cov: Array
+    why: Array
+    deviation: Array
+    predicted: Array
+
+
+class MarkMeasurement:
+    """The two rounds of matching, and the verdict on every mark."""
+
+    def __init__(
+        self, frame: Frame, design: ReseauDesign, source: Array, placed: Placement, options: ReseauOptions
+    ) -> None:
+        self.frame, self.design, self.source, self.options = frame, design, source, options
+        self.screened, self.assignment = placed.screened, placed.assignment
+        self.field, self.predicted = placed.assignment.field, placed.assignment.predicted
+        mark = design.mark
+        scale = np.sqrt(np.abs(np.linalg.det(self.field.jacobian(source))))
+        self.px_per_unit = float(np.median(scale))
+        size = mark.line_width if mark.shape == "line-grid" else mark.size
+        self.free_size = size is None
+        self.size = placed.mark_px / self.px_per_unit if size is None else size
+        self.extent_px = self.px_per_unit * (3.0 * self.size if mark.shape == "line-grid" else self.size)
+
+    def result(self) -> tuple[Rows, Matches, Verdict]:
+        """Match, learn, match again, judge."""
+        placed = self.assignment
+        has = placed.candidate >= 0
+        # The strongest tell what a mark looks like here, and where exactly to look for the others.
+        strongest = np.flatnonzero(has)[np.argsort(placed.candidate[has], kind="stable")[:_LEARN_FROM]]
+        first = self._match(
+            strongest, placed.at[strongest], self._first_options(), 0.3 if self.free_size else 0.1
+        )
+        self._learn(first, placed.at[strongest])
+        at = np.flatnonzero(self._near_frame(self.predicted))
+        found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
+        self._refit(at, found)
+        judged = self._judged(at, found)
+        # Where a mark was missed, its neighbours now say better where to look.
+        again = np.flatnonzero((judged.why[at] != "") & (found.seen > _SEEN))
+        if 0 < len(again) < len(at):
+            found = found.replaced(again, self._match_all(at[again], judged.predicted[at[again]]))
+            judged = self._judged(at, found)
+        return at, found, judged
+
+    def _near_frame(self, xy: Array) -> Mask:
+        """Marks of which something may be in the frame."""
+        margin = self.extent_px / 2 + 1.0
+        limits = np.array([self.frame.width, self.frame.height]) - 1 + margin
+        return np.asarray(((xy > -margin) & (xy < limits)).all(axis=1))
+
+    def _first_options(self) -> MatchOptions:
+        return MatchOptions(
+            half_px=int(np.clip(np.ceil(self.extent_px / 2 + 4), 4, 40)),
+            psf_px=self.options.psf_px,
+            psf_log_sigma=0.5,
+            polarity=self.design.polarity,
+            response=PixelResponse(self.options.fill),
+            start_px=2.0,
+        )
+
+    def _outline(self, at: Rows, options: MatchOptions) -> Outline:
+        """Outlines of the marks `at` in pixels, as the field maps them."""
+        psf_px = float(np.max(options.psf_px))
+        jacobian = self.field.jacobian(self.source[at])
+        mark = self.design.mark
+        width = self.size if mark.shape == "line-grid" else mark.line_width
+        # The wires of a crossing end where the window does not see it, turned by whatever angle.
+        reach = (1.5 * max(options.half) + 8 * psf_px) / self.px_per_unit
+        outline = mark_outline(mark.shape, self.size, width, 0.8 * psf_px / self.px_per_unit, reach).affine(
+            jacobian
+        )
+        # A mapping that mirrors turns the direction of travel around.
+        return Outline(outline.xy, outline.dxy * np.sign(np.linalg.det(jacobian))[:, None, None])
+
+    def _match(self, at: Rows, start: Array, options: MatchOptions, size_sigma: float) -> Matches:
+        return match(
+            self.screened.grey,
+            self.screened.valid,
+            self._outline(at, options),
+            start,
+            options,
+            noise=self.screened.noise,
+            form=SIZE,
+            form_sigma=np.array([size_sigma]),
+        )
+
+    def _refit(self, at: Rows, found: Matches) -> None:
+        """The field through the marks beyond doubt; that of the candidates was coarse."""
+        near = np.abs(found.xy - self.predicted[at]).max(axis=1) < max(3.0, self.extent_px)
+        sure = _sure(found) & near
+        if sure.sum() >= 10:
+            relative = self._relative(found.cov[sure])
+            self.field = SmoothField.fit(self.source[at[sure]], found.xy[sure], sigma=relative)
+            self.predicted = self.field(self.source)
+
+    def _learn(self, first: Matches, start: Array) -> None:
+        """What the marks of this frame look like: width, contrast, size; and its noise."""
+        sure = _sure(first)
+        self.variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
+        if sure.sum() < 5:
+            self.psf_px, self.psf_spread = self.options.psf_px, 0.3
+            self.contrast, self.contrast_spread, self.size_spread = None, np.inf, 0.1
+            return
+        log_psf, self.psf_spread = _robust(np.log(first.psf_px[sure]), 0.08)
+        self.psf_px = float(np.exp(log_psf))
+        self.contrast, spread = _robust(first.contrast[sure], 0.03)
+        self.contrast_spread = 1.5 * spread
+        growth, self.size_spread = _robust(first.form[sure, 0], 0.02)
+        self.size *= 1 + growth
+        self.extent_px *= 1 + growth
+
+    def _match_all(self, at: Rows, start: Array) -> Matches:
+        """Match with what has been learnt; amid a scene with a curved background, where that is better."""
+        options = replace(
+            self._first_options(),
+            psf_px=self.psf_px,
+            psf_log_sigma=max(0.25, 1.5 * self.psf_spread),
+            contrast=self.contrast,
+            contrast_sigma=self.contrast_spread,
+            row_jitter_px=self.options.row_jitter_px,
+            start_px=1.0,
+            variance=self.variance,
+        )
+        found = self._match(at, start, options, self.size_spread)
+        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
+        uneasy = np.flatnonzero(~found.converged | (found.noise > 1.5 * ordinary) | (found.rejected > 0.1))
+        if not len(uneasy):
+            return found
+        curved = self._match(at[uneasy], start[uneasy], replace(options, background=2), self.size_spread)
+        better = ~found.converged[uneasy] | (_size(curved.cov) < 0.8 * _size(found.cov[uneasy]))
+        better &= curved.converged
+        return found.replaced(uneasy[better], curved.select(better))
+
+    def _judged(self, at: Rows, found: Matches) -> Verdict:
+        n = len(self.source)
+        why = np.full(n, "", dtype=object)
+        outside = np.ones(n, dtype=bool)
+        outside[at] = False
+        why[outside] = "outside the frame"
+        for mask, reason in self._objections(at, found):
+            why[at[mask & (why[at] == "")]] = reason
+        xy, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+        xy[at], cov[at] = found.xy, found.cov
+        deviation = self._judge_by_neighbours(at, found, xy, cov, why)
+        return Verdict(xy, cov, why, deviation, self.field(self.source))
+
+    def _objections(self, at: Rows, found: Matches) -> list[tuple[Mask, str]]:
+        """What speaks against a mark in its own image, the gravest first."""
+        o = self.options
+        sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
+        strong = found.converged & (found.t > 8)
+        ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.psf_px
+        contrast_sigma = found.contrast / np.maximum(np.abs(found.t), 1e-9)
+        expected = 0.0 if self.contrast is None else self.contrast
+        unlike = np.abs(found.contrast - expected) > _LIKE_OTHERS * np.hypot(
+            self.contrast_spread, contrast_sigma
+        )
+        moved = np.hypot(*(found.xy - self.predicted[at]).T) > max(2.5, 0.6 * self.extent_px)
+        return [
+            (found.seen <= _SEEN, "on lost lines or beyond the edge of the frame"),
+            (~found.converged, "the match does not converge"),
+            (~(found.t >= o.least_t), "no mark stands out from its surroundings"),
+            (found.psf_px > _BLURRED * ordinary, "blurred unlike the other marks"),
+            (unlike, "of another contrast than the other marks"),
+            (strong & (found.correlation < 0.5), "the image is not that of a mark"),
+            (found.rejected > 0.4, "disturbed by bit errors or the scene"),
+            (moved, "no mark where its neighbours have it"),
+            (~(sigma <= o.most_sigma_px), "too uncertain"),
+        ]
+
+    def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
+        """Reject, the worst first, what lies where its neighbours do not have it; fit the field anew."""
+        deviation = np.full(xy.shape, np.nan)
+        limit = self.options.neighbour_px
+        while (good := np.flatnonzero(why == "")).size >= 10:
+            relative = self._relative(cov[good])
+            # The length found first serves all rounds; where there is none yet, the likeliest is taken.
+            length = self.field.length if np.isfinite(self.field.length) else None
+            self.field = SmoothField.fit(self.source[good], xy[good], sigma=relative, length=length)
+            deviation[:] = np.nan
+            deviation[good], sigma = self.field.leave_one_out()
+            # Where the neighbours themselves do not know to a pixel, they cannot object.
+            excess = (np.abs(deviation[good]) / np.maximum(limit, 3 * sigma)).max(axis=1)
+            worst = int(excess.argmax())
+            if excess[worst] <= 1:
+                break
+            off = np.hypot(*deviation[good[worst]])
+            why[good[worst]] = f"{off:.1f} px off the prediction of its neighbours"
+        deviation[why != ""] = np.nan
+        return deviation
+
+    def _relative(self, cov: Array) -> Array:
+        """Relative standard deviations of points for a field."""
+        variance = np.trace(cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
+        relative: Array = np.sqrt(variance / np.median(variance))
+        return relative
+
+
+def _sure(found: Matches) -> Mask:
+    """Matches beyond doubt."""
+    sure: Mask = found.converged & (found.t > 8) & (found.seen > 0.9) & (found.rejected < 0.2)
+    return sure
+
+
+def _robust(values: Array, least: float) -> tuple[float, float]:
+    """Median and a robust spread, not below `least`."""
+    median = float(np.median(values))
+    return median, max(least, 1.4826 * float(np.median(np.abs(values - median))))
+
+
+def _size(cov: Array) -> Array:
+    """Root of the trace of covariances, infinite where not known."""
+    size: Array = np.sqrt(np.nan_to_num(np.trace(cov, axis1=1, axis2=2), nan=np.inf, posinf=np.inf))
+    return size

@@ -1,0 +1,221 @@
+"""Measure the marks of a reseau in one frame.
+
+Screened frame → candidates by matched filter → the design laid over them → every mark matched with its formed
+image, twice: first to learn what the marks of this frame look like (width of the point-spread function,
+contrast, size), then with that as prior knowledge → each mark judged by its own image and by its neighbours.
+A mark that is not there, or cannot be told from its surroundings, is reported as not found, with the reason.
+A sheet of disks with coded rings is laid over the frame by these; see :mod:`reseau.refine.sheet`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ...adjust import Failure
+from ...core.data import Array, Frame, Mask, Rows
+from ...core.errors import UsageError
+from ...io import ReseauDesign
+from ...optics.field import SmoothField
+from ..matching import Matches
+from ..measured import Measured
+from .grid import GridOptions, spacing
+from .marks import MarkMeasurement, ReseauOptions, Verdict
+from .placing import PlacingOptions, place
+from .sheet_marks import measure_sheet
+
+__all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
+
+_DISTORTED = 0.03
+"""Part of the spacing of the marks by which they may lie off their prediction, on the average."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReseauResult(Measured):
+    """The marks of a reseau in one frame; `deviation` is from what all *other* marks predict (leave-one-out).
+
+    Parameters
+    ----------
+    psf_px : ndarray (n,)
+        Width of the point-spread function of each match, NaN where there was none.
+    field : SmoothField
+        From the design to the image: a polynomial and a local model on top.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    psf_px: Array
+    field: SmoothField
+    notes: tuple[str, ...] = ()
+
+    def need(self, trials: int = 499, seed: int = 0) -> Array:
+        """Probability, per axis (2,), that white noise alone would ask as much for the local model."""
+        f = self.field
+        return SmoothField.fit(f.source, f.target, sigma=f.sigma, trials=trials, seed=seed).need
+
+    def shadow(self, design: ReseauDesign, shape: tuple[int, int], margin_px: float = 2.0) -> Mask:
+        """Pixels that the reseau hides from what lies behind it.
+
+        Parameters
+        ----------
+        design : ReseauDesign
+            The reseau that was measured.
+        shape : tuple
+            Height and width of the frame.
+        margin_px : float
+            Added on either side of a wire or around a mark, for the blur.
+
+        Returns
+        -------
+        ndarray (h, w) of bool
+        """
+        hidden = np.zeros(shape, dtype=np.uint8)
+        xy = design.xy[np.isfinite(design.xy).all(axis=1)]
+        scale = np.sqrt(np.abs(np.linalg.det(self.field.jacobian(xy)))).max()
+        mark = design.mark
+        size = (mark.line_width if mark.shape == "line-grid" else mark.size) or 0.0
+        width = max(1, round(scale * size + 2 * margin_px))
+        if mark.shape != "line-grid":
+            for centre in self.field(xy):
+                cv2.circle(hidden, tuple(int(c) for c in np.rint(centre)), (width + 1) // 2, 1, -1)
+            return hidden > 0
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        along = np.linspace(-0.06, 1.06, 120)[:, None] * (high - low) + low  # wires run on to their frame
+        for axis in (0, 1):
+            for at in np.unique(np.round(xy[:, axis], 9)):
+                line = along.copy()
+                line[:, axis] = at
+                # Four binary digits behind the point make a smooth line.
+                bent = np.rint(self.field(line) * 16).astype(np.int32)
+                cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
+        return hidden > 0
+
+
+def measure_reseau(
+    frame: Frame, design: ReseauDesign, options: ReseauOptions | None = None
+) -> ReseauResult | Failure:
+    """Measure every mark of a reseau that can be measured.
+
+    Parameters
+    ----------
+    frame : Frame
+        A frame that shows the reseau, whole or in part, in front of any scene. A sheet of disks with coded
+        rings may be turned and tilted as it likes.
+    design : ReseauDesign
+        The reseau, with or without nominal positions in the image.
+    options : ReseauOptions, optional
+        How.
+
+    Returns
+    -------
+    ReseauResult or Failure
+        A failure (falsy) when the design is not to be found in the frame.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+    UsageError
+        When the design has neither coordinates nor nominal positions to go by.
+    """
+    options = options or ReseauOptions()
+    source = _source(design)
+    known = np.flatnonzero(np.isfinite(source).all(axis=1))
+    if len(known) < 4:
+        raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
+    nominal = design.nominal_px[known]
+    use_nominal = options.nominal and bool(np.isfinite(nominal).all())
+    if design.rings is not None and not use_nominal:
+        columns = measure_sheet(frame, design, options)
+        return columns if isinstance(columns, Failure) else ReseauResult(**columns)
+    grid = GridOptions(np.deg2rad(options.max_rotation_deg), options.mirrored)
+    placed = place(
+        frame,
+        design,
+        source[known],
+        PlacingOptions(
+            nominal if use_nominal else None,
+            options.nominal_within_px,
+            options.mark_px,
+            options.psf_px,
+            grid,
+        ),
+    )
+    if isinstance(placed, Failure):
+        return placed
+    measurement = MarkMeasurement(frame, design, source[known], placed, options)
+    at, found, judged = measurement.result()
+    why_not = _disagreement(source[known], judged, options)
+    if why_not:
+        return Failure(f"{frame.name}: design {design.name!r} is not to be found in the frame: {why_not}")
+    return _columns(frame, design, known, at, found, judged, measurement.field)
+
+
+def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str:
+    """Why what was measured is not this design: its marks do not lie together as they should; else nothing.
+
+    Specks and patterns of a scene look like marks one by one. Laid over enough of them the design finds some
+    near its marks, but no smooth field goes through these.
+    """
+    good = np.flatnonzero(judged.why == "")
+    if len(good) < 4:
+        return f"{len(good)} marks could be measured"
+    if np.isfinite(judged.deviation[good]).all():
+        off = np.sqrt((judged.deviation[good] ** 2).mean(axis=0)).max()
+    elif len(good) > 4:  # too few for the neighbours to judge one another, but not for a plane
+        off = SmoothField.fit(source[good], judged.xy[good], degree=1, local=False).noise.max()
+    else:
+        return ""
+    # Few marks of a strongly distorted image do not predict each other to a pixel.
+    if off <= max(options.neighbour_px, _DISTORTED * spacing(judged.predicted)):
+        return ""
+    return f"{len(good)} places look like its marks, but lie {off:.1f} px off each other's prediction"
+
+
+def _source(design: ReseauDesign) -> Array:
+    """Plane coordinates to go by: those of the design, or nominal positions where it has none."""
+    if np.isfinite(design.xy).all(axis=1).sum() >= 4:
+        return design.xy
+    return design.nominal_px
+
+
+def _columns(
+    frame: Frame,
+    design: ReseauDesign,
+    known: Rows,
+    at: Rows,
+    found: Matches,
+    judged: Verdict,
+    field: SmoothField,
+) -> ReseauResult:
+    """Spread over all marks of the design, those without coordinates among them."""
+    good = judged.why == ""
+    judged.xy[~good], judged.cov[~good] = np.nan, np.nan
+    n = len(design.points)
+
+    def spread(values: Array, rows: Rows) -> Array:
+        full = np.full((n, *values.shape[1:]), np.nan)
+        full[rows] = values
+        return full
+
+    ok, reasons = np.zeros(n, dtype=bool), np.full(n, "the design does not say where", dtype=object)
+    ok[known], reasons[known] = good, judged.why
+    inside = known[at]
+    return ReseauResult(
+        image=frame.name,
+        sha256=frame.sha256,
+        ids=design.ids,
+        xy=spread(judged.xy, known),
+        cov=spread(judged.cov, known),
+        ok=ok,
+        why=tuple(reasons),
+        predicted=spread(judged.predicted, known),
+        psf_px=spread(found.psf_px, inside),
+        contrast=spread(found.contrast, inside),
+        t=spread(found.t, inside),
+        noise=spread(found.noise, inside),
+        deviation=spread(judged.deviation, known),
+        field=field,
+    )

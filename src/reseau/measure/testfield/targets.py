@@ -1,0 +1,290 @@
+"""Targets of a testfield matched with their formed images, all of a frame together.
+
+A target's image is formed as the mapping through the lines has it there, to second order: the image of its
+centroid is estimated, so that the perspective, which puts the centroid of the image elsewhere, does no harm.
+What its neighbours and the lines take of the light in its window is formed too, and taken off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ...core.data import Array, Mask, Rows
+from ...io import TestfieldDesign
+from ...optics import Chain
+from ...optics.formation import PixelResponse
+from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, Some, Window, match
+from .images import form_targets
+from .lattice import slope_of
+from .light import Light
+from .profiles import blur_of, crossings, strip
+
+__all__ = ["Scene", "match_targets", "merged"]
+
+_AT_ONCE = 100
+"""Targets that are matched together: what their images take stays in a processor's cache."""
+_FLAT, _LEAST_FLAT = 0.2, 500
+"""Flat is where the jitter of rows is this part of the noise or less; so many such pixels tell the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A frame, and what is known of the testfield in it when targets are matched.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    valid : ndarray (h, w) of bool
+        Pixels that may be used.
+    noise : float
+        Standard deviation of the grey values.
+    design : TestfieldDesign
+        What stands on the board.
+    mapping : Chain
+        From lattice coordinates to the image.
+    frame, origin : ndarray (2, 2), (2,)
+        Lattice coordinates are `frame` times those of the design, plus `origin`.
+    light : Light
+        How it is lit.
+    psf_px : float
+        Width of the point-spread function.
+    response : PixelResponse
+        The pixel.
+    row_jitter_px : float
+        Standard deviation of the shift of a row.
+    """
+
+    grey: NDArray[np.float32]
+    valid: Mask
+    noise: float
+    design: TestfieldDesign
+    mapping: Chain
+    frame: Array
+    origin: Array
+    light: Light
+    psf_px: float
+    response: PixelResponse
+    row_jitter_px: float
+
+    def lattice(self, xy: Array) -> Array:
+        """Lattice coordinates (n, 2) of points of the design (n, 2)."""
+        return np.asarray(xy @ self.frame.T + self.origin)
+
+
+def match_targets(
+    scene: Scene, rows: Rows, inside: Mask, background: int = 1, *, searching: bool = True
+) -> Matches:
+    """Match targets of the design.
+
+    Parameters
+    ----------
+    scene : Scene
+        The frame.
+    rows : ndarray of int (k,)
+        All targets whose light falls into the frame.
+    inside : ndarray of bool (k,)
+        Which of them are wanted.
+    background : int
+        Degree of the polynomial that the ground around each is.
+    searching : bool
+        Whether those in whose windows something is amiss are searched for, and it; see
+        :func:`reseau.measure.matching.match`.
+
+    Returns
+    -------
+    Matches
+        Of the n that are wanted, in their order; residuals are in windows of the largest size.
+    """
+    if not inside.all():
+        rows, inside = _around(scene, rows, inside)
+    at = scene.lattice(scene.design.xy[rows])
+    images, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+    canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows], inside)
+    return merged(*canvas.match(background, searching))
+
+
+def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
+    """Of the targets those that are wanted, and those whose light falls into the windows of these."""
+    # Two windows overlap no farther than targets stand apart in their squares, and half as far again.
+    xy = scene.lattice(scene.design.xy[rows])
+    step = np.abs(scene.frame).max() * np.sqrt(scene.design.pitch**2 / 16)
+    size = max(scene.design.targets.size) * np.abs(scene.frame).max()
+    slope = slope_of(scene.mapping, xy[inside])
+    blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(slope)).min())
+    far = max(1.5 * step, 1.2 * size + blur)
+    keep = inside.copy()
+    keep[~inside] = (np.abs(xy[~inside, None] - xy[inside]).max(axis=2) < far).any(axis=1)
+    return rows[keep], inside[keep]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Targets of like size: those wanted (n,), half their windows, what each takes or adds, their images."""
+
+    rows: Rows
+    half: Rows
+    own: Array
+    formed: Shape
+
+
+class _Canvas:
+    """Light that the marks of a testfield take or add, and the matching of each without the others."""
+
+    def __init__(
+        self, scene: Scene, images: GrownOutline, xy: Array, reach: Array, large: Mask, wanted: Mask
+    ) -> None:
+        self.scene, self.images, self.xy = scene, images, xy
+        self.total = _line_light(scene)
+        self.near = np.zeros(self.total.shape, dtype=bool)
+        self.parts: list[_Part] = []
+        for size in (False, True):
+            of = large == size
+            if of.any():
+                half = np.ceil(reach[of].max(axis=0) + 2.5 * scene.psf_px + 1.0).astype(np.intp)
+                self._lay(np.flatnonzero(of & ~wanted), half)
+                mine = np.flatnonzero(of & wanted)
+                for some in np.array_split(mine, -(-len(mine) // _AT_ONCE)) if len(mine) else []:
+                    self.parts.append(self._lay(some, half, wanted=True))
+
+    def _lay(self, part: Rows, half: Rows, *, wanted: bool = False) -> _Part:
+        """Lay the light of some targets on the whole; of those wanted the derivatives are formed as well."""
+        (h, w), xy = self.total.shape, self.xy[part]
+        centre = np.rint(xy)
+        right, down = (np.arange(-n, n + 1.0) for n in half)
+        window = Window(centre[:, :1] + right, centre[:, 1:] + down, self.scene.response)
+        width, form = np.full(len(part), self.scene.psf_px), np.zeros((len(part), 1))
+        formed: Shape = Some(self.images, part)
+        if wanted:
+            share, slopes = self.images.derivatives(xy, width, form, part, window)
+            formed = FormedShape(formed, xy, width, share, slopes)
+        else:
+            share = self.images.image(xy, width, form, part, window)
+        own = self.scene.light.at(xy)[1][:, None, None] * share
+        column, row = window.columns.astype(np.intp), window.rows.astype(np.intp)
+        seen = ((row >= 0) & (row < h))[:, :, None] & ((column >= 0) & (column < w))[:, None, :]
+        flat = (row[:, :, None] * w + column[:, None, :])[seen]
+        self.total += np.bincount(flat, own[seen], minlength=h * w).reshape(h, w)
+        if wanted:
+            self.near.reshape(-1)[flat] = True
+        return _Part(part, half, own, formed)
+
+    def match(self, background: int, searching: bool) -> tuple[list[Rows], list[Matches]]:
+        """Match small and large targets in windows of one size each: their rows, and what was found."""
+        noise = self._noise()
+        return [part.rows for part in self.parts], [
+            self._match(part, background, noise, searching) for part in self.parts
+        ]
+
+    def _noise(self) -> float:
+        """Noise where the image is flat: elsewhere the jitter of the rows would pass for it."""
+        scene = self.scene
+        if scene.row_jitter_px == 0:
+            return scene.noise
+        left = scene.grey + (self.total if scene.design.polarity == "dark" else -self.total)
+        bend = left[:, 1:-1] - (left[:, :-2] + left[:, 2:]) / 2
+        steep = np.abs(self.total[:, 2:] - self.total[:, :-2]) / 2
+        flat = self.near[:, 1:-1] & scene.valid[:, 1:-1] & (steep * scene.row_jitter_px < _FLAT * scene.noise)
+        if flat.sum() < _LEAST_FLAT:
+            return scene.noise
+        # The median of normal deviates is 0.6745 of their σ; the variance of such a difference is 3/2 σ².
+        return float(np.median(np.abs(bend[flat])) / (0.6745 * np.sqrt(1.5)))
+
+    def _match(self, part: _Part, background: int, noise: float, searching: bool) -> Matches:
+        scene, (h, w), half = self.scene, self.total.shape, part.half
+        centre = np.rint(self.xy[part.rows]).astype(np.intp)
+        column, row = (
+            (centre[:, k, None] + np.arange(-half[k], half[k] + 1)).clip(0, size - 1)
+            for k, size in ((0, w), (1, h))
+        )
+        others = self.total[row[:, :, None], column[:, None, :]] - part.own
+        options = MatchOptions(
+            half_px=(int(half[0]), int(half[1])),
+            psf_px=scene.psf_px,
+            psf_log_sigma=0.3,
+            response=scene.response,
+            polarity=scene.design.polarity,
+            row_jitter_px=scene.row_jitter_px,
+            start_px=0.3,
+            settled=0.1,
+            background=background,
+        )
+        level, amplitude = scene.light.at(centre.astype(np.float64))
+        # Slopes across half a window, in the order of the matcher's monomials: 1, v, u.
+        right, down = (
+            scene.light.at(centre + step)[0] - level
+            for step in (np.array([half[0], 0.0]), np.array([0.0, half[1]]))
+        )
+        dark = scene.design.polarity == "dark"
+        contrast = amplitude / level if dark else amplitude
+        return match(
+            scene.grey,
+            scene.valid,
+            part.formed,
+            self.xy[part.rows],
+            options,
+            noise=noise,
+            form_sigma=np.array([0.05]),
+            others=-others if dark else others,
+            light=(contrast, np.stack([level, down, right], axis=1)) if background == 1 else None,
+            searching=searching,
+        )
+
+
+def _line_light(scene: Scene) -> Array:
+    """Grey values that the lines take or add, (h, w)."""
+    h, w = scene.grey.shape
+    lines, free = scene.design.lines, np.ones(h * w)
+    x0, y0, x1, y1 = lines.extent
+    blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
+    for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
+        along = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
+        on = np.empty((len(places), 2, count, 2))
+        on[..., 1 - axis] = along
+        on[..., axis] = np.array(places)[:, None, None] + np.array([0.0, lines.width])[:, None]
+        images = scene.mapping(scene.lattice(on.reshape(-1, 2))).reshape(on.shape)
+        for middle, beside in images:
+            line = crossings(middle, np.arange(count, dtype=float), (h, w), 4 * blur)
+            if line is None:
+                continue
+            line = line.within(int(5 * blur + 3), (h, w))
+            if not len(line.step):
+                continue
+            width = (beside - middle)[np.rint(line.along).astype(np.intp)]
+            half = 0.5 * np.abs((width * line.normal).sum(axis=1))
+            # A line may run at 45° to the rows or columns that it is followed along.
+            reach = int(np.ceil((3.5 * blur + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min()))
+            row, column, distance = line.around(reach)
+            share = strip(distance, half[:, None], blur)
+            # Its ends are blurred likewise.
+            ends = np.sort(middle[[0, -1], line.axis])
+            share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
+            keep = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+            free[(row * w + column)[keep]] *= 1 - share[keep]
+    taken: Array = scene.light.contrast_over((h, w)) * (1 - free.reshape(h, w))
+    return taken
+
+
+def merged(parts: list[Rows], found: list[Matches]) -> Matches:
+    """Matches of several parts in the order of their rows; smaller windows are filled up with NaN."""
+    order = np.argsort(np.concatenate(parts), kind="stable")
+    most = np.max([matches.residuals.shape[1:] for matches in found], axis=0)
+    columns: dict[str, Any] = {}
+    for name in Matches.__dataclass_fields__:
+        values = [getattr(matches, name) for matches in found]
+        if name == "residuals":
+            values = [
+                np.pad(
+                    v,
+                    [(0, 0), *([(n - m) // 2] * 2 for m, n in zip(v.shape[1:], most, strict=True))],
+                    constant_values=np.nan,
+                )
+                for v in values
+            ]
+        columns[name] = np.concatenate(values)[order]
+    return Matches(**columns)

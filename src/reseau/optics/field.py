@@ -1,0 +1,274 @@
+r"""A smooth field through measured points: polynomial trend and, where it is needed, a local model on top.
+
+The local model is least-squares collocation (Krarup 1969; Moritz 1980, eq. 14-26; Kraus & Mikhail 1972),
+:math:`l = A x + s + n`: what the polynomial cannot follow is a signal s whose covariance falls off with
+distance, here :math:`C(d) = s^2 (1 + z + z^2/3) e^{-z}` with :math:`z = \sqrt5\,d/L`, twice
+differentiable. Its three numbers are estimated by restricted maximum likelihood (Patterson & Thompson 1971),
+so that the trend does not bias them, and the need of the signal at all is tested.
+
+What the field says *beyond* the points it was made from is the trend and the fading signal: it does not
+extrapolate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial.distance import cdist
+
+from ..core.data import Array
+from ..core.errors import UsageError
+
+__all__ = ["SmoothField", "trend_degree"]
+
+_LENGTHS = 0.12 * 2.0 ** np.arange(6)
+"""Correlation lengths looked at, in half extents of the field."""
+_RATIOS = np.concatenate([[0.0], 10.0 ** np.arange(-2, 3.01, 0.5)])
+"""Variances of the signal over that of the noise looked at."""
+
+
+def trend_degree(points: int, most: int = 5) -> int:
+    """Highest degree of a trend that leaves five points to each pair of coefficients.
+
+    Examples
+    --------
+    >>> [trend_degree(n) for n in (8, 20, 80, 200)]
+    [0, 1, 4, 5]
+    """
+    return max(d for d in range(most + 1) if d == 0 or 2.5 * (d + 1) * (d + 2) <= points + 4)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothField:
+    """A plane-to-plane field fitted to points.
+
+    Parameters
+    ----------
+    source : ndarray (n, 2)
+        Where the field is known.
+    target : ndarray (n, 2)
+        Its values there.
+    degree : int
+        Degree of the trend.
+    length : float
+        Correlation length L of the signal in the unit of `source`.
+    ratio : ndarray (2,)
+        Variance of the signal over that of the noise, per axis; 0 where there is none.
+    noise : ndarray (2,)
+        Standard deviation of the noise of a point of weight 1, per axis.
+    need : ndarray (2,)
+        Probability, per axis, that white noise alone would ask as much for a signal; NaN if not tested.
+    sigma : ndarray (n,)
+        Relative standard deviations of the points.
+    """
+
+    source: Array
+    target: Array
+    degree: int
+    length: float
+    ratio: Array
+    noise: Array
+    need: Array
+    sigma: Array
+    _solutions: tuple[tuple[Array, Array, Array], ...]
+
+    @classmethod
+    def fit(
+        cls,
+        source: Array,
+        target: Array,
+        *,
+        sigma: Array | None = None,
+        degree: int | None = None,
+        local: bool = True,
+        length: float | None = None,
+        trials: int = 0,
+        seed: int = 0,
+        null: Array | None = None,
+    ) -> SmoothField:
+        """Fit the field.
+
+        Parameters
+        ----------
+        source, target : ndarray (n, 2)
+            Points and the values there.
+        sigma : ndarray (n,), optional
+            Relative standard deviations of the values; equal by default.
+        degree : int, optional
+            Degree of the trend; by default as high as the number of points bears.
+        local : bool
+            Whether a signal may be added to the trend.
+        length : float, optional
+            Correlation length, where it is known; else the likeliest is taken.
+        trials : int
+            Number of simulated fields of white noise for the test of the signal's need; 0: no test.
+        seed : int
+            Of the simulation.
+        null : ndarray (trials, n, 2), optional
+            Values without a signal to test against instead, where these are not white: the residuals of an
+            adjustment lack what its parameters took.
+
+        Raises
+        ------
+        UsageError
+            When there are fewer points than coefficients of the trend, plus two.
+        """
+        degree = trend_degree(len(source)) if degree is None else degree
+        relative = np.ones(len(source)) if sigma is None else np.asarray(sigma, dtype=np.float64)
+        design, extent = _design(source, source, degree)
+        if len(source) < design.shape[1] + 2:
+            raise UsageError(f"{len(source)} points do not bear a trend of degree {degree}")
+        if not local:
+            return _polynomial(source, target, degree, design, relative)
+        q, _ = np.linalg.qr(design / relative[:, None], mode="complete")
+        free = q[:, design.shape[1] :]
+        white = free.T @ (target / relative[:, None])
+        distance = cdist(source, source)
+        ratios, lengths = _RATIOS, _LENGTHS if length is None else np.array([length / extent])
+        spectra = [_spectrum(free, _correlation(distance / (extent * scale)), relative) for scale in lengths]
+        gains = np.array([_gains(spectrum, vectors.T @ white, ratios) for spectrum, vectors in spectra])
+        best = int(gains.max(axis=1).sum(axis=1).argmax())
+        at = gains[best].argmax(axis=0)
+        if null is None:
+            white_noise = np.random.default_rng(seed).standard_normal((1, free.shape[1], trials))
+        else:
+            white_noise = np.einsum("nf,tna->aft", free / relative[:, None], null)
+        need = _need(spectra, ratios, gains, white_noise)
+        ratio = ratios[at]
+        spectrum, vectors = spectra[best]
+        solutions, noise = [], np.empty(2)
+        for axis in range(2):
+            damped = 1 / (ratio[axis] * spectrum + 1)
+            basis = free @ vectors
+            noise[axis] = np.sqrt(np.mean((vectors.T @ white[:, axis]) ** 2 * damped))
+            inverse = (basis * damped) @ basis.T  # (K + D)⁻¹ after the trend, in whitened coordinates
+            weights = inverse @ (target[:, axis] / relative)
+            kernel = ratio[axis] * _correlation(distance / (extent * lengths[best]))
+            rest = target[:, axis] - weights * relative - kernel @ (weights / relative)
+            trend = np.linalg.lstsq(design, rest, rcond=None)[0]
+            solutions.append((weights, np.diag(inverse), trend))
+        return cls(
+            source,
+            target,
+            degree,
+            float(extent * lengths[best]),
+            ratio,
+            noise,
+            need,
+            relative,
+            tuple(solutions),
+        )
+
+    def __call__(self, xy: Array) -> Array:
+        """Values of the field at points (n, 2)."""
+        design, _ = _design(self.source, xy, self.degree)
+        if not self.ratio.any():
+            return design @ np.stack([trend for _, _, trend in self._solutions], axis=1)
+        kernel = _correlation(cdist(xy, self.source) / self.length)
+        parts = [
+            design @ trend + ratio * (kernel @ (weights / self.sigma))
+            for ratio, (weights, _, trend) in zip(self.ratio, self._solutions, strict=True)
+        ]
+        return np.stack(parts, axis=1)
+
+    def jacobian(self, xy: Array) -> Array:
+        """Derivatives of the field at points, (n, 2, 2), by central differences."""
+        step = 1e-4 * _extent(self.source)[1]
+        return np.stack(
+            [(self(xy + shift) - self(xy - shift)) / (2 * step) for shift in step * np.eye(2)], axis=2
+        )
+
+    def leave_one_out(self) -> tuple[Array, Array]:
+        """Predict every point from the others.
+
+        Returns
+        -------
+        deviation : ndarray (n, 2)
+            Value minus prediction.
+        sigma : ndarray (n, 2)
+            Standard deviation of that, noise of the point included.
+
+        Notes
+        -----
+        With :math:`P` the inverse covariance after elimination of the trend, :math:`(P l)_i / P_{ii}` and
+        :math:`P_{ii}^{-1/2}` (Dubrule 1983); nothing is fitted anew.
+        """
+        scale = self.sigma[:, None]
+        weights = np.stack([solution[0] for solution in self._solutions], axis=1)
+        diagonal = np.maximum(np.stack([solution[1] for solution in self._solutions], axis=1), 1e-12)
+        return weights / diagonal * scale, self.noise / np.sqrt(diagonal) * scale
+
+
+def _polynomial(source: Array, target: Array, degree: int, design: Array, relative: Array) -> SmoothField:
+    """The trend alone, by least squares."""
+    q, r = np.linalg.qr(design / relative[:, None])
+    white = target / relative[:, None]
+    fitted = q.T @ white
+    rest = white - q @ fitted
+    noise = np.sqrt((rest**2).sum(axis=0) / (len(source) - design.shape[1]))
+    trend = np.linalg.solve(r, fitted)
+    free = 1 - (q**2).sum(axis=1)
+    solutions = tuple((rest[:, axis], free, trend[:, axis]) for axis in range(2))
+    none = np.zeros(2)
+    return SmoothField(source, target, degree, np.inf, none, noise, np.full(2, np.nan), relative, solutions)
+
+
+def _extent(source: Array) -> tuple[Array, float]:
+    low, high = source.min(axis=0), source.max(axis=0)
+    return (low + high) / 2, float(max((high - low).max() / 2, 1e-12))
+
+
+def _design(source: Array, xy: Array, degree: int) -> tuple[Array, float]:
+    """Monomials of the trend at `xy`, scaled to the extent of the source."""
+    centre, extent = _extent(source)
+    x, y = ((xy - centre) / extent).T
+    columns = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack(columns, axis=1), extent
+
+
+def _correlation(z: Array) -> Array:
+    """Matérn's correlation of smoothness 5/2 at distances in correlation lengths."""
+    z = np.sqrt(5) * z
+    value: Array = (1 + z + z * z / 3) * np.exp(-z)
+    return value
+
+
+def _spectrum(free: Array, correlation: Array, relative: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of the signal's covariance in the space that the trend leaves free."""
+    values, vectors = eigh(free.T @ (correlation / np.outer(relative, relative)) @ free, check_finite=False)
+    return np.maximum(values, 0), vectors
+
+
+def _gains(spectrum: Array, white: Array, ratios: Array) -> Array:
+    """Restricted log-likelihood over that without signal, (ratios, columns of `white`).
+
+    The variance of the noise is replaced by its estimate for each ratio.
+    """
+    damped = 1 / (ratios[:, None] * spectrum + 1)
+    variance = damped @ white**2 / len(spectrum)
+    gain: Array = -0.5 * (
+        len(spectrum) * np.log(np.maximum(variance, 1e-300)) - np.log(damped).sum(axis=1)[:, None]
+    )
+    return gain - gain[:1]
+
+
+def _need(spectra: list[tuple[Array, Array]], ratios: Array, gains: Array, null: Array) -> Array:
+    """Share of simulated fields without a signal whose likelihood gains as much by one; exact in level.
+
+    The simulated fields (1 or 2 axes, free values, trials) are seen through the basis of each spectrum.
+    """
+    trials = null.shape[2]
+    if not trials:
+        return np.full(2, np.nan)
+    simulated = np.max(
+        [
+            [_gains(values, vectors.T @ axis, ratios).max(axis=0) for axis in null]
+            for values, vectors in spectra
+        ],
+        axis=0,
+    )
+    observed = gains.max(axis=(0, 1))
+    need: Array = (1 + (simulated >= observed[:, None]).sum(axis=1)) / (trials + 1)
+    return need

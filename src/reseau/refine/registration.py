@@ -1,0 +1,148 @@
+"""Refer a photograph to PHOTO I by the reseau that both show.
+
+The camera's correction says where in the image every mark of the reseau should appear. A similarity from
+where the marks are to where they should be carries any other measurement in the photograph to PHOTO I;
+whether it differs from doing nothing tells if the camera has moved in between. A camera that was pushed far,
+or turned, sees the reseau in another perspective and through other parts of its lens: where the similarity
+leaves more than the marks' errors, a smooth field through the marks takes its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from ..adjust import Failure
+from ..core.data import Array, ImagePoints
+from ..io import ReseauDesign
+from ..measure.fitting import carried, fit_mapping
+from ..optics import RationalPolynomial, Similarity
+from ..optics.field import SmoothField
+from .camera import CameraCorrection
+
+__all__ = ["Registration", "register"]
+
+_LEAST_PX = 0.05
+"""A displacement smaller than this is nobody's concern, however significant."""
+_UNLIKE = 2.0
+"""Standard deviation of unit weight from which a similarity does not do."""
+_FIELD_FROM = 20
+"""Marks that a smooth field needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A photograph referred to PHOTO I.
+
+    Parameters
+    ----------
+    system : Similarity or SmoothField
+        Pixels of this photograph to pixels of PHOTO I.
+    marks : int
+        Marks it was made from.
+    sigma0 : float
+        Standard deviation of unit weight of a similarity; far above one where the photographs differ by more.
+    left_px : float
+        How far marks lie from where the others carry them, root mean square per axis; of a similarity, from
+        where they should be.
+    displacement_px : float
+        Largest displacement of a mark.
+    p : float
+        Probability of as large a difference from the identity when nothing has moved.
+    moved : bool
+        Whether the camera has moved: significantly at 0.001, and by more than 0.05 px.
+    """
+
+    system: Similarity | SmoothField
+    marks: int
+    sigma0: float
+    left_px: float
+    displacement_px: float
+    p: float
+    moved: bool
+
+    @property
+    def similar(self) -> bool:
+        """Whether a similarity does; else the camera was turned or pushed so far that it does not."""
+        return isinstance(self.system, Similarity)
+
+    def apply(self, points: ImagePoints) -> ImagePoints:
+        """Points of this photograph as they would be in PHOTO I; the errors of its many marks left out."""
+        if isinstance(self.system, Similarity):
+            return carried(self.system, points)
+        slope = self.system.jacobian(points.xy)
+        cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
+        return ImagePoints(points.names, self.system(points.xy), cov)
+
+
+def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection) -> Registration | Failure:
+    """Refer a photograph to PHOTO I.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        Marks of the reseau in the photograph, in pixels.
+    design : ReseauDesign
+        The reseau.
+    camera : CameraCorrection
+        Made from PHOTO I.
+
+    Returns
+    -------
+    Registration or Failure
+        A failure with fewer than four marks.
+    """
+    row_of = {name: i for i, name in enumerate(design.ids)}
+    known = [name for name in points.names if name in row_of]
+    expected = camera.to_pixels(camera.object_system(design.xy[[row_of[name] for name in known]]))
+    usable = np.asarray(np.isfinite(expected).all(axis=1))
+    marks, expected = points.select(known).select(usable), expected[usable]
+    if len(marks) < 4:
+        return Failure(
+            f"{len(marks)} marks of reseau {design.name!r} were measured; four refer it to PHOTO I"
+        )
+    centre, length = expected.mean(axis=0), float(np.ptp(expected, axis=0).max())
+    local = ImagePoints(marks.names, (marks.xy - centre) / length, marks.cov / length**2)
+    fit = fit_mapping(RationalPolynomial.similarity(), local, (expected - centre) / length)
+    if isinstance(fit, Failure):
+        return fit
+    off = fit.values - [0.0, 0.0, 1.0, 0.0]
+    cofactor = fit.cofactor + _of_the_camera(camera, marks, expected, length, fit.cofactor)
+    statistic = float(off @ np.linalg.solve(cofactor, off)) / 4 / max(1.0, fit.sigma0**2)
+    p = float(scipy.stats.f.sf(statistic, 4, fit.redundancy))
+    system: Similarity | SmoothField = _about(fit.values, centre, length)
+    left = system(marks.xy) - expected
+    if fit.sigma0 > _UNLIKE and len(marks) >= _FIELD_FROM:
+        system = SmoothField.fit(marks.xy, expected)
+        left, _ = system.leave_one_out()
+    displacement = float(np.hypot(*(system(marks.xy) - marks.xy).T).max())
+    moved = (fit.sigma0 > _UNLIKE or p < 0.001) and displacement > _LEAST_PX
+    left_px = float(np.sqrt((left**2).mean()))
+    return Registration(system, len(marks), float(fit.sigma0), left_px, displacement, p, moved)
+
+
+def _of_the_camera(
+    camera: CameraCorrection, marks: ImagePoints, expected: Array, length: float, cofactor: Array
+) -> Array:
+    """What the errors of the camera's coefficients add to the similarity's covariance, (4, 4).
+
+    They move the expected positions together, by −(∂X/∂x)⁻¹ ∂X/∂a.
+    """
+    photo, by_pixel, _ = camera.photo_system.derivatives(expected)
+    _, by_photo, by_a = camera.model.derivatives(photo)
+    moves = -np.linalg.solve(by_photo @ by_pixel, by_a) / length
+    local = (expected - expected.mean(axis=0)) / length
+    by_parameter = RationalPolynomial.similarity().derivatives(local).d_parameters
+    weights = np.linalg.inv(marks.cov / length**2)
+    k = cofactor @ np.einsum("nip,nij,nja->pa", by_parameter, weights, moves)
+    added: Array = k @ camera.cofactor @ k.T
+    return added
+
+
+def _about(values: Array, centre: Array, length: float) -> Similarity:
+    """A similarity of coordinates reduced to a centre and a length, as one of pixels."""
+    x0, y0, a, b = values
+    shift = centre + length * np.array([x0, y0]) - np.array([[a, -b], [b, a]]) @ centre
+    return Similarity(np.array([*shift, a, b]))

@@ -1,0 +1,88 @@
+"""What is odd about a photograph of the oscilloscope procedure, in words for those who took it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core.data import ImagePoints
+from ..io import ReseauDesign
+from .camera import CameraCorrection
+from .instrument import InstrumentCorrection
+from .registration import Registration
+from .standard import StandardTest
+
+__all__ = ["of_the_camera", "of_the_change", "of_the_object"]
+
+_UPRIGHT = np.deg2rad(20.0)
+"""Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
+_ANOTHER_SHAPE_PX = 0.3
+"""What may remain at the marks of a photograph referred to PHOTO I."""
+
+
+def of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[str, ...]:
+    """What is odd about the camera's side."""
+    notes = []
+    angle = camera.photo_system.angle
+    if abs(angle) > np.pi - _UPRIGHT:
+        notes.append("the x-axis of the common system runs to the left in the image: are O and S swapped?")
+    elif abs(angle) > _UPRIGHT:
+        notes.append(
+            f"the common system is turned by {np.rad2deg(angle):.0f}° in the image: are O and S right?"
+        )
+    if registration is not None and registration.moved:
+        notes.append(
+            f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
+            "the photograph was carried back"
+        )
+    if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
+        notes.append(
+            f"the marks of the reseau lie by {registration.left_px:.2f} px (rms) otherwise than in PHOTO I: "
+            "take PHOTO I anew"
+        )
+    return tuple(notes)
+
+
+def of_the_change(test: StandardTest, registration: Registration | None, unit: str) -> tuple[str, ...]:
+    """What has changed since a calibration, and what it points to."""
+    if test.holds:
+        return ()
+    notes, shift = [], float(np.hypot(*test.shift))
+    if test.p_shift < test.alpha:
+        said = f"the display has shifted against the reseau by {shift:.3g} {unit}"
+        if registration is not None and registration.moved:
+            notes.append(
+                f"{said} while the camera moved: there is a gap between reseau and screen (parallax); "
+                "keep the camera where PHOTO I was taken"
+            )
+        else:
+            notes.append(f"{said}: was it centred anew?")
+    if test.p_rest < test.alpha:
+        rod, length = test.largest
+        notes.append(
+            f"the instrument draws otherwise than it did, by up to {length:.3g} {unit} at rod {rod}: "
+            "make its calibration anew"
+        )
+    return tuple(notes)
+
+
+def of_the_object(
+    instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
+) -> tuple[str, ...]:
+    """What is odd about the test object's side."""
+    notes, plane = [], instrument.plane
+    if abs(plane.rotation) > np.pi - _UPRIGHT:
+        notes.append("the test object stands on its head or M and N are swapped")
+    elif abs(plane.rotation) > np.deg2rad(2.0):
+        notes.append(f"the test object is turned by {np.rad2deg(plane.rotation):.1f}° against the reseau")
+    missing = [i for i, name in enumerate(design.ids) if name not in pins.names]
+    for axis, word in ((1, "row"), (0, "column")):
+        for value in np.unique(np.round(design.xy[:, axis], 6)):
+            line = np.flatnonzero(np.abs(design.xy[:, axis] - value) < 1e-6)
+            if len(line) >= 3 and set(line) <= set(missing):
+                notes.append(f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing")
+    ratio = plane.scale[0] / plane.scale[1]
+    if abs(ratio - 1) > 0.1:
+        notes.append(
+            f"the scales along and across differ by {abs(ratio - 1):.0%}: check the display's aspect"
+        )
+    return tuple(notes)

@@ -1,0 +1,177 @@
+r"""Whether stored coefficients still hold for a new photograph of the test object.
+
+Wishahy calls the coefficients of an instrument "theoretically standard": found once, they serve for every
+further photograph. Each new image of the test object can contradict that. With the same rods as before their
+errors are the same, and every rod is held against where it was seen then:
+
+.. math:: d_i = f(x_i^{new}) - f(x_i^{old}), \qquad \chi^2 = \sum_i d_i^T \Sigma_i^{-1} d_i ,
+
+with f the stored correction and the covariances of both measurements alone. With other rods
+:math:`d_i = f(x_i) - X_i`; the rods' tolerance and the covariance of the coefficients take part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from ..adjust import Failure
+from ..core.data import Array, ImagePoints
+from ..core.errors import UsageError
+from ..io import ReseauDesign
+from .instrument import InstrumentCorrection
+
+__all__ = ["StandardTest", "still_standard"]
+
+
+@dataclass(frozen=True, eq=False)
+class StandardTest:
+    """Stored coefficients against a new photograph; object coordinates in the unit of the instrument.
+
+    Parameters
+    ----------
+    names : tuple of str (n,)
+        The rods compared.
+    change : ndarray (n, 2)
+        By how much the stored correction now has each elsewhere.
+    sigma : ndarray (n, 2)
+        Standard deviations of that when nothing has changed.
+    statistic, degrees, critical, p : float, int, float, float
+        χ² of all changes together, the value it exceeds with probability alpha, and its probability.
+    shift, shift_sigma : ndarray (2,)
+        What the changes have in common, and its standard deviations.
+    p_shift, p_rest : float
+        Probability of as large a common shift, and of as large changes beside it, when nothing has changed.
+    same_object : bool
+        Whether the rods were taken to be those of the stored calibration.
+    alpha : float
+        Level.
+    """
+
+    names: tuple[str, ...]
+    change: Array
+    sigma: Array
+    statistic: float
+    degrees: int
+    critical: float
+    p: float
+    shift: Array
+    shift_sigma: Array
+    p_shift: float
+    p_rest: float
+    same_object: bool
+    alpha: float
+
+    def __bool__(self) -> bool:
+        return True
+
+    @property
+    def holds(self) -> bool:
+        """Whether the stored coefficients are not contradicted."""
+        return self.p >= self.alpha
+
+    @property
+    def largest(self) -> tuple[str, float]:
+        """The rod that has changed most, and by how much."""
+        length = np.hypot(*self.change.T)
+        worst = int(length.argmax())
+        return self.names[worst], float(length[worst])
+
+
+def still_standard(
+    stored: InstrumentCorrection,
+    pins: ImagePoints,
+    rods: ReseauDesign,
+    *,
+    same_object: bool = True,
+    alpha: float = 0.05,
+) -> StandardTest | Failure:
+    """Test whether a stored correction still holds.
+
+    Parameters
+    ----------
+    stored : InstrumentCorrection
+        Groups A and B, as read from a calibration.
+    pins : ImagePoints
+        Images of the rods in the new photograph, referred to PHOTO I (px).
+    rods : ReseauDesign
+        The rods.
+    same_object : bool
+        Whether they are those that the calibration was made with, their errors therefore the same.
+    alpha : float
+        Level of the tests.
+
+    Returns
+    -------
+    StandardTest or Failure
+        A failure with fewer than four rods in common.
+
+    Raises
+    ------
+    UsageError
+        When the level is none.
+    """
+    if not 0 < alpha < 1:
+        raise UsageError(f"{alpha:g} is not between 0 and 1", where="alpha")
+    known = set(stored.pins.names) if same_object else {p.id for p in rods.points if p.x is not None}
+    names = [name for name in pins.names if name in known and name in rods.ids]
+    if len(names) < 4:
+        return Failure(f"{len(names)} of {len(pins)} points are rods that can be compared; four are needed")
+    now = pins.select(names)
+    change, cov = _against_before(stored, now) if same_object else _against_design(stored, now, rods)
+    whole = np.linalg.inv(cov)
+    d = change.ravel()
+    statistic = float(d @ whole @ d)
+    common = np.tile(np.eye(2), (len(names), 1))
+    cofactor = np.linalg.inv(common.T @ whole @ common)
+    shift = cofactor @ common.T @ whole @ d
+    of_shift = float(shift @ np.linalg.solve(cofactor, shift))
+    return StandardTest(
+        names=tuple(names),
+        change=change,
+        sigma=np.sqrt(np.diagonal(cov)).reshape(-1, 2),
+        statistic=statistic,
+        degrees=len(d),
+        critical=float(scipy.stats.chi2.isf(alpha, len(d))),
+        p=float(scipy.stats.chi2.sf(statistic, len(d))),
+        shift=shift,
+        shift_sigma=np.sqrt(np.diagonal(cofactor)),
+        p_shift=float(scipy.stats.chi2.sf(of_shift, 2)),
+        p_rest=float(scipy.stats.chi2.sf(statistic - of_shift, len(d) - 2)),
+        same_object=same_object,
+        alpha=alpha,
+    )
+
+
+def _against_before(stored: InstrumentCorrection, now: ImagePoints) -> tuple[Array, Array]:
+    """Changes (n, 2) against the images that the calibration was made with, and their covariance."""
+    before = stored.pins.select(now.names)
+    both = np.zeros((2 * len(now), 2 * len(now)))
+    values = []
+    for points in (now, before):
+        value, slope, _ = stored.derivatives(points.xy)
+        values.append(value)
+        both += _blocks(slope @ points.cov @ np.swapaxes(slope, 1, 2))
+    return values[0] - values[1], both
+
+
+def _against_design(
+    stored: InstrumentCorrection, now: ImagePoints, rods: ReseauDesign
+) -> tuple[Array, Array]:
+    """Changes (n, 2) against the design of the rods, and their covariance."""
+    design = {p.id: (p.x, p.y, p.sigma or 0.0) for p in rods.points}
+    table = np.array([design[name] for name in now.names], dtype=np.float64)
+    value, slope, by_coefficients = stored.derivatives(now.xy)
+    errors = slope @ now.cov @ np.swapaxes(slope, 1, 2) + table[:, 2, None, None] ** 2 * np.eye(2)
+    moves = by_coefficients.reshape(2 * len(now), -1)
+    return value - table[:, :2], _blocks(errors) + moves @ stored.covariance @ moves.T
+
+
+def _blocks(cov: Array) -> Array:
+    """Covariances (n, 2, 2) of independent points as one matrix (2n, 2n)."""
+    whole = np.zeros((len(cov), 2, len(cov), 2))
+    each = np.arange(len(cov))
+    whole[each, :, each, :] = cov
+    return whole.reshape(2 * len(cov), 2 * len(cov))

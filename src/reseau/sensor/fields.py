@@ -1,0 +1,120 @@
+"""What differs from pixel to pixel: bias, dark current, response; and the pixels that are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from ..core.data import Mask
+from ..core.threads import one_thread
+from .series import Image32, Level, SensorSeries
+
+__all__ = ["Fields", "estimate_fields"]
+
+_FALSE_ALARMS = 0.5
+"""Good pixels that are taken for defective ones, on average over a whole sensor."""
+_TESTS = 4
+_BRIGHTEST = 0.8
+"""Share of the full scale up to which levels tell the response."""
+_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Of each pixel.
+
+    Parameters
+    ----------
+    bias : ndarray (height, width)
+        Grey value in the dark at no exposure.
+    dark_current : ndarray (height, width)
+        Grey values that a microsecond of exposure adds in the dark.
+    response : ndarray (height, width)
+        To light, of a mean of 1 over the good pixels.
+    defects : ndarray (height, width) of bool
+        Pixels that are not to be used.
+    """
+
+    bias: Image32
+    dark_current: Image32
+    response: Image32
+    defects: Mask
+
+    def dark(self, exposure_us: float) -> Image32:
+        """Grey values in the dark."""
+        return (self.bias + self.dark_current * np.float32(exposure_us)).astype(np.float32)
+
+
+def estimate_fields(series: SensorSeries) -> Fields:
+    """Bias and dark current by straight lines through each pixel's dark levels, response by its bright ones.
+
+    The lines are least squares in closed form, weighted by the numbers of frames. A pixel is defective when
+    it stands out of the others in bias, dark current, response (by a robust normal test) or scatter (by χ²)
+    by more than half a good pixel of the whole sensor would.
+    """
+    bias, current = _dark_lines(series.dark)
+    bright = [level for level in series.bright if level.mean.mean() < _BRIGHTEST * series.full_scale]
+    bright = bright or [series.bright[0]]
+    signal = np.zeros(series.shape)
+    for level in bright:
+        signal += level.count * (level.mean - bias - current * level.exposure_us)
+    usual = float(np.median(signal))
+    response = signal / usual if usual > 0 else np.ones(series.shape)
+    defects = _outliers(bias) | _outliers(_unshaded(response)) | _noisy(series)
+    if np.ptp([level.exposure_us for level in series.dark]) > 0:
+        defects |= _outliers(current)
+    good = ~defects
+    response = np.where(good, response / response[good].mean(), 1.0)
+    return Fields(bias.astype(np.float32), current.astype(np.float32), response.astype(np.float32), defects)
+
+
+def _dark_lines(levels: tuple[Level, ...]) -> tuple[Image32, Image32]:
+    weights = np.array([level.count for level in levels], dtype=np.float64)
+    times = np.array([level.exposure_us for level in levels])
+    middle = float((weights * times).sum() / weights.sum())
+    mean = sum(w * level.mean.astype(np.float64) for w, level in zip(weights, levels, strict=True))
+    mean = mean / weights.sum()
+    spread = float((weights * (times - middle) ** 2).sum())
+    slope = np.zeros_like(mean)
+    if spread > 0:
+        for w, t, level in zip(weights, times, levels, strict=True):
+            slope += w * (t - middle) * level.mean / spread
+    return (mean - slope * middle).astype(np.float32), slope.astype(np.float32)
+
+
+def _unshaded(response: np.ndarray) -> np.ndarray:
+    """The response without what changes slowly: light that falls off is no defect."""
+    across, down = (np.vander(np.linspace(-1, 1, n), 4, increasing=True) for n in response.shape[::-1])
+    flat = response.ravel()
+    usual = np.abs(flat - np.median(flat)) < 10 * _MAD * np.median(np.abs(flat - np.median(flat))) + 1e-12
+    chosen = np.flatnonzero(usual)[:: max(1, flat.size // 20000)]
+    row, column = np.divmod(chosen, response.shape[1])
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    terms = np.stack([across[column, i] * down[row, j] for i, j in powers], axis=-1)
+    surface = np.zeros((4, 4))
+    with one_thread():  # the same sums however many processors there are
+        surface[tuple(np.transpose(powers))] = np.linalg.lstsq(terms, flat[chosen], rcond=None)[0]
+        rest: np.ndarray = response - down @ surface.T @ across.T
+    return rest
+
+
+def _outliers(values: np.ndarray) -> Mask:
+    middle = np.median(values)
+    scale = _MAD * np.median(np.abs(values - middle))
+    limit = stats.norm.isf(_FALSE_ALARMS / _TESTS / values.size / 2)
+    found: Mask = np.abs(values - middle) > limit * max(scale, 1e-12)
+    return found if scale > 0 else np.zeros(values.shape, dtype=bool)
+
+
+def _noisy(series: SensorSeries) -> Mask:
+    """Pixels that scatter in the dark more than χ² lets the others."""
+    dof = sum(level.count - 1 for level in series.dark)
+    pooled = np.zeros(series.shape)
+    for level in series.dark:
+        pooled += (level.count - 1) / dof * level.variance
+    usual = float(np.median(pooled)) / (stats.chi2.median(dof) / dof)
+    limit = stats.chi2.isf(_FALSE_ALARMS / _TESTS / pooled.size, dof) / dof
+    noisy: Mask = pooled > limit * max(usual, 1 / 12)
+    return noisy

@@ -1,0 +1,207 @@
+"""From the frames of a series to the calibration of the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..adjust import Failure
+from ..calibration.document import Calibration, Covariance, Quantity
+from ..core.data import Array, Frame
+from ..core.errors import EstimationError
+from .correction import SensorCorrection
+from .edge import EdgeSpread, measure_edge
+from .fields import Fields, estimate_fields
+from .series import Level, SensorSeries
+from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
+
+__all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
+
+_FULL = 0.97
+"""Of the signal at which pixels are full: beyond, an edge is cut off."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorResult:
+    """What was found of a sensor; truthy.
+
+    Parameters
+    ----------
+    fields : Fields
+        Of each pixel.
+    transfer : PhotonTransfer
+        Gain, noise, full well.
+    linearity : Linearity or Failure
+        The answer to light; falsy with too few exposures, and then taken as straight.
+    full_scale : float
+        Of the frames.
+    exposure_us : float
+        The brightest unsaturated one.
+    edge : EdgeSpread or Failure, optional
+        Sharpness; falsy where there is no edge to be measured.
+    """
+
+    fields: Fields
+    transfer: PhotonTransfer
+    linearity: Linearity | Failure
+    full_scale: float
+    exposure_us: float
+    edge: EdgeSpread | Failure | None = None
+
+    @property
+    def dsnu(self) -> float:
+        """Standard deviation of the bias over the good pixels (grey values)."""
+        return float(self.fields.bias[~self.fields.defects].std(dtype=np.float64))
+
+    @property
+    def prnu(self) -> float:
+        """Standard deviation of the response over the good pixels, uneven light included."""
+        return float(self.fields.response[~self.fields.defects].std(dtype=np.float64))
+
+    @property
+    def correction(self) -> SensorCorrection:
+        """What is applied to frames."""
+        b2, b3 = 0.0, 0.0
+        if isinstance(self.linearity, Linearity):
+            b2, b3 = self.linearity.fit["b2"], self.linearity.fit["b3"]
+        return SensorCorrection(self.fields, b2, b3, self.full_scale, self.exposure_us)
+
+    def quantities(self) -> dict[str, Quantity]:
+        """What was estimated, by name."""
+        fit = self.transfer.fit
+        found = {
+            "gain": Quantity(value=fit["gain"], sigma=fit.sigma_of("gain"), unit="e-/DN"),
+            "read_noise": Quantity(value=abs(fit["read_noise"]), sigma=fit.sigma_of("read_noise"), unit="DN"),
+        }
+        if (well := self.transfer.full_well) is not None:
+            found["full_well"] = Quantity(value=well[0], sigma=well[1], unit="e-")
+        if isinstance(self.linearity, Linearity):
+            for name in ("b2", "b3"):
+                fit = self.linearity.fit
+                found[name] = Quantity(value=fit[name], sigma=fit.sigma_of(name), unit="1")
+        if isinstance(self.edge, EdgeSpread):
+            found |= self.edge.quantities()
+        return found
+
+    def variance(self, frame: Frame, exposures: int, exposure_us: float) -> Array:
+        """Of the grey values that the correction makes of a frame, by the photon transfer.
+
+        Parameters
+        ----------
+        frame : Frame
+            Uncorrected, the mean of some exposures.
+        exposures : int
+            How many.
+        exposure_us : float
+            Of each.
+
+        Notes
+        -----
+        With s̃ the linearised signal and q its slope, (q²(σ² + 1/12) + s̃/g) / (n r²).
+        """
+        u = (frame.pixels - self.fields.dark(exposure_us)).astype(np.float64) / self.full_scale
+        b2, b3 = self.correction.b2, self.correction.b3
+        signal, slope = u * (1 + b2 * u + b3 * u**2) * self.full_scale, 1 + 2 * b2 * u + 3 * b3 * u**2
+        fit = self.transfer.fit
+        read = slope**2 * (fit["read_noise"] ** 2 + ROUNDING)
+        noise: Array = read + np.maximum(signal, 0.0) / fit["gain"]
+        return noise / (exposures * self.fields.response.astype(np.float64) ** 2)
+
+    def calibration(self, name: str, provenance: Mapping[str, Any], times: Mapping[str, str]) -> Calibration:
+        """As a ``reseau-calibration/1`` of the kind camera, whose model is a sensor."""
+        fit = self.transfer.fit
+        names: tuple[str, ...] = ("gain", "read_noise")
+        matrix = np.zeros((4, 4))
+        matrix[:2, :2] = fit.covariance_of(*names)
+        if isinstance(self.linearity, Linearity):
+            names += ("b2", "b3")
+            matrix[2:, 2:] = self.linearity.fit.covariance_of("b2", "b3")
+        size = len(names)
+        rows = tuple(tuple(row) for row in matrix[:size, :size].tolist())
+        test = fit.global_test()
+        tests = [{"name": "photon transfer", "passed": test.passed, "statistic": test.statistic}]
+        model = self.correction.to_model()
+        if isinstance(self.edge, EdgeSpread):
+            tests, model = tests + self.edge.tests(), model | self.edge.to_model()
+        return Calibration(
+            kind="camera",
+            name=name,
+            model=model,
+            parameters=self.quantities(),
+            covariance=Covariance(names=names, matrix=rows),
+            sigma0=fit.sigma0,
+            redundancy=fit.redundancy,
+            tests=tuple(tests),
+            validity=self.validity(),
+            provenance=dict(provenance),
+            times=dict(times),
+        )
+
+    def validity(self) -> dict[str, Any]:
+        """Where the calibration holds, and how uneven the sensor is."""
+        height, width = self.fields.bias.shape
+        straight = isinstance(self.linearity, Linearity)
+        found = {
+            "size": [width, height],
+            "full_scale": self.full_scale,
+            "exposure_us": self.exposure_us,
+            "dsnu": self.dsnu,
+            "prnu": self.prnu,
+            "defects": int(self.fields.defects.sum()),
+            "nonlinearity": self.linearity.worst if isinstance(self.linearity, Linearity) else None,
+            "linearity": "fitted" if straight else getattr(self.linearity, "reason", ""),
+            "saturated": self.transfer.curve.plateau is not None,
+        }
+        if self.edge is None:
+            return found
+        if isinstance(self.edge, Failure):
+            return found | {"edge": self.edge.reason}
+        return found | self.edge.validity()
+
+
+def calibrate_sensor(series: SensorSeries) -> SensorResult:
+    """Calibrate a sensor.
+
+    Parameters
+    ----------
+    series : SensorSeries
+        Frames in the dark and of even light.
+
+    Raises
+    ------
+    EstimationError
+        When gain and noise cannot be had.
+    """
+    fields = estimate_fields(series)
+    curve = curve_of(series, fields)
+    linearity = fit_linearity(curve, series.full_scale)
+    transfer = fit_transfer(curve, linearity if isinstance(linearity, Linearity) else None)
+    if isinstance(transfer, Failure):
+        raise EstimationError(transfer.reason, where="photon transfer")
+    brightest = curve.exposure_us[curve.bright & curve.usable].max()
+    return SensorResult(fields, transfer, linearity, series.full_scale, float(brightest))
+
+
+def with_edge(
+    result: SensorResult, edge: Level, region: tuple[int, int, int, int] | None = None
+) -> SensorResult:
+    """The calibration with the sharpness of an edge, which is freed of what the sensor did to it.
+
+    Parameters
+    ----------
+    result : SensorResult
+        Of the same sensor.
+    edge : Level
+        Frames of a slanted edge.
+    region : (left, top, width, height), optional
+        Where nothing else is; by default the whole frame.
+    """
+    frame = Frame(edge.mean, result.full_scale, "edge")
+    corrected = result.correction.apply(frame, edge.exposure_us)
+    if (well := result.transfer.saturation) is not None:
+        corrected = replace(corrected, full_scale=min(corrected.full_scale, _FULL * well))
+    variance = result.variance(frame, edge.count, edge.exposure_us)
+    return replace(result, edge=measure_edge(corrected, region, variance, ~result.fields.defects))

@@ -1,0 +1,207 @@
+"""How grey values answer to light and how they scatter: linearity, and the photon transfer curve.
+
+Sources: Janesick, *Photon Transfer*; EMVA Standard 1288, release 4.0. The variance of a grey value is that of
+the arriving electrons, the signal over the gain in electrons per grey value, with that of reading, and 1/12
+of rounding to whole grey values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..adjust import Adjustment, Failure, GaussHelmert, GaussMarkov, Options, Parameters, adjust
+from ..core.data import Array, Mask
+from .fields import Fields
+from .series import SensorSeries
+
+__all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", "fit_transfer"]
+
+ROUNDING = 1 / 12
+_LINEAR = 0.7
+"""Share of the saturation up to which levels take part, as EMVA 1288 has it."""
+_COLLAPSED = 0.5
+"""Of the variance that is expected: less than this is a saturated level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Means over the good pixels, level by level; dark ones first.
+
+    Parameters
+    ----------
+    exposure_us, signal, variance : ndarray (m,)
+        Exposure, grey value above the dark one, variance of a pixel from frame to frame.
+    signal_sigma, variance_sigma : ndarray (m,)
+        Their standard deviations.
+    bright : ndarray (m,) of bool
+        Which are of light.
+    usable : ndarray (m,) of bool
+        Which are far enough from saturation.
+    plateau : float or None
+        Signal at which it saturates; None when no level does.
+    """
+
+    exposure_us: Array
+    signal: Array
+    variance: Array
+    signal_sigma: Array
+    variance_sigma: Array
+    bright: Mask
+    usable: Mask
+    plateau: float | None
+
+
+def curve_of(series: SensorSeries, fields: Fields) -> Curve:
+    """The means of a series."""
+    good = ~fields.defects
+    levels = [*series.dark, *series.bright]
+    bright = np.array([False] * len(series.dark) + [True] * len(series.bright))
+    times = np.array([level.exposure_us for level in levels])
+    signal = np.array(
+        [
+            float((level.mean - fields.dark(level.exposure_us))[good].mean(dtype=np.float64)) if lit else 0.0
+            for level, lit in zip(levels, bright, strict=True)
+        ]
+    )
+    variance = np.array([float(level.variance[good].mean(dtype=np.float64)) for level in levels])
+    frames = np.array([level.count for level in levels])
+    freedom = (frames - 1) * int(good.sum())
+    # Where nothing scatters, as in saturation or below one grey value, the rounding does.
+    safe = np.maximum(variance, ROUNDING)
+    order = np.argsort(times[bright])
+    plateau, most = _saturation(signal[bright][order], variance[bright][order])
+    usable = ~bright | (signal <= _LINEAR * most)
+    return Curve(
+        times,
+        signal,
+        variance,
+        np.sqrt(safe / (frames * good.sum())),
+        safe * np.sqrt(2 / freedom),
+        bright,
+        usable,
+        plateau,
+    )
+
+
+def _saturation(signal: Array, variance: Array) -> tuple[float | None, float]:
+    """Signal of the plateau, when there is one, and the one up to which the variance grows."""
+    top = int(np.argmax(variance))
+    for k in range(top + 1, len(signal)):
+        if variance[k] < _COLLAPSED * variance[top]:
+            return float(signal[k:].max()), float(signal[top])
+    return None, float(signal.max()) / _LINEAR
+
+
+@dataclass(frozen=True, eq=False)
+class Linearity:
+    """How far the answer is from a straight line.
+
+    Parameters
+    ----------
+    fit : Adjustment
+        Of `slope` (grey values per microsecond), `b2` and `b3`: signal·(1 + b2·u + b3·u²) = slope·exposure,
+        with u the signal over the full scale.
+    full_scale : float
+        Of u.
+    worst : float
+        Largest deviation of a level from the straight line, of the signal.
+    """
+
+    fit: Adjustment
+    full_scale: float
+    worst: float
+
+    def straight(self, signal: Array) -> tuple[Array, Array]:
+        """Linearised signals, and the slope of that at them."""
+        u, b2, b3 = signal / self.full_scale, self.fit["b2"], self.fit["b3"]
+        return signal * (1 + b2 * u + b3 * u**2), 1 + 2 * b2 * u + 3 * b3 * u**2
+
+
+def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
+    """Fit the linearity to the levels of light below saturation; exposures are taken as true."""
+    use = curve.bright & curve.usable & (curve.exposure_us > 0)
+    signal, times = curve.signal[use][:, None], curve.exposure_us[use][:, None]
+    if len(signal) < 4:
+        return Failure("fewer than four levels of light below saturation: take more exposures")
+    scale = float((signal * times).sum() / (times**2).sum())
+
+    def conditions(observed: Array, x: Array) -> Array:
+        u = observed / full_scale
+        left: Array = observed * (1 + x[1] * u + x[2] * u**2) - x[0] * scale * times
+        return left
+
+    def jacobians(observed: Array, x: Array) -> tuple[Array, Array]:
+        u = observed / full_scale
+        by_parameters = np.stack([-scale * times, observed * u, observed * u**2], axis=-1)
+        by_signal = 1 + 2 * x[1] * u + 3 * x[2] * u**2
+        return by_parameters, by_signal[..., None]
+
+    parameters = Parameters(["slope", "b2", "b3"], [1.0, 0.0, 0.0])
+    problem = GaussHelmert(conditions, signal, curve.signal_sigma[use][:, None], parameters, jacobians)
+    found = adjust(problem)
+    if isinstance(found, Failure):
+        return found
+    straight = found["slope"] * scale * times
+    worst = float(np.abs(signal / straight - 1).max())
+    return Linearity(found, full_scale, worst)
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonTransfer:
+    """Gain and noise.
+
+    Parameters
+    ----------
+    fit : Adjustment
+        Of `gain` (electrons per grey value) and `read_noise` (grey values).
+    curve : Curve
+        What it was fitted to.
+    saturation : float or None
+        Linearised signal at which it saturates; None when no level does.
+    """
+
+    fit: Adjustment
+    curve: Curve
+    saturation: float | None
+
+    @property
+    def full_well(self) -> tuple[float, float] | None:
+        """Electrons at which a pixel saturates, and their sigma; None when no level reached that."""
+        if self.saturation is None:
+            return None
+        return self.saturation * self.fit["gain"], self.saturation * self.fit.sigma_of("gain")
+
+
+def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTransfer | Failure:
+    """Fit the photon transfer curve: σ² = σ_read² + 1/12 + signal/gain.
+
+    Where the answer bends, the signal is the linearised one, and the light's part of the variance that of the
+    linearised signal over the square of its slope. The signal's own uncertainty is carried to the variance.
+    """
+    use = curve.usable
+    signal, variance = curve.signal[use], curve.variance[use]
+    top, saturation = np.array([curve.plateau or 0.0]), curve.plateau
+    if linearity is not None:
+        signal, bend = linearity.straight(signal)
+        signal = signal / bend**2
+        saturation = None if curve.plateau is None else float(linearity.straight(top)[0][0])
+    if (curve.bright & use).sum() < 2 or not np.ptp(signal) > 0:
+        return Failure("fewer than two levels of light below saturation: take shorter exposures")
+    slope, floor = np.polyfit(signal, variance, 1, w=1 / curve.variance_sigma[use])
+    if not slope > 0:
+        return Failure("the variance does not grow with the light: is it even, and no gamma curve set?")
+    sigma = np.hypot(curve.variance_sigma[use], slope * curve.signal_sigma[use] * curve.bright[use])
+
+    def computed(x: Array) -> Array:
+        expected: Array = x[1] ** 2 + ROUNDING + signal / x[0]
+        return expected
+
+    def jacobian(x: Array) -> Array:
+        return np.stack([-signal / x[0] ** 2, np.full_like(signal, 2 * x[1])], axis=1)
+
+    start = [1 / slope, np.sqrt(max(floor - ROUNDING, 1e-4))]
+    parameters = Parameters(["gain", "read_noise"], start)
+    found = adjust(GaussMarkov(computed, variance, sigma, parameters, jacobian), Options(scale="a-priori"))
+    return found if isinstance(found, Failure) else PhotonTransfer(found, curve, saturation)

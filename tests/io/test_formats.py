@@ -1,0 +1,180 @@
+"""Documents: strict, round trip, and errors that name the key."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.core.data import ImagePoints
+from reseau.core.errors import FormatError, InputError
+from reseau.io import ReseauDesign, ReseauMeasurement, read_text, write_whole
+
+
+def design() -> dict[str, Any]:
+    return {
+        "schema": "reseau-design/1",
+        "name": "d",
+        "unit": "mm",
+        "mark": {"shape": "cross", "size": 4.0, "line_width": 0.5},
+        "polarity": "dark",
+        "origin": "a",
+        "axis": "b",
+        "points": [
+            {"id": "a", "x": 0.0, "y": 0, "sigma": 0.01, "nominal_px": [10.5, 20]},
+            {"id": "b", "x": 10.0, "y": 0.0},
+            {"id": "c", "x": None, "y": None},
+        ],
+    }
+
+
+def test_a_design_survives_the_way_to_the_file_and_back(tmp_path: Path) -> None:
+    first = ReseauDesign.parse(json.dumps(design()), where="d.json")
+    path = tmp_path / "d.json"
+    write_whole(path, first.to_json())
+    assert ReseauDesign.read(path) == first
+    assert ReseauDesign.read(path).to_json() == first.to_json()
+    assert next(iter(json.loads(first.to_json()))) == "schema"
+    assert first.ids == ("a", "b", "c")
+    np.testing.assert_array_equal(first.xy, [[0, 0], [10, 0], [np.nan, np.nan]])
+    np.testing.assert_array_equal(first.nominal_px[0], [10.5, 20])
+    assert np.isnan(first.nominal_px[1:]).all()
+
+
+def broken(change: str) -> str:
+    content = design()
+    match change:
+        case "unknown":
+            content["colour"] = 1
+        case "unknown-in-point":
+            content["points"][1]["z"] = 1.0
+        case "missing":
+            del content["unit"]
+        case "twice":
+            content["points"][1]["id"] = "a"
+        case "half":
+            content["points"][1]["y"] = None
+        case "origin":
+            content["origin"] = "q"
+        case "same":
+            content["axis"] = "a"
+        case "empty":
+            content["points"] = []
+        case "shape":
+            content["mark"]["shape"] = "star"
+        case "string":
+            content["points"][0]["x"] = "0"
+        case "schema":
+            content["schema"] = "reseau-design/9"
+    return json.dumps(content)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ("unknown", "unknown key `colour`"),
+        ("unknown-in-point", r"unknown key `points\[1\]\.z`"),
+        ("missing", "missing key `unit`"),
+        ("twice", "the id 'a' stands twice"),
+        ("half", "point 'b' has only one of its two coordinates"),
+        ("origin", "`origin` names 'q'"),
+        ("same", "must differ"),
+        ("empty", "no points"),
+        ("shape", "mark.shape"),
+        ("string", "valid number"),
+        ("schema", "'reseau-design/1' was expected"),
+    ],
+)
+def test_a_design_that_breaks_a_rule_is_refused_in_one_line(change: str, complaint: str) -> None:
+    with pytest.raises(FormatError, match=complaint) as caught:
+        ReseauDesign.parse(broken(change), where="bad.json")
+    assert str(caught.value).startswith("bad.json: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "3", "null", "[" * 100_000, '{"a": 1}'])
+def test_what_is_no_document_is_refused(text: str) -> None:
+    with pytest.raises(FormatError, match=r"x\.json: (is no JSON|has no key `schema`)"):
+        ReseauDesign.parse(text, where="x.json")
+
+
+def test_not_a_number_is_no_coordinate() -> None:
+    text = json.dumps(design()).replace("10.0", "NaN", 1)
+    with pytest.raises(FormatError, match="finite"):
+        ReseauDesign.parse(text, where="x.json")
+
+
+def test_files_that_are_not_there_or_no_text_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.json: cannot be read \(No such file"):
+        read_text(tmp_path / "none.json")
+    (tmp_path / "b.json").write_bytes(b"\xff\xfe\0")
+    with pytest.raises(InputError, match=r"b\.json: is no UTF-8"):
+        read_text(tmp_path / "b.json")
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    write_whole(tmp_path / "a.txt", "ä")
+    write_whole(tmp_path / "a.txt", b"new")
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    with pytest.raises(InputError, match="cannot be written"):
+        write_whole(tmp_path / "none" / "a.txt", "x")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_whole(tmp_path / "folder", "x")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "folder"]
+
+
+def test_measured_points_keep_their_covariance() -> None:
+    cov = np.array([[[0.04, 0.01], [0.01, 0.09]]])
+    points = ImagePoints(("a",), np.array([[1.5, 2.5]]), cov)
+    document = ReseauMeasurement.from_image_points(points, image="p.png", sha256="0")
+    again = ReseauMeasurement.parse(document.to_json(), where="m.json").image_points()
+    np.testing.assert_allclose(again.cov, cov, rtol=1e-14)
+    np.testing.assert_array_equal(again.xy, points.xy)
+
+
+def test_marks_that_were_not_measured_are_no_points() -> None:
+    document = {
+        "schema": "reseau-measurement/1",
+        "image": "p.png",
+        "sha256": "",
+        "unit": "px",
+        "points": [{"id": "a", "ok": False, "why": "gone"}, {"id": "b", "x": 1.0, "y": 2.0, "ok": True}],
+        "found": 1,
+        "expected": 2,
+    }
+    points = ReseauMeasurement.parse(json.dumps(document), where="m").image_points()
+    assert points.names == ("b",)
+    np.testing.assert_array_equal(points.sigma, [[1.0, 1.0]])
+
+
+def test_coordinates_by_hand_come_as_csv(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text("id,x,y,sx,sy\n a ,1,2,0.1,0.2\n\nb,3.5,-4e1,1,1\n")
+    points = ReseauMeasurement.read_csv(path).image_points()
+    assert points.names == ("a", "b")
+    np.testing.assert_array_equal(points.xy, [[1, 2], [3.5, -40]])
+    np.testing.assert_allclose(points.sigma[0], [0.1, 0.2], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "first line"),
+        ("name,x,y\na,1,2\n", "first line"),
+        ("id,x,y\n", "holds no points"),
+        ("id,x,y\na,1\n", "line 2"),
+        ("id,x,y\na,1,2,3\n", "line 2"),
+        ("id,x,y\na,1,2\nb,1,nan\n", "line 3"),
+        ("id,x,y,sx,sy\na,1,2,0,1\n", "line 2"),
+        ("id,x,y\na,1,2\na,3,4\n", "line 3: the id 'a' stands twice"),
+    ],
+)
+def test_a_csv_that_breaks_a_rule_is_refused_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=rf"p\.csv: .*{complaint}"):
+        ReseauMeasurement.read_csv(path)

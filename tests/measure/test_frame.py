@@ -1,0 +1,243 @@
+"""Frames oriented: corners where they truly are, sigmas that cover, and refusal rather than a guess."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.core.data import Array
+from reseau.io.scans import scan_of
+from reseau.measure.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of
+from reseau.procedures.frame import helped
+from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
+
+BUSY = Beside(perforations=True, print=True, neighbours=True, dust=40, scratches=3)
+
+
+def oriented(frame: FilmFrame, **options: object) -> FrameResult:
+    known = FrameOptions(formats=(frame.format[:2],), **options)  # type: ignore[arg-type]
+    results = orient_frames(scan_of(frame.scan(), dpi=frame.dpi), known)
+    assert len(results) == 1
+    return results[0]
+
+
+def errors(result: FrameResult, frame: FilmFrame) -> Array:
+    assert result.lines is not None, result.why
+    return np.asarray(result.lines.corners - frame.truth.corners)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        FilmFrame(1),
+        FilmFrame(2, tilt_deg=14.0, beside=BUSY),
+        FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
+        FilmFrame(4, negative=True, beside=BUSY),
+        FilmFrame(5, beside=Beside(lines=1)),
+        FilmFrame(6, beside=Beside(rods=1)),
+        FilmFrame(7, beside=Beside(blown=True)),
+        FilmFrame(8, bow_mm=0.1),
+        FilmFrame(9, format=RICOH._replace(radius=1.5)),
+        FilmFrame(10, bits=16),
+        FilmFrame(11, contrast=0.3),
+    ],
+    ids=lambda frame: f"seed {frame.seed}",
+)
+def test_corners_are_found_whatever_disturbs(frame: FilmFrame) -> None:
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_a_frame_that_stands_upright_is_named_as_seen() -> None:
+    frame = FilmFrame(12, tilt_deg=90.0)
+    result = oriented(frame)
+    assert result.format_mm == (24.0, 36.0)
+    assert result.lines is not None
+    seen = np.roll(frame.truth.corners, -1, axis=0)  # the frame's upper right corner is at the upper left
+    np.testing.assert_allclose(result.lines.corners, seen, rtol=0, atol=0.35)
+
+
+def test_predicted_sigmas_cover() -> None:
+    normalised = []
+    for seed in range(14):
+        frame = FilmFrame(seed + 50, dpi=400)
+        result = oriented(frame)
+        assert result.lines is not None
+        normalised.append(errors(result, frame).ravel() / np.sqrt(np.diag(result.lines.covariance)))
+    # 112 values in fives that go together: their rms is 1 ± 0.15.
+    assert 0.65 < np.sqrt(np.mean(np.square(normalised))) < 1.4
+
+
+def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
+    frame = FilmFrame(21, bow_mm=0.15)
+    result = oriented(frame)
+    assert result.lines is not None
+    np.testing.assert_allclose(result.lines.bow, frame.bows_px, rtol=0, atol=0.25)
+    reported = [edge.curvature_px for edge in result.edges.values()]
+    assert any(bow for bow in reported)
+
+
+def test_a_line_that_nothing_parts_from_an_edge_is_not_taken_for_it() -> None:
+    # A bright line within half a pixel of the upper edge at one end: told by the width of its steps alone.
+    result = oriented(FilmFrame(320035, beside=Beside(lines=1)))
+    assert result.status == "declined"
+    assert "standard deviation" in result.why
+
+
+def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
+    frame = FilmFrame(300088, beside=Beside(lines=1))  # by steps alone its corners were 1.2 px off
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None:
+    """The line is at one distance from the edge all along: alone, nothing tells them apart."""
+    frame = FilmFrame(320035, beside=Beside(lines=1))
+    alone = oriented(frame)
+    assert alone.status == "declined"
+    roll = roll_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0)
+    assert isinstance(roll, Roll)
+    (found,) = helped(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
+    assert found.status == "oriented", found.why
+    assert "roll" in found.why
+    assert np.abs(errors(found, frame)).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        FilmFrame(6002, blur_px=1.5, noise=0.5, grain=0.5),  # its lower edge was found 1.5 px outside
+        FilmFrame(6003, dpi=1200, blur_px=2.5),  # a picture's forms were taken for a line along the edge
+        FilmFrame(1019, grain=10.0),  # the steps of its darkest edge were looked for beside them
+    ],
+    ids=["hardly noise", "fine", "grain"],
+)
+def test_edges_are_found_as_soft_and_as_grainy_as_they_are(frame: FilmFrame) -> None:
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.4
+
+
+def test_a_thing_that_bends_away_from_a_dark_edge_is_no_bow_of_it() -> None:
+    frame = FilmFrame(
+        6010, dpi=1200, blur_px=2.5, beside=Beside(rods=1)
+    )  # it was 1.2 px off with sigmas of 0.2
+    result = oriented(frame)
+    assert not result or np.abs(errors(result, frame)).max() < 0.5
+
+
+def test_places_do_not_lie_inwards_in_noise() -> None:
+    """With a noise of a tenth of the contrast the mean of eight frames was 0.04 px, five standard errors."""
+    inwards = []
+    for seed in range(8):
+        frame = FilmFrame(300 + seed, noise=8.0)
+        middle = frame.truth.corners.mean(axis=0)
+        away = frame.truth.corners - middle
+        inwards.append(-(errors(oriented(frame), frame) * np.sign(away)).mean())
+    assert abs(np.mean(inwards)) < 0.025
+
+
+def test_a_scratch_along_the_film_beside_an_edge_is_passed_over() -> None:
+    frame = FilmFrame(300017, beside=Beside(scratches=8))
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_fourth_is() -> None:
+    frame = FilmFrame(31, crop="right")
+    result = oriented(frame)
+    assert result.status == "three-edges"
+    assert result.why.startswith("right edge: ")
+    assert result.lines is not None
+    error, sigma = errors(result, frame), np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
+    assert np.abs(error[[0, 3]]).max() < 0.3
+    assert (np.abs(error) < 4 * sigma).all()
+    assert sigma[1, 0] > 1.0
+    assert not result.edges["right"].found
+
+
+def test_of_the_channels_that_of_most_contrast_is_kept() -> None:
+    frame = FilmFrame(42, colour=True, dpi=400)
+    result = oriented(frame)
+    assert result.channel == "red"
+    assert np.abs(errors(result, frame)).max() < 0.3
+
+
+def test_another_channel_is_kept_where_that_of_most_contrast_hides_an_edge() -> None:
+    frame = FilmFrame(320035, colour=True)
+    pixels = frame.scan()
+    pixels[..., 0] = FilmFrame(320035, colour=True, beside=Beside(lines=1)).scan()[..., 0]
+    result = orient_frames(scan_of(pixels, dpi=frame.dpi), FrameOptions(formats=((36.0, 24.0),)))[0]
+    assert result.status == "oriented"
+    assert result.channel == "green"
+    assert np.abs(errors(result, frame)).max() < 0.3
+
+
+def moved_at_its_corners(frame: FilmFrame, by: Array) -> tuple[FrameResult, Array]:
+    """A scan warped so that its corners (4, 2) move by this much; and where the frame's corners are then."""
+    pixels = frame.scan()
+    h, w = pixels.shape
+    square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)
+    moved = cv2.getPerspectiveTransform(square, (square + by).astype(np.float32))
+    seen = cv2.warpPerspective(pixels, moved, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    options = FrameOptions(formats=((36.0, 24.0),))
+    (result,) = orient_frames(scan_of(seen, dpi=frame.dpi), options)
+    return result, cv2.perspectiveTransform(frame.truth.corners[None], moved)[0]
+
+
+def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
+    # Left and right edge converge by two degrees.
+    by = np.array([[-14.0, 0.0], [14.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    result, corners = moved_at_its_corners(FilmFrame(51), by)
+    assert result.status == "oriented", result.why
+    assert "seen at a slant" in result.why
+    assert result.lines is not None
+    np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=0.3)
+
+
+def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
+    # One corner moved alone: its edges are turned by a degree and more.
+    by = np.array([[24.0, 16.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    result, _ = moved_at_its_corners(FilmFrame(52), by)
+    assert result.status == "declined"
+    assert "do not make a frame" in result.why
+
+
+def test_what_is_no_frame_is_declined_with_what_would_help() -> None:
+    rng = np.random.default_rng(0)
+    blank = np.full((500, 700), 12, dtype=np.uint8)
+    noise = rng.integers(0, 255, (500, 700)).astype(np.uint8)
+    inner = FilmFrame(1, margin_mm=-1.0).scan()
+    for pixels, words in ((blank, "of one tone"), (noise, "no frame"), (inner, "no frame")):
+        (result,) = orient_frames(scan_of(pixels))
+        assert not result
+        assert words in result.why
+        assert ";" in result.why
+        document = result.document()
+        assert document.status == "declined"
+        assert document.corners is None
+
+
+def test_a_wrong_format_is_declined() -> None:
+    (result,) = orient_frames(scan_of(FilmFrame(1).scan()), FrameOptions(formats=((56.0, 56.0),)))
+    assert not result
+
+
+def test_the_document_says_pp_axes_and_scale() -> None:
+    frame = FilmFrame(51, tilt_deg=3.0)
+    document = oriented(frame).document()
+    ul, ur, lr, ll = frame.truth.corners
+    point, angle = document.principal_point, document.angle_deg
+    assert point is not None
+    assert angle is not None
+    assert document.px_per_mm is not None
+    way = lr - ll
+    assert angle == pytest.approx(-np.rad2deg(np.arctan2(way[1], way[0])), abs=0.02)
+    s, t = np.linalg.solve(np.stack([lr - ul, -(ll - ur)], axis=1), ur - ul)
+    np.testing.assert_allclose([point.x, point.y], ul + s * (lr - ul), rtol=0, atol=0.15)
+    assert document.px_per_mm == pytest.approx((600 / 25.4, 600 / 25.4), rel=0.005)
+    assert 0 < t < 1

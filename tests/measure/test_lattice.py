@@ -1,0 +1,84 @@
+"""Lines of a testfield: found, numbered, and adjusted to a few hundredths of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.adjust import Failure
+from reseau.core.data import Array
+from reseau.measure.screening import quiet_noise
+from reseau.measure.testfield.lattice import LatticeFit, lattices, refit, second_order
+from reseau.measure.testfield.lines import Lattice, find_lattice, ridge_points
+from reseau.measure.testfield.profiles import blur_of
+from reseau_sims import FieldBench, Station
+
+
+def fitted(bench: FieldBench, station: Station) -> LatticeFit:
+    grey = bench.record(station).pixels.astype(np.float32)
+    ridges = ridge_points(grey, quiet_noise(grey))
+    found = find_lattice(ridges)
+    assert isinstance(found, Lattice), found.reason
+    return next(lattices(grey, ridges, found, 2 / 125, blur_of(0.8, bench.response)))
+
+
+def off_the_lines(bench: FieldBench, station: Station, fit: LatticeFit) -> Array:
+    """Distances in the plane of the board (mm) of the fitted lines from the nearest true ones."""
+    i, j = np.meshgrid(fit.across, np.linspace(fit.along.min(), fit.along.max(), 41))
+    j2, i2 = np.meshgrid(fit.along, np.linspace(fit.across.min(), fit.across.max(), 41))
+    found = []
+    truth = bench.truth(station)
+    for at in (np.stack([i.ravel(), j.ravel()], 1), np.stack([i2.ravel(), j2.ravel()], 1)):
+        xy = fit.mapping(at.astype(float))
+        xy = xy[((xy > 0) & (xy < 239)).all(axis=1)]
+        board = bench.design.xy[np.hypot(*(xy[:, None] - truth.xy).transpose(2, 0, 1)).argmin(axis=1)]
+        for _ in range(6):
+            seen, slope = truth.view(board)
+            board = board + np.linalg.solve(slope, (xy - seen)[..., None])[..., 0]
+        found.append(np.abs(board - 125 * np.rint(board / 125)).min(axis=1))
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("station", [Station(0), Station(30, 90), Station(45, 180, 37)])
+def test_lines_are_adjusted_to_a_hundredth_of_a_pixel(station: Station) -> None:
+    bench = FieldBench(seed=2)
+    fit = fitted(bench, station)
+    off = off_the_lines(bench, station, fit)
+    # A pixel sees 2.35 mm of the board.
+    assert np.sqrt((off**2).mean()) / 2.35 < 0.02
+    assert min(len(fit.across), len(fit.along)) >= 5
+
+
+def test_the_lattice_runs_up_when_it_runs_right() -> None:
+    bench = FieldBench()
+    for station in (Station(0), Station(30, 90, 180)):
+        fit = fitted(bench, station)
+        slope = second_order(fit.mapping, np.array([[fit.across.mean(), fit.along.mean()]]))[1]
+        assert np.linalg.det(slope)[0] < 0
+
+
+def test_second_order_is_the_derivative_of_the_mapping() -> None:
+    fit = fitted(FieldBench().distorted(10), Station(30))
+    at = np.array([[1.3, 2.1], [2.7, 0.6]])
+    value, slope, bend = second_order(fit.mapping, at)
+    step = np.array([[0.05, -0.03]])
+    expected = value + slope @ step[0] + 0.5 * np.einsum("kabc,b,c->ka", bend, step[0], step[0])
+    np.testing.assert_allclose(fit.mapping(at + step), expected, rtol=0, atol=2e-3)  # px; the third order
+    analytic = fit.mapping.derivatives(at).d_xy
+    np.testing.assert_allclose(slope, analytic, rtol=0, atol=2e-3)
+
+
+def test_a_mapping_goes_through_the_points_it_is_given() -> None:
+    bench, station = FieldBench(), Station(45)
+    fit = fitted(bench, station)
+    at = np.random.default_rng(0).uniform([0, 0], [4, 4], (60, 2))
+    moved = fit.mapping(at) + 0.02 * np.sin(at)
+    again = refit(fit.mapping, at, moved, 0.01)
+    np.testing.assert_allclose(again(at), moved, rtol=0, atol=0.003)
+
+
+def test_where_there_are_no_lines_there_is_no_lattice() -> None:
+    grey = np.random.default_rng(1).normal(100, 3, (200, 200)).astype(np.float32)
+    found = find_lattice(ridge_points(grey, 3.0))
+    assert isinstance(found, Failure)
+    assert "no straight lines" in found.reason

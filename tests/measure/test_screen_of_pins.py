@@ -1,0 +1,82 @@
+"""Pins on a screen behind a reseau: flanks that wires hide, lines of the raster, light that falls off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array, Mask
+from reseau.measure import find_pins
+from reseau.measure.pins.glow import falloff
+
+from .test_pins import NOISE, arcs, frame, nearest, picture
+
+_SIZE = (600, 800)
+_AT = np.stack(np.meshgrid(np.arange(100.0, 720, 150), np.arange(70.0, 560, 90)), axis=-1).reshape(-1, 2)
+_LINES_PX = 3.6
+
+
+def _reseau(rows: Array, half: int = 4) -> Mask:
+    """Wires along rows, and upright ones at the edges."""
+    hidden = np.zeros(_SIZE, dtype=bool)
+    for row in rows:
+        hidden[round(row) - half : round(row) + half + 1] = True
+    hidden[:, [2, 3, -4, -3]] = True
+    return hidden
+
+
+def _glowing(lines: float = 0.0, fall: float = 0.0, seed: int = 0) -> tuple[Array, Array]:
+    """Echoes on a raster of a glow of 45; where they are, and the picture."""
+    rng = np.random.default_rng(seed)
+    truth = _AT + rng.uniform(-4, 4, _AT.shape)
+    light = picture(truth, arcs(len(truth), 18.0, 3.6, 0.004), _SIZE, 120.0, noise=0.0) + 37.0
+    row, column = np.indices(_SIZE)
+    light *= 1 + lines * np.cos(2 * np.pi * row / _LINES_PX)
+    light *= 1 - fall * ((column - 400) / 400) ** 2
+    return truth, light + NOISE * rng.standard_normal(_SIZE)
+
+
+def test_where_one_flank_is_hidden_the_sigma_knows_of_the_lines_of_a_raster():
+    normalised, unveiled = [], []
+    for seed in range(3):
+        truth, pixels = _glowing(lines=0.015, seed=seed)
+        hidden = _reseau(np.arange(63.0, 560, 90))
+        pixels[hidden] *= 0.1
+        points = find_pins(frame(pixels), hidden=hidden).points
+        rows = nearest(points.xy, truth)
+        found = np.hypot(*(points.xy[rows] - truth).T) < 3
+        at, error = rows[found], (points.xy[rows] - truth)[found]
+        veiled = np.abs(np.round((truth[found, 1] - 63) / 90) * 90 + 63 - truth[found, 1]) < 8
+        normalised.append((error / points.sigma[at])[veiled, 1])
+        unveiled.append(points.sigma[at][~veiled, 1])
+    veiled_errors = np.concatenate(normalised)
+    assert len(veiled_errors) >= 20
+    assert np.sqrt(np.mean(veiled_errors**2)) < 1.6
+    # What is seen whole is as sure as before.
+    assert np.median(np.concatenate(unveiled)) < 0.05
+
+
+def test_light_that_falls_off_moves_no_echo_where_the_raster_tells_how():
+    truth, pixels = _glowing(fall=0.3)
+    hidden = _reseau(np.array([5.0, 595.0]))
+    sides = np.sign(truth[:, 0] - 400)
+    outward = []
+    for known in (None, hidden):
+        points = find_pins(frame(pixels), hidden=known).points
+        off = (points.xy[nearest(points.xy, truth)] - truth)[:, 0]
+        outward.append(float(np.mean(sides * off)))
+    assert outward[0] < -0.15
+    assert abs(outward[1]) < 0.04
+
+
+@pytest.mark.parametrize("glow", [0.0, 45.0])
+def test_without_a_raster_that_is_lit_nothing_is_said_of_its_light(glow: float):
+    ground = np.full(_SIZE, glow, dtype=np.float32)
+    ground += np.linspace(0, 0.2 * glow, _SIZE[1], dtype=np.float32)
+    found = falloff(ground, _reseau(np.array([5.0, 595.0])), NOISE)
+    assert falloff(ground, np.zeros(_SIZE, dtype=bool), NOISE) is None
+    if not glow:
+        assert found is None
+    else:
+        assert found is not None
+        np.testing.assert_allclose(found, ground / ground[300, 400], atol=2e-3)

@@ -1,0 +1,159 @@
+"""Sheets of disks with coded rings, formed at any rotation and tilt, and in photographs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.cli import run
+from reseau.core.data import Frame
+from reseau.core.errors import FormatError
+from reseau.designs import coded_sheet
+from reseau.io import ReseauDesign, ReseauMeasurement
+from reseau.io.images import read_frame, write_image
+from reseau.measure import ReseauResult, measure_reseau
+
+from . import camcal, sheets
+
+
+def measured(formed: sheets.Formed, design: ReseauDesign | None = None) -> ReseauResult:
+    result = measure_reseau(formed.frame, design or sheets.DESIGN)
+    assert isinstance(result, ReseauResult), result.reason
+    return result
+
+
+@pytest.mark.parametrize(("roll", "tilt"), [(0.0, 0.0), (100.0, 30.0), (200.0, 45.0), (300.0, 45.0)])
+def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll: float, tilt: float) -> None:
+    formed = sheets.form(sheets.Camera(roll, tilt))
+    result = measured(formed)
+    error = result.xy - formed.truth
+    assert result.ok.all(), result.why
+    # The centre of its ellipse is up to 0.1 px off the image of a disk's centre here.
+    assert np.abs(error.mean(axis=0)).max() < 0.006
+    assert np.sqrt((error**2).mean()) < 0.02
+    # The covariances are from the residuals of 56 disks each.
+    assert 0.8 < np.sqrt((error**2).sum() / np.trace(result.cov, axis1=1, axis2=2).sum()) < 1.25
+
+
+def test_disks_beyond_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
+    formed = sheets.form(sheets.Camera(20.0, 30.0, (330.0, 0.0)))
+    result = measured(formed)
+    inside = ((formed.truth > 12) & (formed.truth < np.array([787, 587]))).all(axis=1)
+    assert 30 < inside.sum() < 50
+    assert result.ok[inside].all()
+    assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
+    assert all(result.why[k] for k in np.flatnonzero(~result.ok))
+
+
+def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
+    formed = sheets.form(sheets.Camera(10.0, 20.0))
+    x, y = np.rint(formed.truth[12]).astype(int)
+    formed.frame.pixels[y - 30 : y + 30, x : x + 60] = 190
+    result = measured(formed)
+    assert not result.ok[12]
+    assert result.why[12]
+    # Its neighbours are none the worse.
+    assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
+
+
+def test_a_sheet_whose_rings_are_hidden_has_no_numbers() -> None:
+    result = measure_reseau(sheets.form(sheets.Camera(10.0, 20.0), rings=False).frame, sheets.DESIGN)
+    assert not result
+    assert "no coded ring tells" in result.reason
+
+
+def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
+    formed = sheets.form(sheets.Camera(10.0, 20.0))
+    turned = Frame(np.ascontiguousarray(formed.frame.pixels[:, ::-1]), 255.0)
+    result = measure_reseau(turned, sheets.DESIGN)
+    assert not result
+    assert "mirrored" in result.reason
+
+
+def test_a_frame_without_a_sheet_is_a_failure_with_a_reason() -> None:
+    noise = np.random.default_rng(1).normal(128, 6, (600, 800)).clip(0, 255).astype(np.uint8)
+    result = measure_reseau(Frame(noise, 255.0), sheets.DESIGN)
+    assert not result
+    assert "is not to be found" in result.reason
+
+
+def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the_design() -> None:
+    design = sheets.DESIGN
+    assert ReseauDesign.parse(design.to_json(), where="file") == design
+    plain = design.model_copy(update={"rings": None})
+    assert "rings" not in plain.to_dict()
+    content = design.to_dict()
+    content["rings"]["sectors"]["no such disk"] = [[0.0, 90.0]]
+    with pytest.raises(FormatError, match="none of the points"):
+        ReseauDesign.parse(json.dumps(content), where="file")
+
+
+def test_the_command_measures_one_colour_of_a_photograph(tmp_path: Path) -> None:
+    formed = sheets.form(sheets.Camera(30.0, 20.0))
+    green = formed.frame.pixels
+    # The red image lies two pixels beside the green one.
+    write_image(tmp_path / "photo.png", np.stack([np.roll(green, 2, axis=1), green, green], axis=2))
+    sheets.DESIGN.write(tmp_path / "sheet.json")
+    files = [str(tmp_path / name) for name in ("photo.png", "sheet.json", "marks.json")]
+    arguments = ["measure", "reseau", files[0], "--design", files[1], "--out", files[2]]
+    for channel, beside in (("green", 0.0), ("red", 2.0)):
+        assert run([*arguments, "--channel", channel]) == 0
+        found = ReseauMeasurement.read(files[2])
+        assert found.found == len(formed.truth)
+        error = found.image_points().xy - formed.truth
+        assert np.abs(error.mean(axis=0) - [beside, 0.0]).max() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 7, 10, 18])
+def test_in_photographs_every_disk_that_another_program_found_is_measured_and_numbered_alike(
+    reference_data: Callable[[str], Path], number: int
+) -> None:
+    folder = reference_data("testfield_camcal")
+    design, theirs = camcal.design(folder), camcal.marks(folder)[number - 1]
+    result = measure_reseau(read_frame(camcal.photographs(folder)[number - 1], "green"), design)
+    assert isinstance(result, ReseauResult)
+    rows = [design.ids.index(name) for name in theirs]
+    assert result.ok[rows].all()
+    difference = result.xy[rows] - np.array(list(theirs.values())) + 0.5
+    # A wrong number would be 60 px off at least; theirs are centres of ellipses, in all colours.
+    assert np.abs(difference).max() < 0.6
+
+
+def test_a_sheet_that_is_designed_is_numbered_from_every_side() -> None:
+    design = coded_sheet(8, 7, 10.0)
+    for roll in (15.0, 105.0, 195.0, 285.0):
+        formed = sheets.form(sheets.Camera(roll, 35.0), design)
+        result = measured(formed, design)
+        assert result.ok.all(), result.why
+        assert np.abs(result.xy - formed.truth).max() < 0.1
+
+
+def test_light_reflected_in_disks_does_not_move_them() -> None:
+    camera = sheets.Camera(20.0, 30.0)
+    x, y = np.meshgrid(np.arange(800.0), np.arange(600.0))
+    # Its contrast changes by a fifth from the middle of a disk to its edge, where it changes most.
+    glare = 0.5 * np.exp(-0.5 * ((x - 400) ** 2 + (y - 300) ** 2) / 25.0**2)
+    formed = sheets.form(camera, glare=glare)
+    result = measured(formed)
+    near = np.hypot(*(formed.truth - [400, 300]).T) < 75
+    error = (result.xy - formed.truth)[result.ok & near]
+    assert (result.ok & near).sum() >= 3
+    assert np.abs(error).max() < 0.06
+
+
+@pytest.mark.parametrize("kept", [(0,), (1,), (2,), (3,)])
+def test_one_ring_in_sight_numbers_a_sheet(kept: tuple[int]) -> None:
+    design = coded_sheet(8, 7, 10.0)
+    assert design.rings is not None
+    names = list(design.rings.sectors)
+    only = {names[kept[0]]: design.rings.sectors[names[kept[0]]]}
+    shown = design.model_copy(update={"rings": design.rings.model_copy(update={"sectors": only})})
+    formed = sheets.form(sheets.Camera(50.0 + 90 * kept[0], 25.0), shown)
+    result = measured(formed, design)
+    assert result.ok.sum() >= 52
+    assert np.abs(result.xy - formed.truth)[result.ok].max() < 0.2

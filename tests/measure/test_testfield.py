@@ -1,0 +1,191 @@
+"""The testfield measured: right numbers and places from every side; a clear answer where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.adjust import Failure
+from reseau.core.data import Array, Frame
+from reseau.core.errors import ImageError
+from reseau.designs import coded_testfield
+from reseau.io import TestfieldDesign
+from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau.optics import Brown, PixelGrid, Sensor
+from reseau_sims import FieldBench, Stain, Station
+from reseau_sims.testfield import JITTER_PX
+
+from .fields import bounds
+
+DESIGN = coded_testfield()
+OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
+
+
+def measured(bench: FieldBench, station: Station) -> tuple[TestfieldResult, Array]:
+    """What is measured, and its errors (n, 2), NaN where nothing was."""
+    result = measure_testfield(bench.record(station), bench.design, OPTIONS)
+    assert isinstance(result, TestfieldResult), result.reason
+    return result, result.xy - bench.truth(station).xy
+
+
+def test_jitter_makes_the_bound_of_x_a_third_larger_than_that_of_y() -> None:
+    bench, station = FieldBench(), Station(0)
+    inside = bench.inside(bench.truth(station), 8.0)
+    variance = np.diagonal(bounds(bench, station, inside)[inside], axis1=1, axis2=2).mean(axis=0)
+    assert np.sqrt(variance[0] / variance[1]) == pytest.approx(1.3, abs=0.01)
+
+
+@pytest.mark.parametrize("station", [Station(0), Station(45, 90, 180), Station(60, 180, 90)])
+def test_targets_are_found_numbered_and_measured_to_their_bound(station: Station) -> None:
+    bench = FieldBench(seed=11)
+    result, error = measured(bench, station)
+    expected = bench.inside(bench.truth(station), 9.0)
+    assert result.ok[expected].all()
+    # A target of another number is a dozen pixels away.
+    assert np.abs(error[result.ok]).max() < 0.06
+    bound = np.diagonal(bounds(bench, station, result.ok), axis1=1, axis2=2)
+    for large in (False, True):
+        of = result.ok & (bench.design.large == large)
+        ratio = np.sqrt((error[of] ** 2).mean() / bound[of].mean())
+        # 300 coordinates tell it to 4 %.
+        assert 0.85 < ratio < 1.18
+    normalised = error[result.ok] ** 2 / np.diagonal(result.cov[result.ok], axis1=1, axis2=2)
+    assert np.sqrt(normalised.mean()) == pytest.approx(1.0, abs=0.12)
+
+
+CASES: dict[str, tuple[FieldBench, Station, int]] = {
+    "the camera turned by 37°": (FieldBench(), Station(45, 0, 37), 380),
+    "pincushion distortion of 10 px": (FieldBench().distorted(10), Station(30), 250),
+    "barrel distortion of 10 px": (FieldBench().distorted(-10), Station(30), 350),
+    "blurred by 1.5 px": (FieldBench(psf_px=1.5), Station(0), 250),
+    "blurred by 2 px": (FieldBench(psf_px=2.0), Station(0), 250),
+    "blurred by 1.7 px, and tilted": (FieldBench(psf_px=1.7), Station(45, 90, 180), 200),
+    "a tenth of the contrast": (FieldBench(contrast=0.1), Station(30), 340),
+    "uneven light": (FieldBench(gradient=(0.4, -0.3), level=140.0), Station(30), 340),
+    "bright on dark": (FieldBench(design=coded_testfield(polarity="bright")), Station(30), 340),
+    "targets turned at random": (FieldBench(design=coded_testfield(turn_seed=3)), Station(0), 300),
+    "from afar": (FieldBench(distance_mm=8000), Station(0), 760),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_nothing_is_wrong_silently(case: str) -> None:
+    bench, station, least = CASES[case]
+    result, error = measured(bench, station)
+    assert result.found >= least
+    sigma = np.sqrt(np.diagonal(result.cov, axis1=1, axis2=2))
+    assert np.nanmax(np.abs(error) / np.hypot(sigma, 0.01)) < 5.0
+
+
+def test_hidden_and_dazzled_targets_are_declared_or_right() -> None:
+    stains = (Stain(80, 80, 30, 200.0), Stain(180, 170, 20, 90.0), Stain(100, 170, 20, 300.0, opaque=False))
+    bench, station = FieldBench(stains=stains), Station(30)
+    result, error = measured(bench, station)
+    away = np.hypot(*(bench.truth(station).xy - [80, 80]).T)
+    assert not result.ok[away < 30].any()
+    assert result.ok.sum() > 260
+    assert np.nanmax(np.abs(error)) < 0.06
+    assert all(why for why, ok in zip(result.why, result.ok, strict=True) if not ok)
+
+
+def test_a_bend_fixed_to_the_board_does_no_harm() -> None:
+    _, error = measured(FieldBench(bend_with="board", bend_mm=1.6), Station(45, 90))
+    assert np.nanmax(np.abs(error)) < 0.05
+
+
+def test_a_frame_of_more_pixels_shows_every_target() -> None:
+    camera = Brown(side="object", grid=PixelGrid(480, 480, (0.027, 0.027))).with_values({"c": 57.5})
+    sensor = Sensor(480, 480, shot_noise=False, read_noise=1.2)
+    result, error = measured(FieldBench(distance_mm=5500, sensor=sensor, camera=camera), Station(30))
+    assert (result.found, result.squares) == (1024, 64)
+    assert np.abs(error).max() < 0.05
+
+
+def answer(pixels: Array, design: TestfieldDesign = DESIGN) -> Any:
+    return measure_testfield(Frame(pixels, 255.0, "frame"), design, OPTIONS)
+
+
+PLAIN, STATION = FieldBench(), Station(30)
+FRAME = PLAIN.record(STATION).pixels
+
+
+@pytest.mark.parametrize(
+    ("pixels", "design", "reason"),
+    [
+        (np.random.default_rng(0).integers(0, 255, (240, 240)), DESIGN, "no straight lines"),
+        (np.tile(np.arange(240), (240, 1)), DESIGN, "no straight lines"),
+        (FRAME[:6, :6], DESIGN, "no straight lines"),
+        (
+            np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.ones((30, 30))) * 200,
+            DESIGN,
+            "in no common lattice",
+        ),
+        (FRAME[:, ::-1], DESIGN, "in a mirror"),
+        (np.hstack([FRAME, FRAME]), DESIGN, "of the design|read like it do not|no common lattice"),
+        (np.hstack([PLAIN.record(Station(0)).pixels] * 2), DESIGN, "shows two testfields"),
+        (
+            np.hstack([PLAIN.record(s).pixels for s in (Station(30, 0, 37), Station(30, 90))]),
+            DESIGN,
+            "shows two",
+        ),
+        (FRAME, coded_testfield(4, 4), "none is one of the design"),
+        (FRAME, coded_testfield(12, 14), "read like it do not"),
+    ],
+    ids=[
+        "noise",
+        "ramp",
+        "tiny",
+        "chessboard",
+        "mirrored",
+        "two of them",
+        "two at right angles",
+        "two from other sides",
+        "another",
+        "a larger one",
+    ],
+)
+def test_what_is_not_the_testfield_gets_a_clear_answer(pixels: Array, design: Any, reason: str) -> None:
+    found = answer(np.ascontiguousarray(pixels).astype(np.uint8), design)
+    assert isinstance(found, Failure)
+    assert found.reason.startswith("frame: ")
+    assert any(part in found.reason for part in reason.split("|")), found.reason
+
+
+def test_a_frame_without_an_image_is_an_error() -> None:
+    with pytest.raises(ImageError, match="of one grey"):
+        answer(np.full((240, 240), 90, dtype=np.uint8))
+
+
+@pytest.mark.parametrize(("corners", "squares"), [([[-250, 250], [125, 125]], 3), ([[-125, 125], [0, 0]], 1)])
+def test_a_part_of_the_testfield_is_enough(corners: Any, squares: int) -> None:
+    truth = PLAIN.truth(STATION)
+    ends = truth.view(np.array(corners, dtype=float))[0]
+    (x0, y0), (x1, y1) = np.floor(ends.min(axis=0) - 4), np.ceil(ends.max(axis=0) + 4)
+    part = FRAME[max(0, int(y0)) : int(y1) + 1, max(0, int(x0)) : int(x1) + 1]
+    found = answer(part)
+    assert isinstance(found, TestfieldResult)
+    assert (found.squares, found.found) == (squares, 16 * squares)
+    error = found.xy - truth.xy + [max(0, x0), max(0, y0)]
+    assert np.nanmax(np.abs(error)) < 0.05
+
+
+def test_a_quarter_turn_of_the_frame_turns_the_numbers_with_it() -> None:
+    first = answer(FRAME)
+    turned = answer(np.ascontiguousarray(np.rot90(FRAME)))
+    both = first.ok & turned.ok
+    assert both.sum() > 330
+    # (x, y) of a frame turned counter-clockwise is (y, 239 − x) of the frame.
+    back = np.stack([239 - turned.xy[:, 1], turned.xy[:, 0]], axis=1)
+    np.testing.assert_allclose(back[both], first.xy[both], rtol=0, atol=0.02)
+
+
+def test_the_result_is_a_document_of_all_targets() -> None:
+    result, _ = measured(replace(PLAIN, missing=frozenset({"28.06"})), STATION)
+    document = result.measurement()
+    assert (document.found, document.expected) == (result.found, 1024)
+    assert not result.ok[DESIGN.ids.index("28.06")]
+    assert len(result.points) == result.found
+    assert (result.rms() < 0.02).all()
