@@ -14,9 +14,9 @@ import numpy as np
 
 from ..core.data import Array
 from ..core.errors import UsageError
+from ..core.figures import drawing as house_style
 from ..io import ReseauDesign, TestfieldDesign
 from ..optics.targets import target_corners
-from .style import drawing as house_style
 
 __all__ = ["design_pdf", "design_svg"]
 

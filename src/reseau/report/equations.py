@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from markupsafe import Markup
 
+from ..core.numbers import power
 from ..optics import RationalPolynomial
 from ..optics.polynomials import monomials
-from .numbers import power
 from .tables import symbol
 
 __all__ = ["Equation", "equations"]

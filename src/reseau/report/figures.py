@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..core.data import Array
+from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 from ..optics import PlaneMapping
-from .style import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
 
 __all__ = [
     "Panel",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, Mask
-from .style import ACCENT
+from ..core.figures import ACCENT
 
 __all__ = ["Arcs", "Marks", "frame_overlay", "preview"]
 

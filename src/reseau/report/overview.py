@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
+from ..core.figures import ACCENT, BLUE, drawing
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import CorrectionFit
@@ -18,7 +19,6 @@ from .figures import Panel, draw_distortion, draw_vectors, length
 from .maps import draw_body
 from .overlay import preview
 from .photo_iii import errors_of
-from .style import ACCENT, BLUE, drawing
 from .tables import rms
 from .truth import Comparison
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from ..core.data import Frame
 from ..core.errors import UsageError
+from ..core.numbers import aligned
 from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .factors import FACTORS, factor_by_factor
-from .numbers import aligned
 from .photo_i import photo_i_section
 from .photo_ii import photo_ii_section
 from .photo_iii import photo_iii_section

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from ..bundle import CommonPattern, Result, by_place, by_point, common_pattern
 from ..core.errors import UsageError
+from ..core.figures import ACCENT, FAINT, INK, drawing, to_svg
 from .figures import nice
-from .style import ACCENT, FAINT, INK, drawing, to_svg
 
 __all__ = ["patterns_of"]
 

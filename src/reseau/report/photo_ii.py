@@ -9,6 +9,7 @@ import scipy.special
 from markupsafe import Markup
 
 from ..core.data import Array, Frame
+from ..core.numbers import aligned, power
 from ..io import ReseauDesign
 from ..optics import RationalPolynomial, wong_display
 from ..procedures.oscilloscope import PhotoII
@@ -16,7 +17,6 @@ from ..refine import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalr
 from .equations import equations
 from .factors import FACTORS, correctors, rods_of
 from .figures import Panel, distortion_figure, residual_figure
-from .numbers import aligned, power
 from .overlay import Arcs, Marks, frame_overlay
 from .tables import (
     Estimates,

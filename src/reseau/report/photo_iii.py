@@ -8,10 +8,10 @@ import numpy as np
 from markupsafe import Markup
 
 from ..core.data import Array, Frame
+from ..core.numbers import aligned
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoIII
 from .maps import PROBABILITY, body_map
-from .numbers import aligned
 from .overlay import Arcs, Marks, frame_overlay
 from .tables import Item, Row
 from .truth import BodyComparison

@@ -10,9 +10,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..adjust import Failure
 from ..core.data import Array
+from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 from ..core.provenance import Provenance
 from ..sensor import EdgeSpread, FreeCurve, Linearity, SensorResult
-from .style import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 from .template import rendered
 
 __all__ = ["mtf_figure", "sensor_report", "transfer_figure"]

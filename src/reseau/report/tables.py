@@ -12,8 +12,8 @@ from markupsafe import Markup
 
 from ..adjust import Adjustment, Elimination
 from ..core.data import Array, Mask
+from ..core.numbers import aligned, grouped, power
 from ..optics.field import SmoothField
-from .numbers import aligned, grouped, power
 
 __all__ = [
     "Estimates",

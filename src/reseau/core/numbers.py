@@ -1,4 +1,4 @@
-"""Numbers as tables want them: a true minus, as many decimals as the column, powers of ten raised."""
+"""Numbers as text: aligned columns, powers of ten, and values with as many digits as their sigma supports."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Power", "aligned", "grouped", "power"]
+__all__ = ["Power", "aligned", "grouped", "measured", "power"]
 
 _MINUS = "\u2212"
 
@@ -64,3 +64,34 @@ def power(value: float, sigma: float) -> Power:
     return Power(
         shown, spread if sigma > 0 else "held", str(exponent).replace("-", _MINUS) if exponent else ""
     )
+
+
+def measured(value: float, sigma: float | None = None, unit: str = "") -> str:
+    """Return a value with its standard deviation and unit, to two digits of the standard deviation.
+
+    Parameters
+    ----------
+    value : float
+        The value.
+    sigma : float, optional
+        Its standard deviation; 0 or None where it is held or unknown.
+    unit : str
+        Unit of both; empty for a number.
+
+    Examples
+    --------
+    >>> measured(57.499512, 0.0030214, "mm")
+    '57.4995 ± 0.0030 mm'
+    >>> measured(-0.00000457215, 0.000000031, "mm^-2")
+    '(-4.572 ± 0.031)e-6 mm^-2'
+    >>> measured(12.5, None, "px")
+    '12.5 px'
+    """
+    tail = f" {unit}" if unit else ""
+    if sigma is None or not np.isfinite(sigma) or sigma <= 0:
+        return f"{value:.7g}{tail}"
+    shown = power(value, sigma)
+    text = f"{shown.value} ± {shown.sigma}".replace(_MINUS, "-")
+    if not shown.exponent:
+        return text + tail
+    return f"({text})e{shown.exponent.replace(_MINUS, '-')}{tail}"

@@ -1,4 +1,4 @@
-"""How figures look: ink on paper, one accent, and the same bytes every time."""
+"""The common style of all figures, drawn to the same bytes every time. Importing it imports matplotlib."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _STYLE = {
 
 @contextmanager
 def drawing() -> Iterator[None]:
-    """Within it figures have the style of the house, whatever the user's own settings are."""
+    """Draw figures in the common style, whatever the user's own settings are."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(_STYLE)  # type: ignore[arg-type]
@@ -47,7 +47,7 @@ def drawing() -> Iterator[None]:
 
 
 def to_svg(figure: Figure) -> str:
-    """The figure as an SVG element, without date and declaration."""
+    """Return the figure as an SVG element, without date and declaration."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
