@@ -1,8 +1,11 @@
 """VISA resources as links: VXI-11, HiSLIP and USBTMC through pyvisa-py, with deadlines that hold.
 
-pyvisa-py's own time-outs are per chunk, or none at all while a connection is opened; so its calls run in a
-thread of their own, one that is not back in time has its sockets taken away, and none takes more than its
-budget of bytes.
+pyvisa-py applies its time-outs to each chunk, and none at all while it opens a connection. Each link
+therefore makes its calls in a thread of its own; when a call exceeds its deadline, its sockets are closed,
+and no call receives more bytes than its budget.
+
+USB uses PyUSB. pyvisa-py takes the system's libusb-1.0 where there is one, and otherwise the library of the
+Python package ``libusb-package``, which is a dependency of this project.
 """
 
 from __future__ import annotations
@@ -25,9 +28,9 @@ from .budget import Account
 __all__ = ["VisaLink", "resources", "scpi_link"]
 
 _READ = 1 << 20
-"""Bytes asked for at once; what is longer comes in several reads."""
+"""Bytes requested in one read; longer messages take several reads."""
 _MOST = 16 << 20
-"""Bytes that one call may take; several reads make a picture."""
+"""Bytes that one call may receive; an image takes several reads."""
 _GRACE_S = 0.3
 _MESSAGE_AVAILABLE = 0x10
 
@@ -36,7 +39,7 @@ _manager: pyvisa.ResourceManager | None = None
 
 
 def _resource_manager() -> pyvisa.ResourceManager:
-    """The one of the process: closing any of several would close all."""
+    """Return the resource manager of the process: closing one of several would close all of them."""
     global _manager
     with _lock:
         if _manager is None:
@@ -45,22 +48,22 @@ def _resource_manager() -> pyvisa.ResourceManager:
 
 
 def resources() -> tuple[str, ...]:
-    """What VISA discovers: VXI-11 by broadcast, HiSLIP by mDNS, USB.
+    """List the resources that VISA discovers: VXI-11 by broadcast, HiSLIP by mDNS, USB.
 
     Raises
     ------
     ConnectionLost
-        When it cannot search, as on a machine without any network.
+        When the search fails, for example on a machine without a network.
     """
     try:
         return tuple(_resource_manager().list_resources("?*"))
     except Exception as error:
-        # Whatever a back end raises: there is no one class of them.
+        # The back ends have no common class of exceptions.
         raise ConnectionLost(f"VISA cannot search ({error})", do="is there a network?") from None
 
 
 class _Worker:
-    """A thread that does one thing after the other for a link."""
+    """A thread that runs the calls of one link in order."""
 
     def __init__(self) -> None:
         self.account = Account(_MOST)
@@ -80,7 +83,7 @@ class _Worker:
                 answer.put((None, error))
 
     def do(self, work: Callable[[], Any], seconds: float) -> Any:
-        """The result of some work; raises queue.Empty when it is not done in time."""
+        """Run a call and return its result; raise queue.Empty when it takes longer than `seconds`."""
         answer: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()
         self._jobs.put((work, answer))
         result, error = answer.get(timeout=max(0.001, seconds))
@@ -89,18 +92,25 @@ class _Worker:
         return result
 
     def end(self) -> None:
-        """No more work; what hangs is waited for no longer than it is worth."""
+        """Stop the thread; wait at most `_GRACE_S` for a call that hangs."""
         self._jobs.put(None)
         self._thread.join(_GRACE_S)
 
 
 class VisaLink:
-    """A VISA resource.
+    """A link to a VISA resource.
 
     Parameters
     ----------
     resource : str
-        As VISA writes it.
+        VISA resource string, for example ``USB0::0x1AB1::0x04CE::DS1ZA::INSTR``.
+
+    Examples
+    --------
+    >>> link = VisaLink("TCPIP::192.0.2.7::inst0::INSTR")
+    >>> link.read(Deadline(1.0))
+    Traceback (most recent call last):
+    reseau.core.errors.ConnectionLost: TCPIP::192.0.2.7::inst0::INSTR is not open; open the link first
     """
 
     def __init__(self, resource: str) -> None:
@@ -109,7 +119,7 @@ class VisaLink:
         self._worker: _Worker | None = None
 
     def open(self, deadline: Deadline) -> None:
-        """Open the resource anew, and clear what it may still want to say."""
+        """Open the resource; an open one is closed before."""
         self.close()
         manager, self._worker = _resource_manager(), _Worker()
         opened: list[Any] = []
@@ -128,13 +138,13 @@ class VisaLink:
         self._resource.read_termination = self._resource.write_termination = None
 
     def close(self) -> None:
-        """Close it, if it is open."""
+        """Close the resource if it is open."""
         resource, self._resource = self._resource, None
         worker, self._worker = self._worker, None
         if worker is None:
             return
         if resource is not None:
-            # A VXI-11 link is closed by a call that a dead instrument does not answer.
+            # VXI-11 closes a link with a remote call, which an instrument that is switched off never answers.
             with suppress(queue.Empty):
                 worker.do(lambda: self._quietly(resource), _GRACE_S)
         worker.account.cut()
@@ -152,20 +162,20 @@ class VisaLink:
         self._do(lambda: self._resource.write_raw(data), deadline, "write")
 
     def pending(self) -> bool:
-        """Whether an answer waits, by the status byte."""
+        """Whether an answer is available, according to the status byte."""
         try:
             status = self._do(lambda: self._resource.read_stb(), Deadline(1.0), "status")
         except DeadlineError:
             return False
         except ConnectionLost:
-            # pyvisa-py cannot ask for it over USB; there a new question discards the answer before.
+            # pyvisa-py cannot read the status byte over USB; there a new query discards the previous answer.
             if self._name.upper().startswith("USB"):
                 return False
             raise
         return bool(int(status) & _MESSAGE_AVAILABLE)
 
     def read(self, deadline: Deadline) -> bytes:
-        """What has come, or nothing after the deadline."""
+        """Return the bytes received; none when the deadline passes."""
 
         def work() -> bytes:
             data, _ = self._resource.visalib.read(self._resource.session, _READ)
@@ -179,14 +189,14 @@ class VisaLink:
     def _do(self, work: Callable[[], Any], deadline: Deadline, what: str) -> Any:
         worker = self._worker
         if worker is None or (self._resource is None and what != "open"):
-            raise ConnectionLost(f"{self._name} is not open")
+            raise ConnectionLost(f"{self._name} is not open", do="open the link first")
         if what != "open":
             self._resource.timeout = max(1, int(1000 * deadline.left))
         try:
             return worker.do(work, deadline.left + _GRACE_S)
         except queue.Empty:
             worker.account.cut()
-            raise DeadlineError(f"{what} was not done within {deadline.seconds:g} s") from None
+            raise DeadlineError(f"{what} did not finish within {deadline.seconds:g} s") from None
         except pyvisa.errors.VisaIOError as error:
             if error.error_code == constants.StatusCode.error_timeout:
                 raise DeadlineError(f"did not answer within {deadline.seconds:g} s") from None
@@ -194,29 +204,37 @@ class VisaLink:
         except InstrumentError:
             raise
         except Exception as error:
-            # Its back end raises OSError, RuntimeError, RPCError, USBError, ValueError and bare Exception.
+            # The back end raises OSError, RuntimeError, RPCError, USBError, ValueError and bare Exception.
             raise ConnectionLost(f"{self._name}: {what} failed ({error})", do="is it switched on?") from None
 
 
 def scpi_link(address: str | Link) -> Link:
-    """The link to an instrument that speaks SCPI.
+    """Return the link to an instrument that is controlled with SCPI.
 
     Parameters
     ----------
     address : str or Link
-        A VISA resource, ``tcp://host:port`` for a raw socket, a serial device, or a link.
+        A VISA resource, ``tcp://host:port`` for a raw socket, a serial device, or a link (returned as it is).
 
     Raises
     ------
     UsageError
-        When it is no address.
+        When the address is not valid.
+
+    Examples
+    --------
+    >>> type(scpi_link("USB0::0x1AB1::0x04CE::DS1ZA::INSTR")).__name__
+    'VisaLink'
+    >>> type(scpi_link("TCPIP::192.0.2.7::5025::SOCKET")).__name__
+    'TcpLink'
     """
     if not isinstance(address, str) or address.startswith("tcp://") or "::" not in address:
         return link_to(address)
     parts = address.split("::")
     if parts[-1].upper() == "SOCKET":
-        # Our own: pyvisa-py's spins when the peer closes, and answers the question before after a time-out.
+        # Not pyvisa-py's socket: it loops when the peer closes, and after a time-out it returns the answer to
+        # the previous query.
         if len(parts) != 4 or not parts[2].isdigit():
-            raise UsageError("is no address", where=address, do="write TCPIP::host::port::SOCKET")
+            raise UsageError("is not a valid address", where=address, do="write TCPIP::host::port::SOCKET")
         return TcpLink(parts[1], int(parts[2]))
     return VisaLink(address)
