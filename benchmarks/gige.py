@@ -27,8 +27,8 @@ from multiprocessing.connection import Connection
 import numpy as np
 import psutil
 
-from reseau_drivers.camera import Camera, aravis
-from reseau_sims.serving import CameraBody, GigeCamera, View
+from reseau_drivers.camera import CameraDriver, aravis
+from reseau_sims.serving import GigeCamera, SimulatedCamera, View
 
 SIZE = 2048
 SECONDS = 8.0
@@ -54,7 +54,7 @@ class Numbered:
 
 def serve(ready: Connection) -> None:
     """The simulated camera, in a process of its own: it is not to take our client's time."""
-    with GigeCamera(CameraBody(Numbered(), SIZE, SIZE), patience_s=120.0) as simulated:
+    with GigeCamera(SimulatedCamera(Numbered(), SIZE, SIZE), wait_s=120.0) as simulated:
         ready.send(simulated.address)
         ready.recv()
 
@@ -107,7 +107,7 @@ def peer(address: str) -> Received:
     return Received(rate, 1000 * cpu / max(1, whole), whole, failed)
 
 
-def ours(camera: Camera) -> Received:
+def ours(camera: CameraDriver) -> Received:
     """Our driver, for the same time."""
     first = camera.expose(20.0)
     began, cpu, whole = time.monotonic(), time.process_time(), 0
@@ -120,7 +120,7 @@ def ours(camera: Camera) -> Received:
     return Received(whole / elapsed, 1000 * used / whole, whole, last.dropped - first.dropped)
 
 
-def long_series(camera: Camera, sight: Numbered, frames: int) -> tuple[list[float], list[float], int]:
+def long_series(camera: CameraDriver, sight: Numbered, frames: int) -> tuple[list[float], list[float], int]:
     """CPU milliseconds of a frame and megabytes of this process, block by block; and frames lost."""
     me = psutil.Process()
     cpu, memory, dropped = [], [], 0

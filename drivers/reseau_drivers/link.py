@@ -18,7 +18,7 @@ from reseau.instruments import Deadline
 
 from .codecs.stream import Damaged, Decoder
 
-__all__ = ["Conversation", "Link", "SerialLink", "TcpLink", "UdpLink", "link_to", "serial_ports"]
+__all__ = ["Link", "MessageLink", "SerialLink", "TcpLink", "UdpLink", "link_to", "serial_ports"]
 
 M = TypeVar("M")
 
@@ -314,7 +314,7 @@ def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -
 _NETWORK: dict[str, Callable[[str, int], Link]] = {"tcp": TcpLink, "udp": UdpLink}
 
 
-class Conversation(Generic[M]):
+class MessageLink(Generic[M]):
     """Messages over a link.
 
     Parameters
@@ -332,24 +332,24 @@ class Conversation(Generic[M]):
 
     def __init__(self, link: Link, decoder: Decoder[M]) -> None:
         self._link, self._decoder = link, decoder
-        self._heard: deque[M | Damaged] = deque()
+        self._received: deque[M | Damaged] = deque()
         self.ignored = 0
 
     def open(self, deadline: Deadline) -> None:
         """Open the link anew."""
         self._link.open(deadline)
         self._decoder.reset()
-        self._heard.clear()
+        self._received.clear()
 
     def close(self) -> None:
         """Close it."""
         self._link.close()
 
-    def tell(self, data: bytes, deadline: Deadline) -> None:
+    def send(self, data: bytes, deadline: Deadline) -> None:
         """Send bytes, and wait for nothing."""
         self._link.write(data, deadline)
 
-    def ask(self, data: bytes, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
+    def query(self, data: bytes, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
         """Send a question and wait for its answer; other messages are passed over.
 
         Raises
@@ -362,28 +362,28 @@ class Conversation(Generic[M]):
             When the link broke.
         """
         # What is there before the question is no answer to it: one that came twice, or was given up.
-        while self._link.pending() and not deadline.over:
+        while self._link.pending() and not deadline.expired:
             self.ignored += len(self._decoder.feed(self._link.read(deadline)))
-        self.ignored += len(self._heard)
-        self._heard.clear()
-        self.tell(data, deadline)
-        return self.hear(is_answer, deadline)
+        self.ignored += len(self._received)
+        self._received.clear()
+        self.send(data, deadline)
+        return self.receive(is_answer, deadline)
 
-    def hear(self, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
-        """Wait for a message; raises as :meth:`ask`."""
+    def receive(self, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
+        """Wait for a message; raises as :meth:`query`."""
         damaged: Damaged | None = None
         while True:
-            while self._heard:
-                message = self._heard.popleft()
+            while self._received:
+                message = self._received.popleft()
                 if isinstance(message, Damaged):
                     damaged = message
                 elif is_answer(message):
                     return message
                 self.ignored += 1
-            if deadline.over:
+            if deadline.expired:
                 if damaged is not None:
                     raise ProtocolError(f"its answer was damaged ({damaged})", do="check cable and speed")
                 raise DeadlineError(
                     f"did not answer within {deadline.seconds:g} s", do="is it switched on, and free?"
                 )
-            self._heard += self._decoder.feed(self._link.read(deadline))
+            self._received += self._decoder.feed(self._link.read(deadline))

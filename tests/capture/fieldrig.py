@@ -54,7 +54,7 @@ class _Simple(Device[Any]):
     """An instrument that is always there."""
 
     def _open(self, deadline: Deadline) -> None: ...
-    def _shut(self) -> None: ...
+    def _disconnect(self) -> None: ...
     def _push(self, settings: Any, deadline: Deadline) -> None: ...
     def _halt(self, deadline: Deadline) -> None: ...
     def _identify(self, deadline: Deadline) -> Identity:
@@ -63,7 +63,7 @@ class _Simple(Device[Any]):
     def _acquire(self) -> dict[str, Any]:
         return {}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         return {}
 
 

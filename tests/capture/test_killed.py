@@ -22,9 +22,9 @@ from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, carry
 from reseau.capture.bench import built
 from reseau.instruments import Instrument
 from reseau_drivers.camera import v4l2
-from reseau_sims.serving import Script
+from reseau_sims.serving import FaultScript
 from reseau_sims.serving.bench import SimulatedBench
-from reseau_sims.serving.imaging import CameraBody, InLaboratory
+from reseau_sims.serving.imaging import LaboratoryScene, SimulatedCamera
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .fieldrig import FieldRig
@@ -64,8 +64,10 @@ def faulty(seed: int) -> Iterator[Bench]:
     """Table and camera of the simulated bench; one answer in a hundred suffers a fault, and one frame."""
     with SimulatedBench(3, repeatable=True, flat=True) as simulated:
         simulated.scripts["table"].at_random(0.01, seed=seed)
-        script = Script(rate=0.01, seed=seed + 1)
-        camera = VideoCamera(CameraBody(InLaboratory(simulated.laboratory, "testfield"), 240, 240, script))
+        script = FaultScript(rate=0.01, seed=seed + 1)
+        camera = VideoCamera(
+            SimulatedCamera(LaboratoryScene(simulated.laboratory, "testfield"), 240, 240, script)
+        )
         file = BenchFile.parse_toml(simulated.toml, where="simulated")
         table = file.instruments["table"]
         entries = {"table": table.model_copy(update={"settings": {"speed": 1000.0}})}

@@ -23,7 +23,7 @@ from reseau.core.errors import DeadlineError, EstimationError, StateError
 from reseau.procedures.live_sensor import LiveSensor
 from reseau_drivers.camera import v4l2
 from reseau_sims.pixels import PixelSensor
-from reseau_sims.serving import CameraBody, Lamp, VideoCamera
+from reseau_sims.serving import LampScene, SimulatedCamera, VideoCamera
 
 from .killing import exit_code
 
@@ -35,8 +35,8 @@ class Rig:
 
     def __init__(self, light: float = 1.0) -> None:
         drawn = PixelSensor.drawn(np.random.default_rng(2), 48, 32, full_well=12_000.0)
-        self.light, self.lamp = light, Lamp(drawn, light)
-        camera = VideoCamera(CameraBody(self.lamp, 48, 32))
+        self.light, self.lamp = light, LampScene(drawn, light)
+        camera = VideoCamera(SimulatedCamera(self.lamp, 48, 32))
         camera.controls[0x980900] = 128
         self.settings = {"format": "Y12", "exposure_us": 1000.0, "buffers": 16}
         self.camera = v4l2("eye", camera.open, settings=self.settings)

@@ -21,7 +21,7 @@ from reseau.io.images import write_image
 from reseau.sensor import Level, SensorSeries, calibrate_sensor
 from reseau_sims import World
 from reseau_sims.pixels import PixelSensor
-from reseau_sims.serving import CameraBody, Lamp, VideoCamera
+from reseau_sims.serving import LampScene, SimulatedCamera, VideoCamera
 
 BENCH = """\
 schema = "reseau-bench/1"
@@ -38,19 +38,19 @@ def sensor() -> PixelSensor:
 
 
 @pytest.fixture
-def lamp(sensor: PixelSensor) -> Lamp:
-    return Lamp(sensor, 1.0)
+def lamp(sensor: PixelSensor) -> LampScene:
+    return LampScene(sensor, 1.0)
 
 
 @pytest.fixture
-def camera(lamp: Lamp) -> VideoCamera:
-    camera = VideoCamera(CameraBody(lamp, 96, 64))
+def camera(lamp: LampScene) -> VideoCamera:
+    camera = VideoCamera(SimulatedCamera(lamp, 96, 64))
     camera.controls[0x980900] = 128
     return camera
 
 
 @pytest.fixture
-def asked(lamp: Lamp, camera: VideoCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def asked(lamp: LampScene, camera: VideoCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A folder with a bench; and what the operator was asked to do, who does it at once."""
     asked: list[str] = []
 
@@ -135,7 +135,7 @@ def test_every_raw_frame_is_kept_and_the_calibration_computed_again_from_them(
 
 
 def test_a_session_that_was_interrupted_goes_on_where_it_stood(
-    asked: list[str], lamp: Lamp, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    asked: list[str], lamp: LampScene, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, left = Session.store, [20]
 

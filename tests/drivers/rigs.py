@@ -22,19 +22,19 @@ from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Set
 from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
 from reseau_sims import serving
 from reseau_sims.serving import (
+    FaultScript,
+    FaultyConnection,
     InProcess,
     Machine,
     PtyServer,
-    Script,
     Server,
     Smc100Line,
     TcpServer,
     UdpServer,
-    Wire,
     ZaberChain,
 )
 from reseau_sims.serving.gige import GigeCamera
-from reseau_sims.serving.imaging import CameraBody, Pattern, View
+from reseau_sims.serving.imaging import SimulatedCamera, StripeScene, View
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 from reseau_sims.serving.v4l2 import VideoCamera
 
@@ -50,9 +50,9 @@ class Rig:
     ----------
     device : Device
         The driver.
-    machine : Machine or CameraBody
+    machine : Machine or SimulatedCamera
         What it drives.
-    script : Script
+    script : FaultScript
         What goes wrong between them.
     work : callable
         Takes the number of a run; does something that is different from run to run, and asserts that what
@@ -62,8 +62,8 @@ class Rig:
     """
 
     device: Device[Any]
-    machine: Machine | CameraBody
-    script: Script
+    machine: Machine | SimulatedCamera
+    script: FaultScript
     work: Callable[[int], None]
     recover: Callable[[], object]
     server: Server | GigeCamera | None = None
@@ -93,11 +93,13 @@ def left_open() -> tuple[int, int, int]:
     return len(fds), sockets, threading.active_count()
 
 
-def _wired(stack: ExitStack, transport: str, machine: Machine, script: Script) -> tuple[Any, Server | None]:
+def _wired(
+    stack: ExitStack, transport: str, machine: Machine, script: FaultScript
+) -> tuple[Any, Server | None]:
     """Address or link by which a driver reaches a machine."""
 
-    def session() -> Wire:
-        return Wire(machine, script)
+    def session() -> FaultyConnection:
+        return FaultyConnection(machine, script)
 
     if transport == "in process":
         return InProcess(session), None
@@ -105,7 +107,9 @@ def _wired(stack: ExitStack, transport: str, machine: Machine, script: Script) -
     return server.address, server
 
 
-def _table_rig(device: Table, machine: ZaberChain | Smc100Line, script: Script, server: Server | None) -> Rig:
+def _table_rig(
+    device: Table, machine: ZaberChain | Smc100Line, script: FaultScript, server: Server | None
+) -> Rig:
     def work(run: int) -> None:
         for axis, plan in device.plans.items():
             target = 10.0 + (7 * run + plan.axis) % 60
@@ -121,7 +125,7 @@ def _table_rig(device: Table, machine: ZaberChain | Smc100Line, script: Script, 
     return Rig(device, machine, script, work, recover, server)
 
 
-def zaber_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def zaber_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = ZaberChain([2, 1])
     address, server = _wired(stack, transport, machine, script)
     plans = {
@@ -133,7 +137,7 @@ def zaber_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return _table_rig(device, machine, script, server)
 
 
-def smc100_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def smc100_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = Smc100Line(1, low=0.0, high=100.0, speed=800.0)
     address, server = _wired(stack, transport, machine, script)
     device = Table("roll", Smc100(link_to(address), 0.15), {"roll": AxisPlan(1, high=100.0)}, seconds=1.2)
@@ -141,7 +145,7 @@ def smc100_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return _table_rig(device, machine, script, server)
 
 
-def ping360_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def ping360_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.Ping360()
     address, server = _wired(stack, transport, machine, script)
     device = Ping360("sonar", link_to(address), Ping360Settings(half_sector=2), seconds=1.2, answer_s=0.15)
@@ -153,7 +157,7 @@ def ping360_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.stop, server)
 
 
-def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def scope_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.Oscilloscope("keysight")
     server: Server | None = None
     if transport in ("tcp", "in process"):
@@ -181,7 +185,7 @@ def scope_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.screen, server)
 
 
-def bk_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def bk_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.BkScanner(
         announces_wrongly=transport == "in process", acknowledges_off=transport != "in process"
     )
@@ -202,7 +206,7 @@ def bk_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.scan, server)
 
 
-def pulser_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
+def pulser_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.CompactPulser()
     address, server = _wired(stack, transport, machine, script)
     device = CompactPulser("pulser", link_to(address), seconds=1.2, answer_s=0.15)
@@ -218,15 +222,15 @@ def pulser_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, machine, script, work, device.stop, server)
 
 
-def v4l2_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
-    body = CameraBody(script=script)
+def v4l2_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    body = SimulatedCamera(script=script)
     camera = VideoCamera(body, first=(1 << 32) - 20)
     device = v4l2("camera", camera.open, settings={"exposure_us": 2000.0, "gain": 3}, seconds=0.5)
 
     def work(run: int) -> None:
         for k in range(5):
-            pattern = Pattern(shift=5 * run + k)
-            body.look_at(pattern)
+            pattern = StripeScene(shift=5 * run + k)
+            body.point_at(pattern)
             shot = device.expose()
             # A frame that began before the camera was turned would show the pattern of before.
             assert shot.fresh
@@ -236,24 +240,24 @@ def v4l2_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, body, script, work, device.expose, extra={"camera": camera})
 
 
-def gige_camera(stack: ExitStack, body: CameraBody, features: str = "") -> GigeCamera:
+def gige_camera(stack: ExitStack, body: SimulatedCamera, features: str = "") -> GigeCamera:
     """A simulated camera on GigE Vision, once no other test has one; without Aravis the test is skipped."""
     missing = aravis_is_missing()
     if missing:
         pytest.skip(missing)
-    return stack.enter_context(GigeCamera(body, features=features, patience_s=240.0))
+    return stack.enter_context(GigeCamera(body, features=features, wait_s=240.0))
 
 
-def gige_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
-    body = CameraBody(script=script)
+def gige_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    body = SimulatedCamera(script=script)
     camera = gige_camera(stack, body)
     light = {"exposure_us": 2000.0, "gain": 3.0, "rate": 100.0}
     device = aravis("camera", camera.address, settings=light | {"width": 96, "height": 64}, seconds=1.0)
 
     def work(run: int) -> None:
         for k in range(5):
-            pattern = Pattern(shift=5 * run + k)
-            body.look_at(pattern)
+            pattern = StripeScene(shift=5 * run + k)
+            body.point_at(pattern)
             shot = device.expose()
             assert shot.fresh
             assert (shot.pixels == pattern(View(2000.0, 3.0, 0.0, 0, 0, 96, 64, 255.0))).all()
@@ -261,7 +265,7 @@ def gige_rig(stack: ExitStack, transport: str, script: Script) -> Rig:
     return Rig(device, body, script, work, device.expose, camera)
 
 
-Maker = Callable[[ExitStack, str, Script], Rig]
+Maker = Callable[[ExitStack, str, FaultScript], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
@@ -278,10 +282,10 @@ RIGS: dict[tuple[str, str], Maker] = {
 
 
 @contextmanager
-def rig(driver: str, transport: str, script: Script | None = None) -> Iterator[Rig]:
+def rig(driver: str, transport: str, script: FaultScript | None = None) -> Iterator[Rig]:
     """A rig, connected and ready; nothing of it is left afterwards."""
     with ExitStack() as stack:
-        made = RIGS[driver, transport](stack, transport, script or Script())
+        made = RIGS[driver, transport](stack, transport, script or FaultScript())
         stack.callback(made.device.close)
         made.device.connect()
         made.recover()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from reseau.core.errors import InstrumentError
-from reseau_sims.serving import KINDS, Fault, Kind, Script
+from reseau_sims.serving import KINDS, Fault, FaultScript, Kind
 
 from .rigs import RIGS, Rig, aravis_is_missing, left_open, rig
 
@@ -50,7 +50,7 @@ def _nothing_is_left_open(_libraries_are_loaded: None, request: pytest.FixtureRe
 def test_a_fault_is_survived_or_said_in_time(
     driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
 ) -> None:
-    script = Script()
+    script = FaultScript()
     for key, value in {"driver": driver, "transport": transport, "fault": kind}.items():
         record_property(key, value)
     with rig(driver, transport, script) as found:
@@ -105,7 +105,7 @@ def test_endurance(driver: str, transport: str, record_property: Callable[[str, 
 
 
 def _endure(driver: str, transport: str, exchanges: int, rate: float) -> dict[str, float]:
-    script = Script()
+    script = FaultScript()
     with rig(driver, transport, script) as found:
         start, run, failed, longest = script.count, 0, 0, 0.0
         script.at_random(rate, seed=7, seconds=0.05)

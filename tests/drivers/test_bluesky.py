@@ -15,7 +15,7 @@ from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, dicom_files, ping360
 from reseau_drivers.turntable import smc100, zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, Machine, Script, Smc100Line, Wire, ZaberChain
+from reseau_sims.serving import FaultyConnection, InProcess, Machine, Smc100Line, ZaberChain
 
 bluesky: Any = pytest.importorskip("bluesky", reason="bluesky is not installed")
 import bluesky.plan_stubs as bps  # noqa: E402
@@ -27,7 +27,7 @@ Pair = tuple[Any, Machine | None]
 
 
 def linked(machine: Machine) -> InProcess:
-    return InProcess(lambda: Wire(machine, Script()))
+    return InProcess(lambda: FaultyConnection(machine))
 
 
 def a_zaber() -> Pair:

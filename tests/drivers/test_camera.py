@@ -30,14 +30,14 @@ from reseau_drivers import camera as cameras
 from reseau_drivers.camera import V4l2Settings, v4l2
 from reseau_drivers.codecs import v4l2 as uapi
 from reseau_sims import World
-from reseau_sims.serving import CameraBody, Fault, Pattern, Still, VideoCamera, View
+from reseau_sims.serving import Fault, SimulatedCamera, StillScene, StripeScene, VideoCamera, View
 
-Cam = cameras.Camera[V4l2Settings]
+Cam = cameras.CameraDriver[V4l2Settings]
 
 
 @pytest.fixture
 def device() -> VideoCamera:
-    return VideoCamera(CameraBody())
+    return VideoCamera(SimulatedCamera())
 
 
 @pytest.fixture
@@ -53,12 +53,12 @@ def test_it_is_a_camera_by_the_protocol(camera: Cam) -> None:
 
 @pytest.mark.parametrize("stamps", [{}, {"start_of_exposure": True}, {"webcam": True}])
 def test_no_frame_began_before_it_was_asked_for(stamps: dict[str, bool]) -> None:
-    device = VideoCamera(CameraBody(), **stamps)
+    device = VideoCamera(SimulatedCamera(), **stamps)
     with v4l2("camera", device.open, settings={"exposure_us": 3000.0, "rate": 200.0}) as camera:
         for shift in range(30):
-            pattern = Pattern(shift=shift)
+            pattern = StripeScene(shift=shift)
             time.sleep(0.012)  # frames of the pattern of before wait in the queue
-            device.body.look_at(pattern)
+            device.body.point_at(pattern)
             asked = datetime.now(UTC)
             shot = camera.expose()
             assert shot.fresh
@@ -71,7 +71,7 @@ def test_no_frame_began_before_it_was_asked_for(stamps: dict[str, bool]) -> None
 
 def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
     for at_start, within in ((True, 1e-4), (False, 6e-3)):
-        device = VideoCamera(CameraBody(), start_of_exposure=at_start)
+        device = VideoCamera(SimulatedCamera(), start_of_exposure=at_start)
         with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
             shot = camera.expose()
             assert 0 < shot.taken_within_s < within
@@ -80,7 +80,7 @@ def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
 
 def test_the_stamps_of_a_webcam_are_no_starts_of_exposures() -> None:
     # The kernel's driver says that they are; they are when the first packet of a frame came.
-    device = VideoCamera(CameraBody(), webcam=True)
+    device = VideoCamera(SimulatedCamera(), webcam=True)
     with v4l2("camera", device.open, settings={"exposure_us": 2000.0, "rate": 100.0}) as camera:
         assert camera.expose().taken_within_s == pytest.approx(6e-3, abs=1e-3)
         assert "first packet" in camera.check(5.0)["clock"]
@@ -101,7 +101,7 @@ def test_a_series_has_every_frame_once_and_says_which_are_fresh(device: VideoCam
 def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, name: str) -> None:
     with v4l2("camera", device.open, settings={"format": name, "exposure_us": 2000.0}) as camera:
         shot = camera.expose()
-        assert (shot.pixels == Pattern()(device.view)).all()
+        assert (shot.pixels == StripeScene()(device.view)).all()
         assert shot.full_scale == {"Y10": 1023, "Y12": 4095, "Y16": 65535}.get(name, 255)
         assert shot.pattern == {"YUYV": "YUYV", "SRGGB8": "RGGB"}.get(name, "")
         assert shot.frame.pixels is shot.pixels
@@ -110,7 +110,7 @@ def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, 
 
 def test_frames_are_to_the_bit_what_the_world_drew() -> None:
     frame = World.standard(seed=5).photo_i()
-    device = VideoCamera(CameraBody(Still(frame), frame.width, frame.height))
+    device = VideoCamera(SimulatedCamera(StillScene(frame), frame.width, frame.height))
     with v4l2("camera", device.open, settings={"exposure_us": 10_000.0}, seconds=10.0) as camera:
         assert camera.expose().frame.sha256 == frame.sha256
         camera.configure(format="Y16")
@@ -122,7 +122,7 @@ def test_a_compressed_frame_keeps_its_file(device: VideoCamera) -> None:
         shot = camera.expose()
         assert shot.pattern == "MJPEG"
         assert shot.raw.startswith(b"\xff\xd8")
-        wanted = Pattern()(device.view).astype(float)
+        wanted = StripeScene()(device.view).astype(float)
         assert np.sqrt(((shot.pixels - wanted) ** 2).mean()) < 8
 
 
@@ -228,7 +228,7 @@ def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
     script.fault_at(script.count + 2, Fault(kind, 0.02))
     shots = list(camera.frames(6))
     assert [fault.kind for fault in script.happened] == [kind]
-    wanted = Pattern()(device.view)
+    wanted = StripeScene()(device.view)
     assert all((shot.pixels == wanted).all() for shot in shots)
     steps = shots[-1].sequence - before.sequence
     assert steps == 6 + shots[-1].dropped - before.dropped
@@ -253,7 +253,7 @@ def test_a_stamp_from_the_future_is_not_believed(device: VideoCamera, camera: Ca
 
 
 def test_numbers_of_32_bits_wrap_without_a_gap() -> None:
-    device = VideoCamera(CameraBody(), first=(1 << 32) - 3)
+    device = VideoCamera(SimulatedCamera(), first=(1 << 32) - 3)
     with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
         numbers = [shot.sequence for shot in camera.frames(8)]
         assert [b - a for a, b in itertools.pairwise(numbers)] == [1] * 7
@@ -306,7 +306,7 @@ class _Noisy:
 
 
 def test_the_self_test_measures_what_is_there(device: VideoCamera, camera: Cam) -> None:
-    device.body.look_at(_Noisy())
+    device.body.point_at(_Noisy())
     camera.configure(format="Y16", rate=50.0)
     script = device.body.script
     script.fault_at(script.count + 3, Fault("dropped"))
@@ -383,7 +383,7 @@ def test_a_camera_s_clock_is_read_where_it_can_be(name: str) -> None:
 
 
 def test_a_camera_that_tells_nothing_of_itself_is_trusted_with_nothing() -> None:
-    device = VideoCamera(CameraBody())
+    device = VideoCamera(SimulatedCamera())
     # In automatic mode the exposure may be as long as the period, and it is not told.
     with v4l2("camera", device.open) as camera:
         shot = camera.expose()

@@ -29,17 +29,26 @@ from reseau_drivers import camera as cameras
 from reseau_drivers.camera import AravisSettings, aravis, gvcp
 from reseau_sims import World
 from reseau_sims.laboratory import Laboratory
-from reseau_sims.serving import CameraBody, Fault, GigeCamera, InLaboratory, Pattern, Script, Still, View
+from reseau_sims.serving import (
+    Fault,
+    FaultScript,
+    GigeCamera,
+    LaboratoryScene,
+    SimulatedCamera,
+    StillScene,
+    StripeScene,
+    View,
+)
 
 from .rigs import gige_camera
 
-Cam = cameras.Camera[AravisSettings]
+Cam = cameras.CameraDriver[AravisSettings]
 SIZE = {"width": 640, "height": 480}
 LIGHT = {"exposure_us": 2000.0, "gain": 0.0, "rate": 100.0}
 
 
-def pattern(shift: int = 0) -> Pattern:
-    return Pattern(640, 480, shift)
+def pattern(shift: int = 0) -> StripeScene:
+    return StripeScene(640, 480, shift)
 
 
 def seen(shift: int, exposure_us: float = 2000.0, full_scale: float = 255.0) -> Any:
@@ -49,7 +58,7 @@ def seen(shift: int, exposure_us: float = 2000.0, full_scale: float = 255.0) -> 
 @pytest.fixture
 def simulated() -> Iterator[GigeCamera]:
     with ExitStack() as stack:
-        yield gige_camera(stack, CameraBody(pattern(), 640, 480))
+        yield gige_camera(stack, SimulatedCamera(pattern(), 640, 480))
 
 
 @pytest.fixture
@@ -61,7 +70,7 @@ def camera(simulated: GigeCamera) -> Iterator[Cam]:
 @pytest.mark.parametrize("name", ["Mono8", "Mono16"])
 def test_frames_are_to_the_bit_what_the_world_drew(simulated: GigeCamera, name: str) -> None:
     frame = World.standard(seed=5).photo_i()
-    simulated.body.look_at(Still(frame))
+    simulated.body.point_at(StillScene(frame))
     size = {"width": frame.width, "height": frame.height, "format": name, "exposure_us": 10_000.0}
     with aravis("camera", simulated.address, settings=size) as camera:
         shot = camera.expose()
@@ -74,7 +83,7 @@ def test_frames_are_to_the_bit_what_the_world_drew(simulated: GigeCamera, name: 
 def test_it_looks_into_the_laboratory(simulated: GigeCamera) -> None:
     laboratory = Laboratory(World.standard(seed=5))
     laboratory.expose("screen")  # what takes long is computed now, not while the camera is controlled
-    simulated.body.look_at(InLaboratory(laboratory))
+    simulated.body.point_at(LaboratoryScene(laboratory))
     settings = {"width": 1600, "height": 1200, "trigger": "software"}
     with aravis("camera", simulated.address, settings=settings) as camera:
         one = camera.expose(20.0)
@@ -95,7 +104,7 @@ def test_colour_stays_raw_and_names_its_pattern(simulated: GigeCamera, camera: C
 def test_no_frame_began_before_it_was_asked_for(simulated: GigeCamera, camera: Cam, trigger: str) -> None:
     camera.configure(trigger=trigger)
     for shift in range(12):
-        simulated.body.look_at(pattern(shift))
+        simulated.body.point_at(pattern(shift))
         shot = camera.expose()
         assert shot.fresh
         assert (shot.pixels == seen(shift)).all()
@@ -105,7 +114,7 @@ def test_no_frame_began_before_it_was_asked_for(simulated: GigeCamera, camera: C
 def test_a_frame_that_waited_somewhere_is_not_fresh(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     time.sleep(0.2)
-    simulated.body.look_at(pattern(5))
+    simulated.body.point_at(pattern(5))
     shots = list(camera.frames(4))
     assert not shots[0].fresh
     assert (shots[0].pixels == seen(0)).all()
@@ -347,12 +356,12 @@ settings = {{width = 320, height = 240, rate = 50.0, exposure_us = 2000.0}}
 
 def test_there_is_one_port_and_one_camera_on_it(simulated: GigeCamera) -> None:
     with pytest.raises(UsageError, match="another simulated GigE camera"):
-        GigeCamera(CameraBody())
+        GigeCamera(SimulatedCamera())
 
 
 def test_where_nobody_answers_it_is_said() -> None:
     with ExitStack() as stack:
-        gige_camera(stack, CameraBody()).pull_plug()
+        gige_camera(stack, SimulatedCamera()).pull_plug()
         with pytest.raises(InstrumentError, match="camera"):
             aravis("camera", "127.0.0.1").connect(2.0)
 
@@ -380,11 +389,11 @@ class Numbered:
 def test_thousands_of_large_frames_leave_memory_flat_and_none_is_damaged() -> None:
     """`benchmarks/gige.py` compares rates; here is what must hold, one frame in fifty being lost or torn."""
     count = int(os.environ.get("RESEAU_FRAMES", "5000"))
-    sight, script = Numbered(), Script(rate=0.02, seed=3, kinds=("dropped", "truncated", "repeated"))
+    sight, script = Numbered(), FaultScript(rate=0.02, seed=3, kinds=("dropped", "truncated", "repeated"))
     settings = {"width": 2048, "height": 2048, "rate": 60.0, "packet_size": 8192, "exposure_us": 10_000.0}
     memory, cpu = [], []
     with ExitStack() as stack:
-        address = gige_camera(stack, CameraBody(sight, 2048, 2048, script)).address
+        address = gige_camera(stack, SimulatedCamera(sight, 2048, 2048, script)).address
         camera = stack.enter_context(aravis("camera", address, settings=settings, seconds=20.0))
         first = camera.expose()
         for _ in range(10):

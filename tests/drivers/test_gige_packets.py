@@ -20,8 +20,8 @@ import pytest
 
 from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline
-from reseau_drivers.camera import Aravis, AravisSettings, Taken, aravis
-from reseau_sims.serving import CameraBody
+from reseau_drivers.camera import Aravis, AravisSettings, RawFrame, aravis
+from reseau_sims.serving import SimulatedCamera
 
 from .rigs import aravis_is_missing, gige_camera
 
@@ -88,10 +88,10 @@ class Wired:
     source: Aravis
     sender: Sender
 
-    def taken(self, seconds: float = 5.0) -> Taken | None:
+    def taken(self, seconds: float = 5.0) -> RawFrame | None:
         """The next whole frame."""
         deadline = Deadline(seconds)
-        while not deadline.over:
+        while not deadline.expired:
             found = self.source.take(deadline.part(0.1))
             if found is not None:
                 return found
@@ -101,7 +101,7 @@ class Wired:
 @contextmanager
 def wired(features: str = "", **settings: Any) -> Iterator[Wired]:
     with ExitStack() as stack:
-        source = Aravis(gige_camera(stack, CameraBody(), features).address)
+        source = Aravis(gige_camera(stack, SimulatedCamera(), features).address)
         stack.callback(source.close)
         deadline = Deadline(20.0)
         source.open(deadline)
@@ -199,7 +199,7 @@ def test_a_frame_triggered_by_a_line_is_fresh_and_one_of_before_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with ExitStack() as stack:
-        address = gige_camera(stack, CameraBody()).address
+        address = gige_camera(stack, SimulatedCamera()).address
         known = {
             "width": WIDTH,
             "height": HEIGHT,

@@ -18,8 +18,15 @@ from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, ping360
 from reseau_drivers.turntable import smc100, zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, Machine, PtyServer, Script, Server, UdpServer, Wire
-from reseau_sims.serving.script import Output
+from reseau_sims.serving import (
+    FaultyConnection,
+    InProcess,
+    Machine,
+    PtyServer,
+    Server,
+    UdpServer,
+)
+from reseau_sims.serving.faults import Output
 
 DRIVERS: dict[str, Callable[..., Any]] = {
     "zaber": lambda name, address, seconds: zaber(name, address, axes={"tilt": {}}, seconds=seconds),
@@ -81,7 +88,7 @@ class Talker:
     def receive(self, data: bytes) -> list[Output]:
         return [(0.0, self._noise)] * 100
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """It does not mind."""
 
 
@@ -131,12 +138,12 @@ MACHINES: dict[str, Callable[[], Machine]] = {
 def test_a_simulator_survives_any_noise_and_says_that_it_was_none_of_its_protocol(machine: str) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     made = MACHINES[machine]()
-    link, deadline = InProcess(lambda: Wire(made, Script())), Deadline(60.0)
+    link, deadline = InProcess(lambda: FaultyConnection(made)), Deadline(60.0)
     link.open(deadline)
     for noise in NOISE.values():
         for _ in range(2):
             link.write(noise, deadline)
-        made.hung_up()
+        made.disconnected()
     link.close()
     assert made.violations
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000

@@ -15,8 +15,8 @@ from reseau.core.errors import InstrumentError
 from reseau_drivers.codecs import hislip, rpc, vxi11
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_sims import serving
-from reseau_sims.serving import HislipInstrument, Script, TcpServer, Vxi11Session
-from reseau_sims.serving.script import Output
+from reseau_sims.serving import FaultScript, HislipInstrument, TcpServer, Vxi11Session
+from reseau_sims.serving.faults import Output
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 
 from .test_hostile import NOISE, flood
@@ -58,7 +58,7 @@ class Harmful:
     def receive(self, data: bytes) -> list[Output]:
         return self._answer(data)
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         pass
 
 
@@ -106,7 +106,7 @@ def test_lengths_of_the_protocol_are_not_believed(
 @pytest.mark.parametrize("kind", HOSTILE)
 @pytest.mark.parametrize("transport", ["vxi-11", "hislip", "usbtmc"])
 def test_answers_that_never_end_within_the_protocol(transport: str, kind: str) -> None:
-    machine, script = serving.Oscilloscope("keysight"), Script()
+    machine, script = serving.Oscilloscope("keysight"), FaultScript()
 
     def execute(message: bytes) -> bytes | None:
         return HOSTILE[kind] or None if b"DATA?" in message else machine.execute(message)
@@ -128,8 +128,8 @@ def test_answers_that_never_end_within_the_protocol(transport: str, kind: str) -
 def test_the_sessions_of_simulators_take_no_more_than_their_limit_either() -> None:
     machine = serving.Oscilloscope("keysight")
     sessions = {
-        "vxi-11": Vxi11Session(machine, machine.execute, Script()),
-        "hislip": HislipInstrument(machine, machine.execute, Script()).channel(),
+        "vxi-11": Vxi11Session(machine, machine.execute, FaultScript()),
+        "hislip": HislipInstrument(machine, machine.execute, FaultScript()).channel(),
     }
     with bounded(seconds=60.0, kib=50_000):
         for session in sessions.values():

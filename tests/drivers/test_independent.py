@@ -10,7 +10,14 @@ import pytest
 from reseau_drivers.scanner import ping360
 from reseau_drivers.turntable import zaber
 from reseau_sims import serving
-from reseau_sims.serving import InProcess, PtyServer, Script, TcpServer, UdpServer, Wire, ZaberChain
+from reseau_sims.serving import (
+    FaultyConnection,
+    InProcess,
+    PtyServer,
+    TcpServer,
+    UdpServer,
+    ZaberChain,
+)
 
 
 def test_zaber_motion_homes_and_moves_the_turntable() -> None:
@@ -19,7 +26,7 @@ def test_zaber_motion_homes_and_moves_the_turntable() -> None:
     for motor in chain.motors.values():
         motor.speed = 1e6
     with (
-        TcpServer(lambda: Wire(chain, Script())) as server,
+        TcpServer(lambda: FaultyConnection(chain)) as server,
         ascii_.Connection.open_tcp("127.0.0.1", server.port) as connection,
     ):
         for number, axis_number in chain.motors:
@@ -38,7 +45,7 @@ def test_zaber_motion_homes_and_moves_the_turntable() -> None:
 def test_bluerobotics_ping_scans() -> None:
     brping = pytest.importorskip("brping", reason="bluerobotics-ping is not installed")
     machine = serving.Ping360()
-    with PtyServer(lambda: Wire(machine, Script())) as server:
+    with PtyServer(lambda: FaultyConnection(machine)) as server:
         client = brping.Ping360()
         client.connect_serial(server.address, 115200)
         try:
@@ -57,7 +64,7 @@ def test_bluerobotics_ping_scans() -> None:
 def test_bluerobotics_ping_scans_over_udp() -> None:
     brping = pytest.importorskip("brping", reason="bluerobotics-ping is not installed")
     machine = serving.Ping360()
-    with UdpServer(lambda: Wire(machine, Script())) as server:
+    with UdpServer(lambda: FaultyConnection(machine)) as server:
         client = brping.Ping360()
         client.connect_udp(server.HOST, server.port)
         try:
@@ -79,11 +86,11 @@ def test_bluesky_scans_over_the_turntable_with_the_sonar() -> None:
     chain, head = ZaberChain([1]), serving.Ping360()
     table = zaber(
         "table",
-        InProcess(lambda: Wire(chain, Script())),
+        InProcess(lambda: FaultyConnection(chain)),
         axes={"tilt": {"per_unit": 1000.0, "high": 90.0}},
         settings={"speed": 900.0},
     )
-    sonar = ping360("sonar", InProcess(lambda: Wire(head, Script())), settings={"half_sector": 3})
+    sonar = ping360("sonar", InProcess(lambda: FaultyConnection(head)), settings={"half_sector": 3})
     for wanted in ("Readable", "Triggerable", "Stageable", "Stoppable", "Configurable"):
         assert isinstance(sonar, getattr(protocols, wanted)), wanted
         assert isinstance(table, getattr(protocols, wanted)), wanted

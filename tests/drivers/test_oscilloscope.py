@@ -26,13 +26,13 @@ from reseau_sims.laboratory import Laboratory
 from reseau_sims.serving import (
     FAMILIES,
     Fault,
+    FaultScript,
+    FaultyConnection,
     HislipInstrument,
     InProcess,
     PortmapperSession,
-    Script,
     TcpServer,
     Vxi11Session,
-    Wire,
 )
 
 from .rigs import rig
@@ -40,7 +40,7 @@ from .rigs import rig
 
 def scope(family: str, **options: Any) -> tuple[Any, serving.Oscilloscope]:
     machine = serving.Oscilloscope(family)
-    return oscilloscope("scope", InProcess(lambda: Wire(machine, Script())), **options), machine
+    return oscilloscope("scope", InProcess(lambda: FaultyConnection(machine)), **options), machine
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -67,13 +67,13 @@ def test_screen_and_waveform_of_every_family(family: str) -> None:
 @pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
 @pytest.mark.parametrize("family", ["keysight", "rigol-2000", "siglent", "tektronix"])
 def test_families_over_their_real_protocols(family: str, transport: str) -> None:
-    machine, script = serving.Oscilloscope(family), Script()
+    machine, script = serving.Oscilloscope(family), FaultScript()
     # Large enough for several chunks of every protocol.
     shown = np.random.default_rng(1).integers(0, 255, (480, 800), dtype=np.uint8)
     machine.screen = lambda: shown
     with ExitStack() as stack:
         if transport == "tcp":
-            address = stack.enter_context(TcpServer(lambda: Wire(machine, script))).address
+            address = stack.enter_context(TcpServer(lambda: FaultyConnection(machine, script))).address
         elif transport == "vxi-11":
             server = stack.enter_context(TcpServer(partial(Vxi11Session, machine, machine.execute, script)))
             address = f"TCPIP::127.0.0.1,{server.port}::inst0::INSTR"
@@ -145,7 +145,7 @@ def test_what_the_scanner_sweeps_is_on_the_oscilloscope() -> None:
     machine = serving.Oscilloscope(
         "rigol-1000z", lambda: laboratory.picture(400, 240), lambda: laboratory.echoes
     )
-    with oscilloscope("scope", InProcess(lambda: Wire(machine, Script()))) as device:
+    with oscilloscope("scope", InProcess(lambda: FaultyConnection(machine))) as device:
         before = device.screen().frame().pixels.astype(int)
         for angle in range(190, 211):
             laboratory.line(angle, 300, 2e-6)
@@ -222,7 +222,7 @@ def _portmapper(core: int) -> TcpServer:
 def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> None:
     laboratory = Laboratory(World.standard(seed=4))
     machine = serving.Oscilloscope(family, lambda: laboratory.picture(400, 240))
-    with TcpServer(partial(Vxi11Session, machine, machine.execute, Script())) as core:
+    with TcpServer(partial(Vxi11Session, machine, machine.execute, FaultScript())) as core:
         portmapper = _portmapper(core.port)
         with portmapper:
             saved = tmp_path / "screen.png"
@@ -245,7 +245,7 @@ def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> 
 def test_our_driver_finds_the_core_channel_by_the_portmapper() -> None:
     machine = serving.Oscilloscope("keysight")
     with (
-        TcpServer(partial(Vxi11Session, machine, machine.execute, Script())) as core,
+        TcpServer(partial(Vxi11Session, machine, machine.execute, FaultScript())) as core,
         _portmapper(core.port),
         oscilloscope("scope", "TCPIP::127.0.0.1::inst0::INSTR") as device,
     ):
@@ -256,7 +256,7 @@ def test_our_driver_finds_the_core_channel_by_the_portmapper() -> None:
 @pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
 @pytest.mark.parametrize("way", ["stop", "close"])
 def test_a_call_that_hangs_is_broken_off_from_another_thread(transport: str, way: str) -> None:
-    script = Script()
+    script = FaultScript()
     with rig("oscilloscope", transport, script) as found:
         caught: list[Exception] = []
 

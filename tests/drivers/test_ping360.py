@@ -15,12 +15,12 @@ from reseau.instruments import UltrasonicScanner
 from reseau_drivers.scanner import Ping360, ping360
 from reseau_sims import Reflectors, World, serving
 from reseau_sims.laboratory import Laboratory
-from reseau_sims.serving import InProcess, Script, UdpServer, Wire
+from reseau_sims.serving import FaultyConnection, InProcess, UdpServer
 
 
 def sonar(laboratory: Laboratory | None = None, **settings: float) -> tuple[Ping360, serving.Ping360]:
     machine = serving.Ping360(laboratory.line) if laboratory else serving.Ping360()
-    return ping360("sonar", InProcess(lambda: Wire(machine, Script())), settings=settings), machine
+    return ping360("sonar", InProcess(lambda: FaultyConnection(machine)), settings=settings), machine
 
 
 def test_a_section_shows_reflectors_at_their_millimetres() -> None:
@@ -116,13 +116,13 @@ def test_settings_are_checked_before_anything_is_sent() -> None:
 
 def test_over_udp_a_peer_that_went_away_is_said_and_found_again() -> None:
     machine = serving.Ping360()
-    with UdpServer(lambda: Wire(machine, Script())) as server:
+    with UdpServer(lambda: FaultyConnection(machine)) as server:
         device = ping360("sonar", server.address, seconds=0.5)
         device.connect()
         port = server.port
     with pytest.raises(InstrumentError, match="sonar"):
         device.line(3)
-    with UdpServer(lambda: Wire(machine, Script()), port):
+    with UdpServer(lambda: FaultyConnection(machine), port):
         assert set(device.line(3)) == {203}
         # Another client does not get between: each is answered at its own port.
         with ping360("other", f"udp://127.0.0.1:{port}", seconds=0.5) as other:

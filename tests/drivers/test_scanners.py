@@ -24,16 +24,16 @@ from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import BkScanner, CompactPulser, bk_oem, compact_pulser
 from reseau_drivers.turntable import zaber
 from reseau_sims import serving
-from reseau_sims.serving import Fault, InProcess, Machine, Script, Wire, ZaberChain
+from reseau_sims.serving import Fault, FaultScript, FaultyConnection, InProcess, Machine, ZaberChain
 
 
 def linked(machine: Machine) -> InProcess:
-    return InProcess(lambda: Wire(machine, Script()))
+    return InProcess(lambda: FaultyConnection(machine))
 
 
 def bk_pair() -> tuple[BkScanner, serving.BkScanner]:
     machine = serving.BkScanner()
-    return bk_oem("bk", InProcess(lambda: Wire(machine, Script()))), machine
+    return bk_oem("bk", InProcess(lambda: FaultyConnection(machine))), machine
 
 
 def test_a_frame_comes_with_its_millimetres() -> None:
@@ -71,7 +71,7 @@ def test_a_window_outside_the_frame_gives_pixels_and_never_wrong_millimetres(sta
 
 def test_a_box_of_the_whole_screen_gives_no_millimetres_either() -> None:
     machine = serving.BkScanner()
-    with bk_oem("bk", InProcess(lambda: Wire(machine, Script())), box="B_GEOMETRY_PIXEL") as device:
+    with bk_oem("bk", InProcess(lambda: FaultyConnection(machine)), box="B_GEOMETRY_PIXEL") as device:
         assert device.scan().mm_per_px is None
     with pytest.raises(SettingError, match="B_GEOMETRY_US_FRAME_GRAB"):
         bk_oem("bk", "tcp://127.0.0.1:1", box="B_GEOMETRY")
@@ -104,20 +104,20 @@ def test_a_size_that_no_scanner_has_is_refused(size: bytes) -> None:
 
 def test_a_frame_of_another_size_is_refused() -> None:
     device, machine = bk_pair()
-    machine._frame = lambda: bk.encode_frame(bk.GrabbedFrame(1, bytes(100), 104))  # type: ignore[method-assign]
-    with pytest.raises(ProtocolError, match="101 bytes for 4800 pixels"):
+    machine._frame = lambda: bk.encode_frame(bk.GrabbedFrame(1, bytes(100), 104))  # type:
+    ignore[method-assign] with pytest.raises(ProtocolError, match="101 bytes for 4800 pixels"):
         device.scan()
     device.close()
 
 
 def pulser(**options: object) -> tuple[CompactPulser, serving.CompactPulser]:
     machine = serving.CompactPulser()
-    return compact_pulser("pulser", InProcess(lambda: Wire(machine, Script())), **options), machine  # type: ignore[arg-type]
+    return compact_pulser("pulser", InProcess(lambda: FaultyConnection(machine)), **options), machine  # type: ignore[arg-type]
 
 
 def test_echoes_of_the_pulser_come_from_its_oscilloscope() -> None:
     shown = serving.Oscilloscope("rigol-1000z")
-    scope = oscilloscope("scope", InProcess(lambda: Wire(shown, Script())))
+    scope = oscilloscope("scope", InProcess(lambda: FaultyConnection(shown)))
     device, machine = pulser(digitiser=scope, settings={"speed_m_s": 1480.0})
     with device, scope:
         with pytest.raises(StateError, match="sends no pulses"):
@@ -133,14 +133,14 @@ def test_echoes_of_the_pulser_come_from_its_oscilloscope() -> None:
 
 
 def test_where_the_gain_alone_is_told_it_vouches_for_the_rest() -> None:
-    machine = serving.CompactPulser(tells="G")
-    device = compact_pulser("pulser", InProcess(lambda: Wire(machine, Script())), answer_s=0.05)
+    machine = serving.CompactPulser(readable="G")
+    device = compact_pulser("pulser", InProcess(lambda: FaultyConnection(machine)), answer_s=0.05)
     with device:
         assert machine.values == {"P": 0, "W": 220, "V": 300, "D": 0, "M": 0, "T": 0, "G": 0}
         device.configure(gain_db=84.0, width_ns=100.0)
         assert (machine.values["G"], machine.values["W"]) == (840, 100)
         assert "tells no other" in device.check()["settings"]
-        machine.afflict("power-cycled")
+        machine.inject_fault("power-cycled")
         with pytest.raises(StateError, match="G = 5"):
             device.verify()
         # In local mode it takes nothing: that is found though the gain is asked for as it was.
@@ -246,12 +246,14 @@ def test_what_works_together_is_named_on_the_bench() -> None:
 
 
 def test_a_pulser_that_was_off_gets_all_its_settings_back() -> None:
-    machine, script = serving.CompactPulser(), Script()
-    device = compact_pulser("pulser", InProcess(lambda: Wire(machine, script)), settings={"voltage": 250.0})
+    machine, script = serving.CompactPulser(), FaultScript()
+    device = compact_pulser(
+        "pulser", InProcess(lambda: FaultyConnection(machine, script)), settings={"voltage": 250.0}
+    )
     with device:
         device.configure(repetition_hz=500.0, gain_db=12.5)
         before = dict(machine.values)
-        machine.afflict("power-cycled")
+        machine.inject_fault("power-cycled")
         script.fault_at(script.count, Fault("disconnected"))
         with pytest.raises(ConnectionLost):
             device.verify()

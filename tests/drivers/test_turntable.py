@@ -11,7 +11,7 @@ from reseau.core.errors import ConnectionLost, DeadlineError, SettingError, Stat
 from reseau.instruments import Movable, Turntable
 from reseau_drivers.link import link_to
 from reseau_drivers.turntable import AxisPlan, Table, Zaber, smc100, zaber
-from reseau_sims.serving import Fault, InProcess, Script, Smc100Line, Wire, ZaberChain
+from reseau_sims.serving import Fault, FaultScript, FaultyConnection, InProcess, Smc100Line, ZaberChain
 
 
 def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
@@ -20,11 +20,16 @@ def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
     return [
         (
             zaber(
-                "table", InProcess(lambda: Wire(chain, Script())), axes={"tilt": axis | {"per_unit": 1000.0}}
+                "table",
+                InProcess(lambda: FaultyConnection(chain)),
+                axes={"tilt": axis | {"per_unit": 1000.0}},
             ),
             chain,
         ),
-        (smc100("table", InProcess(lambda: Wire(line, Script())), axes={"tilt": axis}), line),
+        (
+            smc100("table", InProcess(lambda: FaultyConnection(line)), axes={"tilt": axis}),
+            line,
+        ),
     ]
 
 
@@ -108,8 +113,8 @@ def test_a_move_that_takes_too_long_is_stopped(which: int) -> None:
     [("stuck", "stalled"), ("out of range", "limit switch"), ("wrong state", "driver is off")],
 )
 def test_flags_of_a_movement_are_said(kind: str, said: str) -> None:
-    chain, script = ZaberChain([1]), Script()
-    link = InProcess(lambda: Wire(chain, script))
+    chain, script = ZaberChain([1]), FaultScript()
+    link = InProcess(lambda: FaultyConnection(chain, script))
     with Table("table", Zaber(link), {"tilt": AxisPlan(per_unit=1000.0)}) as table:
         table.home("tilt")
         script.fault_at(script.count + 6, Fault(kind))  # type: ignore[arg-type]
@@ -118,9 +123,11 @@ def test_flags_of_a_movement_are_said(kind: str, said: str) -> None:
 
 
 def test_a_table_that_lost_power_says_so_and_gets_its_speed_back() -> None:
-    chain, script = ZaberChain([1]), Script()
+    chain, script = ZaberChain([1]), FaultScript()
     with Table(
-        "table", Zaber(InProcess(lambda: Wire(chain, script))), {"tilt": AxisPlan(per_unit=1000.0)}
+        "table",
+        Zaber(InProcess(lambda: FaultyConnection(chain, script))),
+        {"tilt": AxisPlan(per_unit=1000.0)},
     ) as table:
         table.configure(speed=100.0)
         table.home("tilt")

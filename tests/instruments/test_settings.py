@@ -49,7 +49,7 @@ def test_a_bench_narrows_limits() -> None:
     assert Pulser().changed({"voltage": 100}, {"voltage": (40.0, 200.0)}).voltage == 100.0
     with pytest.raises(SettingError, match="40…200 V"):
         Pulser().changed({"voltage": 250.0}, {"voltage": (40.0, 200.0)})
-    with pytest.raises(SettingError, match="no setting"):
+    with pytest.raises(SettingError, match="is not a setting"):
         Pulser().changed({}, {"colour": (0.0, 1.0)})
 
 
@@ -63,8 +63,8 @@ def test_a_deadline_runs_out_and_its_parts_never_after_it() -> None:
     part = deadline.part(10.0)
     assert part.left <= deadline.seconds
     time.sleep(0.03)
-    assert deadline.over
-    assert part.over
+    assert deadline.expired
+    assert part.expired
     for seconds in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(UsageError):
             Deadline(seconds)

@@ -7,18 +7,17 @@ from functools import partial
 from typing import Any
 
 from .aravis import Aravis, AravisSettings, aravis_cameras
-from .camera import Camera, CameraSettings, Shot, Source, Taken
-from .kernel import KernelNode, OpenNode, video_devices
-from .v4l2 import V4l2, V4l2Settings
+from .camera import CameraDriver, CameraExposure, CameraInterface, CameraSettings, RawFrame
+from .v4l2 import KernelNode, OpenNode, V4l2, V4l2Settings, video_devices
 
 __all__ = [
     "Aravis",
     "AravisSettings",
-    "Camera",
+    "CameraDriver",
+    "CameraExposure",
+    "CameraInterface",
     "CameraSettings",
-    "Shot",
-    "Source",
-    "Taken",
+    "RawFrame",
     "V4l2",
     "V4l2Settings",
     "aravis",
@@ -30,7 +29,7 @@ __all__ = [
 
 def v4l2(
     name: str, address: str | OpenNode, *, settings: Mapping[str, Any] | None = None, **options: Any
-) -> Camera[V4l2Settings]:
+) -> CameraDriver[V4l2Settings]:
     """A camera of Video4Linux; found by its entry point.
 
     Parameters
@@ -42,15 +41,15 @@ def v4l2(
     settings : mapping, optional
         Of :class:`V4l2Settings`.
     **options
-        Of :class:`Camera`.
+        Of :class:`CameraDriver`.
     """
     open_node = partial(KernelNode, address) if isinstance(address, str) else address
-    return Camera(name, V4l2(open_node), V4l2Settings().changed(settings or {}), **options)
+    return CameraDriver(name, V4l2(open_node), V4l2Settings().changed(settings or {}), **options)
 
 
 def aravis(
     name: str, address: str, *, settings: Mapping[str, Any] | None = None, **options: Any
-) -> Camera[AravisSettings]:
+) -> CameraDriver[AravisSettings]:
     """A camera of GigE Vision or USB3 Vision; found by its entry point.
 
     Parameters
@@ -62,6 +61,6 @@ def aravis(
     settings : mapping, optional
         Of :class:`AravisSettings`.
     **options
-        Of :class:`Camera`.
+        Of :class:`CameraDriver`.
     """
-    return Camera(name, Aravis(address), AravisSettings().changed(settings or {}), **options)
+    return CameraDriver(name, Aravis(address), AravisSettings().changed(settings or {}), **options)

@@ -6,9 +6,11 @@ the driver says so when it connects. A buffer that was taken is copied and alway
 
 from __future__ import annotations
 
+import math
+import shlex
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -16,14 +18,19 @@ from operator import methodcaller
 from threading import Event, Thread
 from typing import Any
 
-from reseau.core.errors import ConnectionLost, InstrumentError, ProtocolError, RefusedError, UsageError
+from reseau.core.errors import (
+    ConnectionLost,
+    InstrumentError,
+    ProtocolError,
+    RefusedError,
+    SettingError,
+    UsageError,
+)
 from reseau.instruments import Deadline, Identity, choice, quantity, text
 
 from ..codecs.pixels import GENICAM, decode
-from .camera import CameraSettings, Taken
-from .clocks import BlockNumbers, Stamps, realtime_offset
-from .features import require_within, same_value, wanted_features
-from .found import Found
+from .camera import CameraSettings, OriginalValues, RawFrame
+from .clocks import BlockCounter, ExposureTimes, realtime_offset
 from .gvcp import HEARTBEAT_S, controlled_elsewhere, require_answer, require_control
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
@@ -47,11 +54,77 @@ class AravisSettings(CameraSettings):
     stamp: str = choice("end", "end", "start")
     chunks: str = choice("off", "off", "on")
     packet_size: int = quantity(0, "B", 0, 65535)
-    features: str = text("")  # by name, before all others; see :mod:`.features`
+    features: str = text("")  # by name, before all others; see :func:`wanted_features`
 
     def __post_init__(self) -> None:
         super().__post_init__()
         wanted_features(self.features)
+
+
+def wanted_features(text: str) -> tuple[tuple[str, str], ...]:
+    """Names and values, in the order in which they are to be set.
+
+    Raises
+    ------
+    SettingError
+        When the text is something else.
+
+    Examples
+    --------
+    >>> wanted_features('ReverseX=true  DeviceUserID="left eye"')
+    (('ReverseX', 'true'), ('DeviceUserID', 'left eye'))
+    """
+    try:
+        pairs = [word.partition("=") for word in shlex.split(text)]
+    except ValueError as error:
+        raise SettingError(f"{text!r} is not whole ({error})", where="features") from None
+    for name, sign, value in pairs:
+        if not (name.isidentifier() and sign and value):
+            raise SettingError(
+                f"{name + sign + value!r} sets no feature",
+                where="features",
+                do="write Name=value, with blanks between them",
+            )
+    return tuple((name, value) for name, _, value in pairs)
+
+
+def same_value(got: str, wanted: str) -> bool:
+    """Whether what a camera says it has is what was asked for.
+
+    Examples
+    --------
+    >>> same_value("2.500000", "2.5"), same_value("16", "0x10"), same_value("true", "True")
+    (True, True, True)
+    >>> same_value("2", "3"), same_value("Off", "On")
+    (False, False)
+    """
+    if got.casefold() == wanted.casefold():
+        return True
+    numbers = _number(got), _number(wanted)
+    return math.isclose(*numbers, rel_tol=1e-6)
+
+
+def require_within(name: str, value: float, bounds: Sequence[float]) -> None:
+    """Make sure that a camera can do what it is to be set to.
+
+    Raises
+    ------
+    RefusedError
+        When the value is beyond its bounds.
+    """
+    low, high = bounds[0], bounds[1]
+    if not low <= value <= high:
+        raise RefusedError(f"{name} {value:g} is beyond its {low:g}…{high:g}")
+
+
+def _number(text: str) -> float:
+    """The number; NaN, which is the same as no other, when it is none."""
+    for kind in (lambda: int(text, 0), lambda: float(text)):
+        try:
+            return kind()
+        except ValueError:
+            continue
+    return math.nan
 
 
 @cache
@@ -108,12 +181,12 @@ class Aravis:
         self._running = False
         self._ours_until = 0.0
         self._settings = AravisSettings()
-        self._numbers, self._found = BlockNumbers(), Found()
+        self._numbers, self._original = BlockCounter(), OriginalValues()
         self._size = (0, 0)
         self._period_ns = _UNKNOWN_PERIOD_NS
         self._exposure_ns: int | None = None
         self._gain = float("nan")
-        self._stamps = Stamps()
+        self._stamps = ExposureTimes()
         self._chunks: tuple[str, ...] = ()
 
     @property
@@ -131,10 +204,10 @@ class Aravis:
         self.close()
         library, _ = _library()
         self._lost = lost = Event()
-        self._numbers, self._found = BlockNumbers(), Found()
+        self._numbers, self._original = BlockCounter(), OriginalValues()
         require_answer(self._address, deadline)
         require_control(self._address, deadline, self._ours_until)
-        with self._told("open"):
+        with self._translated_errors("open"):
             self._camera = library.Camera.new(self._address)
             self._camera.get_device().connect("control-lost", lambda *_: lost.set())
             if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
@@ -158,7 +231,7 @@ class Aravis:
 
     def identify(self, deadline: Deadline) -> Identity:
         """What it says it is."""
-        with self._told("identify") as camera:
+        with self._translated_errors("identify") as camera:
             version = ""
             if camera.is_feature_available("DeviceVersion"):
                 version = camera.get_string("DeviceVersion")
@@ -170,7 +243,7 @@ class Aravis:
         """Stop, and have it set so."""
         self.halt()
         self._settings = settings
-        with self._told("set") as camera:
+        with self._translated_errors("set") as camera:
             for name, value in wanted_features(settings.features):
                 self._set_feature(camera, name, value)
             self._set_region(camera, settings)
@@ -186,7 +259,7 @@ class Aravis:
 
     def dark(self, settings: AravisSettings) -> AravisSettings:
         """Settings with the shortest exposure."""
-        with self._told("limits") as camera:
+        with self._translated_errors("limits") as camera:
             if not camera.is_exposure_time_available():
                 return settings
             return replace(settings, exposure_us=max(1.0, float(camera.get_exposure_time_bounds()[0])))
@@ -195,7 +268,7 @@ class Aravis:
         """Have it deliver frames, if it does not yet."""
         if self._running:
             return
-        with self._told("start") as camera:
+        with self._translated_errors("start") as camera:
             self._stream = camera.create_stream(None, None)
             if self._stream is None:
                 raise RefusedError("opens no stream", do="is it open elsewhere?")
@@ -216,14 +289,14 @@ class Aravis:
             self._stream.push_buffer(buffer)
         if self._settings.trigger == "software":
             self._stamps.triggered = time.monotonic_ns()
-            with self._told("trigger") as camera:
+            with self._translated_errors("trigger") as camera:
                 camera.software_trigger()
 
-    def take(self, deadline: Deadline) -> Taken | None:
+    def take(self, deadline: Deadline) -> RawFrame | None:
         """The next whole frame that is newer than the last."""
         if self._lost.is_set() or self._stream is None:
             raise ConnectionLost("control of the camera was lost", do="is it on, and the cable good?")
-        with self._told("fetch"):
+        with self._translated_errors("fetch"):
             stream = _held(self._stream)
             buffer = stream.timeout_pop_buffer(max(1, int(deadline.left * 1e6)))
             if buffer is None:
@@ -240,14 +313,14 @@ class Aravis:
         if not self._running:
             return
         self._running = False
-        with self._told("stop") as camera:
+        with self._translated_errors("stop") as camera:
             camera.stop_acquisition()
 
     def clock(self, deadline: Deadline) -> str:
         """How its clock stands to UTC."""
-        with self._told("clock"):
+        with self._translated_errors("clock"):
             self._stamps.offset = self._latched()
-        return self._stamps.told()
+        return self._stamps.describe()
 
     def _counted(self, buffer: Any) -> int | None:
         """The number of a whole frame counted on; None of a damaged one, or one that is not newer.
@@ -258,7 +331,7 @@ class Aravis:
             return None
         return self._numbers.next(int(buffer.get_frame_id()))
 
-    def _read(self, buffer: Any, sequence: int) -> Taken | None:
+    def _read(self, buffer: Any, sequence: int) -> RawFrame | None:
         width, height = buffer.get_image_width(), buffer.get_image_height()
         layout = GENICAM[self._settings.format]
         if buffer.get_image_pixel_format() != layout.code or (width, height) != self._size:
@@ -277,7 +350,7 @@ class Aravis:
         began = self._stamps.began(int(buffer.get_timestamp()), arrived, before, exposure_ns or 0)
         pixels = decode(layout, width, height, buffer.get_data(), stride)
         exposure_us = float("nan") if exposure_ns is None else exposure_ns / 1000
-        return Taken(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
+        return RawFrame(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
 
     def _latched(self) -> tuple[int, int] | None:
         """What is added to the camera's clock to have ours, and its uncertainty; None: it cannot be read."""
@@ -293,14 +366,14 @@ class Aravis:
                 readings.append((after - before, (before + after) // 2, int(camera.get_integer(value))))
             if readings[0][2] == readings[-1][2]:
                 return None  # a clock that stands still is none
-            took, ours, theirs = min(readings)
-            return ours - theirs, (took + 1) // 2
+            accepted, ours, theirs = min(readings)
+            return ours - theirs, (accepted + 1) // 2
         return None
 
     def _set_feature(self, camera: Any, name: str, value: str) -> None:
         if not camera.is_feature_available(name):
             raise RefusedError(f"has no feature {name}", do="arv-tool-0.8 features lists those that it has")
-        # No names for the device and its nodes: see :meth:`_told`.
+        # No names for the device and its nodes: see :meth:`_translated_errors`.
         camera.get_device().get_feature(name).set_value_from_string(value)
         got = str(camera.get_device().get_feature(name).get_value_as_string())
         if not same_value(got, value):
@@ -324,7 +397,7 @@ class Aravis:
         camera.set_pixel_format_from_string(settings.format)
         now = tuple(camera.get_region())
         asked = settings.left, settings.top, settings.width, settings.height
-        found = self._found.before("region", any(asked), lambda: now) or now
+        found = self._original.keep("region", any(asked), lambda: now) or now
         region = (*asked[:2], asked[2] or found[2], asked[3] or found[3]) if any(asked) else found
         left, top, width, height = region
         sensor = camera.get_sensor_size()
@@ -347,7 +420,7 @@ class Aravis:
             value = getattr(settings, name)
             if given:
                 require_within(name, value, methodcaller(f"get_{feature}_bounds")(camera))
-            found = self._found.before(name, given, partial(methodcaller(f"get_{feature}"), camera))
+            found = self._original.keep(name, given, partial(methodcaller(f"get_{feature}"), camera))
             if given or found is not None:
                 getattr(camera, f"set_{feature}")(value if given else found)
         self._period_ns = _UNKNOWN_PERIOD_NS
@@ -359,7 +432,7 @@ class Aravis:
         self._gain = float(camera.get_gain()) if camera.is_gain_available() else float("nan")
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[Any]:
+    def _translated_errors(self, what: str) -> Iterator[Any]:
         """The camera; and what the library's errors mean."""
         glib = _library()[1]
         if self._camera is None and what != "open":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,9 +18,9 @@ from reseau.core.errors import DeadlineError, InstrumentError, RefusedError, Sta
 from reseau.core.provenance import sha256_of
 from reseau.instruments import Deadline, Device, Identity, Limits, Settings, quantity
 
-from .clocks import Span, utc
+from .clocks import TimeInterval, utc
 
-__all__ = ["Camera", "CameraSettings", "Shot", "Source", "Taken"]
+__all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame"]
 
 _SLICE_S = 0.05
 """How long one waits for a frame before looking whether one was told to stop."""
@@ -46,7 +46,7 @@ S = TypeVar("S", bound=CameraSettings)
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class RawFrame:
     """A whole frame as a camera delivered it.
 
     Parameters
@@ -61,7 +61,7 @@ class Taken:
         The frame where the grey values are not all of it.
     sequence : int
         Counted on without wrapping.
-    began : Span
+    began : TimeInterval
         When its exposure began.
     exposure_us, gain : float
         As the camera says; NaN where it does not.
@@ -72,12 +72,47 @@ class Taken:
     pattern: str
     raw: bytes
     sequence: int
-    began: Span
+    began: TimeInterval
     exposure_us: float
     gain: float
 
 
-class Source(Protocol[S]):
+class OriginalValues:
+    """Values as they were found, by name.
+
+    Examples
+    --------
+    >>> found, gain = OriginalValues(), 7
+    >>> found.keep("gain", True, lambda: gain)
+    7
+    >>> gain = 3
+    >>> found.keep("gain", True, lambda: gain), found.keep("gain", False), found.keep("gain", False)
+    (7, 7, None)
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[Hashable, Any] = {}
+
+    def keep(self, name: Hashable, given: bool, now: Callable[[], Any] | None = None) -> Any:
+        """What there was before it was changed; None where it was not.
+
+        Parameters
+        ----------
+        name : hashable
+            Of the setting.
+        given : bool
+            Whether it is changed now; otherwise what there was is to be brought back, and forgotten.
+        now : callable, optional
+            Asks for what there is, when it is changed for the first time.
+        """
+        if not given:
+            return self._values.pop(name, None)
+        if name not in self._values and now is not None:
+            self._values[name] = now()
+        return self._values.get(name)
+
+
+class CameraInterface(Protocol[S]):
     """What a camera does on its own interface."""
 
     @property
@@ -109,7 +144,7 @@ class Source(Protocol[S]):
     def request(self, deadline: Deadline) -> None:
         """Trigger it by software, where it is set to be; frames of before are let go."""
 
-    def take(self, deadline: Deadline) -> Taken | None:
+    def take(self, deadline: Deadline) -> RawFrame | None:
         """The next whole frame that is newer than the last; None when there is none by then."""
 
     def halt(self) -> None:
@@ -120,7 +155,7 @@ class Source(Protocol[S]):
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class CameraExposure:
     """A frame with what is known of it; see :class:`reseau.instruments.Exposure`."""
 
     taken: datetime
@@ -142,14 +177,14 @@ class Shot:
         return Frame(self.pixels, self.full_scale, self.name, sha256_of(self.raw or self.pixels.tobytes()))
 
 
-class Camera(Device[S]):
+class CameraDriver(Device[S]):
     """A camera.
 
     Parameters
     ----------
     name : str
         On the bench.
-    source : Source
+    source : CameraInterface
         Its interface.
     settings : CameraSettings
         Pushed on every connection.
@@ -167,7 +202,7 @@ class Camera(Device[S]):
     def __init__(
         self,
         name: str,
-        source: Source[S],
+        source: CameraInterface[S],
         settings: S,
         *,
         seconds: float = 5.0,
@@ -180,7 +215,7 @@ class Camera(Device[S]):
     def _open(self, deadline: Deadline) -> None:
         self._source.open(deadline)
 
-    def _shut(self) -> None:
+    def _disconnect(self) -> None:
         self._source.close()
 
     def _push(self, settings: S, deadline: Deadline) -> None:
@@ -207,14 +242,14 @@ class Camera(Device[S]):
             f"{self.name}_dropped": shot.dropped,
         }
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         return {
             f"{self.name}_image": {"dtype": "array", "shape": list(self._source.shape)},
             f"{self.name}_sequence": {"dtype": "integer", "shape": []},
             f"{self.name}_dropped": {"dtype": "integer", "shape": []},
         }
 
-    def expose(self, seconds: float | None = None) -> Shot:
+    def expose(self, seconds: float | None = None) -> CameraExposure:
         """A frame whose exposure began after this call.
 
         Raises
@@ -232,7 +267,7 @@ class Camera(Device[S]):
         with self._exchange("expose", seconds) as deadline:
             return self._next(deadline, stale=False)
 
-    def frames(self, count: int, seconds: float | None = None) -> Iterator[Shot]:
+    def frames(self, count: int, seconds: float | None = None) -> Iterator[CameraExposure]:
         """Frames one after the other, as the camera delivers them; each says whether it is fresh.
 
         Parameters
@@ -253,7 +288,7 @@ class Camera(Device[S]):
                 shot = self._next(deadline, stale=True)
             yield shot
 
-    def _next(self, deadline: Deadline, *, stale: bool) -> Shot:
+    def _next(self, deadline: Deadline, *, stale: bool) -> CameraExposure:
         self._source.start(deadline)
         asked, passed = time.monotonic_ns(), 0
         self._source.request(deadline)
@@ -267,16 +302,16 @@ class Camera(Device[S]):
                     return self._shot(taken, fresh)
                 self.skipped += 1
                 passed += 1
-            if deadline.over:
+            if deadline.expired:
                 seen = f"; {passed} came that may have begun before it was asked for" if passed else ""
                 raise DeadlineError(
                     f"delivered no new frame within {deadline.seconds:g} s{seen}",
                     do="is it triggered, and the exposure shorter than that?",
                 )
 
-    def _shot(self, taken: Taken, fresh: bool) -> Shot:
+    def _shot(self, taken: RawFrame, fresh: bool) -> CameraExposure:
         at, within = utc(taken.began)
-        return Shot(
+        return CameraExposure(
             at,
             within,
             fresh,
@@ -307,7 +342,7 @@ class Camera(Device[S]):
         found["dropped"] = f"{shots[-1].dropped - shots[0].dropped} of {steps + 1}"
         found["clock"] = (
             f"start of exposure within ± {shots[-1].taken_within_s * 1e3:.3g} ms; "
-            + self._asked(self._source.clock, "clock", deadline)
+            + self._exchanged(self._source.clock, "clock", deadline)
         )
         before, shortest = self.settings, self._source.dark(self.settings)
         try:
@@ -319,7 +354,7 @@ class Camera(Device[S]):
         found["dark"] = f"mean {(one + two).mean() / 2:.3g}, noise {noise:.3g} at the shortest exposure"
         return found
 
-    def _asked(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
+    def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
         with self._exchange(command, deadline.left or 1e-3) as part:
             return ask(part)
 

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-__all__ = ["BlockNumbers", "Span", "Stamps", "Wrapping", "realtime_offset", "utc"]
+__all__ = ["BlockCounter", "ExposureTimes", "FrameCounter", "TimeInterval", "realtime_offset", "utc"]
 
 _TRIES = 5
 _SHORT, _SHORT_WITH_ZERO, _LONG = 65535, 65536, 1 << 64
@@ -17,7 +17,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
-class Span:
+class TimeInterval:
     """When an exposure began, as far as it is known: between these (ns)."""
 
     earliest: int
@@ -34,7 +34,7 @@ def realtime_offset() -> tuple[int, int]:
     return best[0], (best[1] + 1) // 2
 
 
-def utc(span: Span) -> tuple[datetime, float]:
+def utc(span: TimeInterval) -> tuple[datetime, float]:
     """The middle of a span in UTC, and how far from it the truth may be (s)."""
     offset, doubt = realtime_offset()
     middle = (span.earliest + span.latest) // 2 + offset
@@ -42,7 +42,7 @@ def utc(span: Span) -> tuple[datetime, float]:
     return _EPOCH + timedelta(microseconds=middle // 1000), half * 1e-9
 
 
-class Wrapping:
+class FrameCounter:
     """Frame numbers that begin anew after their highest one, and what is missing between them.
 
     Parameters
@@ -52,7 +52,7 @@ class Wrapping:
 
     Examples
     --------
-    >>> numbers = Wrapping(65536)
+    >>> numbers = FrameCounter(65536)
     >>> [numbers.next(n) for n in (65534, 65535, 1)], numbers.lost
     ([65534, 65535, 65537], 1)
     >>> numbers.next(1), numbers.next(65535)
@@ -84,12 +84,12 @@ class Wrapping:
         return self._counted
 
 
-class BlockNumbers(Wrapping):
+class BlockCounter(FrameCounter):
     """Frame numbers of GenICam: GigE Vision 1 counts 1…65535, some cameras 0…65535, all others in 64 bits.
 
     Examples
     --------
-    >>> numbers = BlockNumbers()
+    >>> numbers = BlockCounter()
     >>> [numbers.next(n) for n in (65535, 0, 1)], numbers.lost
     ([65535, 65536, 65537], 0)
     """
@@ -98,7 +98,7 @@ class BlockNumbers(Wrapping):
         super().__init__(_SHORT)
 
     def next(self, number: int) -> int | None:
-        """As of :class:`Wrapping`; how many there are shows by itself."""
+        """As of :class:`FrameCounter`; how many there are shows by itself."""
         if number > _SHORT:
             self.period = _LONG
         elif number == 0 and self.period == _SHORT:
@@ -106,7 +106,7 @@ class BlockNumbers(Wrapping):
         return super().next(number)
 
 
-class Stamps:
+class ExposureTimes:
     """When exposures began, of frames that a camera stamps by a clock of its own.
 
     Attributes
@@ -118,13 +118,13 @@ class Stamps:
 
     Examples
     --------
-    >>> stamps = Stamps()
+    >>> stamps = ExposureTimes()
     >>> stamps.restart(period=10)
     >>> stamps.began(1000, 5000, before=3, exposure=3), stamps.began(1100, 5140, before=3, exposure=3)
-    (Span(earliest=4987, latest=4997), Span(earliest=5087, latest=5137))
+    (TimeInterval(earliest=4987, latest=4997), TimeInterval(earliest=5087, latest=5137))
     >>> stamps.offset = 4000, 2
     >>> stamps.began(1200, 5240, before=3, exposure=3)
-    Span(earliest=5195, latest=5199)
+    TimeInterval(earliest=5195, latest=5199)
     """
 
     def __init__(self) -> None:
@@ -137,7 +137,7 @@ class Stamps:
         """The camera was started anew; its frames follow one another after this period."""
         self._period, self._least_delay, self.triggered = period, None, None
 
-    def began(self, stamped: int, arrived: int, before: int, exposure: int) -> Span:
+    def began(self, stamped: int, arrived: int, before: int, exposure: int) -> TimeInterval:
         """When an exposure began.
 
         Parameters
@@ -147,23 +147,23 @@ class Stamps:
         before : int
             How long before its stamp it began.
         exposure : int
-            How long it took.
+            How long it accepted.
         """
         if self.offset is not None:
             begun, doubt = stamped + self.offset[0] - before, self.offset[1]
-            span = Span(begun - doubt, begun + doubt)
+            span = TimeInterval(begun - doubt, begun + doubt)
         else:
             # A frame that came later after its stamp than another did has waited for as long somewhere.
             delay = arrived - stamped
             self._least_delay = delay if self._least_delay is None else min(delay, self._least_delay)
             waited = delay - self._least_delay
-            span = Span(arrived - waited - exposure - self._period, arrived - exposure)
+            span = TimeInterval(arrived - waited - exposure - self._period, arrived - exposure)
         if self.triggered is None:
             return span
         # Everything of before was let go, so this one was exposed at the trigger, or after it.
-        return Span(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
+        return TimeInterval(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """How the camera's clock stands to UTC."""
         real = realtime_offset()[0]
         if self.offset is not None:

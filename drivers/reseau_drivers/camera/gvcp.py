@@ -67,7 +67,7 @@ def require_control(address: str, deadline: Deadline, ours_until: float = 0.0) -
     if not _is_ip(address):
         return
     while _privilege(address, deadline) & (_EXCLUSIVE | _CONTROL):
-        if time.monotonic() >= ours_until or deadline.over:
+        if time.monotonic() >= ours_until or deadline.expired:
             raise controlled_elsewhere(address)
         time.sleep(deadline.at_most(_PAUSE_S))
 
@@ -105,7 +105,7 @@ def _answer(address: str, command: int, data: bytes, deadline: Deadline) -> byte
             except OSError:
                 # Refused at once, or no answer in time: packets get lost, a camera may be starting.
                 pass
-            if deadline.over:
+            if deadline.expired:
                 break
     raise ConnectionLost(f"{address} does not answer", do="is it switched on, and the address right?")
 

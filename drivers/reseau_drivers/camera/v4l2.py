@@ -8,11 +8,16 @@ frame.
 from __future__ import annotations
 
 import errno
+import fcntl
+import mmap
 import os
+import select
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -21,12 +26,10 @@ from reseau.instruments import Deadline, Identity, choice, quantity
 
 from ..codecs import v4l2 as uapi
 from ..codecs.pixels import VIDEO, decode, size_of
-from .camera import CameraSettings, Taken
-from .clocks import Span, Wrapping
-from .found import Found
-from .kernel import Mapping, Node, OpenNode
+from .camera import CameraSettings, OriginalValues, RawFrame
+from .clocks import FrameCounter, TimeInterval
 
-__all__ = ["V4l2", "V4l2Settings"]
+__all__ = ["KernelNode", "Mapping", "Node", "OpenNode", "V4l2", "V4l2Settings", "video_devices"]
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 """From frame to frame, where the driver does not tell: none is slower."""
@@ -36,6 +39,91 @@ _MOST_CONTROLS = 500
 _WEBCAMS = "uvcvideo"
 """The kernel's driver of USB webcams. It says that it stamps starts of exposures, but stamps a frame when its
 first packet comes, unless it is told to believe the camera's own clock (its parameter ``hwtimestamps``)."""
+
+
+class Mapping(Protocol):
+    """Memory shared with the device."""
+
+    def __getitem__(self, part: slice, /) -> bytes:
+        """A copy of a part."""
+
+    def close(self) -> None:
+        """Give it back."""
+
+
+class Node(Protocol):
+    """A device that has been opened; raises OSError as the kernel does."""
+
+    def ioctl(self, request: int, data: bytearray) -> None:
+        """Ask or tell it something; the answer replaces the data."""
+
+    def map(self, length: int, offset: int) -> Mapping:
+        """Map memory of it."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until a frame can be fetched; whether it can."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+OpenNode = Callable[[], Node]
+
+
+class KernelNode:
+    """A device node.
+
+    Parameters
+    ----------
+    path : str
+        As ``/dev/video0``, or one of the links in ``/dev/v4l/by-id`` that stay.
+
+    Raises
+    ------
+    ConnectionLost
+        When it cannot be opened.
+    """
+
+    def __init__(self, path: str) -> None:
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise ConnectionLost(
+                f"{path} cannot be opened ({error.strerror})", do="is it plugged in, and may you use it?"
+            ) from None
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def ioctl(self, request: int, data: bytearray) -> None:
+        """Ask or tell it something; the answer replaces the data."""
+        fcntl.ioctl(self._fd, request, data, True)
+
+    def map(self, length: int, offset: int) -> Mapping:
+        """Map memory of it."""
+        return mmap.mmap(self._fd, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until a frame can be fetched; whether it can."""
+        for _, events in self._poll.poll(max(0, int(seconds * 1000))):
+            if events & select.POLLIN:
+                return True
+            # Unplugged it hangs up; an error alone is one of its queue of buffers.
+            number = errno.EIO if events == select.POLLERR else errno.ENODEV
+            raise OSError(number, os.strerror(number))
+        return False
+
+    def close(self) -> None:
+        """Close it."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with suppress(OSError):
+                os.close(fd)
+
+
+def video_devices() -> tuple[str, ...]:
+    """Nodes of video devices, by the links that stay where there are any; found by its entry point."""
+    stable = sorted(str(path) for path in Path("/dev/v4l/by-id").glob("*"))
+    return tuple(stable or sorted(str(path) for path in Path("/dev").glob("video*")))
 
 
 @dataclass(frozen=True)
@@ -60,9 +148,9 @@ class V4l2:
         self._node: Node | None = None
         self._maps: list[Mapping] = []
         self._streaming = False
-        self._numbers = Wrapping(1 << 32)
+        self._numbers = FrameCounter(1 << 32)
         self._damaged = 0
-        self._found = Found()
+        self._original = OriginalValues()
         self._buffers = 4
         self._format, self._layout = uapi.Format(0, 0, "GREY"), VIDEO["GREY"]
         self._period_ns = _UNKNOWN_PERIOD_NS
@@ -84,9 +172,9 @@ class V4l2:
     def open(self, deadline: Deadline) -> None:
         """Open the node anew; nothing of an earlier one is used again."""
         self.close()
-        self._numbers, self._damaged, self._found = Wrapping(1 << 32), 0, Found()
+        self._numbers, self._damaged, self._original = FrameCounter(1 << 32), 0, OriginalValues()
         self._node = self._open_node()
-        with self._told("query"):
+        with self._translated_errors("query"):
             found = uapi.Capability.parse(self._ask(uapi.QUERYCAP, bytearray(uapi.Capability.SIZE)))
         if not found.capabilities & uapi.Capability.VIDEO_CAPTURE:
             raise RefusedError("is no camera", do="name the node that captures; see v4l2-ctl --list-devices")
@@ -114,7 +202,7 @@ class V4l2:
         """Stop, and have it set so."""
         self.halt()
         self._buffers = settings.buffers
-        with self._told("set"):
+        with self._translated_errors("set"):
             self._set_format(settings)
             self._set_rate(settings.rate)
         self._set_exposure(settings.exposure_us)
@@ -133,7 +221,7 @@ class V4l2:
         """Have it deliver frames, if it does not yet."""
         if self._streaming:
             return
-        with self._told("start"):
+        with self._translated_errors("start"):
             count = uapi.Request.parse(self._ask(uapi.REQBUFS, uapi.Request(self._buffers).build())).count
             for index in range(count):
                 asked = uapi.Buffer(index).build()
@@ -148,9 +236,9 @@ class V4l2:
     def request(self, deadline: Deadline) -> None:
         """Nothing to send: it runs freely."""
 
-    def take(self, deadline: Deadline) -> Taken | None:
+    def take(self, deadline: Deadline) -> RawFrame | None:
         """The next whole frame that is newer than the last."""
-        with self._told("fetch"):
+        with self._translated_errors("fetch"):
             if not self._opened().wait(deadline.left):
                 return None
             try:
@@ -177,7 +265,7 @@ class V4l2:
             return None
         exposure_us = float("nan") if self._exposure_ns is None else self._exposure_ns / 1000
         raw = data if self._layout.pattern in ("YUYV", "MJPEG") else b""
-        return Taken(
+        return RawFrame(
             pixels,
             self._layout.full_scale,
             self._layout.pattern,
@@ -197,7 +285,7 @@ class V4l2:
             each.close()
         if self._streaming or maps:
             self._streaming = False
-            with self._told("stop"):
+            with self._translated_errors("stop"):
                 self._ask(uapi.STREAMOFF, uapi.stream_type())
                 self._ask(uapi.REQBUFS, uapi.Request(0).build())
 
@@ -209,7 +297,7 @@ class V4l2:
         need = size_of(self._layout, self._format.width, self._format.height, self._format.stride)
         return not buffer.flags & uapi.Buffer.ERROR and buffer.used >= max(1, need)
 
-    def _began(self, buffer: uapi.Buffer, now: int) -> Span:
+    def _began(self, buffer: uapi.Buffer, now: int) -> TimeInterval:
         """When the exposure began; see the documentation of ``v4l2_buffer``'s flags."""
         if buffer.flags & uapi.Buffer.CLOCKS != uapi.Buffer.MONOTONIC:
             raise ProtocolError("stamps its frames by an unknown clock")
@@ -225,23 +313,23 @@ class V4l2:
         earliest = stamp - self._period_ns - (self._period_ns if exposure is None else exposure)
         if at_start and self._identity.maker == _WEBCAMS:
             self._stamped_at = "first packet of the frame"
-            return Span(earliest, stamp)
+            return TimeInterval(earliest, stamp)
         if at_start:
             self._stamped_at = "start of the exposure"
-            return Span(stamp, stamp + 1000)
+            return TimeInterval(stamp, stamp + 1000)
         self._stamped_at = "end of the frame"
-        return Span(earliest, stamp - (exposure or 0))
+        return TimeInterval(earliest, stamp - (exposure or 0))
 
     def _set_format(self, settings: V4l2Settings) -> None:
         now = uapi.Format.parse(self._ask(uapi.G_FMT, uapi.Format(0, 0, "GREY").build()))
         sized = bool(settings.width or settings.height)
-        width, height = self._found.before("size", sized, lambda: (now.width, now.height)) or (
+        width, height = self._original.keep("size", sized, lambda: (now.width, now.height)) or (
             now.width,
             now.height,
         )
         width, height = settings.width or width, settings.height or height
         moved = bool(settings.left or settings.top)
-        region = self._found.before("region", moved, self._region)
+        region = self._original.keep("region", moved, self._region)
         if moved:
             region = uapi.Selection(settings.left, settings.top, width, height)
         if region is not None:
@@ -250,15 +338,15 @@ class V4l2:
                 raise RefusedError(f"reads the region {got}, not {region}")
         self._layout = VIDEO[settings.format]
         wanted = uapi.Format(width, height, str(self._layout.code))
-        took = uapi.Format.parse(self._ask(uapi.S_FMT, wanted.build()))
-        if (took.width, took.height, took.fourcc) != (width, height, wanted.fourcc):
+        accepted = uapi.Format.parse(self._ask(uapi.S_FMT, wanted.build()))
+        if (accepted.width, accepted.height, accepted.fourcc) != (width, height, wanted.fourcc):
             offered = ", ".join(self._offered())
             raise RefusedError(
-                f"delivers {took.width}×{took.height} {took.fourcc.strip()}, not {width}×{height} "
-                f"{settings.format}",
+                f"delivers {accepted.width}×{accepted.height} {accepted.fourcc.strip()}, "
+                f"not {width}×{height} {settings.format}",
                 do=f"it offers {offered}",
             )
-        self._format = took
+        self._format = accepted
 
     def _region(self) -> uapi.Selection:
         """The region of the sensor that is read."""
@@ -266,9 +354,9 @@ class V4l2:
 
     def _set_rate(self, rate: float) -> None:
         self._period_ns = _UNKNOWN_PERIOD_NS
-        # Not every driver knows of intervals; one that does tells the one that it took.
+        # Not every driver knows of intervals; one that does tells the one that it accepted.
         with suppress(OSError):
-            interval = self._found.before("interval", bool(rate), self._interval)
+            interval = self._original.keep("interval", bool(rate), self._interval)
             if rate:
                 interval = uapi.Interval(1000, round(rate * 1000))
             if interval is not None:
@@ -311,8 +399,8 @@ class V4l2:
             raise RefusedError(f"has no control of {name}")
         if not control.low <= value <= control.high:
             raise RefusedError(f"{name} {value} is beyond its {control.low}…{control.high}")
-        self._found.before(identifier, True, lambda: self._get(identifier))
-        with self._told(f"set {control.name}"):
+        self._original.keep(identifier, True, lambda: self._get(identifier))
+        with self._translated_errors(f"set {control.name}"):
             self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
         if (got := self._get(identifier)) != value:
             raise RefusedError(f"{name} is {got}, not {value}", do="is it driven automatically?")
@@ -320,12 +408,12 @@ class V4l2:
     def _put_back(self, *identifiers: int) -> None:
         """Controls as they were found, where they have been changed."""
         for identifier in identifiers:
-            if (value := self._found.before(identifier, False)) is not None:
-                with self._told(f"set {self._controls[identifier].name}"):
+            if (value := self._original.keep(identifier, False)) is not None:
+                with self._translated_errors(f"set {self._controls[identifier].name}"):
                     self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
 
     def _get(self, identifier: int) -> int:
-        with self._told("get"):
+        with self._translated_errors("get"):
             data = self._ask(uapi.G_CTRL, uapi.control_value(identifier))
         return int(np.frombuffer(data, "<i4")[1])
 
@@ -364,7 +452,7 @@ class V4l2:
         return self._node
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _translated_errors(self, what: str) -> Iterator[None]:
         """Name what the kernel's numbers mean."""
         try:
             yield

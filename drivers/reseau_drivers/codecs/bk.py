@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError
 
-from .stream import Damaged, shown
+from .stream import Damaged, excerpt
 
 __all__ = ["PORT", "GrabbedFrame", "MessageDecoder", "encode", "encode_frame", "numbers", "parse_frame"]
 
@@ -54,7 +54,7 @@ class MessageDecoder:
 
     def reset(self) -> None:
         """Forget the message that was begun."""
-        self._begun: bytearray | None = None
+        self._partial: bytearray | None = None
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
         """Messages that are complete with these bytes, without their frame and escapes."""
@@ -63,7 +63,7 @@ class MessageDecoder:
         for mark in _MARKS.finditer(data):
             self._take(data[at : mark.start()], found)
             at = mark.end()
-            body, self._begun = self._begun, bytearray() if mark[0] == b"\x01" else None
+            body, self._partial = self._partial, bytearray() if mark[0] == b"\x01" else None
             if body is None:
                 continue
             if mark[0] == b"\x04":
@@ -78,13 +78,13 @@ class MessageDecoder:
         """Add a piece without marks to the message that was begun."""
         if not piece:
             return
-        if self._begun is None:
+        if self._partial is None:
             _report(found, piece, f"{len(piece)} bytes between messages")
-        elif len(self._begun) + len(piece) > self._limit:
-            _report(found, bytes(self._begun[:60]), f"longer than {self._limit} bytes")
-            self._begun = None
+        elif len(self._partial) + len(piece) > self._limit:
+            _report(found, bytes(self._partial[:60]), f"longer than {self._limit} bytes")
+            self._partial = None
         else:
-            self._begun += piece
+            self._partial += piece
 
 
 def _report(found: list[bytes | Damaged], data: bytes, why: str) -> None:
@@ -149,7 +149,7 @@ def parse_frame(content: bytes, size: int) -> GrabbedFrame:
     digits = int(head[1]) if head else 0
     length = content[head.end() : head.end() + digits] if head else b""
     if head is None or len(length) != digits or not length.isdigit():
-        raise ProtocolError(f"no frame: {shown(content)}")
+        raise ProtocolError(f"no frame: {excerpt(content)}")
     start = head.end() + digits
     stamp, pixels = content[start : start + _STAMP], content[start + _STAMP :]
     if len(pixels) == size + 1:
@@ -180,4 +180,4 @@ def numbers(content: bytes, name: str) -> tuple[float, ...]:
             raise ValueError
         return tuple(float(value) for value in content[len(prefix) :].rstrip(b"; ").split(b","))
     except ValueError:
-        raise ProtocolError(f"no answer to {name}: {shown(content)}") from None
+        raise ProtocolError(f"no answer to {name}: {excerpt(content)}") from None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from .stream import shown
+from .stream import excerpt
 
 __all__ = ["LETTERS", "LIMIT", "Setting", "decode", "encode", "encode_answer"]
 
@@ -80,4 +80,4 @@ def decode(line: bytes) -> tuple[Setting, bool]:
         if found and found[1].decode() in LETTERS:
             value = None if found[2] == b"?" else int(found[2])
             return Setting(found[1].decode(), value), answer
-    raise ProtocolError(f"no line of a CompactPulser: {shown(line)}")
+    raise ProtocolError(f"no line of a CompactPulser: {excerpt(line)}")

@@ -112,24 +112,24 @@ class MessageDecoder:
 
     def reset(self) -> None:
         """Forget the message that was begun."""
-        self._begun, self._lost = bytearray(), False
+        self._partial, self._failed = bytearray(), False
 
     def feed(self, data: bytes) -> list[Message | Damaged]:
         """Messages that are complete with these bytes."""
-        if self._lost:
+        if self._failed:
             return []
         found: list[Message | Damaged] = []
-        self._begun += data
-        while len(self._begun) >= HEAD:
-            prologue, kind, control, parameter, length = _HEAD.unpack_from(self._begun)
+        self._partial += data
+        while len(self._partial) >= HEAD:
+            prologue, kind, control, parameter, length = _HEAD.unpack_from(self._partial)
             if prologue != b"HS" or length > self._limit:
                 why = "no head of HiSLIP" if prologue != b"HS" else f"a payload of {length} bytes"
-                found.append(Damaged(bytes(self._begun[:60]), why))
-                self._begun.clear()
-                self._lost = True
+                found.append(Damaged(bytes(self._partial[:60]), why))
+                self._partial.clear()
+                self._failed = True
                 return found
-            if len(self._begun) < HEAD + length:
+            if len(self._partial) < HEAD + length:
                 return found
-            found.append(Message(kind, control, parameter, bytes(self._begun[HEAD : HEAD + length])))
-            del self._begun[: HEAD + length]
+            found.append(Message(kind, control, parameter, bytes(self._partial[HEAD : HEAD + length])))
+            del self._partial[: HEAD + length]
         return found

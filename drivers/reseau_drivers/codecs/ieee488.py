@@ -15,14 +15,14 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError
 
-from .stream import shown
+from .stream import excerpt
 
 __all__ = [
     "LARGEST",
     "Header",
     "block",
     "error_entry",
-    "missing_of",
+    "missing_bytes",
     "parse_block",
     "picture",
     "split_message",
@@ -53,10 +53,10 @@ def _block_span(data: bytes) -> tuple[int, int] | None:
     if head is None:
         if len(data) < 2 and data in (b"", b"#"):
             return None
-        raise ProtocolError(f"no block: {shown(data)}")
+        raise ProtocolError(f"no block: {excerpt(data)}")
     digits = data[2 : 2 + int(head[1])]
     if digits and not digits.isdigit():
-        raise ProtocolError(f"no block: {shown(data)}")
+        raise ProtocolError(f"no block: {excerpt(data)}")
     if len(digits) < int(head[1]):
         return None
     start, length = 2 + len(digits), int(digits)
@@ -78,7 +78,7 @@ def _png_end(data: bytes) -> int | None:
     return None
 
 
-def missing_of(data: bytes) -> int | None:
+def missing_bytes(data: bytes) -> int | None:
     r"""How many bytes a binary answer lacks that begins with these: 0 when it is whole.
 
     Parameters
@@ -98,7 +98,7 @@ def missing_of(data: bytes) -> int | None:
 
     Examples
     --------
-    >>> missing_of(b"#15ab"), missing_of(b"#15abcde\n"), missing_of(b"#1")
+    >>> missing_bytes(b"#15ab"), missing_bytes(b"#15abcde\n"), missing_bytes(b"#1")
     (3, 0, None)
     """
     end: int | None
@@ -109,14 +109,14 @@ def missing_of(data: bytes) -> int | None:
         end = None if span is None else span[1]
     elif data[:1] == _PNG[:1]:
         if not _PNG.startswith(data[:8]):
-            raise ProtocolError(f"neither block nor picture: {shown(data)}")
+            raise ProtocolError(f"neither block nor picture: {excerpt(data)}")
         end = _png_end(data) if len(data) >= 8 else None
     elif data[:2] in (b"B", b"BM"):
         end = int.from_bytes(data[2:6], "little") if len(data) >= 6 else None
         if end is not None and not 54 <= end <= LARGEST:
             raise ProtocolError(f"a BMP of {end} bytes")
     else:
-        raise ProtocolError(f"neither block nor picture: {shown(data)}")
+        raise ProtocolError(f"neither block nor picture: {excerpt(data)}")
     return None if end is None else max(0, end - len(data))
 
 
@@ -130,7 +130,7 @@ def parse_block(data: bytes) -> bytes:
     """
     span = _block_span(data)
     if span is None or len(data) < span[1]:
-        raise ProtocolError(f"a block that is not complete: {shown(data)}")
+        raise ProtocolError(f"a block that is not complete: {excerpt(data)}")
     return data[span[0] : span[1]]
 
 
@@ -144,8 +144,8 @@ def picture(data: bytes) -> bytes:
     """
     inner = parse_block(data) if data[:1] == b"#" else data
     if inner[:8] != _PNG and inner[:2] != b"BM":
-        raise ProtocolError(f"no picture: {shown(data)}")
-    lacking = missing_of(inner)
+        raise ProtocolError(f"no picture: {excerpt(data)}")
+    lacking = missing_bytes(inner)
     if lacking != 0:
         raise ProtocolError(f"a picture that is not complete ({len(inner)} bytes)")
     end = _png_end(inner) if inner[:8] == _PNG else int.from_bytes(inner[2:6], "little")
@@ -216,5 +216,5 @@ def error_entry(answer: str) -> tuple[int, str]:
     """
     found = re.fullmatch(r"\s*([+-]?\d{1,6})\s*(?:,\s*\"?(.*?)\"?)?\s*", answer)
     if found is None:
-        raise ProtocolError(f"no entry of an error queue: {shown(answer.encode())}")
+        raise ProtocolError(f"no entry of an error queue: {excerpt(answer.encode())}")
     return int(found[1]), found[2] or ""

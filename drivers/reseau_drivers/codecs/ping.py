@@ -103,12 +103,12 @@ class FrameDecoder:
 
     def reset(self) -> None:
         """Forget the frame that was begun."""
-        self._begun = bytearray()
+        self._partial = bytearray()
 
     def feed(self, data: bytes) -> list[Frame | Damaged]:
         """Frames that are complete with these bytes."""
         found: list[Frame | Damaged] = []
-        begun = self._begun
+        begun = self._partial
         begun += data
         while True:
             self._skip_to_start(found)
@@ -129,19 +129,19 @@ class FrameDecoder:
             del begun[: end + 2]
 
     def _skip_to_start(self, found: list[Frame | Damaged]) -> None:
-        start = self._begun.find(b"BR")
+        start = self._partial.find(b"BR")
         if start < 0:
-            start = len(self._begun) - (self._begun[-1:] == b"B")
+            start = len(self._partial) - (self._partial[-1:] == b"B")
         if start > 0:
             if not found or not isinstance(found[-1], Damaged):
-                found.append(Damaged(bytes(self._begun[: min(start, 60)]), f"{start} bytes between frames"))
-            del self._begun[:start]
+                found.append(Damaged(bytes(self._partial[: min(start, 60)]), f"{start} bytes between frames"))
+            del self._partial[:start]
 
     def _give_up(self, found: list[Frame | Damaged], why: str) -> None:
         # One report for what is damaged in one go: garbage can look like thousands of frames.
         if not found or not isinstance(found[-1], Damaged):
-            found.append(Damaged(bytes(self._begun[:60]), why))
-        del self._begun[:2]
+            found.append(Damaged(bytes(self._partial[:60]), why))
+        del self._partial[:2]
 
 
 def _unpacked(layout: struct.Struct, payload: bytes, what: str) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError
 
-from .stream import Damaged, shown
+from .stream import Damaged, excerpt
 
 __all__ = [
     "ACCEPTED",
@@ -89,7 +89,7 @@ class Unpacker:
 
     def _take(self, count: int) -> bytes:
         if len(self._data) - self._at < count:
-            raise ProtocolError(f"XDR ends too early: {shown(self._data)}")
+            raise ProtocolError(f"XDR ends too early: {excerpt(self._data)}")
         self._at += count
         return self._data[self._at - count : self._at]
 
@@ -114,26 +114,26 @@ class RecordDecoder:
 
     def reset(self) -> None:
         """Forget the record that was begun."""
-        self._begun, self._record, self._lost = bytearray(), bytearray(), False
+        self._partial, self._record, self._failed = bytearray(), bytearray(), False
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
         """Records that are complete with these bytes."""
-        if self._lost:
+        if self._failed:
             return []
         found: list[bytes | Damaged] = []
-        self._begun += data
-        while len(self._begun) >= 4:
-            head = int.from_bytes(self._begun[:4], "big")
+        self._partial += data
+        while len(self._partial) >= 4:
+            head = int.from_bytes(self._partial[:4], "big")
             length = head & ~_LAST
             if length + len(self._record) > self._limit:
-                found.append(Damaged(bytes(self._begun[:60]), f"a record of more than {self._limit} bytes"))
-                self._begun.clear()
-                self._lost = True
+                found.append(Damaged(bytes(self._partial[:60]), f"a record of more than {self._limit} bytes"))
+                self._partial.clear()
+                self._failed = True
                 return found
-            if len(self._begun) < 4 + length:
+            if len(self._partial) < 4 + length:
                 return found
-            self._record += self._begun[4 : 4 + length]
-            del self._begun[: 4 + length]
+            self._record += self._partial[4 : 4 + length]
+            del self._partial[: 4 + length]
             if head & _LAST:
                 found.append(bytes(self._record))
                 self._record.clear()
@@ -168,7 +168,7 @@ def decode_call(data: bytes) -> Call:
     found = Unpacker(data)
     xid, kind, version = found.number(), found.number(), found.number()
     if kind != 0 or version != 2:
-        raise ProtocolError(f"no RPC call: {shown(data)}")
+        raise ProtocolError(f"no RPC call: {excerpt(data)}")
     program, its_version, procedure = found.number(), found.number(), found.number()
     for _ in ("credentials", "verifier"):
         found.number()
@@ -192,7 +192,7 @@ def decode_reply(data: bytes) -> tuple[int, int, bytes]:
     found = Unpacker(data)
     xid, kind, state = found.number(), found.number(), found.number()
     if kind != 1 or state != ACCEPTED:
-        raise ProtocolError(f"no RPC reply to an accepted call: {shown(data)}")
+        raise ProtocolError(f"no RPC reply to an accepted call: {excerpt(data)}")
     found.number()
     found.opaque(400)
     return xid, found.number(), found.rest()

@@ -14,7 +14,7 @@ from enum import Enum
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from .stream import shown
+from .stream import excerpt
 
 __all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
 
@@ -137,7 +137,7 @@ class Status:
         return phase(self.state)
 
     @property
-    def complaints(self) -> tuple[str, ...]:
+    def error_texts(self) -> tuple[str, ...]:
         """What is wrong, in words."""
         return tuple(text for bit, text in BITS.items() if self.errors & bit)
 
@@ -171,7 +171,7 @@ def decode(line: bytes) -> Line:
     """
     found = _LINE.fullmatch(line.strip(b"\r\n"))
     if found is None or not 1 <= int(found[1]) <= 31:
-        raise ProtocolError(f"no line of an SMC100: {shown(line)}")
+        raise ProtocolError(f"no line of an SMC100: {excerpt(line)}")
     return Line(int(found[1]), found[2].decode(), found[3].decode())
 
 
@@ -185,7 +185,7 @@ def decode_status(value: str) -> Status:
 
     Examples
     --------
-    >>> decode_status("002028").complaints
+    >>> decode_status("002028").error_texts
     ('following error',)
     """
     if re.fullmatch(r"[0-9A-Fa-f]{6}", value) is None:

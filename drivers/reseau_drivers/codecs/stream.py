@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["Damaged", "Decoder", "LineDecoder", "shown"]
+__all__ = ["Damaged", "Decoder", "LineDecoder", "excerpt"]
 
 T = TypeVar("T")
 
@@ -29,7 +29,7 @@ class Damaged:
     why: str
 
     def __str__(self) -> str:
-        return f"{self.why}: {shown(self.data)}"
+        return f"{self.why}: {excerpt(self.data)}"
 
 
 class Decoder(Protocol, Generic[T]):
@@ -42,12 +42,12 @@ class Decoder(Protocol, Generic[T]):
         """Forget what was begun: the connection is a new one."""
 
 
-def shown(data: bytes) -> str:
+def excerpt(data: bytes) -> str:
     r"""Bytes as one can read them, not too many.
 
     Examples
     --------
-    >>> shown(b"1TS\x00\r\n")
+    >>> excerpt(b"1TS\x00\r\n")
     "b'1TS\\x00\\r\\n'"
     """
     return repr(data[:_SHOWN]) + (f" … ({len(data)} bytes)" if len(data) > _SHOWN else "")
@@ -78,7 +78,7 @@ class LineDecoder:
 
     def reset(self) -> None:
         """Forget the line that was begun."""
-        self._begun = bytearray()
+        self._partial = bytearray()
         self._skipping = False
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
@@ -86,9 +86,9 @@ class LineDecoder:
         found: list[bytes | Damaged] = []
         *ended, rest = data.split(self._end)
         for piece in ended:
-            line = bytes(self._begun) + piece
+            line = bytes(self._partial) + piece
             skipped, self._skipping = self._skipping, False
-            self._begun.clear()
+            self._partial.clear()
             stripped = line.strip(b"\r\n")
             if skipped:
                 continue
@@ -97,9 +97,9 @@ class LineDecoder:
             elif stripped:
                 found.append(stripped)
         if not self._skipping:
-            self._begun += rest
-            if len(self._begun) > self._limit + 1:
-                found.append(Damaged(bytes(self._begun[:_SHOWN]), f"longer than {self._limit} bytes"))
-                self._begun.clear()
+            self._partial += rest
+            if len(self._partial) > self._limit + 1:
+                found.append(Damaged(bytes(self._partial[:_SHOWN]), f"longer than {self._limit} bytes"))
+                self._partial.clear()
                 self._skipping = True
         return found

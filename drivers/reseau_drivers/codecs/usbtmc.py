@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError
 
-from .stream import shown
+from .stream import excerpt
 
 __all__ = ["END", "HEAD", "OUT", "REQUEST_IN", "Transfer", "decode", "encode_in"]
 
@@ -62,10 +62,10 @@ def decode(packet: bytes) -> Transfer:
     b'*IDN?\\n'
     """
     if len(packet) < HEAD:
-        raise ProtocolError(f"no USBTMC transfer: {shown(packet)}")
+        raise ProtocolError(f"no USBTMC transfer: {excerpt(packet)}")
     kind, tag, complement, _, size, attributes = _HEAD.unpack_from(packet)
     if tag == 0 or tag ^ complement != 0xFF or kind not in (OUT, REQUEST_IN):
-        raise ProtocolError(f"no USBTMC transfer: {shown(packet)}")
+        raise ProtocolError(f"no USBTMC transfer: {excerpt(packet)}")
     if kind == REQUEST_IN:
         return Transfer(kind, tag, size, False)
     # The padding to four bytes may be missing, as some hosts leave it out; data may not.

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from .stream import Damaged, LineDecoder, shown
+from .stream import Damaged, LineDecoder, excerpt
 
 __all__ = [
     "FAULTS",
@@ -151,7 +151,7 @@ def _content(line: bytes) -> bytes:
     """What stands between the lead and the checksum, when that is right; a message may have none."""
     content, colon, check = line[1:].partition(b":")
     if colon and check.upper() != lrc(content):
-        raise ProtocolError(f"a message with a wrong checksum: {shown(line)}")
+        raise ProtocolError(f"a message with a wrong checksum: {excerpt(line)}")
     return content
 
 
@@ -182,7 +182,7 @@ def decode(line: bytes) -> Message:
     if lead == b"!" and (found := _ALERT.fullmatch(content)):
         device, axis, busy, flag, data = found.groups()
         return Alert(int(device), int(axis), busy == b"BUSY", flag.decode(), (data or b"").decode())
-    raise ProtocolError(f"no message of a Zaber device: {shown(line)}")
+    raise ProtocolError(f"no message of a Zaber device: {excerpt(line)}")
 
 
 def decode_command(line: bytes) -> Command:
@@ -195,16 +195,16 @@ def decode_command(line: bytes) -> Command:
     """
     start = line.rfind(b"/")
     if start < 0:
-        raise ProtocolError(f"no command: {shown(line)}")
+        raise ProtocolError(f"no command: {excerpt(line)}")
     content = _content(line[start:])
     if not content.isascii():
-        raise ProtocolError(f"no command: {shown(line)}")
+        raise ProtocolError(f"no command: {excerpt(line)}")
     words, numbers = content.decode("ascii").split(), list[int]()
     while words and len(numbers) < 3 and words[0].isdigit():
         numbers.append(int(words.pop(0)))
     device, axis, id_ = (numbers[k] if k < len(numbers) else None for k in range(3))
     if max(device or 0, id_ or 0) > 99 or (axis or 0) > 9:
-        raise ProtocolError(f"no command: {shown(line)}")
+        raise ProtocolError(f"no command: {excerpt(line)}")
     return Command(device or 0, axis or 0, " ".join(words), id_)
 
 

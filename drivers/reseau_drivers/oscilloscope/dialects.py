@@ -22,7 +22,7 @@ from reseau.core.errors import ProtocolError
 __all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of", "fields_of", "samples_of"]
 
 Numbers = dict[str, float]
-Step = tuple[Literal["tell", "ask", "fetch"], str]
+Step = tuple[Literal["send", "query", "fetch"], str]
 """``tell`` sends a command; ``ask`` waits for a line, and lets it be; ``fetch`` takes a picture or block."""
 
 
@@ -184,7 +184,7 @@ DIALECTS: tuple[Dialect, ...] = (
     Dialect(
         "Keysight InfiniiVision X",
         r"(KEYSIGHT|AGILENT).*,(DSO|MSO|EDU|DSOX|MSOX|MXR)?.*",
-        (("tell", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
+        (("send", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
         _KEYSIGHT,
     ),
     Dialect(
@@ -210,10 +210,10 @@ DIALECTS: tuple[Dialect, ...] = (
         "Tektronix with a file system",
         r"TEKTRONIX,(MSO|DPO|LPD)(2[24]|4[46]|5[468]|58LP|6[468])B?\b.*",
         (
-            ("tell", 'SAVe:IMAGe "C:/Temp/reseau.png"'),
-            ("ask", "*OPC?"),
+            ("send", 'SAVe:IMAGe "C:/Temp/reseau.png"'),
+            ("query", "*OPC?"),
             ("fetch", 'FILESystem:READFile "C:/Temp/reseau.png"'),
-            ("tell", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
+            ("send", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
         ),
         _TEKTRONIX,
         setup=("HEADer OFF",),
@@ -224,8 +224,8 @@ DIALECTS: tuple[Dialect, ...] = (
         "Tektronix",
         r"TEKTRONIX.*",
         (
-            ("tell", "SAVe:IMAGe:FILEFormat PNG"),
-            ("tell", "HARDCopy:INKSaver OFF"),
+            ("send", "SAVe:IMAGe:FILEFormat PNG"),
+            ("send", "HARDCopy:INKSaver OFF"),
             ("fetch", "HARDCopy STARt"),
         ),
         _TEKTRONIX,
@@ -237,27 +237,27 @@ DIALECTS: tuple[Dialect, ...] = (
         "Rohde & Schwarz with a file system",
         r"ROHDE&SCHWARZ,(RTO|RTE|RTP|MXO).*",
         (
-            ("tell", "HCOPy:DEVice1:LANGuage PNG"),
-            ("tell", "MMEMory:NAME 'C:\\reseau.png'"),
-            ("tell", "HCOPy:IMMediate1"),
-            ("ask", "*OPC?"),
+            ("send", "HCOPy:DEVice1:LANGuage PNG"),
+            ("send", "MMEMory:NAME 'C:\\reseau.png'"),
+            ("send", "HCOPy:IMMediate1"),
+            ("query", "*OPC?"),
             ("fetch", "MMEMory:DATA? 'C:\\reseau.png'"),
-            ("tell", "MMEMory:DELete 'C:\\reseau.png'"),
+            ("send", "MMEMory:DELete 'C:\\reseau.png'"),
         ),
         _ROHDE,
     ),
     Dialect(
         "Rohde & Schwarz",
         r"(ROHDE&SCHWARZ|HAMEG).*",
-        (("tell", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
+        (("send", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
         _ROHDE,
     ),
     Dialect(
         "LeCroy",
         r"LECROY.*",
         (
-            ("tell", "CHDR OFF"),
-            ("tell", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"),
+            ("send", "CHDR OFF"),
+            ("send", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"),
             ("fetch", "SCDP"),
         ),
         halt="STOP",

@@ -12,8 +12,8 @@ from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline, Device, Identity, Limits, ScreenPicture, Settings, Waveform, quantity
 from reseau.instruments.values import now
 
-from ..codecs.ieee488 import LARGEST, error_entry, missing_of, parse_block, picture
-from ..codecs.stream import shown
+from ..codecs.ieee488 import LARGEST, error_entry, missing_bytes, parse_block, picture
+from ..codecs.stream import excerpt
 from ..link import Link
 from .dialects import Dialect, WaveformDialect, dialect_of, fields_of, samples_of
 
@@ -59,8 +59,8 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         limits: Limits | None = None,
     ) -> None:
         super().__init__(name, settings or OscilloscopeSettings(), seconds=seconds, limits=limits)
-        self._link, self._given, self._dialect = link, dialect, dialect
-        self._idn, self._heard, self._asked = "", bytearray(), False
+        self._link, self._forced_dialect, self._dialect = link, dialect, dialect
+        self._idn, self._received, self._answer_pending = "", bytearray(), False
 
     @property
     def dialect(self) -> Dialect | None:
@@ -69,32 +69,32 @@ class Oscilloscope(Device[OscilloscopeSettings]):
 
     def _open(self, deadline: Deadline) -> None:
         self._link.open(deadline)
-        self._heard.clear()
-        self._tell("*CLS", deadline)
-        self._idn = self._ask("*IDN?", deadline)
+        self._received.clear()
+        self._send("*CLS", deadline)
+        self._idn = self._query("*IDN?", deadline)
         if self._idn.count(",") < 2:
             raise ProtocolError(f"{self._idn!r} is no answer to *IDN?")
-        self._dialect = self._given or dialect_of(self._idn)
+        self._dialect = self._forced_dialect or dialect_of(self._idn)
 
-    def _shut(self) -> None:
+    def _disconnect(self) -> None:
         self._link.close()
 
     def _push(self, settings: OscilloscopeSettings, deadline: Deadline) -> None:
-        for command in self._spoken.setup:
-            self._tell(command, deadline)
+        for command in self._required_dialect.setup:
+            self._send(command, deadline)
 
     def _identify(self, deadline: Deadline) -> Identity:
         maker, model, *rest = [part.strip() for part in self._idn.split(",", 3)]
         return Identity(maker, model, *rest)
 
     def _halt(self, deadline: Deadline) -> None:
-        self._tell(self._spoken.halt, deadline)
+        self._send(self._required_dialect.halt, deadline)
 
     def _acquire(self) -> dict[str, Any]:
         picture_ = self.screen()
         return {f"{self.name}_screen": picture_.frame(self.name).pixels}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         reading = self._reading.get(f"{self.name}_screen")
         shape = list(np.shape(reading["value"])) if reading else [0, 0]
         return {f"{self.name}_screen": {"dtype": "array", "shape": shape}}
@@ -106,10 +106,10 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         return staged
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        found = {"dialect": self._spoken.name}
-        if self._spoken.errors:
-            with self._exchange("check", deadline.rest) as time:
-                number, text = error_entry(self._ask(self._spoken.errors, time))
+        found = {"dialect": self._required_dialect.name}
+        if self._required_dialect.errors:
+            with self._exchange("check", deadline.left_or_minimum) as time:
+                number, text = error_entry(self._query(self._required_dialect.errors, time))
                 found["error"] = f"{number} {text}".strip() if number else "none"
         return found
 
@@ -123,11 +123,11 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         """
         with self._exchange("screen", seconds) as deadline:
             asked, data = now(), b""
-            for how, text in self._spoken.screen:
-                if how == "tell":
-                    self._tell(text, deadline)
-                elif how == "ask":
-                    self._ask(text, deadline)
+            for how, text in self._required_dialect.screen:
+                if how == "send":
+                    self._send(text, deadline)
+                elif how == "query":
+                    self._query(text, deadline)
                 else:
                     data = picture(self._fetch(text, deadline))
             _verify_png(data)
@@ -145,15 +145,15 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         """
         self._settings.changed({"channel": channel}, self._limits)
         with self._exchange(f"waveform of channel {channel}", seconds) as deadline:
-            dialect = self._spoken.waveform
+            dialect = self._required_dialect.waveform
             if dialect is None:
-                raise RefusedError(f"waveforms of {self._spoken.name} are not known")
+                raise RefusedError(f"waveforms of {self._required_dialect.name} are not known")
             asked = now()
             for command in dialect.setup:
-                self._tell(command.format(n=channel), deadline)
+                self._send(command.format(n=channel), deadline)
             numbers: dict[str, float] = {}
             for names, question in dialect.scale.items():
-                numbers |= _numbers(names, self._ask(question.format(n=channel), deadline))
+                numbers |= _numbers(names, self._query(question.format(n=channel), deadline))
             if dialect.preamble:
                 numbers |= fields_of(parse_block(self._fetch(dialect.preamble, deadline)), dialect)
             data = self._samples(dialect, numbers, channel, deadline)
@@ -170,7 +170,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         """The samples of a waveform, in as many blocks as they come in."""
         said, dtype = dialect.sampled(numbers)
         if said:
-            self._tell(said, deadline)
+            self._send(said, deadline)
         question = dialect.data.format(n=channel)
         if not dialect.piece:
             return parse_block(self._fetch(question, deadline))
@@ -179,7 +179,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         if not 0 < wanted <= LARGEST:
             raise ProtocolError(f"announces {numbers['points']:g} samples")
         while len(data) < wanted:
-            self._tell(dialect.piece.format(at=len(data) // size), deadline)
+            self._send(dialect.piece.format(at=len(data) // size), deadline)
             piece = parse_block(self._fetch(question, deadline))
             if not piece:
                 break
@@ -190,67 +190,67 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         """What its error queue holds; taken out of it."""
         found: list[str] = []
         with self._exchange("errors", seconds) as deadline:
-            while self._spoken.errors and len(found) < 100:
-                number, text = error_entry(self._ask(self._spoken.errors, deadline))
+            while self._required_dialect.errors and len(found) < 100:
+                number, text = error_entry(self._query(self._required_dialect.errors, deadline))
                 if number == 0:
                     break
                 found.append(f"{number} {text}")
         return found
 
     @property
-    def _spoken(self) -> Dialect:
+    def _required_dialect(self) -> Dialect:
         if self._dialect is None:
             raise ProtocolError("has not said who it is")
         return self._dialect
 
-    def _tell(self, text: str, deadline: Deadline) -> None:
+    def _send(self, text: str, deadline: Deadline) -> None:
         # What is still there of the last answer is none to what follows, and would be an interrupted one.
-        while self._asked and self._link.pending() and not deadline.over:
+        while self._answer_pending and self._link.pending() and not deadline.expired:
             self._link.read(deadline)
-        self._asked = False
+        self._answer_pending = False
         self._link.write(text.encode("ascii") + b"\n", deadline)
 
-    def _question(self, text: str, deadline: Deadline) -> None:
-        self._heard.clear()
-        self._tell(text, deadline)
-        self._asked = True
+    def _start_query(self, text: str, deadline: Deadline) -> None:
+        self._received.clear()
+        self._send(text, deadline)
+        self._answer_pending = True
 
-    def _ask(self, text: str, deadline: Deadline) -> str:
-        self._question(text, deadline)
+    def _query(self, text: str, deadline: Deadline) -> str:
+        self._start_query(text, deadline)
         while True:
-            line, newline, _ = self._heard.lstrip(b"\r\n").partition(b"\n")
+            line, newline, _ = self._received.lstrip(b"\r\n").partition(b"\n")
             if newline:
                 return line.strip().decode("latin-1")
-            if len(self._heard) > _LONGEST_LINE:
-                raise ProtocolError(f"{text} is answered without end: {shown(bytes(self._heard))}")
-            self._more(deadline, text)
+            if len(self._received) > _LONGEST_LINE:
+                raise ProtocolError(f"{text} is answered without end: {excerpt(bytes(self._received))}")
+            self._receive(deadline, text)
 
     def _fetch(self, text: str, deadline: Deadline) -> bytes:
-        self._question(text, deadline)
+        self._start_query(text, deadline)
         lacking: int | None = None
         while True:
             # Asked again only when as much has come as was missing: a picture is large.
-            if self._heard and not lacking:
-                start = _start_of_binary(self._heard)
-                lacking = missing_of(bytes(self._heard[start:]))
+            if self._received and not lacking:
+                start = _start_of_binary(self._received)
+                lacking = missing_bytes(bytes(self._received[start:]))
                 if lacking == 0:
-                    return bytes(self._heard[start:])
-            before = len(self._heard)
-            self._more(deadline, text)
+                    return bytes(self._received[start:])
+            before = len(self._received)
+            self._receive(deadline, text)
             if lacking:
-                lacking = max(0, lacking - (len(self._heard) - before))
-            if len(self._heard) > LARGEST:
+                lacking = max(0, lacking - (len(self._received) - before))
+            if len(self._received) > LARGEST:
                 raise ProtocolError(f"{text} is answered without end")
 
-    def _more(self, deadline: Deadline, text: str) -> None:
-        if deadline.over:
-            if self._heard:
-                raise ProtocolError(f"the answer to {text} broke off after {len(self._heard)} bytes")
+    def _receive(self, deadline: Deadline, text: str) -> None:
+        if deadline.expired:
+            if self._received:
+                raise ProtocolError(f"the answer to {text} broke off after {len(self._received)} bytes")
             raise DeadlineError(
                 f"{text} was not answered within {deadline.seconds:g} s",
                 do="is it busy, or its screen locked?",
             )
-        self._heard += self._link.read(deadline)
+        self._received += self._link.read(deadline)
 
 
 def _start_of_binary(data: bytearray) -> int:

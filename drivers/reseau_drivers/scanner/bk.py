@@ -18,8 +18,8 @@ from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settin
 from reseau.instruments.values import now
 
 from ..codecs import bk
-from ..codecs.stream import shown
-from ..link import Conversation, Link
+from ..codecs.stream import excerpt
+from ..link import Link, MessageLink
 
 __all__ = ["BkScanner", "BkSettings"]
 
@@ -70,14 +70,14 @@ class BkScanner(Device[BkSettings]):
             raise SettingError(f"box is one of {', '.join(_BOXES)}", where=name)
         super().__init__(name, settings or BkSettings(), seconds=seconds, limits=limits)
         self._box = box
-        self._talk: Conversation[bytes] = Conversation(link, bk.MessageDecoder())
+        self._link: MessageLink[bytes] = MessageLink(link, bk.MessageDecoder())
 
     def _open(self, deadline: Deadline) -> None:
-        self._talk.open(deadline)
+        self._link.open(deadline)
         self._quiet(deadline)
 
-    def _shut(self) -> None:
-        self._talk.close()
+    def _disconnect(self) -> None:
+        self._link.close()
 
     def _push(self, settings: BkSettings, deadline: Deadline) -> None:
         """Nothing to send: the interface reads."""
@@ -94,7 +94,7 @@ class BkScanner(Device[BkSettings]):
         mm = scan.mm_per_px or (float("nan"), float("nan"))
         return {f"{self.name}_section": scan.pixels, f"{self.name}_mm_per_px": list(mm)}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         with self._exchange("window") as deadline:
             width, height = self._window(deadline)
         return {
@@ -103,7 +103,7 @@ class BkScanner(Device[BkSettings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        scan = self.scan(deadline.rest)
+        scan = self.scan(deadline.left_or_minimum)
         height, width = scan.pixels.shape
         mm = "of unknown size" if scan.mm_per_px is None else "of {:g} × {:g} mm".format(*scan.mm_per_px)
         return {"frame": f"{width}×{height} px {mm}"}
@@ -121,7 +121,7 @@ class BkScanner(Device[BkSettings]):
             width, height = self._window(deadline)
             mm, origin = self._geometry(width, height, deadline)
             gain = self._numbers("B_GAIN:A", 1, deadline)[0]
-            grabbed = bk.parse_frame(self._ask(_ON, b"DATA:GRAB_FRAME ", deadline), width * height)
+            grabbed = bk.parse_frame(self._query(_ON, b"DATA:GRAB_FRAME ", deadline), width * height)
             if self._quiet(deadline) != (width, height):
                 raise ProtocolError("changed its window while a frame was taken", do="take it again")
             pixels = np.frombuffer(grabbed.pixels, np.uint8).reshape(height, width)
@@ -131,7 +131,7 @@ class BkScanner(Device[BkSettings]):
     def _quiet(self, deadline: Deadline) -> tuple[int, int]:
         """Let no more frames come; the window, whose answer comes behind the last of them."""
         # Some instruments acknowledge this, others do not: nothing may depend on it.
-        self._talk.tell(bk.encode(_OFF), deadline)
+        self._link.send(bk.encode(_OFF), deadline)
         return self._window(deadline)
 
     def _window(self, deadline: Deadline) -> tuple[int, int]:
@@ -153,14 +153,14 @@ class BkScanner(Device[BkSettings]):
 
     def _numbers(self, name: str, count: int, deadline: Deadline) -> tuple[float, ...]:
         """Numbers that the scanner tells under a name."""
-        answer = self._ask(f"QUERY:{name};".encode(), f"DATA:{name} ".encode(), deadline)
+        answer = self._query(f"QUERY:{name};".encode(), f"DATA:{name} ".encode(), deadline)
         found = bk.numbers(answer, name)
         if len(found) != count or not np.isfinite(found).all():
             raise ProtocolError(f"states {found} for {name}")
         return found
 
-    def _ask(self, question: bytes, head: bytes, deadline: Deadline) -> bytes:
-        answer = self._talk.ask(bk.encode(question), lambda got: got.startswith((head, b"ERROR")), deadline)
+    def _query(self, question: bytes, head: bytes, deadline: Deadline) -> bytes:
+        answer = self._link.query(bk.encode(question), lambda got: got.startswith((head, b"ERROR")), deadline)
         if answer.startswith(b"ERROR"):
-            raise RefusedError(f"refused: {shown(answer)}", command=question.decode())
+            raise RefusedError(f"refused: {excerpt(answer)}", command=question.decode())
         return answer

@@ -8,12 +8,15 @@ pulse lies at c·t/2. A table that carries the transducer along makes sections o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from reseau.core.data import Array
-from reseau.core.errors import DeadlineError, SettingError, StateError
+from reseau.core.errors import DeadlineError, ProtocolError, SettingError, StateError
 from reseau.instruments import (
     BScan,
     Deadline,
@@ -31,8 +34,7 @@ from reseau.instruments.values import now
 
 from ..codecs.compactpulser import LIMIT, Setting, decode, encode
 from ..codecs.stream import LineDecoder
-from ..link import Conversation, Link
-from .section import section
+from ..link import Link, MessageLink
 
 __all__ = ["CompactPulser", "CompactPulserSettings"]
 
@@ -97,10 +99,10 @@ class CompactPulser(Device[CompactPulserSettings]):
         limits: Limits | None = None,
     ) -> None:
         super().__init__(name, settings or CompactPulserSettings(), seconds=seconds, limits=limits)
-        self._talk: Conversation[bytes] = Conversation(link, LineDecoder(end=b"\r", limit=LIMIT))
+        self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(end=b"\r", limit=LIMIT))
         self._digitiser, self._carrier, self._axis = digitiser, carrier, axis
         self._answer_s = answer_s
-        self._told, self._scanning = "G", False
+        self._readable, self._scanning = "G", False
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
         """Find what was named among the instruments of the bench.
@@ -124,14 +126,14 @@ class CompactPulser(Device[CompactPulserSettings]):
             self._carrier = table
 
     def _open(self, deadline: Deadline) -> None:
-        self._talk.open(deadline)
+        self._link.open(deadline)
         # Ends what may have been begun on the line. The first answer only shows that somebody is there.
-        self._talk.tell(b"\r", deadline)
+        self._link.send(b"\r", deadline)
         self._value("G", deadline)
-        self._told = "".join(_letters(self.settings)) if self._tells("W", deadline) else "G"
+        self._readable = "".join(_letters(self.settings)) if self._answers("W", deadline) else "G"
 
-    def _shut(self) -> None:
-        self._talk.close()
+    def _disconnect(self) -> None:
+        self._link.close()
 
     def _push(self, settings: CompactPulserSettings, deadline: Deadline) -> None:
         wanted = _letters(settings)
@@ -169,8 +171,8 @@ class CompactPulser(Device[CompactPulserSettings]):
             self._verify(_letters(self.settings), deadline)
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        self.verify(deadline.rest)
-        alone = len(self._told) == 1
+        self.verify(deadline.left_or_minimum)
+        alone = len(self._readable) == 1
         return {"settings": "gain as pushed; it tells no other" if alone else "as pushed"}
 
     def _identify(self, deadline: Deadline) -> Identity:
@@ -186,7 +188,7 @@ class CompactPulser(Device[CompactPulserSettings]):
         scan = self.scan()
         return {f"{self.name}_section": scan.pixels, f"{self.name}_mm_per_px": list(scan.mm_per_px or ())}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         if self._carrier is not None:
             return {
                 f"{self.name}_section": {"dtype": "array", "shape": [0, self.settings.lines]},
@@ -232,23 +234,25 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._stopping.clear()
         self._scanning = True
         try:
-            lines = [self._carried(self._carrier, k, deadline) for k in range(s.lines)]
+            lines = [self._line_at(self._carrier, k, deadline) for k in range(s.lines)]
         finally:
             self._scanning = False
-        with self._exchange("scan", deadline.rest):
+        with self._exchange("scan", deadline.left_or_minimum):
             pixels, row, step_s = section(lines, s.full_scale_v)
         mm = (s.step_mm, s.speed_m_s * 1e3 * step_s / 2)
         return BScan(pixels, mm, ((s.lines - 1) / 2, row), s.speed_m_s, float("nan"), s.gain_db, asked)
 
-    def _carried(self, carrier: Turntable, number: int, deadline: Deadline) -> Waveform:
+    def _line_at(self, carrier: Turntable, number: int, deadline: Deadline) -> Waveform:
         """The line of this number of a section."""
         if self._stopping.is_set():
             raise StateError("was stopped", where=self.name, command="scan")
-        if deadline.over:
+        if deadline.expired:
             what = f"was not done within {deadline.seconds:g} s"
             raise DeadlineError(what, where=self.name, command="scan")
-        carrier.move(self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.rest)
-        return self.line(deadline.rest)
+        carrier.move(
+            self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.left_or_minimum
+        )
+        return self.line(deadline.left_or_minimum)
 
     def depths_mm(self, line: Waveform) -> Array:
         """Where the samples of a line lie (n,)."""
@@ -256,17 +260,17 @@ class CompactPulser(Device[CompactPulserSettings]):
         return depths
 
     def _set(self, letter: str, value: int, deadline: Deadline) -> None:
-        self._talk.tell(encode(Setting(letter, value)), deadline)
+        self._link.send(encode(Setting(letter, value)), deadline)
         self._verify({letter: value}, deadline)
 
     def _verify(self, wanted: Mapping[str, int], deadline: Deadline) -> None:
         for letter, value in wanted.items():
-            if letter in self._told and (found := self._value(letter, deadline)) != value:
+            if letter in self._readable and (found := self._value(letter, deadline)) != value:
                 raise StateError(
                     f"has {letter} = {found} and not {value}", do="is it in local mode, or was it off?"
                 )
 
-    def _tells(self, letter: str, deadline: Deadline) -> bool:
+    def _answers(self, letter: str, deadline: Deadline) -> bool:
         """Whether a letter is told; asked twice, as an answer may get lost."""
         for _ in range(2):
             try:
@@ -278,7 +282,7 @@ class CompactPulser(Device[CompactPulserSettings]):
 
     def _value(self, letter: str, deadline: Deadline) -> int | None:
         head = f"{letter}=".encode()
-        line = self._talk.ask(
+        line = self._link.query(
             encode(Setting(letter, None)), lambda line: line.startswith(head), deadline.part(self._answer_s)
         )
         return decode(line)[0].value
@@ -295,3 +299,54 @@ def _letters(s: CompactPulserSettings) -> dict[str, int]:
         "T": s.trigger,
         "P": round(s.repetition_hz / 10),
     }
+
+
+def envelope(volts: Array) -> Array:
+    """Amplitude (n,) of an oscillation: the modulus of its analytic signal, its mean taken off."""
+    count = len(volts)
+    weights = np.zeros(count)
+    weights[0] = 1.0
+    weights[1 : (count + 1) // 2] = 2.0
+    if count % 2 == 0:
+        weights[count // 2] = 1.0
+    amplitude: Array = np.abs(np.fft.ifft(np.fft.fft(volts - volts.mean()) * weights))
+    return amplitude
+
+
+def section(lines: Sequence[Waveform], full_scale_v: float) -> tuple[NDArray[np.uint8], float, float]:
+    """Lines as the columns of a picture.
+
+    Parameters
+    ----------
+    lines : sequence of Waveform
+        Each taken at the next place; time 0 is the pulse.
+    full_scale_v : float
+        Amplitude that is shown as 255.
+
+    Returns
+    -------
+    pixels : ndarray (samples, lines)
+        From the pulse on.
+    row : float
+        Of the pulse: between −1 and 0.
+    step_s : float
+        Time from row to row.
+
+    Raises
+    ------
+    ProtocolError
+        When the lines are not alike, or end before the pulse.
+    """
+    first = lines[0]
+    begin = max(0, int(np.ceil(-first.start_s / first.step_s - 1e-9)))
+    for line in lines:
+        same = len(line.volts) == len(first.volts) and np.allclose(
+            (line.start_s, line.step_s), (first.start_s, first.step_s), rtol=1e-6, atol=1e-12
+        )
+        if not same:
+            raise ProtocolError("its digitiser changed the time base within a section")
+    if len(first.volts) - begin < 2:
+        raise ProtocolError("its digitiser shows nothing behind the pulse", do="move the trigger")
+    amplitudes = np.column_stack([envelope(line.volts)[begin:] for line in lines])
+    pixels = np.clip(np.rint(255 * amplitudes / full_scale_v), 0, 255).astype(np.uint8)
+    return pixels, -(first.start_s / first.step_s + begin), first.step_s

@@ -108,7 +108,7 @@ class DicomFiles(Device[DicomSettings]):
         )
         self._frames = []
         for path in found[:_MOST_FILES]:
-            if deadline.over:
+            if deadline.expired:
                 raise DeadlineError(f"{len(found)} files were not read within {deadline.seconds:g} s")
             try:
                 header = self._header(path)
@@ -121,7 +121,7 @@ class DicomFiles(Device[DicomSettings]):
         if not self._frames:
             raise ProtocolError(f"{self._path} holds no DICOM image")
 
-    def _shut(self) -> None:
+    def _disconnect(self) -> None:
         """Files are opened for each frame alone."""
 
     def _push(self, settings: DicomSettings, deadline: Deadline) -> None:
@@ -143,7 +143,7 @@ class DicomFiles(Device[DicomSettings]):
         mm = scan.mm_per_px or (math.nan, math.nan)
         return {f"{self.name}_section": scan.pixels, f"{self.name}_mm_per_px": list(mm)}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         with self._exchange("describe"):
             header = self._header(self._frames[min(self._next, len(self._frames) - 1)][0])
         return {
@@ -158,7 +158,7 @@ class DicomFiles(Device[DicomSettings]):
         return staged
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        with self._exchange("check", deadline.rest):
+        with self._exchange("check", deadline.left_or_minimum):
             path, index = self._frames[0]
             scale = self._scale(self._header(path))
             self._pixels(path, index)

@@ -19,7 +19,7 @@ from reseau.core.errors import DeadlineError, ProtocolError, RefusedError, State
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 
 from ..codecs import ping
-from ..link import Conversation, Link
+from ..link import Link, MessageLink
 
 __all__ = ["Ping360", "Ping360Settings"]
 
@@ -90,16 +90,16 @@ class Ping360(Device[Ping360Settings]):
         limits: Limits | None = None,
     ) -> None:
         super().__init__(name, settings or Ping360Settings(), seconds=seconds, limits=limits)
-        self._talk: Conversation[ping.Frame] = Conversation(link, ping.FrameDecoder())
+        self._link: MessageLink[ping.Frame] = MessageLink(link, ping.FrameDecoder())
         self._answer_s = answer_s
 
     def _open(self, deadline: Deadline) -> None:
-        self._talk.open(deadline)
+        self._link.open(deadline)
         # Lines bear no number, but come in order: behind this answer nothing old is left.
         self._request(ping.DEVICE_INFORMATION, deadline)
 
-    def _shut(self) -> None:
-        self._talk.close()
+    def _disconnect(self) -> None:
+        self._link.close()
 
     def _push(self, settings: Ping360Settings, deadline: Deadline) -> None:
         """Nothing to send: every line brings its settings along."""
@@ -117,7 +117,7 @@ class Ping360(Device[Ping360Settings]):
         scan = self.scan()
         return {f"{self.name}_section": scan.pixels, f"{self.name}_mm_per_px": list(scan.mm_per_px or ())}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         height, width = _raster(self.settings)[1]
         return {
             f"{self.name}_section": {"dtype": "array", "shape": [height, width]},
@@ -125,7 +125,7 @@ class Ping360(Device[Ping360Settings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        line = self.line(0, deadline.rest)
+        line = self.line(0, deadline.left_or_minimum)
         return {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
 
     def line(self, angle: int, seconds: float | None = None) -> NDArray[np.uint8]:
@@ -168,7 +168,7 @@ class Ping360(Device[Ping360Settings]):
         for angle in s.angles:
             if self._stopping.is_set():
                 raise StateError("was stopped", where=self.name, command="scan")
-            if deadline.over:
+            if deadline.expired:
                 raise DeadlineError(
                     f"was not done within {deadline.seconds:g} s", where=self.name, command="scan"
                 )
@@ -191,7 +191,7 @@ class Ping360(Device[Ping360Settings]):
             return False
 
         try:
-            frame = self._talk.ask(ping.encode(asked.frame()), answers, deadline)
+            frame = self._link.query(ping.encode(asked.frame()), answers, deadline)
         except DeadlineError:
             if not others:
                 raise
@@ -206,7 +206,7 @@ class Ping360(Device[Ping360Settings]):
 
     def _request(self, id_: int, deadline: Deadline) -> ping.Frame:
         asked = ping.Frame(ping.GENERAL_REQUEST, struct.pack("<H", id_))
-        frame = self._talk.ask(
+        frame = self._link.query(
             ping.encode(asked),
             lambda frame: frame.id == id_ or _nacks(frame, id_),
             deadline.part(self._answer_s),
@@ -217,7 +217,7 @@ class Ping360(Device[Ping360Settings]):
 
     def _confirmed(self, frame: ping.Frame, deadline: Deadline) -> None:
         acked = ping.Frame(ping.ACK, struct.pack("<H", frame.id))
-        answer = self._talk.ask(
+        answer = self._link.query(
             ping.encode(frame),
             lambda got: (got.id, got.payload) == (acked.id, acked.payload) or _nacks(got, frame.id),
             deadline.part(self._answer_s),

@@ -12,7 +12,7 @@ from reseau.instruments import AxisState, Deadline, Device, Identity, Limits, Se
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
 _POLL_S, _HALT_S = 0.02, 1.0
-_PATIENCE = 3
+_ATTEMPTS = 3
 """Bad answers in a row that are asked for again while an axis moves: it must not be left alone for one."""
 
 
@@ -66,7 +66,7 @@ class AxisPlan:
             raise SettingError("has no axes", where="table", do="name at least one")
         return {name: cls(**plan) for name, plan in axes.items()}
 
-    def checked(self, name: str, position: float) -> float:
+    def require_reachable(self, name: str, position: float) -> float:
         """The position, when it is one that may be moved to.
 
         Raises
@@ -163,7 +163,7 @@ class Axis:
 
     def check_value(self, value: float) -> None:
         """Raise SettingError when it cannot be moved there; for plans that are checked before they run."""
-        self._table.plans[self._key].checked(f"{self._key} of {self._table.name}", value)
+        self._table.plans[self._key].require_reachable(f"{self._key} of {self._table.name}", value)
 
     def read(self) -> dict[str, Any]:
         """Where it stands."""
@@ -220,7 +220,7 @@ class Table(Device[TableSettings]):
     def _open(self, deadline: Deadline) -> None:
         self._controller.open(deadline)
 
-    def _shut(self) -> None:
+    def _disconnect(self) -> None:
         self._controller.close()
 
     def _push(self, settings: TableSettings, deadline: Deadline) -> None:
@@ -237,7 +237,7 @@ class Table(Device[TableSettings]):
     def _acquire(self) -> dict[str, Any]:
         return {f"{self.name}_{key}": self.state(key).position for key in self.plans}
 
-    def _kinds(self) -> dict[str, dict[str, Any]]:
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
         return {
             f"{self.name}_{key}": {"dtype": "number", "shape": [], "units": plan.unit}
             for key, plan in self.plans.items()
@@ -251,7 +251,7 @@ class Table(Device[TableSettings]):
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {}
         for key in self.plans:
-            state = self.state(key, deadline.rest)
+            state = self.state(key, deadline.left_or_minimum)
             found[key] = "; ".join(
                 (
                     f"{state.position:g} {self.plans[key].unit}" if state.homed else "not homed",
@@ -289,7 +289,7 @@ class Table(Device[TableSettings]):
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         with self._exchange(command, deadline.left) as time:
             self._controller.begin_home(plan, time)
-        state = self._arrived(axis, plan, deadline, command)
+        state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
             raise StateError("did not find its reference", where=self.name, command=command)
         with self._exchange(command, max(_POLL_S, deadline.at_most(self._seconds))) as time:
@@ -310,7 +310,7 @@ class Table(Device[TableSettings]):
             When it was not done in time; the axis has been told to stop.
         """
         command, plan = f"move {axis} to {position:g} {self._plan(axis).unit}", self._plan(axis)
-        plan.checked(f"{axis} of {self.name}", position)
+        plan.require_reachable(f"{axis} of {self.name}", position)
         self._stopping.clear()
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         state = self.state(axis, deadline.at_most(self._seconds))
@@ -322,18 +322,18 @@ class Table(Device[TableSettings]):
         for target in (*before, position):
             with self._exchange(command, deadline.at_most(self._seconds)) as time:
                 self._controller.begin_move(plan, target, time)
-            state = self._arrived(axis, plan, deadline, command)
+            state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
             raise StateError("lost its reference", where=self.name, command=command, do=f"home {axis} again")
         if abs(state.position - position) > plan.tolerance:
             raise StateError(f"stands at {state.position:g} {plan.unit}", where=self.name, command=command)
         return state
 
-    def _arrived(self, axis: str, plan: AxisPlan, deadline: Deadline, command: str) -> AxisState:
+    def _wait_until_stopped(self, axis: str, plan: AxisPlan, deadline: Deadline, command: str) -> AxisState:
         """Wait until an axis stands; one that did not make it is told to stop."""
         try:
-            state = self._until(
-                self._patient(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds)))),
+            state = self._wait_until(
+                self._retrying(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds)))),
                 lambda state: not state.moving or bool(state.faults),
                 deadline,
                 _POLL_S,
@@ -348,11 +348,11 @@ class Table(Device[TableSettings]):
             raise StateError("; ".join(state.faults), where=self.name, command=command)
         return state
 
-    def _patient(self, ask: Callable[[], AxisState]) -> Callable[[], AxisState]:
+    def _retrying(self, ask: Callable[[], AxisState]) -> Callable[[], AxisState]:
         """The same question, asked again after an answer that was lost or damaged."""
 
         def asked() -> AxisState:
-            for _ in range(_PATIENCE - 1):
+            for _ in range(_ATTEMPTS - 1):
                 try:
                     return ask()
                 except (DeadlineError, ProtocolError):

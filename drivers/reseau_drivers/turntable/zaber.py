@@ -11,7 +11,7 @@ from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import AxisState, Deadline, Identity
 
 from ..codecs.zaber import FAULTS, Command, Message, MessageDecoder, Reply, encode
-from ..link import Conversation, Link
+from ..link import Link, MessageLink
 from .table import AxisPlan
 
 __all__ = ["Zaber"]
@@ -34,22 +34,22 @@ class Zaber:
 
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
         self._answer_s = answer_s
-        self._talk: Conversation[Message] = Conversation(link, MessageDecoder())
+        self._link: MessageLink[Message] = MessageLink(link, MessageDecoder())
         self._id = 0
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection."""
-        self._talk.open(deadline)
+        self._link.open(deadline)
 
     def close(self) -> None:
         """Close it."""
-        self._talk.close()
+        self._link.close()
 
     def identify(self, plans: Mapping[str, AxisPlan], deadline: Deadline) -> Identity:
         """Device numbers, serial numbers and firmware of all that are needed."""
         found = []
         for device in sorted({plan.device for plan in plans.values()}):
-            said = [self._ask(device, 0, f"get {what}", deadline).data for what in _WHO]
+            said = [self._query(device, 0, f"get {what}", deadline).data for what in _IDENTITY]
             found.append(said)
         models, serials, versions = (", ".join(column) for column in zip(*found, strict=True))
         return Identity("Zaber", models, serials, versions)
@@ -57,31 +57,31 @@ class Zaber:
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
         """Speed of an axis."""
         speed = max(1, round(units_per_s * plan.per_unit * _SPEED))
-        self._ask(plan.device, plan.axis, f"set maxspeed {speed}", deadline)
+        self._query(plan.device, plan.axis, f"set maxspeed {speed}", deadline)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Begin to look for the reference."""
-        self._ask(plan.device, plan.axis, "warnings clear", deadline)
-        self._ask(plan.device, plan.axis, "home", deadline)
+        self._query(plan.device, plan.axis, "warnings clear", deadline)
+        self._query(plan.device, plan.axis, "home", deadline)
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
         """Begin to move."""
         # Warnings stay until they are cleared: what is seen afterwards is of this movement.
-        self._ask(plan.device, plan.axis, "warnings clear", deadline)
-        self._ask(plan.device, plan.axis, f"move abs {round(position * plan.per_unit)}", deadline)
+        self._query(plan.device, plan.axis, "warnings clear", deadline)
+        self._query(plan.device, plan.axis, f"move abs {round(position * plan.per_unit)}", deadline)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop."""
-        self._ask(plan.device, plan.axis, "stop", deadline)
+        self._query(plan.device, plan.axis, "stop", deadline)
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
         """How the axis stands."""
-        reply = self._ask(plan.device, plan.axis, "warnings", deadline)
+        reply = self._query(plan.device, plan.axis, "warnings", deadline)
         count, *flags = reply.data.split()
         if not count.isdigit() or int(count) != len(flags):
             raise ProtocolError(f"{reply.data!r} is no list of warnings")
         # Whether it stands is asked first: a position read before could be one on the way.
-        position = self._ask(plan.device, plan.axis, "get pos", deadline).data
+        position = self._query(plan.device, plan.axis, "get pos", deadline).data
         try:
             steps = float(position)
         except ValueError:
@@ -90,7 +90,7 @@ class Zaber:
         homed = not any(flag in _UNREFERENCED for flag in flags)
         return AxisState(steps / plan.per_unit, reply.busy, homed, faults)
 
-    def _ask(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
+    def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
         """Send a command and wait for its reply, which bears its number."""
         self._id = (self._id + 1) % 100
         sent = Command(device, axis, words, self._id)
@@ -102,7 +102,7 @@ class Zaber:
                 and (message.device, message.axis) == (device, axis)
             )
 
-        reply = self._talk.ask(encode(sent), answers, deadline.part(self._answer_s))
+        reply = self._link.query(encode(sent), answers, deadline.part(self._answer_s))
         if not isinstance(reply, Reply):
             raise ProtocolError("sent no reply")
         if not reply.ok:
@@ -113,4 +113,4 @@ class Zaber:
         return reply
 
 
-_WHO = ("device.id", "system.serial", "version")
+_IDENTITY = ("device.id", "system.serial", "version")

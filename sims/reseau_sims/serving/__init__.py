@@ -1,23 +1,24 @@
-"""Simulators behind the protocols of the real instruments: pseudo-terminals, TCP, UDP, SCPI, VXI-11, HiSLIP.
+"""Simulated instruments behind the protocols of the real ones.
 
-An instrument is a :class:`~reseau_sims.serving.machine.Machine`: bytes in, answers out, a list of what its
-client did wrong. A :class:`~reseau_sims.serving.machine.Wire` spoils answers by a script; a server, or a link
-within the process, carries it to a client. All of them listen on the loopback interface alone.
+Transports are pseudo-terminals, TCP, UDP, VXI-11, HiSLIP, USBTMC, Video4Linux and GigE Vision. An instrument
+is a :class:`~reseau_sims.serving.machine.Machine`: bytes in, answers out, and a list of protocol violations
+of its client. A :class:`~reseau_sims.serving.machine.FaultyConnection` injects faults into the answers; a
+server, or a link within the process, connects it to a client. All servers listen on the loopback interface
+only.
 """
 
 from .bench import SimulatedBench
 from .bk import BkScanner
 from .compactpulser import CompactPulser
-from .datagrams import UdpServer
+from .faults import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, FaultScript, Kind
 from .gige import GigeCamera, aravis_is_installed
-from .imaging import CameraBody, InLaboratory, Lamp, Pattern, Sight, Still, View
-from .machine import Machine, Session, Wire
+from .imaging import LaboratoryScene, LampScene, Scene, SimulatedCamera, StillScene, StripeScene, View
+from .machine import FaultyConnection, Machine, Session
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
 from .ping360 import Ping360
 from .scpi import HislipInstrument, PortmapperSession, Vxi11Session
-from .script import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, Kind, Script
-from .servers import InProcess, PtyServer, Server, TcpServer
+from .servers import InProcess, PtyServer, Server, TcpServer, UdpServer
 from .smc100 import Smc100Line
 from .usbtmc import UsbInstrument, plugged_in
 from .v4l2 import VideoCamera
@@ -29,37 +30,37 @@ __all__ = [
     "KINDS",
     "LINE_KINDS",
     "BkScanner",
-    "CameraBody",
     "CompactPulser",
     "Family",
     "Fault",
+    "FaultScript",
+    "FaultyConnection",
     "GigeCamera",
     "HislipInstrument",
-    "InLaboratory",
     "InProcess",
     "Kind",
-    "Lamp",
+    "LaboratoryScene",
+    "LampScene",
     "Machine",
     "Motor",
     "Oscilloscope",
-    "Pattern",
     "Ping360",
     "PortmapperSession",
     "PtyServer",
-    "Script",
+    "Scene",
     "Server",
     "Session",
-    "Sight",
     "SimulatedBench",
+    "SimulatedCamera",
     "Smc100Line",
-    "Still",
+    "StillScene",
+    "StripeScene",
     "TcpServer",
     "UdpServer",
     "UsbInstrument",
     "VideoCamera",
     "View",
     "Vxi11Session",
-    "Wire",
     "ZaberChain",
     "aravis_is_installed",
     "plugged_in",

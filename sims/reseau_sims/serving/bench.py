@@ -16,13 +16,13 @@ from ..testfield import FieldBench
 from ..world import World
 from .bk import BkScanner
 from .compactpulser import CompactPulser
+from .faults import FaultScript
 from .gige import GigeCamera, aravis_is_installed
-from .imaging import CameraBody, InLaboratory
-from .machine import Machine, Wire
+from .imaging import LaboratoryScene, SimulatedCamera
+from .machine import FaultyConnection, Machine
 from .oscilloscope import FAMILIES, Oscilloscope
 from .ping360 import Ping360
 from .scpi import Vxi11Session
-from .script import Script
 from .servers import PtyServer, TcpServer
 from .smc100 import Smc100Line
 from .v4l2 import VideoCamera
@@ -31,7 +31,7 @@ from .zaber import ZaberChain
 __all__ = ["SimulatedBench", "TableKind", "serve"]
 
 TableKind = Literal["zaber", "smc100"]
-Sight = Literal["screen", "testfield"]
+SceneName = Literal["screen", "testfield"]
 _PATIENCE_S = 120.0
 """For the port of another simulated camera of this machine."""
 _DISTORTION_PX = 1.5
@@ -130,7 +130,7 @@ class SimulatedBench:
         *,
         table: TableKind = "zaber",
         family: str = "keysight",
-        camera: Sight | None = None,
+        camera: SceneName | None = None,
         repeatable: bool = False,
         flat: bool = False,
         in_process: bool = False,
@@ -138,7 +138,7 @@ class SimulatedBench:
         for what, known, asked in (
             ("table", get_args(TableKind), table),
             ("oscilloscope", tuple(FAMILIES), family),
-            ("sight of a camera", get_args(Sight), camera),
+            ("scene for a camera", get_args(SceneName), camera),
         ):
             if asked is not None and asked not in known:
                 raise UsageError(f"is no simulated {what}", where=asked, do=f"there are {', '.join(known)}")
@@ -153,13 +153,15 @@ class SimulatedBench:
             "pulser": self._pulser,
             "oscilloscope": scope,
         }
-        self.scripts = {name: Script() for name in self.machines}
+        self.scripts = {name: FaultScript() for name in self.machines}
         self._servers = ExitStack()
         self.video: VideoCamera | None = None
         with ExitStack() as stack:
             addresses = {
                 name: stack.enter_context(
-                    (TcpServer if name == "bmode" else PtyServer)(partial(Wire, machine, self.scripts[name]))
+                    (TcpServer if name == "bmode" else PtyServer)(
+                        partial(FaultyConnection, machine, self.scripts[name])
+                    )
                 ).address
                 for name, machine in self.machines.items()
                 if name != "oscilloscope"
@@ -168,20 +170,20 @@ class SimulatedBench:
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
             addresses["oscilloscope"] = f"TCPIP::{core.HOST},{core.port}::inst0::INSTR"
-            door = "" if camera is None else self._camera(camera, in_process, stack)
+            entry = "" if camera is None else self._camera(camera, in_process, stack)
             self._servers = stack.pop_all()
         axes = "".join(_axis_entry(table, name) for name in AXES)
-        self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + door
+        self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + entry
 
-    def _camera(self, sight: Sight, in_process: bool, stack: ExitStack) -> str:
+    def _camera(self, scene: SceneName, in_process: bool, stack: ExitStack) -> str:
         """The camera; its part of the ``bench.toml``, where it can be reached from outside."""
-        first = self.laboratory.expose(sight)  # what takes long is computed now
-        body = CameraBody(InLaboratory(self.laboratory, sight), first.width, first.height)
+        first = self.laboratory.expose(scene)  # what takes long is computed now
+        body = SimulatedCamera(LaboratoryScene(self.laboratory, scene), first.width, first.height)
         self.scripts["camera"] = body.script
         if in_process or not aravis_is_installed():
             self.video = VideoCamera(body)
             return ""
-        served = GigeCamera(body, patience_s=_PATIENCE_S)
+        served = GigeCamera(body, wait_s=_PATIENCE_S)
         stack.callback(served.close)
         return _CAMERA.format(address=served.address, width=first.width, height=first.height)
 

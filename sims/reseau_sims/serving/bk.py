@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from reseau_drivers.codecs import bk
 from reseau_drivers.codecs.stream import Damaged
 
+from .faults import Kind
 from .machine import Machine
-from .script import Kind
 
 __all__ = ["BkScanner"]
 
@@ -51,7 +51,7 @@ class BkScanner(Machine):
         self.section, self._mm, self._wrong = section, mm_per_px, announces_wrongly
         self._messages = bk.MessageDecoder(4096)
         self._acknowledges_off, self.streaming = acknowledges_off, False
-        self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
+        self._silent, self._refuse, self._wrong_size, self._stamp = 0, False, False, 0
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Messages in answer."""
@@ -62,8 +62,8 @@ class BkScanner(Machine):
                 continue
             frames = self.streaming
             content = self._answer(message)
-            if self._mute:
-                self._mute -= 1
+            if self._silent:
+                self._silent -= 1
                 continue
             found = [self._frame()] if frames else []
             found += [content] if content is not None else []
@@ -71,19 +71,19 @@ class BkScanner(Machine):
             answers += [bk.encode(each) for each in found]
         return answers
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A message that was begun is forgotten, and frames go to nobody."""
         self._messages.reset()
         self.streaming = False
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: one answer stays out; wrong state: an error; out of range: too few rows."""
         if kind == "stuck":
-            self._mute = 1
+            self._silent = 1
         self._refuse = self._refuse or kind == "wrong state"
-        self._odd = self._odd or kind == "out of range"
+        self._wrong_size = self._wrong_size or kind == "out of range"
         if kind == "power-cycled":
-            self._mute, self._refuse, self._odd, self._stamp = 0, False, False, 0
+            self._silent, self._refuse, self._wrong_size, self._stamp = 0, False, False, 0
             self.streaming = False
 
     def _answer(self, message: bytes) -> bytes | None:
@@ -116,7 +116,7 @@ class BkScanner(Machine):
     def _frame(self) -> bytes:
         self._stamp += 50
         pixels = self.section().tobytes()
-        if self._odd:
-            self._odd, pixels = False, pixels[: len(pixels) // 2]
+        if self._wrong_size:
+            self._wrong_size, pixels = False, pixels[: len(pixels) // 2]
         announced = 7 if self._wrong else len(pixels) + 4
         return bk.encode_frame(bk.GrabbedFrame(self._stamp, pixels, announced))

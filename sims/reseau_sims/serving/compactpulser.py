@@ -11,8 +11,8 @@ from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.compactpulser import LETTERS, LIMIT, Setting, decode, encode_answer
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 
+from .faults import Kind
 from .machine import Machine
-from .script import Kind
 
 __all__ = ["CompactPulser"]
 
@@ -24,16 +24,16 @@ class CompactPulser(Machine):
 
     Parameters
     ----------
-    tells : str
+    readable : str
         The letters that it answers questions about.
     """
 
-    def __init__(self, tells: str = "".join(LETTERS)) -> None:
+    def __init__(self, readable: str = "".join(LETTERS)) -> None:
         super().__init__()
-        self._told = tells
+        self._readable = readable
         self._lines = LineDecoder(end=b"\r", limit=LIMIT)
         self.values = dict(_START)
-        self._deaf, self._mute, self._odd = False, 0, False
+        self._ignore_command, self._silent, self._wrong_value = False, 0, False
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Answers to questions."""
@@ -49,28 +49,28 @@ class CompactPulser(Machine):
                 self.violations.append(error.what)
                 continue
             if setting.value is not None:
-                if not self._deaf:
+                if not self._ignore_command:
                     self.values[setting.letter] = setting.value
-                self._deaf = False
-            elif setting.letter not in self._told:
+                self._ignore_command = False
+            elif setting.letter not in self._readable:
                 continue
-            elif self._mute:
-                self._mute -= 1
+            elif self._silent:
+                self._silent -= 1
             else:
-                value = self.values[setting.letter] + (1000 if self._odd else 0)
-                self._odd = False
+                value = self.values[setting.letter] + (1000 if self._wrong_value else 0)
+                self._wrong_value = False
                 answers.append(encode_answer(Setting(setting.letter, value)))
         return answers
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A command that was begun is forgotten."""
         self._lines.reset()
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: one answer stays out; wrong state: one command is not taken; out of range: a wrong value."""
         if kind == "stuck":
-            self._mute = 1
-        self._deaf = self._deaf or kind == "wrong state"
-        self._odd = self._odd or kind == "out of range"
+            self._silent = 1
+        self._ignore_command = self._ignore_command or kind == "wrong state"
+        self._wrong_value = self._wrong_value or kind == "out of range"
         if kind == "power-cycled":
             self.values = {letter: _START[letter] for letter in LETTERS}

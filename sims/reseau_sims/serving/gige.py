@@ -1,7 +1,7 @@
-"""A simulated camera on GigE Vision, on the loopback interface: real packets, by Aravis's fake camera.
+"""Simulated GigE Vision camera on the loopback interface: real packets, sent by Aravis's fake camera.
 
-The library speaks the protocol (in a process of its own, see :mod:`~reseau_sims.serving.gige_door`); what is
-seen, and what goes wrong, comes from here. Aravis (``libaravis-0.8-0``) has to be installed.
+The library implements the protocol in a process of its own (see :mod:`~reseau_sims.serving.gige_process`);
+images and faults come from this module. Aravis (``libaravis-0.8-0``) must be installed.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from numpy.typing import NDArray
 from reseau.core.errors import UsageError
 from reseau_drivers.codecs.pixels import GENICAM, encode
 
-from . import gige_door as door
-from .imaging import CameraBody, View
-from .script import Fault
+from . import gige_process
+from .faults import Fault
+from .imaging import SimulatedCamera, View
 
 __all__ = ["GigeCamera", "aravis_is_installed"]
 
 _LARGEST = 2048
 """Rows and columns of the library's fake camera."""
 _FORMATS = {layout.code: layout for layout in GENICAM.values()}
-_OBEY_S = 10.0
+_DONE_S = 10.0
 _AN_HOUR_NS = 3_600_000_000_000
 
 
@@ -54,7 +54,7 @@ class GigeCamera:
 
     Parameters
     ----------
-    body : CameraBody
+    body : SimulatedCamera
         What it looks with; frames are the upper left part of what it sees, as large as they are asked for. A
         picture has to be drawn within two seconds: the library answers nothing meanwhile, and its client
         gives control up. Where drawing takes long, trigger by software.
@@ -62,7 +62,7 @@ class GigeCamera:
         What it is called.
     features : str
         File of further features (GenICam) that it has, beside those of the library's.
-    patience_s : float
+    wait_s : float
         How long one waits for another simulated camera of this machine to end: there is one port.
 
     Raises
@@ -74,14 +74,14 @@ class GigeCamera:
     ADDRESS = "127.0.0.1"
 
     def __init__(
-        self, body: CameraBody, *, serial: str = "SIM1", features: str = "", patience_s: float = 0.0
+        self, body: SimulatedCamera, *, serial: str = "SIM1", features: str = "", wait_s: float = 0.0
     ) -> None:
         if not _library_is_there():
             raise UsageError("Aravis is not installed", do="apt-get install libaravis-0.8-0")
         self.body, self._serial, self._features = body, serial, features
         self.frames = 0
         """Frames that were asked for."""
-        self._turn = _one_at_a_time(patience_s)
+        self._lock_file = _one_at_a_time(wait_s)
         self._size = _LARGEST * _LARGEST * 2
         self._descriptor = os.memfd_create("reseau-gige")
         os.ftruncate(self._descriptor, self._size)
@@ -89,7 +89,7 @@ class GigeCamera:
         # A file, not a pipe: the library may warn of much, and nobody reads it.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
         self._ended, self._lock = False, threading.Lock()
-        self._given, self._obeyed, self._serving = 0, 0, False
+        self._issued, self._done, self._serving = 0, 0, False
         self._replugging: threading.Thread | None = None
         self._heard = threading.Condition()
         self._last: tuple[int, int, bytes] | None = None
@@ -104,7 +104,7 @@ class GigeCamera:
         memory = str(self._descriptor), str(self._size)
         features = [self._features] if self._features else []
         self._process = subprocess.Popen(
-            [sys.executable, door.__file__, self.ADDRESS, self._serial, *memory, *features],
+            [sys.executable, gige_process.__file__, self.ADDRESS, self._serial, *memory, *features],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,
@@ -112,26 +112,28 @@ class GigeCamera:
             env={**os.environ, "PYTHONPATH": ""},
         )
         assert self._process.stdout is not None
-        if self._process.stdout.read(door.REQUEST.size) != door.OBEYED:
+        if self._process.stdout.read(gige_process.REQUEST.size) != gige_process.DONE:
             self._process.wait(5.0)
             self._said.seek(0)
             said = self._said.read().decode("utf-8", "replace").strip()
             self.close()
             raise UsageError(said or "ended at once", where="simulated GigE camera")
-        self._given, self._obeyed, self._serving = 0, 0, True
+        self._issued, self._done, self._serving = 0, 0, True
         self._thread = threading.Thread(target=self._serve, name="GigeCamera", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
         stdout = self._process.stdout
         assert stdout is not None
-        while len(data := stdout.read(door.REQUEST.size)) == door.REQUEST.size:
-            if data == door.OBEYED:
+        while len(data := stdout.read(gige_process.REQUEST.size)) == gige_process.REQUEST.size:
+            if data == gige_process.DONE:
                 with self._heard:
-                    self._obeyed += 1
+                    self._done += 1
                     self._heard.notify_all()
                 continue
-            number, stamp, exposure, gain, code, left, top, width, height, _ = door.REQUEST.unpack(data)
+            number, stamp, exposure, gain, code, left, top, width, height, _ = gige_process.REQUEST.unpack(
+                data
+            )
             layout = _FORMATS.get(code, GENICAM["Mono8"])
             view = View(float(exposure), float(gain), 0.0, left, top, width, height, layout.full_scale)
             pixels = encode(layout, self._filled(view))
@@ -166,15 +168,15 @@ class GigeCamera:
         elif kind == "out of range":
             stamp_ = stamp + _AN_HOUR_NS
         self._memory[: len(pixels)] = pixels
-        self._order(door.FRAME, wait, loss, number_, stamp_, len(pixels))
+        self._send_order(gige_process.FRAME, wait, loss, number_, stamp_, len(pixels))
         self._last = number, stamp, pixels
         if fault is not None:
-            self._befall(fault)
+            self._apply_fault(fault)
 
-    def _befall(self, fault: Fault) -> None:
+    def _apply_fault(self, fault: Fault) -> None:
         """What befalls the camera itself, behind the frame."""
         if fault.kind == "stuck":
-            self._besides(door.STICK)
+            self._send_command(gige_process.STICK)
         elif fault.kind == "disconnected":
             # The thread of the frames, which this is, ends with the process that is unplugged.
             self._replugging = threading.Thread(target=self._unplug_for, args=(fault.seconds,), daemon=True)
@@ -186,11 +188,11 @@ class GigeCamera:
 
     def hang_up(self) -> None:
         """Take its control from whoever has it, and stop; it can be opened anew."""
-        self._besides(door.HANG_UP)
+        self._send_command(gige_process.HANG_UP)
 
     def power_cycle(self) -> None:
         """Switch it off and on: it forgets who had it, and how it was set."""
-        self._besides(door.RESET)
+        self._send_command(gige_process.RESET)
 
     def pull_plug(self) -> None:
         """Nobody answers any more, until :meth:`plug_in`."""
@@ -208,17 +210,17 @@ class GigeCamera:
         time.sleep(seconds)
         self.plug_in()
 
-    def _besides(self, kind: bytes) -> None:
+    def _send_command(self, kind: bytes) -> None:
         """An order besides any frame, obeyed when this returns, unless the frames' own thread gives it."""
         with self._heard:
-            self._given += 1
-            number = self._given
-        self._order(kind)
+            self._issued += 1
+            number = self._issued
+        self._send_order(kind)
         if threading.current_thread() is not self._thread:
             with self._heard:
-                self._heard.wait_for(lambda: self._obeyed >= number or not self._serving, _OBEY_S)
+                self._heard.wait_for(lambda: self._done >= number or not self._serving, _DONE_S)
 
-    def _order(
+    def _send_order(
         self,
         kind: bytes,
         wait: float = 0.0,
@@ -230,7 +232,7 @@ class GigeCamera:
         stdin = self._process.stdin
         assert stdin is not None
         with self._lock, suppress(OSError, ValueError):
-            stdin.write(door.ORDER.pack(kind, wait, loss, number, stamp, size))
+            stdin.write(gige_process.ORDER.pack(kind, wait, loss, number, stamp, size))
             stdin.flush()
 
     def close(self) -> None:
@@ -240,7 +242,7 @@ class GigeCamera:
         self._ended = True
         if self._replugging is not None:
             self._replugging.join()
-        self._order(door.END)
+        self._send_order(gige_process.END)
         try:
             self._process.wait(5.0)
         except subprocess.TimeoutExpired:
@@ -252,7 +254,7 @@ class GigeCamera:
         self._memory.close()
         self._said.close()
         os.close(self._descriptor)
-        os.close(self._turn)
+        os.close(self._lock_file)
 
     def _close_pipes(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
@@ -267,11 +269,11 @@ class GigeCamera:
         self.close()
 
 
-def _one_at_a_time(patience_s: float) -> int:
+def _one_at_a_time(wait_s: float) -> int:
     """A lock that goes with the process: the library binds one port of the machine."""
     path = Path(tempfile.gettempdir()) / f"reseau-gige-{os.getuid()}.lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    until = time.monotonic() + patience_s
+    until = time.monotonic() + wait_s
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

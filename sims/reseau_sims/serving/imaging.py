@@ -16,12 +16,12 @@ from reseau.core.data import Array, Frame
 from ..laboratory import Laboratory
 from ..pixels import PixelSensor
 from ..streams import stream
-from .script import Script
+from .faults import FaultScript
 
-__all__ = ["CameraBody", "InLaboratory", "Lamp", "Pattern", "Sight", "Still", "View"]
+__all__ = ["LaboratoryScene", "LampScene", "Scene", "SimulatedCamera", "StillScene", "StripeScene", "View"]
 
 NOMINAL_US = 10_000.0
-"""Exposure at which a sight has its own brightness."""
+"""Exposure at which a scene has its own brightness."""
 _KEPT = 16
 
 
@@ -70,7 +70,7 @@ class View:
         return np.clip(part + self.offset, 0, self.full_scale).astype(whole.dtype)
 
 
-class Sight(Protocol):
+class Scene(Protocol):
     """What a camera looks at."""
 
     def __call__(self, view: View) -> NDArray[Any]:
@@ -78,7 +78,7 @@ class Sight(Protocol):
 
 
 @dataclass(frozen=True)
-class Pattern:
+class StripeScene:
     """Slanted stripes that tell their shift: a picture that is no other's.
 
     Parameters
@@ -102,7 +102,7 @@ class Pattern:
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
+class StillScene:
     """A picture that was taken at the nominal exposure; other settings scale it.
 
     Parameters
@@ -119,27 +119,27 @@ class Still:
 
 
 @dataclass(frozen=True, eq=False)
-class InLaboratory:
+class LaboratoryScene:
     """What a camera of the laboratory sees now; no two pictures have the same noise.
 
     Parameters
     ----------
     laboratory : Laboratory
         Where it stands.
-    sight : {"screen", "testfield"}
+    scene : {"screen", "testfield"}
         What stands before it.
     """
 
     laboratory: Laboratory
-    sight: Literal["screen", "testfield"] = "screen"
+    scene: Literal["screen", "testfield"] = "screen"
 
     def __call__(self, view: View) -> NDArray[Any]:
         """The picture of a view."""
-        return view.seen(_levelled(self.laboratory.expose(self.sight, view.light, view.gain), view, 1.0))
+        return view.seen(_levelled(self.laboratory.expose(self.scene, view.light, view.gain), view, 1.0))
 
 
 @dataclass(eq=False)
-class Lamp:
+class LampScene:
     """A sensor of uneven pixels before a lamp, without a lens; no two pictures have the same noise.
 
     Parameters
@@ -173,16 +173,16 @@ def _levelled(frame: Frame, view: View, factor: float) -> NDArray[Any]:
     return np.clip(np.rint(frame.pixels * factor), 0, view.full_scale).astype(dtype)
 
 
-class CameraBody:
+class SimulatedCamera:
     """A sensor that looks at something; the doors in front of it are V4L2 or GigE Vision.
 
     Parameters
     ----------
-    sight : Sight
+    scene : Scene
         What it looks at first.
     width, height : int
         Of its sensor.
-    script : Script, optional
+    script : FaultScript, optional
         Which frames suffer which fault.
 
     Attributes
@@ -196,31 +196,31 @@ class CameraBody:
     """
 
     def __init__(
-        self, sight: Sight | None = None, width: int = 96, height: int = 64, script: Script | None = None
+        self, scene: Scene | None = None, width: int = 96, height: int = 64, script: FaultScript | None = None
     ) -> None:
         self.lock = threading.RLock()
         self.width, self.height = width, height
-        self.script = script or Script()
+        self.script = script or FaultScript()
         self.violations: list[str] = []
         self.drawn: deque[NDArray[Any]] = deque(maxlen=_KEPT)
         self.before_change: list[Callable[[], None]] = []
-        self._sight: Sight = sight or Pattern(width, height)
+        self._scene: Scene = scene or StripeScene(width, height)
 
     @property
-    def sight(self) -> Sight:
+    def scene(self) -> Scene:
         """What it looks at."""
-        return self._sight
+        return self._scene
 
-    def look_at(self, sight: Sight) -> None:
+    def point_at(self, scene: Scene) -> None:
         """Turn it to something else."""
         with self.lock:
             for each in self.before_change:
                 each()
-            self._sight = sight
+            self._scene = scene
 
     def draw(self, view: View) -> NDArray[Any]:
         """The picture that it takes now."""
         with self.lock:
-            picture = self._sight(view)
+            picture = self._scene(view)
             self.drawn.append(picture)
             return picture

@@ -7,9 +7,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
-from .script import DEVICE_KINDS, Kind, Output, Script
+from .faults import DEVICE_KINDS, FaultScript, Kind, Output
 
-__all__ = ["Machine", "Session", "Wire"]
+__all__ = ["FaultyConnection", "Machine", "Session"]
 
 
 class Machine(ABC):
@@ -25,11 +25,11 @@ class Machine(ABC):
         """Answers to these bytes, one by one."""
 
     @abstractmethod
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Have one of :data:`DEVICE_KINDS` happen."""
 
     @abstractmethod
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """The client went away: a command that was begun is forgotten."""
 
 
@@ -39,23 +39,23 @@ class Session(Protocol):
     def receive(self, data: bytes) -> list[Output]:
         """What is sent in answer."""
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """The connection is over."""
 
 
-class Wire:
+class FaultyConnection:
     """A connection on which answers suffer faults.
 
     Parameters
     ----------
     machine : Machine
         Answers.
-    script : Script
+    script : FaultScript
         Says which answers suffer.
     """
 
-    def __init__(self, machine: Machine, script: Script) -> None:
-        self.machine, self.script = machine, script
+    def __init__(self, machine: Machine, script: FaultScript | None = None) -> None:
+        self.machine, self.script = machine, script or FaultScript()
 
     def receive(self, data: bytes) -> list[Output]:
         """What is sent in answer."""
@@ -67,11 +67,11 @@ class Wire:
                     sent.append((0.0, answer))
                     continue
                 if fault.kind in DEVICE_KINDS:
-                    self.machine.afflict(fault.kind)
+                    self.machine.inject_fault(fault.kind)
                 sent += self.script.spoil(answer, fault)
         return sent
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """The connection is over."""
         with self.machine.lock:
-            self.machine.hung_up()
+            self.machine.disconnected()

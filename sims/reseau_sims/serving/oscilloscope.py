@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from reseau_drivers.codecs.ieee488 import Header, block, split_message
 
+from .faults import Kind
 from .machine import Machine
-from .script import Kind
 
 __all__ = ["FAMILIES", "Family", "Oscilloscope"]
 
@@ -174,7 +174,7 @@ class Oscilloscope(Machine):
     def __post_init__(self) -> None:
         super().__init__()
         self._like = FAMILIES[self.family]
-        self._mute, self._odd = 0, False
+        self._silent, self._wrong_size = 0, False
         self._begun = b""
         self._piece, self._wide = 0, False
 
@@ -186,18 +186,18 @@ class Oscilloscope(Machine):
             self._begun = b""
         return [answer for message in messages if (answer := self.execute(message)) is not None]
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A message that was begun is forgotten."""
         self._begun = b""
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: two answers stay out; wrong state: an error; out of range: cut off; power: defaults."""
         if kind == "stuck":
-            self._mute = 2
+            self._silent = 2
         elif kind == "wrong state":
             self._errors.append('-221,"Settings conflict"')
         elif kind == "out of range":
-            self._odd = True
+            self._wrong_size = True
         elif kind == "power-cycled":
             self._seen.clear()
             self._errors.clear()
@@ -214,8 +214,8 @@ class Oscilloscope(Machine):
                 answers.append(answer)
         if not answers:
             return None
-        if self._mute:
-            self._mute -= 1
+        if self._silent:
+            self._silent -= 1
             return None
         joined = b";".join(answers)
         bare = any(self._is_screen(header) for header, _ in split_message(text)) and not self._like.newline
@@ -255,7 +255,7 @@ class Oscilloscope(Machine):
             "*IDN?": lambda _: self._like.idn.encode(),
             "*OPC?": lambda _: b"1",
             "*CLS": taken(self._errors.clear),
-            "*RST": taken(lambda: self.afflict("power-cycled")),
+            "*RST": taken(lambda: self.inject_fault("power-cycled")),
             "*TST?": lambda _: b"0",
             ":SYSTem:ERRor?": lambda _: (self._errors.pop(0) if self._errors else '0,"No error"').encode(),
             ":STOP": taken(run(False)),
@@ -278,8 +278,8 @@ class Oscilloscope(Machine):
             return None
         found, coded = cv2.imencode(".bmp" if as_bmp else like.picture, self.screen())
         data = coded.tobytes() if found else b""
-        if self._odd:
-            self._odd, data = False, data[:-30]
+        if self._wrong_size:
+            self._wrong_size, data = False, data[:-30]
         return block(data) if like.as_block else data
 
     def _waveform(self) -> dict[str, Callable[[str, str], bytes | None]]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from reseau_drivers.codecs import ping
 from reseau_drivers.codecs.stream import Damaged
 
+from .faults import Kind
 from .machine import Machine
-from .script import Kind
 
 __all__ = ["Ping360"]
 
@@ -40,7 +40,7 @@ class Ping360(Machine):
     def __init__(self, echo: Echo = _silence) -> None:
         super().__init__()
         self._echo, self._frames = echo, ping.FrameDecoder()
-        self.motor_on, self._stuck, self._refuse, self._odd = False, False, False, False
+        self.motor_on, self._stuck, self._refuse, self._wrong_size = False, False, False, False
         self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
 
     def receive(self, data: bytes) -> Sequence[bytes]:
@@ -56,17 +56,17 @@ class Ping360(Machine):
                 answers.append(ping.encode(self._obey(frame)))
         return answers
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A message that was begun is forgotten."""
         self._frames.reset()
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: the head does not turn; wrong state: it refuses; out of range: too many samples."""
         self._stuck = self._stuck or kind == "stuck"
         self._refuse = self._refuse or kind == "wrong state"
-        self._odd = self._odd or kind == "out of range"
+        self._wrong_size = self._wrong_size or kind == "out of range"
         if kind == "power-cycled":
-            self.motor_on = self._stuck = self._refuse = self._odd = False
+            self.motor_on = self._stuck = self._refuse = self._wrong_size = False
             self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
 
     def _obey(self, frame: ping.Frame) -> ping.Frame:
@@ -75,7 +75,7 @@ class Ping360(Machine):
         if frame.id == ping.TRANSDUCER and len(frame.payload) == 14:
             return self._ping(ping.Transducer.parse(frame.payload))
         if frame.id == ping.MOTOR_OFF:
-            self.motor_on = self._stuck = self._refuse = self._odd = False
+            self.motor_on = self._stuck = self._refuse = self._wrong_size = False
             return ping.Frame(ping.ACK, struct.pack("<H", frame.id), 1)
         return self._no(frame.id, "unknown message")
 
@@ -119,7 +119,7 @@ class Ping360(Machine):
             return ping.DeviceData(settings, b"").frame()
         period = asked.period * ping.PERIOD_NS * 1e-9
         samples = self._echo(angle, asked.samples, period, _GAINS[asked.gain]).tobytes()
-        if self._odd:
-            self._odd, samples = False, samples + bytes(300)
+        if self._wrong_size:
+            self._wrong_size, samples = False, samples + bytes(300)
         self.last = ping.DeviceData(settings, samples)
         return self.last.frame()

@@ -16,10 +16,13 @@ from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import hislip, rpc, vxi11
 from reseau_drivers.codecs.stream import Damaged
 
+from .faults import DEVICE_KINDS, FaultScript, Output
 from .machine import Machine
-from .script import DEVICE_KINDS, Output, Script
 
 __all__ = ["AnswerQueue", "HislipInstrument", "PortmapperSession", "Vxi11Session"]
+
+Execute = Callable[[bytes], bytes | None]
+"""Executes a program message; returns the answer, or None if there is none."""
 
 _LARGEST = 1 << 20
 """Bytes of the largest message that is taken."""
@@ -28,7 +31,7 @@ _LARGEST = 1 << 20
 class AnswerQueue:
     """Answers that wait to be read, each from its time on; None hangs up."""
 
-    def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
+    def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self._machine, self._execute, self._script = machine, execute, script
         self._waiting: list[tuple[float, bytes | None]] = []
         self._surplus = False
@@ -50,7 +53,7 @@ class AnswerQueue:
             sent: list[Output] = [(0.0, answer)]
             if fault is not None:
                 if fault.kind in DEVICE_KINDS:
-                    self._machine.afflict(fault.kind)
+                    self._machine.inject_fault(fault.kind)
                 sent = self._script.spoil(answer, fault)
                 self._surplus = fault.kind == "repeated"
             self._waiting += [(time.monotonic() + delay, data) for delay, data in sent]
@@ -103,14 +106,14 @@ class PortmapperSession:
             sent.append((0.0, rpc.record(reply)))
         return sent
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """Nothing is kept."""
 
 
 class Vxi11Session:
     """One connection to the core channel, with its links."""
 
-    def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
+    def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self._machine = machine
         self._open: Callable[[], AnswerQueue] = lambda: AnswerQueue(machine, execute, script)
         self._links: dict[int, AnswerQueue] = {}
@@ -118,7 +121,7 @@ class Vxi11Session:
         self._numbers = itertools.count(1)
         self._records = rpc.RecordDecoder(_LARGEST + 1024)
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """Links end with their connection."""
         self._links.clear()
 
@@ -214,7 +217,7 @@ class Vxi11Session:
 class HislipInstrument:
     """Sessions of HiSLIP: each a synchronous and an asynchronous channel."""
 
-    def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
+    def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self.machine = machine
         self.open_queue: Callable[[], AnswerQueue] = lambda: AnswerQueue(machine, execute, script)
         self.queues: dict[int, AnswerQueue] = {}
@@ -241,7 +244,7 @@ class _Channel:
         self._synchronous = False
         self._begun = b""
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A session ends with its synchronous channel."""
         if self._synchronous and self._session is not None:
             self._instrument.queues.pop(self._session, None)

@@ -23,13 +23,15 @@ from typing import Self
 from reseau.core.errors import ConnectionLost
 from reseau.instruments import Deadline
 
+from .faults import Output
 from .machine import Session
-from .script import Output
 
-__all__ = ["InProcess", "PtyServer", "Server", "TcpServer"]
+__all__ = ["InProcess", "PtyServer", "Server", "TcpServer", "UdpServer"]
 
 _CHUNK = 65536
 _MOST_UNSENT = 64_000_000
+_LARGEST_SENT, _LARGEST_RECEIVED = 4096, 65536
+"""Bytes of a datagram that is sent, as clients by others take it; and of one that is taken."""
 
 
 class _Connection:
@@ -39,15 +41,15 @@ class _Connection:
         self.fd, self.session, self.close = fd, session, close
         self.ready = bytearray()
         self._due: list[tuple[float, int, bytes | None]] = []
-        self._order = 0
+        self._send_order = 0
         self._last = 0.0
 
     def put(self, outputs: list[Output]) -> None:
         """Add what a session wants to send; what comes later is sent later, as on any wire."""
         for delay, data in outputs:
             self._last = max(self._last, time.monotonic() + delay)
-            heapq.heappush(self._due, (self._last, self._order, data))
-            self._order += 1
+            heapq.heappush(self._due, (self._last, self._send_order, data))
+            self._send_order += 1
 
     def mature(self) -> bool:
         """Make what is due ready to be sent; False when the session wants to hang up then."""
@@ -137,7 +139,7 @@ class Server(ABC):
     def _remove(self, connection: _Connection) -> None:
         del self._connections[connection.fd]
         self._selector.unregister(connection.fd)
-        connection.session.hung_up()
+        connection.session.disconnected()
         with suppress(OSError):
             connection.close()
         if not self._closing:
@@ -262,6 +264,62 @@ class TcpServer(Server):
         self._listener.close()
 
 
+class UdpServer(Server):
+    """Serves datagrams on a port of the loopback interface; whoever spoke last is answered.
+
+    Parameters
+    ----------
+    open_session : callable
+        Makes the session of a client that was not heard before.
+    port : int
+        0 takes a free one.
+    """
+
+    HOST = "127.0.0.1"
+
+    def __init__(self, open_session: Callable[[], Session], port: int = 0) -> None:
+        super().__init__(open_session)
+        self.port = port
+        self._peer: tuple[str, int] | None = None
+        self._bind()
+
+    def _bind(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((self.HOST, self.port))
+        self.port = int(self._socket.getsockname()[1])
+        self._peer = None
+        self._add(self._socket.fileno(), self._socket.close)
+
+    @property
+    def address(self) -> str:
+        """``udp://127.0.0.1:port``."""
+        return f"udp://{self.HOST}:{self.port}"
+
+    def _accept(self, fd: int) -> bool:
+        return False
+
+    def _read(self, fd: int) -> bytes:
+        data, peer = self._socket.recvfrom(_LARGEST_RECEIVED)
+        if not data:
+            raise BlockingIOError
+        if peer != self._peer:
+            # What another had begun is not continued.
+            self._peer = peer
+            self._connections[fd].session.disconnected()
+        return data
+
+    def _write(self, fd: int, data: bytes) -> int:
+        if self._peer is None:
+            return len(data)
+        return self._socket.sendto(data[:_LARGEST_SENT], self._peer)
+
+    def _after_loss(self) -> None:
+        self._bind()
+
+    def _release(self) -> None:
+        """Its socket was its connection."""
+
+
 class PtyServer(Server):
     """Serves on a pseudo-terminal, under a name that stays when it is unplugged and plugged in again."""
 
@@ -321,7 +379,7 @@ class InProcess:
         """End the session."""
         connection, self._connection = self._connection, None
         if connection is not None:
-            connection.session.hung_up()
+            connection.session.disconnected()
 
     def write(self, data: bytes, deadline: Deadline) -> None:
         """Hand it over."""

@@ -13,9 +13,9 @@ from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.smc100 import LIMIT, Line, decode, encode
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 
+from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
-from .script import Kind
 
 __all__ = ["Smc100Line"]
 
@@ -78,11 +78,11 @@ class Smc100Line(Machine):
                 answers.append(encode(Line(command.address, command.name, said)))
         return answers
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A command that was begun is forgotten."""
         self._lines.reset()
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: a following error; wrong state: disabled; out of range: at the end of the run."""
         for motor in self.motors.values():
             if kind == "stuck":

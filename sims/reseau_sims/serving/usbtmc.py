@@ -21,9 +21,9 @@ import usb.core
 from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import usbtmc
 
+from .faults import FaultScript
 from .machine import Machine
 from .scpi import AnswerQueue
-from .script import Script
 
 __all__ = ["UsbInstrument", "plugged_in"]
 
@@ -46,14 +46,18 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         Answers.
     execute : callable
         Takes program messages.
-    script : Script
+    script : FaultScript
         What goes wrong.
     serial : str
         Number of the instrument.
     """
 
     def __init__(
-        self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script, serial: str = "SIM1"
+        self,
+        machine: Machine,
+        execute: Callable[[bytes], bytes | None],
+        script: FaultScript,
+        serial: str = "SIM1",
     ) -> None:
         super().__init__()
         self._machine, self._strings = machine, (*_STRINGS, serial)

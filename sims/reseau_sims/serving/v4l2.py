@@ -13,7 +13,7 @@ import time
 from reseau_drivers.codecs import v4l2 as uapi
 from reseau_drivers.codecs.pixels import VIDEO
 
-from .imaging import CameraBody
+from .imaging import SimulatedCamera
 from .video import CONTROLS, FORMATS, Memory, Stream, Video
 
 __all__ = ["VideoCamera", "VideoNode"]
@@ -27,7 +27,7 @@ class VideoCamera(Video):
     """A camera with nodes; parameters as of :class:`Video`."""
 
     def __init__(
-        self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
+        self, body: SimulatedCamera, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
     ) -> None:
         super().__init__(body, first=first, start_of_exposure=start_of_exposure, webcam=webcam)
         self.plugged_in = True

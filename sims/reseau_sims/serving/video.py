@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from reseau_drivers.codecs import v4l2 as uapi
 from reseau_drivers.codecs.pixels import VIDEO, encode
 
-from .imaging import CameraBody, View
-from .script import Fault
+from .faults import Fault
+from .imaging import SimulatedCamera, View
 
 __all__ = ["CONTROLS", "FORMATS", "Memory", "Stream", "Video"]
 
@@ -84,7 +84,7 @@ class Video:
 
     Parameters
     ----------
-    body : CameraBody
+    body : SimulatedCamera
         What it looks with.
     first : int
         Number of its first frame.
@@ -96,7 +96,7 @@ class Video:
     """
 
     def __init__(
-        self, body: CameraBody, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
+        self, body: SimulatedCamera, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
     ) -> None:
         self.body, self.first, self._at_start, self.webcam = body, first, start_of_exposure, webcam
         self.stream: Stream | None = None

@@ -12,9 +12,9 @@ from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 from reseau_drivers.codecs.zaber import Command, Reply, decode_command, encode
 
+from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
-from .script import Kind
 
 __all__ = ["ZaberChain"]
 
@@ -76,11 +76,11 @@ class ZaberChain(Machine):
             replies += self._obey(command)
         return replies
 
-    def hung_up(self) -> None:
+    def disconnected(self) -> None:
         """A command that was begun is forgotten."""
         self._lines.reset()
 
-    def afflict(self, kind: Kind) -> None:
+    def inject_fault(self, kind: Kind) -> None:
         """Stuck: something is in the way; wrong state: drivers off; out of range: a limit met."""
         for motor in self.motors.values():
             if kind == "stuck":

@@ -1,7 +1,7 @@
-"""What an instrument is to those who use it: protocols, settings, values; it talks to nothing.
+"""Interfaces of instruments: protocols, settings with units and limits, and the values that they return.
 
-Drivers live in a package of their own, ``reseau_drivers``, and are found through the entry points of the
-group ``reseau.instruments``; so may be those of others.
+This package does no input or output. Drivers are in the separate package ``reseau_drivers``; drivers of
+either package are found through the entry points of the group ``reseau.instruments``.
 """
 
 from .deadline import Deadline

@@ -1,4 +1,4 @@
-"""What all drivers do alike: one exchange at a time, one deadline, settings that outlive a connection."""
+"""Base class of drivers: exclusive access, one time limit per call, settings restored on reconnection."""
 
 from __future__ import annotations
 
@@ -21,27 +21,50 @@ S = TypeVar("S", bound=Settings)
 T = TypeVar("T")
 
 _GRACE_S = 1.0
-"""How long an instrument that went away, or a call that is to end, is waited for."""
+"""Time to wait for an instrument that has disappeared, or for a call that has to end (s)."""
 
 
 class Device(ABC, Generic[S]):
-    """Base of drivers; a driver says how to open, to shut, to push settings, to ask who is there.
+    """Base class of drivers.
+
+    A driver implements how to open and close the connection, send settings, identify the instrument, stop it
+    and take a reading.
 
     Parameters
     ----------
     name : str
-        On the bench; messages begin with it.
+        Name on the bench; error messages begin with it.
     settings : Settings
-        Pushed on every connection.
+        Sent on every connection.
     seconds : float
-        Deadline of calls that name none.
+        Time limit of calls that do not specify one (s).
     limits : mapping, optional
-        Of settings, narrower than the instrument's own.
+        Limits of settings, narrower than those of the instrument.
 
     Notes
     -----
-    After a connection was lost, an answer was late or none, it is closed: the next call opens a new one and
-    pushes the settings again, so that no answer to an earlier question can be taken for one to the next.
+    After a lost connection, a late answer or no answer, the connection is closed. The next call opens a new
+    one and sends the settings again, so that an answer to an earlier query cannot be taken for the answer to
+    a later one.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from reseau.instruments import quantity
+    >>> @dataclass(frozen=True)
+    ... class Rate(Settings):
+    ...     rate: float = quantity(1.0, "1/s", 0.1, 10.0)
+    >>> class Counter(Device[Rate]):
+    ...     def _open(self, deadline): pass
+    ...     def _disconnect(self): pass
+    ...     def _push(self, settings, deadline): pass
+    ...     def _identify(self, deadline): return Identity("reseau", "counter")
+    ...     def _halt(self, deadline): pass
+    ...     def _acquire(self): return {"count": 3}
+    ...     def _reading_format(self): return {"count": {"dtype": "integer", "shape": []}}
+    >>> with Counter("counter", Rate()) as counter:
+    ...     counter.configure(rate=2.0)[1]["counter_rate"]["value"], counter.read()["count"]["value"]
+    (2.0, 3)
     """
 
     def __init__(
@@ -55,15 +78,15 @@ class Device(ABC, Generic[S]):
         self._connected = False
         self._reading: dict[str, Any] = {}
         self.reconnections = 0
-        """How often a connection has been made anew."""
+        """Number of connections made, the first included."""
 
     @abstractmethod
     def _open(self, deadline: Deadline) -> None:
         """Open the connection."""
 
     @abstractmethod
-    def _shut(self) -> None:
-        """Close the connection; may raise, and may be called when there is none."""
+    def _disconnect(self) -> None:
+        """Close the connection; may raise, and may be called without a connection."""
 
     @abstractmethod
     def _push(self, settings: S, deadline: Deadline) -> None:
@@ -71,60 +94,63 @@ class Device(ABC, Generic[S]):
 
     @abstractmethod
     def _identify(self, deadline: Deadline) -> Identity:
-        """Ask who is there."""
+        """Query the identity."""
 
     @abstractmethod
     def _halt(self, deadline: Deadline) -> None:
-        """Stop whatever moves, sends or records."""
+        """Stop any movement, transmission or recording."""
 
     @abstractmethod
     def _acquire(self) -> dict[str, Any]:
-        """Take a reading: values by name."""
+        """Take a reading and return its values by name."""
 
     @abstractmethod
-    def _kinds(self) -> dict[str, dict[str, Any]]:
-        """What a reading holds: dtype, shape and units by name."""
+    def _reading_format(self) -> dict[str, dict[str, Any]]:
+        """Return type, shape and unit of each value of a reading, by name."""
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        """The test that the instrument can do of itself: what was tested, and what came out."""
+        """Run the instrument's self-test; return results by name of the test."""
         return {}
 
     @property
     def settings(self) -> S:
-        """As they were pushed last, or will be with the next connection."""
+        """Settings as last sent, or as they will be sent on the next connection."""
         return self._settings
 
     @contextmanager
     def _exchange(self, command: str, seconds: float | None = None) -> Iterator[Deadline]:
-        """The connection for oneself, opened if need be, until the deadline; names errors."""
+        """Reserve the connection, open it if necessary, and add instrument and command to errors."""
         deadline = Deadline(self._seconds if seconds is None else seconds)
         if not self._lock.acquire(timeout=deadline.left):
-            raise DeadlineError("was busy all the time", where=self.name, command=command)
+            raise DeadlineError("was busy until the deadline", where=self.name, command=command)
         try:
             if not self._connected:
-                self._establish(deadline)
+                self._connect_and_configure(deadline)
             yield deadline
         except InstrumentError as error:
-            # Refusals and states are answers; after anything else the connection cannot be trusted.
+            # Refusals and state errors are valid answers; after any other error the connection is unreliable.
             if not isinstance(error, StateError | RefusedError):
                 self._drop()
-            raise self._named(error, command) from None
+            raise self._with_context(error, command) from None
         except OSError as error:
             self._drop()
             raise ConnectionLost(
-                f"the connection broke ({error})", where=self.name, command=command, do="is it switched on?"
+                f"the connection was lost ({error})",
+                where=self.name,
+                command=command,
+                do="is it switched on?",
             ) from None
         finally:
             self._lock.release()
 
-    def _named(self, error: InstrumentError, command: str) -> InstrumentError:
-        """The same error, which names the instrument and the command."""
+    def _with_context(self, error: InstrumentError, command: str) -> InstrumentError:
+        """Return the same error with the name of the instrument and the command."""
         if error.instrument is not None:
             return error
         return type(error)(error.what, where=self.name, do=error.do, command=error.command or command)
 
-    def _establish(self, deadline: Deadline) -> None:
-        # What was there a moment ago may be back in a moment: a cable, a port that is made anew.
+    def _connect_and_configure(self, deadline: Deadline) -> None:
+        # An instrument that has just disappeared may return soon: a loose cable, a port that is recreated.
         grace = deadline.part(_GRACE_S) if self.reconnections else None
         try:
             while True:
@@ -132,12 +158,12 @@ class Device(ABC, Generic[S]):
                     self._open(deadline)
                     break
                 except ConnectionLost:
-                    if grace is None or grace.over:
+                    if grace is None or grace.expired:
                         raise
                     time.sleep(grace.at_most(0.05))
             self._push(self._settings, deadline)
         except InstrumentError:
-            # Also one that is there and refuses: what is not connected is not kept from others.
+            # Also if the instrument refuses the settings: others can then use it.
             self._drop()
             raise
         self._connected = True
@@ -146,31 +172,31 @@ class Device(ABC, Generic[S]):
     def _drop(self) -> None:
         self._connected = False
         with suppress(Exception):
-            self._shut()
+            self._disconnect()
 
     def connect(self, seconds: float | None = None) -> Identity:
-        """Connect, push the settings, and ask who it is.
+        """Connect, send the settings, and return the identity.
 
         Raises
         ------
         InstrumentError
-            When it cannot be reached or does not answer as it should.
+            If the instrument cannot be reached or its answer is not valid.
         """
         with self._exchange("connect", seconds) as deadline:
             return self._identify(deadline)
 
     def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Test itself: who it is, its firmware, and what its driver adds; the deadline is of all together."""
+        """Run the self-test: identity, firmware and the tests of the driver, within one time limit."""
         deadline = Deadline(self._seconds if seconds is None else seconds)
         found = self.connect(deadline.left)
-        said = " ".join(part for part in (found.maker, found.model, found.serial) if part)
-        told = {"identity": said or "unknown", "firmware": found.firmware or "not told"}
-        return told | self._test(deadline)
+        identity = " ".join(part for part in (found.maker, found.model, found.serial) if part)
+        result = {"identity": identity or "unknown", "firmware": found.firmware or "not reported"}
+        return result | self._test(deadline)
 
     def close(self) -> None:
-        """Let go of it; never raises."""
+        """Close the connection; never raises."""
         self._stopping.set()
-        # A call that goes on sees the flag; should it hang, its connection is taken from it all the same.
+        # A call in progress sees the flag; if it hangs, its connection is closed anyway.
         got = self._lock.acquire(timeout=_GRACE_S)
         try:
             self._drop()
@@ -186,20 +212,20 @@ class Device(ABC, Generic[S]):
         self.close()
 
     def stop(self, *, success: bool = False) -> None:
-        """Stop whatever it does, from any thread; a call that goes on for more than a second is broken off.
+        """Stop the instrument, from any thread; a call in progress is interrupted after one second.
 
         Raises
         ------
         InstrumentError
-            When it could not be told so: it may still be moving.
+            If the command could not be sent: the instrument may still be moving.
         """
         self._stopping.set()
         if self._lock.acquire(timeout=_GRACE_S):
             self._lock.release()
         else:
-            # A call hangs: its connection is taken from it, and a new one says stop.
+            # The call in progress hangs: close its connection and send the stop command on a new one.
             with suppress(Exception):
-                self._shut()
+                self._disconnect()
         with self._exchange("stop") as deadline:
             self._halt(deadline)
 
@@ -214,7 +240,7 @@ class Device(ABC, Generic[S]):
         Raises
         ------
         SettingError
-            When there is no such setting or a value is beyond its limits; nothing was sent.
+            If a setting does not exist or a value is outside its limits; nothing is sent then.
         """
         new, old = self._settings.changed(changes, self._limits), self.read_configuration()
         with self._exchange("configure") as deadline:
@@ -229,7 +255,7 @@ class Device(ABC, Generic[S]):
         return [self]
 
     def unstage(self) -> list[Any]:
-        """Bring it to rest after a run; the connection stays."""
+        """Stop the instrument after a run; the connection stays open."""
         self.stop()
         self._stopping.clear()
         return [self]
@@ -243,17 +269,17 @@ class Device(ABC, Generic[S]):
         self._reading = {name: {"value": value, "timestamp": at} for name, value in values.items()}
 
     def read(self) -> dict[str, Any]:
-        """The last reading; takes one when there is none."""
+        """Return the last reading; take one if there is none."""
         if not self._reading:
             self._take()
         return dict(self._reading)
 
     def describe(self) -> dict[str, Any]:
-        """What a reading holds."""
-        return {name: {"source": self.name, **kind} for name, kind in self._kinds().items()}
+        """Return the contents of a reading: source, type, shape and unit by name."""
+        return {name: {"source": self.name, **kind} for name, kind in self._reading_format().items()}
 
     def read_configuration(self) -> dict[str, Any]:
-        """The settings as a reading."""
+        """Return the settings as a reading."""
         at = time.time()
         return {
             f"{self.name}_{name}": {"value": value, "timestamp": at}
@@ -261,7 +287,7 @@ class Device(ABC, Generic[S]):
         }
 
     def describe_configuration(self) -> dict[str, Any]:
-        """What the reading of the settings holds."""
+        """Return the contents of the reading of the settings."""
         units, limits = self._settings.units, self._settings.limits
         found: dict[str, Any] = {}
         for name, value in self._settings.to_dict().items():
@@ -275,7 +301,7 @@ class Device(ABC, Generic[S]):
                 }
         return found
 
-    def _until(
+    def _wait_until(
         self,
         ask: Callable[[], T],
         done: Callable[[T], bool],
@@ -283,15 +309,15 @@ class Device(ABC, Generic[S]):
         pause_s: float,
         command: str,
     ) -> T:
-        """Ask again and again until it is done; stops when told to."""
+        """Repeat a query until a condition is met; raise if stopped or if the deadline passes."""
         while True:
             if self._stopping.is_set():
                 raise StateError("was stopped", where=self.name, command=command)
             answer = ask()
             if done(answer):
                 return answer
-            if deadline.over:
+            if deadline.expired:
                 raise DeadlineError(
-                    f"was not done within {deadline.seconds:g} s", where=self.name, command=command
+                    f"did not finish within {deadline.seconds:g} s", where=self.name, command=command
                 )
             self._stopping.wait(deadline.at_most(pause_s))

@@ -1,8 +1,8 @@
-"""What an instrument is, to those who use it; drivers keep to it without inheriting from it.
+"""Protocols of instruments; drivers satisfy them without inheriting from them.
 
-Every call has a total deadline in seconds and raises an :class:`~reseau.core.errors.InstrumentError` when it
-was not done by then; `stop` works from any thread; `close` never raises. Each also satisfies bluesky's
-protocols of the same names, so that bluesky's plans drive them as they are.
+Every call has one total time limit in seconds and raises an :class:`~reseau.core.errors.InstrumentError` if
+it does not finish within that limit. `stop` can be called from any thread; `close` never raises. The
+protocols include bluesky's protocols of the same names, so that bluesky's plans can use every instrument.
 """
 
 from __future__ import annotations
@@ -21,163 +21,205 @@ __all__ = ["Camera", "Exposure", "Instrument", "Movable", "Oscilloscope", "Turnt
 
 @runtime_checkable
 class Instrument(Protocol):
-    """What all of them can do."""
+    """Methods that every instrument has.
+
+    Examples
+    --------
+    >>> isinstance("a text", Instrument)
+    False
+    """
 
     @property
     def name(self) -> str:
-        """What it is called on the bench."""
+        """Name on the bench."""
 
     @property
     def settings(self) -> Settings:
-        """As they were pushed last."""
+        """Settings as last sent to the instrument."""
 
     def connect(self, seconds: float | None = None) -> Identity:
-        """Connect, push the settings, and ask who it is."""
+        """Connect, send the settings, and return the identity."""
 
     def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Test itself: what was tested, and what came out."""
+        """Run the self-test; return results by name of the test."""
 
     def close(self) -> None:
-        """Let go of it; never raises."""
+        """Close the connection; never raises."""
 
     def stop(self, *, success: bool = False) -> None:
-        """Stop whatever it does, from any thread."""
+        """Stop any movement, transmission or recording, from any thread."""
 
     def configure(self, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Change settings; returns the readings of the old ones and of the new ones."""
+        """Change settings; return readings of the old and the new settings."""
 
     def stage(self) -> list[Any]:
-        """Make it ready for a run."""
+        """Prepare for a run."""
 
     def unstage(self) -> list[Any]:
-        """Bring it back to rest."""
+        """Stop after a run."""
 
     def trigger(self) -> Status:
-        """Take a reading."""
+        """Take a reading in the background."""
 
     def read(self) -> dict[str, Any]:
-        """The last reading."""
+        """Return the last reading."""
 
     def describe(self) -> dict[str, Any]:
-        """What a reading holds."""
+        """Return the contents of a reading: type, shape and unit by name."""
 
     def read_configuration(self) -> dict[str, Any]:
-        """The settings as a reading."""
+        """Return the settings as a reading."""
 
     def describe_configuration(self) -> dict[str, Any]:
-        """What that holds."""
+        """Return the contents of the reading of the settings."""
 
 
 @runtime_checkable
 class Oscilloscope(Instrument, Protocol):
-    """An oscilloscope."""
+    """Oscilloscope.
+
+    Examples
+    --------
+    >>> sorted(name for name in ("screen", "waveform") if hasattr(Oscilloscope, name))
+    ['screen', 'waveform']
+    """
 
     def screen(self, seconds: float | None = None) -> ScreenPicture:
-        """The picture of its screen."""
+        """Return the picture of the screen."""
 
     def waveform(self, channel: int = 1, seconds: float | None = None) -> Waveform:
-        """The samples of a channel."""
+        """Return the samples of a channel."""
 
 
 @runtime_checkable
 class UltrasonicScanner(Instrument, Protocol):
-    """An instrument that makes sections by ultrasound."""
+    """Instrument that makes ultrasonic sections (B-mode images).
+
+    Examples
+    --------
+    >>> hasattr(UltrasonicScanner, "scan")
+    True
+    """
 
     def scan(self, seconds: float | None = None) -> BScan:
-        """One section."""
+        """Return one section."""
 
 
 @runtime_checkable
 class Movable(Protocol):
-    """One axis of a turntable, as bluesky moves it."""
+    """One axis of a turntable, as bluesky moves it.
+
+    Examples
+    --------
+    >>> isinstance(3.0, Movable)
+    False
+    """
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the axis."""
 
     @property
     def unit(self) -> str:
-        """Of its positions and limits: degrees or millimetres."""
+        """Unit of positions and limits: ``deg`` or ``mm``."""
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest position that it may be moved to."""
+        """Lowest and highest allowed position."""
 
     @property
     def position(self) -> float:
-        """Where it stands."""
+        """Current position."""
 
     def set(self, value: float) -> Status:
-        """Begin to move there."""
+        """Start to move to a position."""
 
     def stop(self, *, success: bool = False) -> None:
-        """Stop it."""
+        """Stop the axis."""
 
 
 @runtime_checkable
 class Turntable(Instrument, Protocol):
-    """Axes that move."""
+    """Instrument with axes that move.
+
+    Examples
+    --------
+    >>> sorted(name for name in ("axes", "home", "move", "state") if hasattr(Turntable, name))
+    ['axes', 'home', 'move', 'state']
+    """
 
     @property
     def axes(self) -> Mapping[str, Movable]:
-        """By name."""
+        """Axes by name."""
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         """Find the reference of an axis."""
 
     def move(self, axis: str, position: float, seconds: float | None = None) -> AxisState:
-        """Move an axis there, and wait."""
+        """Move an axis to a position, and wait until it has stopped."""
 
     def state(self, axis: str, seconds: float | None = None) -> AxisState:
-        """How an axis stands."""
+        """Return the state of an axis."""
 
 
 class Exposure(Protocol):
-    """A frame of a camera with what is known of it."""
+    """Frame of a camera with its time and settings.
+
+    Examples
+    --------
+    >>> hasattr(Exposure, "taken_within_s")
+    True
+    """
 
     @property
     def frame(self) -> Frame:
-        """The image; grey values as the camera sent them, of a mosaic of colours all of them."""
+        """Image with the grey values that the camera sent; of a colour mosaic, all raw pixels."""
 
     @property
     def pattern(self) -> str:
-        """Of colour that is kept raw: filters of the first two rows (RGGB …), YUYV, MJPEG; empty for grey."""
+        """Colour pattern of raw pixels (RGGB …, the filters of the first two rows; YUYV; MJPEG); empty for grey."""
 
     @property
     def sequence(self) -> int:
-        """Its number; a gap means that frames were lost."""
+        """Frame number; a gap means lost frames."""
 
     @property
     def taken(self) -> datetime:
-        """When its exposure began, UTC."""
+        """Start of the exposure, UTC."""
 
     @property
     def taken_within_s(self) -> float:
-        """How far from that it may have begun (s)."""
+        """Half-width of the interval that contains the start of the exposure (s)."""
 
     @property
     def fresh(self) -> bool:
-        """Whether its exposure surely began after it was asked for."""
+        """Whether the exposure certainly started after the request."""
 
     @property
     def exposure_us(self) -> float:
-        """Exposure time; NaN where the camera does not tell."""
+        """Exposure time (µs); NaN if the camera does not report it."""
 
     @property
     def gain(self) -> float:
-        """Gain, dB where the camera has a unit for it; NaN where it does not tell."""
+        """Gain, in dB if the camera defines a unit; NaN if the camera does not report it."""
 
     @property
     def dropped(self) -> int:
-        """Frames lost or damaged since the camera was connected."""
+        """Number of frames lost or damaged since the camera was connected."""
 
 
 @runtime_checkable
 class Camera(Instrument, Protocol):
-    """A camera."""
+    """Camera.
+
+    Examples
+    --------
+    >>> sorted(name for name in ("expose", "frames") if hasattr(Camera, name))
+    ['expose', 'frames']
+    """
 
     def expose(self, seconds: float | None = None) -> Exposure:
-        """A frame whose exposure began after this call."""
+        """Return a frame whose exposure started after this call."""
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Exposure]:
-        """Frames one after the other, as the camera delivers them; each says whether it is fresh."""
+        """Yield consecutive frames as the camera delivers them; each states whether it is fresh."""

@@ -12,42 +12,81 @@ from ..core.errors import SettingError
 __all__ = ["Limits", "Settings", "choice", "quantity", "text"]
 
 Limits = Mapping[str, tuple[float, float]]
-"""Lowest and highest value of a setting, by its name."""
+"""Lowest and highest allowed value of each setting, by name."""
 
 
 def quantity(default: float, unit: str, low: float, high: float) -> Any:
-    """A field of settings that is a number.
+    """Declare a numeric setting.
 
     Parameters
     ----------
     default : float
-        An int makes it a whole number.
+        Default value; an int declares a setting that takes whole numbers only.
     unit : str
-        As it is shown.
+        Unit, as it is displayed.
     low, high : float
-        Limits, themselves allowed.
+        Limits, inclusive, in `unit`.
+
+    Examples
+    --------
+    >>> @dataclass(frozen=True)
+    ... class Averaging(Settings):
+    ...     frames: int = quantity(1, "", 1, 64)
+    >>> Averaging(4).limits
+    {'frames': (1, 64)}
     """
     return field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
 def choice(default: str, *options: str) -> Any:
-    """A field of settings that is one of several words."""
+    """Declare a setting with a fixed set of values.
+
+    Parameters
+    ----------
+    default : str
+        Default value.
+    *options : str
+        Allowed values.
+
+    Examples
+    --------
+    >>> @dataclass(frozen=True)
+    ... class Mode(Settings):
+    ...     mode: str = choice("echo", "echo", "through")
+    >>> Mode("off")
+    Traceback (most recent call last):
+    reseau.core.errors.SettingError: mode: 'off' is not one of echo, through
+    """
     return field(default=default, metadata={"options": options})
 
 
 def text(default: str) -> Any:
-    """A field of settings that is text of its own form, which the driver checks."""
+    """Declare a free text setting; the driver checks its syntax.
+
+    Parameters
+    ----------
+    default : str
+        Default value.
+
+    Examples
+    --------
+    >>> @dataclass(frozen=True)
+    ... class Note(Settings):
+    ...     note: str = text("")
+    >>> Note("left camera").to_dict()
+    {'note': 'left camera'}
+    """
     return field(default=default, metadata={"text": True})
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of an instrument's settings; fields are made by :func:`quantity`, :func:`choice`, :func:`text`.
+    """Base class of settings; declare fields with :func:`quantity`, :func:`choice` and :func:`text`.
 
     Raises
     ------
     SettingError
-        When a value is of another type, not finite, or beyond its limits.
+        If a value has a wrong type, is not finite, or is outside its limits.
 
     Examples
     --------
@@ -58,7 +97,7 @@ class Settings:
     {'voltage': 'V'}
     >>> Pulser(400.0)
     Traceback (most recent call last):
-    reseau.core.errors.SettingError: voltage: 400 V is beyond 40…300 V
+    reseau.core.errors.SettingError: voltage: 400 V is outside 40…300 V
     """
 
     def __post_init__(self) -> None:
@@ -67,17 +106,17 @@ class Settings:
             if "options" in each.metadata:
                 if value not in each.metadata["options"]:
                     raise SettingError(
-                        f"{value!r} is none of {', '.join(each.metadata['options'])}", where=each.name
+                        f"{value!r} is not one of {', '.join(each.metadata['options'])}", where=each.name
                     )
                 continue
             if "text" in each.metadata:
                 if not isinstance(value, str):
-                    raise SettingError(f"{value!r} is no text", where=each.name)
+                    raise SettingError(f"{value!r} is not a text", where=each.name)
                 continue
             whole = isinstance(each.default, int)
             if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
                 raise SettingError(
-                    f"{value!r} is no {'whole number' if whole else 'number'}", where=each.name
+                    f"{value!r} is not a {'whole number' if whole else 'number'}", where=each.name
                 )
             if not whole:
                 object.__setattr__(self, each.name, float(value))
@@ -85,12 +124,12 @@ class Settings:
 
     @property
     def units(self) -> dict[str, str]:
-        """Units by name; words have none."""
+        """Units by name of the setting; only numeric settings have one."""
         return {each.name: each.metadata["unit"] for each in fields(self) if "unit" in each.metadata}
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
-        """Limits by name."""
+        """Limits by name of the setting."""
         return {
             each.name: (each.metadata["low"], each.metadata["high"])
             for each in fields(self)
@@ -98,29 +137,31 @@ class Settings:
         }
 
     def to_dict(self) -> dict[str, float | str]:
-        """Values by name."""
+        """Return the values by name."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def changed(self, changes: Mapping[str, Any], limits: Limits | None = None) -> Self:
-        """These settings with some other values.
+        """Return a copy with other values.
 
         Parameters
         ----------
         changes : mapping
             New values by name.
         limits : mapping, optional
-            Narrower ones, those of a bench.
+            Narrower limits by name, for example those of a bench.
 
         Raises
         ------
         SettingError
-            When there is no such setting, or a value is beyond a limit.
+            If a setting does not exist or a value is outside its limits.
         """
         known = {each.name for each in fields(self)}
         for name in (*changes, *(limits or {})):
             if name not in known:
                 raise SettingError(
-                    "is no setting here", where=name, do=f"there are {', '.join(sorted(known))}"
+                    "is not a setting of this instrument",
+                    where=name,
+                    do=f"choose from {', '.join(sorted(known))}",
                 )
         new = replace(self, **changes)
         for name, (low, high) in (limits or {}).items():
@@ -130,4 +171,4 @@ class Settings:
 
 def _check(name: str, value: float, unit: str, low: float, high: float) -> None:
     if not math.isfinite(value) or not low <= value <= high:
-        raise SettingError(f"{value:g} {unit} is beyond {low:g}…{high:g} {unit}", where=name)
+        raise SettingError(f"{value:g} {unit} is outside {low:g}…{high:g} {unit}", where=name)

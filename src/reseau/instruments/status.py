@@ -1,4 +1,4 @@
-"""The outcome of something that goes on in the background, as bluesky's ``Status`` has it."""
+"""Outcome of an operation in the background, compatible with bluesky's ``Status``."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["Status"]
 
 
 class Status:
-    """Something that has been begun and will be done, well or badly.
+    """Operation that runs in a thread of its own.
 
     Parameters
     ----------
     work : callable
-        Runs in a thread of its own.
+        Operation without arguments; an exception means failure.
     name : str
-        Of the thread.
+        Name of the thread.
 
     Examples
     --------
@@ -47,41 +47,46 @@ class Status:
             callback(self)
 
     def __repr__(self) -> str:
-        # bluesky's FailedStatus says no more than this.
+        # bluesky's FailedStatus shows only this text.
         how = "done" if self.success else f"failed: {self._error}" if self.done else "under way"
         return f"<{self._thread.name}: {how}>"
 
     @property
     def done(self) -> bool:
-        """Whether it is over."""
+        """Whether the operation has finished."""
         return self._finished.is_set()
 
     @property
     def success(self) -> bool:
-        """Whether it is over and went well."""
+        """Whether the operation has finished without an exception."""
         return self.done and self._error is None
 
     def exception(self, timeout: float | None = 0.0) -> BaseException | None:
-        """What went wrong, if anything; waits as long as allowed.
+        """Wait for the end of the operation and return its exception, or None.
+
+        Parameters
+        ----------
+        timeout : float, optional
+            Longest time to wait (s); None waits without limit.
 
         Raises
         ------
         DeadlineError
-            When it is not over by then.
+            If the operation has not finished by then.
         """
         if not self._finished.wait(timeout):
-            raise DeadlineError("is not done yet", where=self._thread.name)
+            raise DeadlineError("has not finished", where=self._thread.name)
         return self._error
 
     def wait(self, timeout: float | None = None) -> None:
-        """Wait until it is over, and raise what went wrong."""
+        """Wait for the end of the operation and raise its exception, if any."""
         error = self.exception(timeout)
         self._thread.join()
         if error is not None:
             raise error
 
     def add_callback(self, callback: Callable[[Status], None]) -> None:
-        """Have a function called when it is over; at once when it is."""
+        """Call a function at the end of the operation; at once if it has already ended."""
         with self._lock:
             if not self._finished.is_set():
                 self._callbacks.append(callback)

@@ -1,4 +1,4 @@
-"""What instruments hand over: who they are, pictures, waveforms, sections, the state of an axis."""
+"""Values that instruments return: identity, screen picture, waveform, section, state of an axis."""
 
 from __future__ import annotations
 
@@ -17,13 +17,26 @@ __all__ = ["AxisState", "BScan", "Identity", "ScreenPicture", "Waveform", "now"]
 
 
 def now() -> datetime:
-    """The time, in UTC."""
+    """Return the current time in UTC."""
     return datetime.now(UTC)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Who an instrument says it is."""
+    """Identity that an instrument reports.
+
+    Parameters
+    ----------
+    maker, model : str
+        Manufacturer and type.
+    serial, firmware : str, optional
+        Serial number and firmware version; empty if not reported.
+
+    Examples
+    --------
+    >>> str(Identity("Blue Robotics", "Ping360", firmware="3.1.1"))
+    'Blue Robotics Ping360 3.1.1'
+    """
 
     maker: str
     model: str
@@ -36,14 +49,21 @@ class Identity:
 
 @dataclass(frozen=True)
 class ScreenPicture:
-    """The picture of an instrument's own screen, as the file that it sent.
+    """Picture of an instrument's own screen, as the file that the instrument sent.
 
     Parameters
     ----------
     data : bytes
-        PNG or BMP.
+        PNG or BMP file.
     taken : datetime
-        When it had been asked for.
+        Time of the request, UTC.
+
+    Examples
+    --------
+    >>> data = cv2.imencode(".png", np.zeros((4, 6), np.uint8))[1].tobytes()
+    >>> picture = ScreenPicture(data)
+    >>> picture.suffix, picture.frame().pixels.shape
+    ('.png', (4, 6))
     """
 
     data: bytes
@@ -51,38 +71,45 @@ class ScreenPicture:
 
     @property
     def suffix(self) -> str:
-        """Of a file that holds it."""
+        """Suffix for a file with this picture: ``.png`` or ``.bmp``."""
         return ".bmp" if self.data[:2] == b"BM" else ".png"
 
     def frame(self, name: str = "screen") -> Frame:
-        """The grey image, 8 bits.
+        """Decode the picture to a grey image with 8 bits.
 
         Raises
         ------
         ImageError
-            When the picture cannot be decoded.
+            If the picture cannot be decoded.
         """
         try:
             grey = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_GRAYSCALE)
         except cv2.error:
             grey = None
         if grey is None:
-            raise ImageError("is no picture that can be decoded", where=name)
+            raise ImageError("cannot be decoded as PNG or BMP", where=name)
         return Frame(grey, 255.0, name, sha256_of(self.data))
 
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
-    """Samples of one channel.
+    """Samples of one channel of an oscilloscope.
 
     Parameters
     ----------
     volts : ndarray (n,)
-        At equal distances of time.
+        Samples (V) at equal time steps.
     start_s, step_s : float
-        Time of the first sample after the trigger, and from one to the next.
+        Time of the first sample relative to the trigger, and the time step (s).
     channel : int
-        Which one.
+        Number of the channel.
+    taken : datetime
+        Time of the request, UTC.
+
+    Examples
+    --------
+    >>> Waveform(np.array([0.0, 0.5, 0.1]), start_s=-1e-6, step_s=1e-6).seconds
+    array([-1.e-06,  0.e+00,  1.e-06])
     """
 
     volts: Array
@@ -93,29 +120,38 @@ class Waveform:
 
     @property
     def seconds(self) -> Array:
-        """Times of the samples (n,)."""
+        """Times of the samples relative to the trigger (n,), in seconds."""
         times: Array = self.start_s + self.step_s * np.arange(len(self.volts), dtype=np.float64)
         return times
 
 
 @dataclass(frozen=True, eq=False)
 class BScan:
-    """A section by ultrasound.
+    """Ultrasonic section (B-mode image).
 
     Parameters
     ----------
     pixels : ndarray (height, width)
-        Echoes, 0 to 255; depth down.
+        Echo amplitudes, 0 to 255; depth increases downwards.
     mm_per_px : (float, float) or None
-        Along x and along y; None where the instrument does not tell: never guessed.
+        Pixel size along x and y (mm); None if the instrument does not report it. It is never guessed.
     origin_px : (float, float)
-        Where the transducer is.
+        Position of the transducer (px).
     speed_m_s : float
-        Of sound, that the millimetres were computed with.
+        Speed of sound (m/s) from which the pixel size was computed.
     frequency_khz, gain : float
-        That it was taken with; NaN where nobody tells.
+        Frequency (kHz) and gain of the acquisition; NaN if unknown.
+    taken : datetime
+        Time of the request, UTC.
     region_px : (int, int, int, int), optional
-        Left, top, right and bottom pixel of where the millimetres hold; by default everywhere.
+        First and last column and row of the region where the pixel size is valid, as left, top, right,
+        bottom; by default the whole image.
+
+    Examples
+    --------
+    >>> scan = BScan(np.zeros((40, 60), np.uint8), (0.2, 0.25), (29.5, 0.0), 1540.0, 6000.0, 57.0)
+    >>> scan.frame().pixels.shape
+    (40, 60)
     """
 
     pixels: NDArray[np.uint8]
@@ -128,24 +164,29 @@ class BScan:
     region_px: tuple[int, int, int, int] | None = None
 
     def frame(self, name: str = "scan") -> Frame:
-        """The section as an image."""
+        """Return the section as an image."""
         return Frame(self.pixels, 255.0, name, sha256_of(self.pixels.tobytes()))
 
 
 @dataclass(frozen=True)
 class AxisState:
-    """How an axis stands.
+    """State of an axis.
 
     Parameters
     ----------
     position : float
-        In the unit of the axis.
+        Position in the unit of the axis.
     moving : bool
-        Whether it moves.
+        Whether the axis moves.
     homed : bool
-        Whether the position means anything.
+        Whether the axis has found its reference; otherwise the position is meaningless.
     faults : tuple of str
-        What went wrong: stalled, a limit met, the driver off.
+        Reported faults: stalled, limit switch reached, driver off.
+
+    Examples
+    --------
+    >>> AxisState(30.0, moving=False, homed=True)
+    AxisState(position=30.0, moving=False, homed=True, faults=())
     """
 
     position: float

@@ -120,7 +120,7 @@ def test_a_length_from_the_wire_reserves_nothing() -> None:
         with pytest.raises(ProtocolError):
             rpc.Unpacker(b"\xff\xff\xff\xff").opaque()
         with pytest.raises(ProtocolError):
-            ieee488.missing_of(b"#9999999999")
+            ieee488.missing_bytes(b"#9999999999")
         assert tracemalloc.get_traced_memory()[1] < 1e5
     finally:
         tracemalloc.stop()
@@ -140,7 +140,7 @@ def test_decoding_one_message_gives_a_value_or_says_what_is_wrong(data: bytes) -
         lambda content: bk.parse_frame(content, 8),
         lambda line: bk.numbers(line, "US_WIN_SIZE"),
         usbtmc.decode,
-        ieee488.missing_of,
+        ieee488.missing_bytes,
         ieee488.parse_block,
         ieee488.picture,
         lambda line: ieee488.error_entry(line.decode("latin-1")),

@@ -71,14 +71,14 @@ def test_smc100_states_of_the_manual(codes: str, phase: smc100.Phase) -> None:
 
 def test_smc100_status_bits_are_the_first_four_digits() -> None:
     # The manual's own example of TS: 0x004C is homing time-out, RMS and peak current limit.
-    assert smc100.decode_status("004C0A").complaints == (
+    assert smc100.decode_status("004C0A").error_texts == (
         "peak current limit",
         "RMS current limit",
         "homing time-out",
     )
-    assert smc100.decode_status("002132").complaints == ("negative end of run", "following error")
-    assert smc100.decode_status("000232").complaints == ("positive end of run",)
-    assert smc100.decode_status("030033").complaints == ("DC voltage too low", "80 W output power exceeded")
+    assert smc100.decode_status("002132").error_texts == ("negative end of run", "following error")
+    assert smc100.decode_status("000232").error_texts == ("positive end of run",)
+    assert smc100.decode_status("030033").error_texts == ("DC voltage too low", "80 W output power exceeded")
 
 
 def test_smc100_errors_are_those_of_the_manual() -> None:
@@ -158,17 +158,17 @@ def test_bk_queries_and_answers_as_public_clients_have_them() -> None:
 
 def test_blocks_and_pictures_end_where_they_say() -> None:
     assert ieee488.parse_block(b"#800000005hello\n") == b"hello"
-    assert ieee488.missing_of(b"#800000005hel") == 2
+    assert ieee488.missing_bytes(b"#800000005hel") == 2
     png = bytes.fromhex(
         "89504e470d0a1a0a 0000000d49484452 00000001000000010800000000 3a7e9b55"
         "0000000a49444154 789c63600000000200 01 48afa471 0000000049454e44 ae426082".replace(" ", "")
     )
-    assert ieee488.missing_of(png) == 0
-    assert ieee488.missing_of(png[:-1]) is None
+    assert ieee488.missing_bytes(png) == 0
+    assert ieee488.missing_bytes(png[:-1]) is None
     assert ieee488.picture(png + b"\n") == png
     assert ieee488.picture(ieee488.block(png) + b"\n") == png
     bmp = b"BM" + (60).to_bytes(4, "little") + bytes(54)
-    assert ieee488.missing_of(bmp[:-4]) == 4
+    assert ieee488.missing_bytes(bmp[:-4]) == 4
     for wrong in (b"hello", b"#", b"#0", b"#9999999999", b"#3ab", b"BM\xff\xff\xff\xff", b"\x89GIF1234"):
         with pytest.raises(ProtocolError):
             ieee488.picture(wrong)

@@ -56,7 +56,7 @@ def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
     node, name = looped
     with v4l2("camera", node, settings={"format": name}) as camera:
         for shift in (0, 9, WORLD):
-            steer("look_at", shift)
+            steer("point_at", shift)
             _seen(camera, shift)
         shot = camera.expose()
         assert shot.full_scale == {"Y10": 1023, "Y12": 4095, "Y16": 65535}.get(name, 255)
@@ -68,7 +68,7 @@ def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
 
 def test_brightness_and_gain_act_on_the_picture(grey: str) -> None:
     with v4l2("camera", grey) as camera:
-        steer("look_at", 3)
+        steer("point_at", 3)
         seen = []
         for changes in ({}, {"brightness": 138}, {"brightness": 128, "gain": 60.0}, {"gain": 0.0}):
             camera.configure(**changes)
@@ -188,7 +188,7 @@ def test_v4l2_ctl_agrees_with_what_our_driver_set(grey: str) -> None:
 def test_v4l2_ctl_captures_the_same_frame(grey: str, tmp_path: Any) -> None:
     if shutil.which("v4l2-ctl") is None:
         pytest.skip("no v4l2-ctl on the host: apt-get install v4l-utils")
-    steer("look_at", 17)
+    steer("point_at", 17)
     with v4l2("camera", grey, settings={"brightness": 128, "gain": 0.0}) as camera:
         _seen(camera, 17)
         camera.stop()
@@ -215,7 +215,7 @@ def test_unplugged_and_plugged_in_again_it_is_set_as_before(grey: str) -> None:
         subprocess.run([busybox, "insmod", "/run/modules/vivid.ko", *options], check=True)
         settle()
         assert steer("start_camera", "GREY") == grey
-        steer("look_at", 31)
+        steer("point_at", 31)
         camera.expose()  # it is set as before by then; the first frames through the loop are older than that
         assert value("camera.view").offset == 12.0
         _seen(camera, 31)

@@ -68,21 +68,21 @@ class Lab:
             "ping360": serving.Ping360,
             "compactpulser": serving.CompactPulser,
         }
-        self.script = serving.Script()
+        self.script = serving.FaultScript()
         self.machine: serving.Machine = self.machines["zaber"]()
-        self.line = SerialPort(serving.Wire(self.machine, self.script))
+        self.line = SerialPort(serving.FaultyConnection(self.machine, self.script))
         self.scope = serving.Oscilloscope("keysight")
-        self.scope_script = serving.Script()
+        self.scope_script = serving.FaultScript()
         self.usb = UsbtmcDevice(self.scope, self.scope.execute, self.scope_script)
-        self.body = serving.CameraBody(serving.Pattern(640, 480), 640, 480)
+        self.body = serving.SimulatedCamera(serving.StripeScene(640, 480), 640, 480)
         self.camera: Any = None
 
     def connect(self, name: str) -> None:
         """Put another instrument at the end of the line."""
-        from reseau_sims.serving import Script, Wire
+        from reseau_sims.serving import FaultScript, FaultyConnection
 
-        self.script, self.machine = Script(), self.machines[name]()
-        self.line.session = Wire(self.machine, self.script)
+        self.script, self.machine = FaultScript(), self.machines[name]()
+        self.line.session = FaultyConnection(self.machine, self.script)
 
     def befall(self, which: str, kind: Any, seconds: float = 0.2) -> None:
         """Have a fault befall the next answer of the line, or of the oscilloscope."""
@@ -94,15 +94,15 @@ class Lab:
     def _sight(self, shift: int) -> Any:
         """Stripes; below 0 what the host drew of the world."""
         from reseau.core.data import Frame
-        from reseau_sims.serving import Pattern, Still
+        from reseau_sims.serving import StillScene, StripeScene
 
         if shift >= 0:
-            return Pattern(640, 480, shift)
-        return Still(Frame(np.load(Path(os.environ["RIG_OUT"], "world.npy")), 255.0))
+            return StripeScene(640, 480, shift)
+        return StillScene(Frame(np.load(Path(os.environ["RIG_OUT"], "world.npy")), 255.0))
 
-    def look_at(self, shift: int) -> None:
+    def point_at(self, shift: int) -> None:
         """Show the camera something else."""
-        self.body.look_at(self._sight(shift))
+        self.body.point_at(self._sight(shift))
 
     def picture(self, shift: int) -> Any:
         """What the camera should show of it, set as it is."""

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau_sims.serving import CameraBody, View
+from reseau_sims.serving import SimulatedCamera, View
 
 __all__ = ["LoopCamera"]
 
@@ -59,13 +59,13 @@ class LoopCamera:
 
     Parameters
     ----------
-    body : CameraBody
+    body : SimulatedCamera
         Its width and height are those of the frames.
     fourcc : str
         GREY, Y10, Y12, Y16 or YUYV.
     """
 
-    def __init__(self, body: CameraBody, fourcc: str) -> None:
+    def __init__(self, body: SimulatedCamera, fourcc: str) -> None:
         self._body, self._fourcc = body, fourcc
         found = nodes()
         self.node = found["cap"]
@@ -151,7 +151,7 @@ class LoopCamera:
             free, on, drawn, picture = list(range(len(maps))), False, None, b""
             while not self._stop.is_set():
                 # Drawn anew only when something changed: the emulated processor has others to serve.
-                wanted = self._body.sight, self.view
+                wanted = self._body.scene, self.view
                 if wanted != drawn:
                     drawn = wanted
                     picture = _bytes(self._body.draw(wanted[1]), self._fourcc)

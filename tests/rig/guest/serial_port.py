@@ -55,7 +55,7 @@ class SerialPort:
             if pulled:
                 self.gadget.unplug()
             os.close(fd)
-            self.session.hung_up()
+            self.session.disconnected()
             if pulled:
                 self.gadget.plug_in()
             else:

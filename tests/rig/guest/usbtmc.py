@@ -10,14 +10,13 @@ import select
 import struct
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs import usbtmc
-from reseau_sims.serving import Machine, Script
-from reseau_sims.serving.scpi import AnswerQueue
+from reseau_sims.serving import FaultScript, Machine
+from reseau_sims.serving.scpi import AnswerQueue, Execute
 
 from .gadget import Gadget, appeared, mounted
 
@@ -66,13 +65,13 @@ class UsbtmcDevice:
         Answers.
     execute : callable
         Takes program messages.
-    script : Script
+    script : FaultScript
         What goes wrong.
     """
 
     RESOURCE = "USB0::4617::1::SCOPE1::0::INSTR"
 
-    def __init__(self, machine: Machine, execute: Callable[[bytes], bytes | None], script: Script) -> None:
+    def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self._machine, self._queue = machine, AnswerQueue(machine, execute, script)
         self._lock = threading.Condition()
         self._begun = b""

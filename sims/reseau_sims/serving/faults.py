@@ -11,7 +11,7 @@ import numpy as np
 
 from reseau.core.errors import UsageError
 
-__all__ = ["DEVICE_KINDS", "KINDS", "LINE_KINDS", "Fault", "Kind", "Output", "Script"]
+__all__ = ["DEVICE_KINDS", "KINDS", "LINE_KINDS", "Fault", "FaultScript", "Kind", "Output"]
 
 Kind = Literal[
     "late",
@@ -55,7 +55,7 @@ class Fault:
             raise UsageError(f"is none of {', '.join(KINDS)}", where=f"fault {self.kind!r}")
 
 
-class Script:
+class FaultScript:
     """Which answers suffer which fault.
 
     Parameters

@@ -1,9 +1,10 @@
-"""The process that speaks GigE Vision: Aravis's fake camera, with pictures of the simulator behind it.
+"""Process that implements GigE Vision: Aravis's fake camera with the images of the simulator.
 
-Run as a script by :class:`reseau_sims.serving.gige.GigeCamera`, with the standard library alone, so that it
-is there at once: ``python gige_door.py ADDRESS SERIAL MEMORY BYTES [FEATURES]``. For each frame it writes a
-request to its standard output and reads the order for it from its standard input; the pixels lie in memory
-shared by its file descriptor. It is a process of its own because a thread of C calls back for every frame.
+:class:`reseau_sims.serving.gige.GigeCamera` runs this file as a script that imports the standard library
+only, so that it starts quickly: ``python gige_process.py ADDRESS SERIAL MEMORY BYTES [FEATURES]``. For each
+frame it writes a request to its standard output and reads the order for it from its standard input; the
+pixels are in memory that is shared by its file descriptor. It is a separate process because a C thread calls
+back for every frame.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, BinaryIO
 
 REQUEST = struct.Struct("<QQIIIIIIII")
 """Number, its own time (ns), exposure (µs), gain (dB), pixel format, left, top, width, height, triggered."""
-OBEYED = bytes(REQUEST.size)
+DONE = bytes(REQUEST.size)
 """In place of a request: up and running, or an order besides any frame was obeyed."""
 ORDER = struct.Struct("<cddqqI")
 """Kind, seconds to wait, share of packets lost, frame number or −1, time (ns) or −1, bytes of the frame."""
@@ -59,7 +60,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 }  # fmt: skip
 
 
-class Door:
+class FakeCameraServer:
     """The fake camera, and the pipe to the simulator.
 
     Parameters
@@ -90,12 +91,12 @@ class Door:
             function.restype, function.argtypes = result, arguments
         named = address.encode(), serial.encode()
         if features:
-            self._door = self._library.arv_gv_fake_camera_new_full(*named, self._described(features))
+            self._server = self._library.arv_gv_fake_camera_new_full(*named, self._described(features))
         else:
-            self._door = self._library.arv_gv_fake_camera_new(*named)
-        if not self._door or not self._library.arv_gv_fake_camera_is_running(self._door):
+            self._server = self._library.arv_gv_fake_camera_new(*named)
+        if not self._server or not self._library.arv_gv_fake_camera_is_running(self._server):
             raise SystemExit(f"no GigE Vision on {address}: is port 3956 taken?")
-        self._camera = self._library.arv_gv_fake_camera_get_fake_camera(self._door)
+        self._camera = self._library.arv_gv_fake_camera_get_fake_camera(self._server)
         self._memory = (ctypes.c_char * len(memory)).from_buffer(memory)
         self._orders, self._requests = orders, requests
         self._frames: queue.Queue[tuple[Any, ...]] = queue.Queue()
@@ -123,7 +124,7 @@ class Door:
 
     def run(self) -> None:
         """Obey orders until there are none any more."""
-        self._send(OBEYED)
+        self._send(DONE)
         while len(data := self._orders.read(ORDER.size)) == ORDER.size:
             order = ORDER.unpack(data)
             if order[0] == END:
@@ -131,12 +132,12 @@ class Door:
             if order[0] == FRAME:
                 self._frames.put(order)
             else:
-                self._obey(order[0])
-                self._send(OBEYED)
+                self._execute(order[0])
+                self._send(DONE)
         # The library's thread may wait for a frame, which never comes now.
         os._exit(0)
 
-    def _obey(self, kind: bytes) -> None:
+    def _execute(self, kind: bytes) -> None:
         self._write(ACQUISITION, 0)
         if kind in (HANG_UP, RESET):
             self._write(PRIVILEGE, 0)
@@ -156,7 +157,7 @@ class Door:
         if wait > 0:
             time.sleep(wait)
         # The library asks for the share of lost packets with every packet of the frame that is sent next.
-        self._objects.g_object_set(_POINTER(self._door), b"gvsp-lost-ratio", ctypes.c_double(loss), None)
+        self._objects.g_object_set(_POINTER(self._server), b"gvsp-lost-ratio", ctypes.c_double(loss), None)
         if number >= 0:
             library.arv_buffer_set_frame_id(buffer, number)
         if stamp >= 0:
@@ -183,7 +184,7 @@ def main() -> None:
     """Serve until the simulator hangs up."""
     address, serial, descriptor, size, *features = sys.argv[1:]
     memory = mmap.mmap(int(descriptor), int(size))
-    Door(address, serial, memory, sys.stdin.buffer, sys.stdout.buffer, *features).run()
+    FakeCameraServer(address, serial, memory, sys.stdin.buffer, sys.stdout.buffer, *features).run()
 
 
 if __name__ == "__main__":
