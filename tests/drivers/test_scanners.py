@@ -104,8 +104,8 @@ def test_a_size_that_no_scanner_has_is_refused(size: bytes) -> None:
 
 def test_a_frame_of_another_size_is_refused() -> None:
     device, machine = bk_pair()
-    machine._frame = lambda: bk.encode_frame(bk.GrabbedFrame(1, bytes(100), 104))  # type:
-    ignore[method-assign] with pytest.raises(ProtocolError, match="101 bytes for 4800 pixels"):
+    machine._frame = lambda: bk.encode_frame(bk.GrabbedFrame(1, bytes(100), 104))  # type: ignore[method-assign]
+    with pytest.raises(ProtocolError, match="101 bytes for 4800 pixels"):
         device.scan()
     device.close()
 

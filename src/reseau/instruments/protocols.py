@@ -177,7 +177,7 @@ class Exposure(Protocol):
 
     @property
     def pattern(self) -> str:
-        """Colour pattern of raw pixels (RGGB …, the filters of the first two rows; YUYV; MJPEG); empty for grey."""
+        """Colour pattern of raw pixels (filters of the first two rows, as RGGB; YUYV; MJPEG); else empty."""
 
     @property
     def sequence(self) -> int:
