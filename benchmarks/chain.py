@@ -10,8 +10,8 @@ import group_a
 import numpy as np
 from photographs import Measured, Physics, measured
 
-from reseau.adjust import Failure
 from reseau.core.data import Array, ImagePoints, Rows
+from reseau.core.failure import Failure
 from reseau.io import ReseauDesign
 from reseau.measure.fitting import fit_mapping
 from reseau.procedures.oscilloscope import PhotoII, photo_i, photo_ii

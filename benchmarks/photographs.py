@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from reseau.adjust import Failure
 from reseau.core.data import ImagePoints
+from reseau.core.failure import Failure
 from reseau.procedures.oscilloscope import photo_i, photo_ii, photo_iii
 from reseau.refine import Registration
 from reseau_sims import World

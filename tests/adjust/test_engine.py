@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reseau.adjust import (
+    AdjustmentFailure,
     Constraint,
-    Failure,
     GaussHelmert,
     GaussMarkov,
     Options,
@@ -219,7 +219,7 @@ def test_a_rank_defect_names_the_parameters_of_its_null_space():
     names = ["a", "b", "c", "shift", "idle"]
     failed = adjust(GaussMarkov(function, noisy(), 0.01, Parameters(names, [1.0, 1.0, 0.0, 0.5, 7.0])))
     assert not failed
-    assert isinstance(failed, Failure)
+    assert isinstance(failed, AdjustmentFailure)
     assert "rank defect 2" in failed.reason
     found = {frozenset(vector) for vector in failed.null_space}
     assert found == {frozenset({"a", "shift"}), frozenset({"idle"})}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from reseau.adjust import (
+    AdjustmentFailure,
     Constraint,
-    Failure,
     GaussHelmert,
     GaussMarkov,
     Options,
@@ -76,7 +76,7 @@ def test_elimination_of_what_cannot_be_adjusted_is_the_failure():
     twice = GaussMarkov(lambda x: T * (x[0] + x[1]), cubic(), 0.1, Parameters("ab", [0.0, 0.0]))
     found = eliminate(twice)
     assert not found
-    assert isinstance(found, Failure)
+    assert isinstance(found, AdjustmentFailure)
     assert "a with b" in found.reason
 
 

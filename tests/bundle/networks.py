@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from reseau.bundle import Additional, BundleProblem, Camera, Network
-from reseau.bundle.solver import approximate
+from reseau.bundle.solver.approximate import approximate
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Values
 from reseau.core.data import Array

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration, Covariance, Quantity
 
+from reseau.calibration.document import Calibration, Covariance, Quantity
 from reseau.core.errors import FormatError
 
 

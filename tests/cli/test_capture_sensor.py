@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from reseau.calibration.document.document import Calibration
 from scipy.special import ndtr
 
 from reseau.archive import Archive, Session
+from reseau.calibration.document import Calibration
 from reseau.cli import run
 from reseau.core.errors import ArchiveError
 from reseau.io.images import write_image

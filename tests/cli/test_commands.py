@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from reseau.calibration.document.document import Calibration
 
+from reseau.calibration.document import Calibration
 from reseau.io import ReseauDesign, ReseauMeasurement
 from reseau.io.images import read_frame, write_image
 

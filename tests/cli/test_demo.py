@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration
 from threadpoolctl import threadpool_limits
 
 from reseau.archive import Archive, verify
+from reseau.calibration.document import Calibration
 from reseau.cli import run
 from reseau.io import ReseauDesign, ReseauMeasurement
 from reseau.refine import InstrumentCorrection

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from reseau.adjust import Adjustment, Elimination, Failure, Options, adjust, check_jacobian
+from reseau.adjust import Adjustment, Elimination, Options, adjust, check_jacobian
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
+from reseau.core.failure import Failure
 from reseau.measure.fitting import fit_mapping, mapping_problem, reduce_mapping
 from reseau.optics import Chain, PlaneMapping, RationalPolynomial, Similarity
 

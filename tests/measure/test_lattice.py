@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.core.data import Array
+from reseau.core.failure import Failure
 from reseau.measure.screening import quiet_noise
 from reseau.measure.testfield.lattice import LatticeFit, lattices, refit, second_order
 from reseau.measure.testfield.lines import Lattice, find_lattice, ridge_points

@@ -9,6 +9,7 @@ import pytest
 
 from reseau.core.data import Frame
 from reseau.core.errors import ImageError, UsageError
+from reseau.core.failure import Code, Failure
 from reseau.io import DesignPoint, ReseauMeasurement
 from reseau.measure import ReseauOptions, measure_reseau
 from reseau.optics import sigma_of_snr
@@ -241,7 +242,9 @@ def test_a_frame_without_the_reseau_is_a_failure_with_the_reason(kind, nominal):
         frame = Frame(clutter(kind, seed), 255.0, "clutter.png")
         result = measure_reseau(frame, form(SMALL, rng(seed)).design, ReseauOptions(nominal=nominal))
         assert not result
-        assert result.reason.startswith("clutter.png: design 'reseau' is not to be found")
+        assert isinstance(result, Failure)
+        assert result.code is Code.NOT_FOUND
+        assert str(result).startswith("clutter.png: design 'reseau' is not to be found")
         assert "\n" not in result.reason
 
 

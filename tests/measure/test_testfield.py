@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.core.data import Array, Frame
 from reseau.core.errors import ImageError
+from reseau.core.failure import Failure
 from reseau.designs import coded_testfield
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
@@ -150,7 +150,7 @@ FRAME = PLAIN.record(STATION).pixels
 def test_what_is_not_the_testfield_gets_a_clear_answer(pixels: Array, design: Any, reason: str) -> None:
     found = answer(np.ascontiguousarray(pixels).astype(np.uint8), design)
     assert isinstance(found, Failure)
-    assert found.reason.startswith("frame: ")
+    assert found.where == "frame"
     assert any(part in found.reason for part in reason.split("|")), found.reason
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.core.data import Frame
 from reseau.core.errors import UsageError
+from reseau.core.failure import Code, Failure
 from reseau.measure.measured import Measured
 from reseau.procedures.calibration import Calibrated, CameraModel, calibrate_camera
 from reseau_sims import FieldBench, Station
@@ -24,7 +24,7 @@ def blank(name: str) -> Frame:
 def measure(frame: Frame) -> Measured | Failure:
     """The true positions of the large targets with noise, or nothing."""
     if frame.name not in STATIONS:
-        return Failure(f"{frame.name}: no target")
+        return Failure("no target", Code.NOT_FOUND, where=frame.name)
     truth = BENCH.truth(STATIONS[frame.name])
     rng = np.random.default_rng(len(frame.name))
     n, ok = len(truth.names), BENCH.inside(truth, 8.0) & BENCH.design.large

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.bundle import Result
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
+from reseau.core.failure import Code, Failure
 from reseau.designs import coded_testfield
 from reseau.optics import Brown, PixelGrid, Pose, project
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
@@ -49,7 +49,9 @@ def recorded(seed: int, poses: int = 2, away: float = 1.0) -> tuple[Seen, Height
 
 def calibrated(seen: Seen, heights: Heights | None) -> Calibrated | Failure:
     options = CalibrationOptions(heights=heights)
-    return calibrate_camera(seen, DESIGN, lambda frame: Failure(""), (240, 240), MODEL, options)
+    return calibrate_camera(
+        seen, DESIGN, lambda frame: Failure("", Code.NOT_FOUND), (240, 240), MODEL, options
+    )
 
 
 def camera_of(found: Calibrated | Failure) -> tuple[np.ndarray, np.ndarray, Result]:

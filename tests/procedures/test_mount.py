@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reseau.adjust import Failure
 from reseau.capture import paper_steps
+from reseau.core.failure import Failure
 from reseau.optics.poses import rotation_matrix
 from reseau.procedures.mount import Mount
 

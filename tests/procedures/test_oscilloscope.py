@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.core.data import Frame
+from reseau.core.failure import Failure
 from reseau.designs import regular_reseau
 from reseau.io import Mark
 from reseau.optics import RationalPolynomial
@@ -76,7 +76,7 @@ def test_a_frame_without_the_reseau_is_a_failure_that_names_both():
     found = photo_i(Frame(noise, 255.0, "dull.png"), RESEAU)
     assert not found
     assert isinstance(found, Failure)
-    assert "dull.png" in found.reason
+    assert found.where == "dull.png"
     assert "small" in found.reason
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from reseau.adjust import Failure
 from reseau.capture import paper_steps, spread
 from reseau.core.data import Array, ImagePoints
+from reseau.core.failure import Code, Failure
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import project
 from reseau.procedures.calibration import CameraModel, calibrate_camera
@@ -46,7 +46,9 @@ def recordings(seed: int) -> list[tuple[str, ImagePoints]]:
 @pytest.mark.parametrize("seed", range(3))
 def test_points_without_depth_do_not_keep_it_from_its_end(seed: int) -> None:
     model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
-    found = calibrate_camera(recordings(seed), board(), lambda frame: Failure(""), (240, 240), model)
+    found = calibrate_camera(
+        recordings(seed), board(), lambda frame: Failure("", Code.NOT_FOUND), (240, 240), model
+    )
     assert not isinstance(found, Failure)
     names, _, values = found.result.camera_columns(0)
     sigma = np.sqrt(np.diag(found.result.camera_covariance(0)))

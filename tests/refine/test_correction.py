@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration
 from scipy.stats import chi2
 
-from reseau.adjust import Failure, adjust
+from reseau.adjust import adjust
+from reseau.calibration.document import Calibration
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError
+from reseau.core.failure import Failure
 from reseau.designs import regular_reseau
 from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.measure.fitting import mapping_problem

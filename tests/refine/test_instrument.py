@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration
 
-from reseau.adjust import Failure
+from reseau.calibration.document import Calibration
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError
+from reseau.core.failure import Failure
 from reseau.io import DesignPoint
 from reseau.refine import InstrumentCorrection, correct_camera, correct_instrument
 

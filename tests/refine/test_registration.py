@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reseau.adjust import Failure
+from reseau.core.failure import Failure
 from reseau.optics import Similarity
 from reseau.refine import correct_camera, register
 

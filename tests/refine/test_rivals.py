@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reseau.adjust import Failure
 from reseau.core.data import ImagePoints
+from reseau.core.failure import Failure
 from reseau.measure.fitting import fit_mapping
 from reseau.optics import RationalPolynomial, wong_display
 from reseau.refine import leave_one_out, rivals

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration
 from scipy.stats import binom
 
-from reseau.adjust import Failure
+from reseau.calibration.document import Calibration
 from reseau.core.data import ImagePoints
+from reseau.core.failure import Failure
 from reseau.refine import InstrumentCorrection, correct_camera, correct_instrument, still_standard
 
 from .oscilloscope import RESEAU, RODS, SIGMA_PX, displayed, measured, reseau_marks

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from reseau.adjust import Failure
+from reseau.core.failure import Code, Failure
 from reseau.core.provenance import Provenance
 from reseau.report.sensor import mtf_figure, sensor_report
 from reseau.sensor import EdgeSpread, Level, SensorResult, SensorSeries, calibrate_sensor, with_edge
@@ -55,7 +55,7 @@ def test_the_curves_of_the_figure_are_those_that_were_found() -> None:
     assert "PolyCollection" in figure or "FillBetween" in figure
 
 
-@pytest.mark.parametrize("edge", [None, Failure("the edge is slanted by 0.1°")])
+@pytest.mark.parametrize("edge", [None, Failure("the edge is slanted by 0.1°", Code.SLANT)])
 def test_what_was_not_measured_is_told(edge: Failure | None) -> None:
     page = sensor_report(replace(result(), edge=edge), title="Sensor")
     assert page.count("<svg") == 1

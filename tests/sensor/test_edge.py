@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.stats import binom
 
-from reseau.adjust import Failure
 from reseau.core.data import Array, Frame
+from reseau.core.failure import Failure
 from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
 from reseau.sensor.free import FREQUENCIES
 

@@ -6,11 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from reseau.calibration.document.document import Calibration
 
-from reseau.adjust import Failure
+from reseau.calibration.document import Calibration
 from reseau.core.data import Array, Frame
 from reseau.core.errors import EstimationError, FormatError, UsageError
+from reseau.core.failure import Failure
 from reseau.sensor import Level, SensorCorrection, SensorResult, SensorSeries, calibrate_sensor
 from reseau_sims.pixels import PixelSensor
 

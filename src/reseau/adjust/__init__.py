@@ -9,16 +9,18 @@ from .consensus import Consensus, ConsensusModel, ransac
 from .differences import JacobianCheck
 from .elimination import Elimination, EliminationStep, eliminate
 from .engine import Options, adjust
+from .fitted import AdjustmentFailure
 from .parameters import Constraint, Parameters, Prior
 from .problem import GaussHelmert, GaussMarkov, Problem
 from .rejection import Rejection, SnoopingStep, data_snooping, reject_outliers
 from .reliability import ExternalReliability, critical_tau, critical_w, noncentrality
-from .result import Adjustment, Failure
+from .result import Adjustment
 from .robust import Robust, robust, weight_function
 from .significance import CoefficientTest, GlobalTest, NestedTest, compare
 
 __all__ = [
     "Adjustment",
+    "AdjustmentFailure",
     "BatchAdjustment",
     "BatchOptions",
     "BatchReason",
@@ -29,7 +31,6 @@ __all__ = [
     "Elimination",
     "EliminationStep",
     "ExternalReliability",
-    "Failure",
     "GaussHelmert",
     "GaussMarkov",
     "GlobalTest",

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
 from .differences import JacobianCheck, compare_jacobians
 from .models import HelmertModel, MarkovModel, model_of
 from .problem import Problem

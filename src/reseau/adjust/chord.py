@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from reseau.core.data import Array, Mask, Rows
-from reseau.core.errors import UsageError
-
+from ..core.data import Array, Mask, Rows
+from ..core.errors import UsageError
 from .marquardt import LEAST_DAMPING, Marquardt
 
 __all__ = ["Chord", "ValuesFunction"]

@@ -9,11 +9,11 @@ from typing import Generic
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from .engine import Options
-from .fitted import Adjustable, F, Failure
+from .fitted import Adjustable, F
 from .stochastic import blocks_of
 
 __all__ = ["VarianceComponents", "variance_components"]
@@ -118,7 +118,9 @@ def variance_components(
         r: Array = np.bincount(label, numbers, len(names) + 1)[:-1].astype(np.float64)
         if r.min() < 1e-6:
             weak = names[int(np.argmin(r))]
-            return Failure(f"the group {weak} has no redundancy to estimate its variance from")
+            return Failure(
+                f"the group {weak} has no redundancy to estimate its variance from", Code.NO_REDUNDANCY
+            )
         change = np.bincount(label, squares, len(names) + 1)[:-1] / r
         part = np.sqrt(r / size)
         weight = information * np.outer(part, part)
@@ -128,12 +130,16 @@ def variance_components(
         elif (change > 0).all():
             variance = variance * change
         else:
-            return Failure(f"the group {names[int(np.argmin(change))]} has no residuals at all")
+            return Failure(
+                f"the group {names[int(np.argmin(change))]} has no residuals at all", Code.NOT_IDENTIFIED
+            )
         if np.abs(change - 1.0).max() < tolerance:
             factors = np.sqrt(variance)
             sigma = factors * np.sqrt(np.diag(np.linalg.inv(weight)) / 2.0)
             return VarianceComponents(names, factors, sigma, r, fit, iteration)
-    return Failure(f"the variance components have not settled in {max_iterations} adjustments")
+    return Failure(
+        f"the variance components have not settled in {max_iterations} adjustments", Code.NOT_CONVERGED
+    )
 
 
 def _labels(problem: Adjustable[F], groups: Mapping[str, ArrayLike]) -> tuple[NDArray[np.intp], Array]:

@@ -9,10 +9,9 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.core.data import Array, Mask
-from reseau.core.errors import UsageError
-
-from .result import Failure
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 
 __all__ = ["Consensus", "ConsensusModel", "ransac"]
 
@@ -132,7 +131,7 @@ def ransac(
             share = float((distance <= threshold).mean())
             needed = _trials(share, min_samples, confidence)
     if best is None:
-        return Failure(f"none of {trials} samples of {min_samples} gave a model", iterations=trials)
+        return Failure(f"none of {trials} samples of {min_samples} gave a model", Code.NOT_FOUND)
     return _refined(model, best, columns, threshold, enough, trials)
 
 
@@ -145,7 +144,9 @@ def _refined(
             break
         again = model.from_estimate(*(c[inliers] for c in columns))
         if not again:
-            return Failure(f"the model cannot be estimated from its {int(inliers.sum())} inliers")
+            return Failure(
+                f"the model cannot be estimated from its {int(inliers.sum())} inliers", Code.NOT_IDENTIFIED
+            )
         within = _distance(again, columns) <= threshold
         best, same = again, bool((within == inliers).all())
         inliers = within
@@ -153,7 +154,7 @@ def _refined(
             break
     if inliers.sum() < enough:
         reason = f"only {int(inliers.sum())} of {len(inliers)} agree with a model, fewer than {enough}"
-        return Failure(reason, iterations=trials)
+        return Failure(reason, Code.TOO_MANY_OUTLIERS)
     return Consensus(best, inliers, trials)
 
 

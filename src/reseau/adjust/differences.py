@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reseau.core.data import Array, Mask
+from ..core.data import Array, Mask
 
 __all__ = ["JacobianCheck", "compare_jacobians", "differences"]
 

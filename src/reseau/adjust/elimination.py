@@ -8,11 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.core.errors import UsageError
-
+from ..core.errors import UsageError
+from ..core.failure import Failure
 from .engine import Options, adjust
+from .fitted import AdjustmentFailure
 from .problem import Problem
-from .result import Adjustment, Failure
+from .result import Adjustment
 from .significance import CoefficientTest, coefficient_test, compare
 
 __all__ = ["Elimination", "EliminationStep", "eliminate"]
@@ -176,7 +177,7 @@ def _tests(
     return tests
 
 
-def _without(fit: Adjustment, name: str, value: float) -> Adjustment | Failure:
+def _without(fit: Adjustment, name: str, value: float) -> Adjustment | AdjustmentFailure:
     """The adjustment with one parameter fixed, begun at the estimates with it."""
     start = fit.problem.parameters if fit.problem.datum else fit.parameters
     return adjust(fit.problem.with_parameters(start.fix(name, at=value)), fit.options)

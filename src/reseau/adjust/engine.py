@@ -13,15 +13,16 @@ from typing import Literal
 
 import numpy as np
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..core.failure import Code
 from ..core.threads import one_thread
 from .checks import check_jacobian
+from .fitted import AdjustmentFailure, NullVector
 from .linear import Linearised, constraint_matrix, linearise
 from .models import Model, State, model_of
 from .problem import Problem
-from .result import Adjustment, Failure, NullVector, Solution
+from .result import Adjustment, Solution
 
 __all__ = ["Options", "adjust"]
 
@@ -78,7 +79,7 @@ class Options:
             raise UsageError("max_iterations, tolerance and damping must be positive", where="Options")
 
 
-def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Failure:
+def adjust(problem: Problem, options: Options | None = None) -> Adjustment | AdjustmentFailure:
     """Adjust a problem by least squares.
 
     Parameters
@@ -132,23 +133,25 @@ class _Run:
         self.costs: list[float] = []
         self.iterations = 0
 
-    def adjust(self) -> Adjustment | Failure:
+    def adjust(self) -> Adjustment | AdjustmentFailure:
         model, x = self.model, self.model.start
         x = self._moved(x, self.constraints.onto(x[self.free].astype(np.float64)))
         self.begin = x[self.free].astype(np.float64)
         state = model.evaluate(x)
         if not state.usable:
-            return self._failure("the problem has no finite residuals at the approximate values", state)
+            return self._failure(
+                "the problem has no finite residuals at the approximate values", Code.NOT_FINITE, state
+            )
         self.floor = model.floor
         self.costs.append(state.cost)
         linear = self._linearise(state)
-        while not isinstance(linear, Failure):
+        while not isinstance(linear, AdjustmentFailure):
             if self._offset(linear, state) <= self.options.tolerance or state.cost <= 100.0 * self._rounding(
                 state, linear
             ):
                 return self._arrived(state, linear)
             following = self._advance(state, linear)
-            if isinstance(following, Failure):
+            if isinstance(following, AdjustmentFailure):
                 return following
             if following is None:
                 return self._arrived(state, linear)
@@ -157,7 +160,7 @@ class _Run:
 
     def _advance(
         self, state: State, linear: Linearised
-    ) -> tuple[State, Linearised | Failure] | Failure | None:
+    ) -> tuple[State, Linearised | AdjustmentFailure] | AdjustmentFailure | None:
         """The next better point; None when rounding leaves none, which is the minimum."""
         if linear.reducible <= 1e-9 * state.cost + self.floor:
             closer = self._closer(state, linear)
@@ -176,8 +179,10 @@ class _Run:
             if not self._restrain():
                 if self._offset(linear, state) < 1e-4 or state.cost <= 1e6 * self._rounding(state, linear):
                     return None
-                return self._failure("no step decreases the sum of squares, nor is it at a minimum", state)
-        return self._failure(f"has not converged in {self.iterations} iterations", state)
+                return self._failure(
+                    "no step decreases the sum of squares, nor is it at a minimum", Code.NOT_CONVERGED, state
+                )
+        return self._failure(f"not converged in {self.iterations} iterations", Code.NOT_CONVERGED, state)
 
     def _trial(
         self, state: State, linear: Linearised, damping: float, length: float, bend: bool = False
@@ -214,7 +219,7 @@ class _Run:
         if not trial.usable or trial.cost > state.cost * (1.0 + 1e-8) + self.floor:
             return None
         following = self._linearise(trial)
-        if isinstance(following, Failure) or following.reducible >= 0.81 * linear.reducible:
+        if isinstance(following, AdjustmentFailure) or following.reducible >= 0.81 * linear.reducible:
             return None
         self.costs.append(trial.cost)
         return trial, following
@@ -238,12 +243,14 @@ class _Run:
         self.length *= 0.5
         return self.length > _LEAST_LENGTH
 
-    def _linearise(self, state: State) -> Linearised | Failure:
+    def _linearise(self, state: State) -> Linearised | AdjustmentFailure:
         design = self.model.design(state)[:, self.free]
         if not np.isfinite(design).all():
             column = int(np.flatnonzero(~np.isfinite(design).all(axis=0))[0])
             name = self.problem.parameters.free[column]
-            return self._failure(f"the derivatives with respect to {name} are not finite", state)
+            return self._failure(
+                f"the derivatives with respect to {name} are not finite", Code.NOT_FINITE, state
+            )
         # After Moré (1978): a column that was long a short while ago is still scaled as such, so that a
         # parameter about to lose its influence does not run away. The memory fades, or narrow valleys would
         # take for ever.
@@ -276,20 +283,20 @@ class _Run:
         inner = g[self.datum].T @ g[self.datum]
         return step - g @ (np.linalg.pinv(inner) @ (g.T @ past)) / (1.0 + damping)
 
-    def _arrived(self, state: State, linear: Linearised) -> Adjustment | Failure:
+    def _arrived(self, state: State, linear: Linearised) -> Adjustment | AdjustmentFailure:
         factor, defect = linear.factor, linear.null.shape[1]
         if defect:
             vectors = self._null_vectors(linear)
             listed = "; ".join(" with ".join(vector) for vector in vectors)
             if not self.datum.any():
                 reason = f"rank defect {defect}: the observations do not determine {listed}"
-                return self._failure(reason, state, vectors)
+                return self._failure(reason, Code.RANK_DEFECT, state, vectors)
             g = linear.null
             inner = g[self.datum].T @ g[self.datum]
             size = np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
             if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < 1e-10:
                 reason = f"rank defect {defect}: the chosen datum does not determine {listed}"
-                return self._failure(reason, state, vectors)
+                return self._failure(reason, Code.NO_DATUM, state, vectors)
             weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
             factor = factor - g @ (weight @ factor)
         return self._adjustment(state, linear, factor, defect)
@@ -344,10 +351,13 @@ class _Run:
             named.append({free[i]: float(vector[i] * scale[i]) for i in involved})
         return tuple(named)
 
-    def _failure(self, reason: str, state: State, null_space: tuple[NullVector, ...] = ()) -> Failure:
+    def _failure(
+        self, reason: str, code: Code, state: State, null_space: tuple[NullVector, ...] = ()
+    ) -> AdjustmentFailure:
         values = state.x.astype(np.float64)
-        return Failure(
-            reason=reason,
+        return AdjustmentFailure(
+            reason,
+            code,
             values=dict(zip(self.problem.parameters.names, values.tolist(), strict=True)),
             iterations=self.iterations,
             costs=tuple(self.costs),

@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.core.data import Array, Mask
-from reseau.core.errors import EstimationError
-
+from ..core.data import Array, Mask
+from ..core.failure import Failure
 from ..core.threads import one_thread
 from .reliability import Standardised, Whitened, noncentrality
 from .significance import GlobalTest, global_test
@@ -26,48 +25,41 @@ from .stochastic import Covariance
 if TYPE_CHECKING:
     from .engine import Options
 
-__all__ = ["Adjustable", "Failure", "Fitted", "NullVector"]
+__all__ = ["Adjustable", "AdjustmentFailure", "Fitted", "NullVector"]
 
 NullVector = Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Failure:
-    """An adjustment that gave no estimate; falsy.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AdjustmentFailure(Failure):
+    """An adjustment that gave no estimate, with the point where it stopped; falsy.
 
     Parameters
     ----------
-    reason : str
-        One line for the user.
+    reason, code, where
+        As for :class:`~reseau.core.failure.Failure`.
     values : mapping of str to float
-        Parameters where it stopped; for a diagnosis, not for use.
+        Parameters where the iteration stopped; for diagnosis only.
     iterations : int
-        Corrections tried.
+        Number of corrections tried.
     costs : tuple of float
-        Weighted sums of squares on the way.
+        Weighted sums of squares of the accepted iterations.
     null_space : tuple of mapping of str to float
-        For a rank defect, combinations of parameters that the observations do not determine: each may change
-        by any multiple of these corrections.
+        For a rank defect, combinations of parameters that the observations do not determine: any multiple of
+        these corrections leaves the sum of squares unchanged.
+
+    Examples
+    --------
+    >>> from reseau.core.failure import Code
+    >>> failed = AdjustmentFailure("not converged in 3 iterations", Code.NOT_CONVERGED, iterations=3)
+    >>> bool(failed), failed.iterations, str(failed)
+    (False, 3, 'not converged in 3 iterations')
     """
 
-    reason: str
     values: Mapping[str, float] = field(default_factory=dict)
     iterations: int = 0
     costs: tuple[float, ...] = ()
     null_space: tuple[NullVector, ...] = ()
-
-    def __bool__(self) -> bool:
-        return False
-
-    def required(self) -> NoReturn:
-        """Raise, for those who must have the estimate.
-
-        Raises
-        ------
-        EstimationError
-            With the reason.
-        """
-        raise EstimationError(self.reason, where="adjustment")
 
 
 class Fitted:

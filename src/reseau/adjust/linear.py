@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reseau.core.data import Array, Mask
-from reseau.core.errors import UsageError
-
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from .parameters import Constraint
 
 __all__ = ["ConstraintMatrix", "Linearised", "constraint_matrix", "linearise"]

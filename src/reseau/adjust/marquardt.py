@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.core.data import Array, Mask, Rows
-from reseau.core.errors import UsageError
+from ..core.data import Array, Mask, Rows
+from ..core.errors import UsageError
 
 __all__ = ["LEAST_DAMPING", "BatchAdjustment", "BatchFunction", "BatchOptions", "BatchReason", "Marquardt"]
 

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
 from .differences import differences
 from .problem import GaussHelmert, GaussMarkov, Problem, Values
 from .stochastic import Blocks, Weighting, blocks_of

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
 from .parameters import Constraint, Parameters
 from .stochastic import Covariance, blocks_of
 
 if TYPE_CHECKING:
+    from ..core.failure import Failure
     from .engine import Options
-    from .fitted import Failure
     from .result import Adjustment
 
 __all__ = ["GaussHelmert", "GaussMarkov", "Problem"]

@@ -12,11 +12,11 @@ from typing import Generic, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.core.data import Array, Mask
-from reseau.core.errors import UsageError
-
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from .engine import Options
-from .fitted import Adjustable, F, Failure, Fitted
+from .fitted import Adjustable, F, Fitted
 from .reliability import critical_tau, critical_w
 from .rounds import Rounds
 
@@ -125,7 +125,7 @@ def reject_outliers(
             return _too_many(int(judged.sum()), runs)
         seen.add(judged.tobytes())
         out = judged
-    return Failure(f"the rejection has not settled in {max_rounds} rounds")
+    return Failure(f"the rejection has not settled in {max_rounds} rounds", Code.NOT_CONVERGED)
 
 
 def data_snooping(
@@ -254,4 +254,4 @@ def _restored(
 def _too_many(count: int, runs: Rounds[F]) -> Failure:
     total = int(runs.eligible.sum())
     reason = f"{count} of {total} observations would have to be left out"
-    return Failure(f"{reason}: look at the model before the observations")
+    return Failure(f"{reason}: look at the model before the observations", Code.TOO_MANY_OUTLIERS)

@@ -15,9 +15,8 @@ import numpy as np
 import scipy.optimize
 import scipy.special
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
 from .stochastic import Blocks
 
 __all__ = [

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
-from .fitted import Failure, Fitted, NullVector
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..core.failure import Failure
+from .fitted import Fitted, NullVector
 from .parameters import Parameters
 from .problem import Problem
 from .reliability import ExternalReliability, Solution, noncentrality

@@ -8,11 +8,11 @@ from typing import Generic, Literal
 
 import numpy as np
 
-from reseau.core.data import Array
-from reseau.core.errors import UsageError
-
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from .engine import Options
-from .fitted import Adjustable, F, Failure
+from .fitted import Adjustable, F
 from .rounds import Rounds
 
 __all__ = ["Robust", "robust", "weight_function"]
@@ -142,7 +142,7 @@ def robust(
     stages: list[WeightName] = ["huber"] if weights == "huber" else ["huber", weights]
     runs, unit, total = Rounds(problem, options), 1.0, 0
     factors = np.ones(problem.observations.shape)
-    fit: F | Failure = Failure("no adjustment was asked for")
+    fit: F | Failure = Failure("no adjustment was asked for", Code.PREREQUISITE_MISSING)
     for stage in stages:
         function = weight_function(stage, tuning if stage == weights else None)
         for _ in range(max_iterations):
@@ -158,5 +158,7 @@ def robust(
             if change < tolerance:
                 break
         else:
-            return Failure(f"the robust weights have not settled in {max_iterations} adjustments")
+            return Failure(
+                f"the robust weights have not settled in {max_iterations} adjustments", Code.NOT_CONVERGED
+            )
     return fit if isinstance(fit, Failure) else Robust(fit, factors, unit, total)

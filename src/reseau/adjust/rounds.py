@@ -7,10 +7,10 @@ from typing import Generic
 import numpy as np
 import scipy.special
 
-from reseau.core.data import Array, Mask
-
+from ..core.data import Array, Mask
+from ..core.failure import Failure
 from .engine import Options
-from .fitted import Adjustable, F, Failure
+from .fitted import Adjustable, F
 from .problem import GaussHelmert
 from .stochastic import Weighting, blocks_of
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
-from reseau.core.errors import UsageError
+from ..core.errors import UsageError
 
 if TYPE_CHECKING:
     from .fitted import Fitted

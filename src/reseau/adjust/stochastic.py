@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reseau.core.data import Array, Mask
-from reseau.core.errors import UsageError
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
 
 __all__ = ["Blocks", "Covariance", "Weighting", "blocks_of"]
 

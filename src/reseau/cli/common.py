@@ -14,8 +14,8 @@ import typer
 from ..core.errors import EstimationError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from ..adjust import Failure
     from ..core.data import Frame, ImagePoints
+    from ..core.failure import Failure
     from ..io import ReseauDesign, ReseauMeasurement, TestfieldDesign
     from ..sensor import SensorCorrection
 
@@ -91,12 +91,11 @@ def required(found: T | Failure, where: object) -> T:
     EstimationError
         When there is no estimate.
     """
-    reason = getattr(found, "reason", None)
-    if not found and reason is not None:
-        # A reason may name the frame already; once is enough.
-        name = Path(str(where)).name
-        raise EstimationError(str(reason).removeprefix(f"{name}: "), where=where)
-    return found  # type: ignore[return-value]
+    from ..core.failure import Failure
+
+    if isinstance(found, Failure):
+        raise EstimationError(found.reason, where=where)
+    return found
 
 
 def writable(path: Path) -> Path:

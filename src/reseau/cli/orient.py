@@ -270,7 +270,7 @@ def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iter
 
 def _common(done: dict[str, _Done]) -> Roll | None:
     """What the frames of the images have in common, if they are many enough."""
-    from ..adjust import Failure
+    from ..core.failure import Failure
     from ..procedures.frame import roll_of
 
     found = roll_of([result for item in done.values() for result in item.results])

@@ -1,4 +1,4 @@
-"""A failed estimate is a value: falsy, with a reason for the user and a code for the program."""
+"""Failed estimates and warnings: a text for the user and a code for the program."""
 
 from __future__ import annotations
 
@@ -8,50 +8,66 @@ from typing import NoReturn
 
 from .errors import EstimationError
 
-__all__ = ["Code", "Failure"]
+__all__ = ["Code", "Failure", "Remark"]
 
 
 class Code(StrEnum):
-    """Why an estimate failed or a result carries a warning; callers branch on it, never on a text."""
+    """Why an estimate failed or a result carries a warning; callers branch on it, never on a text.
 
-    AMBIGUOUS = "ambiguous"
-    COLLINEAR = "collinear"
-    DECLINED = "declined"
-    DOUBTFUL_CONTROL = "doubtful-control"
-    INCONSISTENT = "inconsistent"
-    LOW_CONTRAST = "low-contrast"
-    MIRRORED = "mirrored"
-    NOT_CONVERGED = "not-converged"
-    NOT_FINITE = "not-finite"
-    NOT_FOUND = "not-found"
-    NOT_IDENTIFIED = "not-identified"
-    NO_DATUM = "no-datum"
-    NO_REDUNDANCY = "no-redundancy"
-    OTHER_DESIGN = "other-design"
-    PREREQUISITE_MISSING = "prerequisite-missing"
-    RANK_DEFECT = "rank-defect"
-    SATURATED = "saturated"
-    SEVERAL_TARGETS = "several-targets"
-    SINGULAR = "singular"
+    Examples
+    --------
+    >>> Code("too-few-points") is Code.TOO_FEW_POINTS
+    True
+    """
+
+    AMBIGUOUS = "ambiguous"  # several solutions fit equally well: add something that distinguishes them
+    CAMERA_MOVED = "camera-moved"  # the camera has moved between photographs
+    COLLINEAR = "collinear"  # all points lie on one line
+    CONTROL_NOT_TESTED = "control-not-tested"  # no redundancy checks the control points
+    CORRELATED = "correlated"  # unknowns that the observations can hardly separate
+    DECLINED = "declined"  # an earlier step declined the image
+    DOUBTFUL_CONTROL = "doubtful-control"  # control points or distances contradict the images
+    GROSS_ERRORS = "gross-errors"  # single observations are probably wrong: check or leave them out
+    IDENTICAL_IMAGES = "identical-images"  # images with the same coordinates or the same pattern of errors
+    INCONSISTENT = "inconsistent"  # the observations contradict the model or each other
+    INSTRUMENT_CHANGED = "instrument-changed"  # the instrument has changed since its calibration
+    LOW_CONTRAST = "low-contrast"  # nothing stands out from the noise
+    MIRRORED = "mirrored"  # the target is seen from behind or the image is mirrored
+    NOT_CONVERGED = "not-converged"  # the iteration ended before its minimum
+    NOT_FINITE = "not-finite"  # the model has no finite value at the approximate values
+    NOT_FOUND = "not-found"  # the target or the feature is not in the image
+    NOT_IDENTIFIED = "not-identified"  # the observations do not determine a point or a parameter
+    NO_DATUM = "no-datum"  # nothing defines the coordinate system
+    NO_REDUNDANCY = "no-redundancy"  # too few observations for the unknowns, or for a test
+    OTHER_DESIGN = "other-design"  # a target of another design is in the image
+    PREREQUISITE_MISSING = "prerequisite-missing"  # an earlier step has no result
+    RANK_DEFECT = "rank-defect"  # the observations do not determine a combination of the unknowns
+    SATURATED = "saturated"  # the image is overexposed
+    SEVERAL_TARGETS = "several-targets"  # the image shows more than one target
+    SIGMAS_DOUBTFUL = "sigmas-doubtful"  # input sigmas do not agree with the residuals
+    SINGULAR = "singular"  # the normal equations are singular to rounding
+    SLANT = "slant"  # an edge is slanted too little or too much
     TOO_FEW_IMAGES = "too-few-images"
-    TOO_FEW_LEVELS = "too-few-levels"
+    TOO_FEW_LEVELS = "too-few-levels"  # exposures at too few levels of light
     TOO_FEW_POINTS = "too-few-points"
-    TOO_MANY_OUTLIERS = "too-many-outliers"
-    TOO_SMALL = "too-small"
+    TOO_MANY_OUTLIERS = "too-many-outliers"  # the model is probably wrong, not the observations
+    TOO_SMALL = "too-small"  # the region or the target covers too few pixels
+    UNKNOWN_STEP = "unknown-step"  # the procedure has no step of this name
+    WEAK_GEOMETRY = "weak-geometry"  # points, images or parameters with very large uncertainty
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An estimate that could not be had; falsy.
+    """An estimate that failed; falsy.
 
     Parameters
     ----------
     reason : str
-        One line for the user: what was wrong and what helps, without the name of the file.
+        One line for the user: what is wrong and what helps, without the name of the file.
     code : Code
         The same for programs.
     where : str
-        The frame, file or mark it is about; empty where the caller knows.
+        The frame, file or mark it is about; empty where only the caller knows it.
 
     Examples
     --------
@@ -71,7 +87,7 @@ class Failure:
         return f"{self.where}: {self.reason}" if self.where else self.reason
 
     def required(self) -> NoReturn:
-        """Raise, for callers that must have the estimate.
+        """Raise, for callers that need the estimate.
 
         Raises
         ------
@@ -79,3 +95,28 @@ class Failure:
             With the reason.
         """
         raise EstimationError(self.reason, where=self.where or None)
+
+
+@dataclass(frozen=True)
+class Remark:
+    """A warning about a result that is usable nevertheless.
+
+    Parameters
+    ----------
+    text : str
+        One line for the user: what was noticed and what helps.
+    code : Code
+        The same for programs.
+
+    Examples
+    --------
+    >>> remark = Remark("the camera has moved", Code.CAMERA_MOVED)
+    >>> str(remark), remark.code == "camera-moved"
+    ('the camera has moved', True)
+    """
+
+    text: str
+    code: Code
+
+    def __str__(self) -> str:
+        return self.text

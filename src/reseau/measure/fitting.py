@@ -8,9 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..adjust import Adjustment, Elimination, Failure, GaussHelmert, Options, Parameters, adjust, eliminate
+from ..adjust import Adjustment, Elimination, GaussHelmert, Options, Parameters, adjust, eliminate
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from ..optics import PlaneMapping, RationalPolynomial
 from ..optics.field import SmoothField
 
@@ -151,7 +152,8 @@ def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
     if 2 * len(points) < len(model.names):
         return Failure(
             f"{len(points)} points give {2 * len(points)} coordinates, "
-            f"fewer than the {len(model.names)} parameters of the model"
+            f"fewer than the {len(model.names)} parameters of the model",
+            Code.TOO_FEW_POINTS,
         )
     return None
 

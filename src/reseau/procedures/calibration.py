@@ -15,10 +15,10 @@ from typing import Literal, Protocol
 import cv2
 import numpy as np
 
-from ..adjust import Failure
 from ..bundle import Camera, ControlPoints, Kind, Network, Options, Result, Searched, search_model
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from ..io.network import CAMERA_PARAMETERS
 from .heights import Heights
 from .measuring import Measurer, measured_in_order, measurer_of
@@ -151,7 +151,7 @@ class Calibrated:
         return True
 
     def required(self) -> Calibrated:
-        """The calibration itself; see :meth:`~reseau.adjust.Failure.required`."""
+        """The calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     @property
@@ -201,7 +201,9 @@ def calibrate_camera(
     measured = _without(measured, options.without)
     if len(measured) < _LEAST_IMAGES:
         why = "".join(f"; {name}: {reason}" for name, reason in declined.items())
-        return Failure(f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}")
+        return Failure(
+            f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}", Code.TOO_FEW_IMAGES
+        )
     if size is None:
         raise UsageError("is not known without an image", where="size of the images")
     camera = first_camera(measured, design, size, model or CameraModel())
@@ -242,7 +244,7 @@ def _measured(
     declined: dict[str, str] = {}
     for name, found in measured_in_order(checked(), measure, workers):
         if isinstance(found, Failure):
-            declined[name] = found.reason.removeprefix(f"{name}: ")
+            declined[name] = found.reason
         elif len(found) < _LEAST_POINTS:
             declined[name] = f"{len(found)} points are too few"
         else:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ..adjust import Failure
+from ..core.failure import Failure
 from ..io import FrameCorners, FrameOrientation
 from ..io.scans import Scan
 from ..measure.frame import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed

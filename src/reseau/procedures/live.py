@@ -12,11 +12,11 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from ..adjust import Failure
 from ..archive import Verdict
 from ..bundle import Lens, Network, Result, adjust_network, calibration_of
 from ..core.data import Frame, ImagePoints
 from ..core.errors import EstimationError
+from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from ..optics import Pose, project
@@ -101,7 +101,7 @@ class LiveTestfield:
         """Measure the target in a frame."""
         found = self._measure(frame)
         if isinstance(found, Failure):
-            return Verdict(False, found.reason.removeprefix(f"{frame.name}: "))
+            return Verdict(False, found.reason)
         if len(found.points) < self._least:
             return Verdict(False, f"{len(found.points)} points are too few")
         self._size = (frame.width, frame.height)
@@ -172,7 +172,11 @@ class LiveTestfield:
         """
         if not candidates:
             return None
-        found = self.calibrated() if len(self._measured) >= _LEAST_IMAGES else Failure("too few images")
+        found = (
+            self.calibrated()
+            if len(self._measured) >= _LEAST_IMAGES
+            else Failure("too few images", Code.TOO_FEW_IMAGES)
+        )
         if isinstance(found, Failure):
             return candidates[0], None
         names, _, _ = found.result.camera_columns(0)
@@ -309,7 +313,7 @@ class LiveOscilloscope:
         """Refine a photograph; which one it is, its step says."""
         found = self._refined(frame, step.name)
         if isinstance(found, Failure):
-            return Verdict(False, found.reason.removeprefix(f"{frame.name}: "))
+            return Verdict(False, found.reason)
         self._inputs[step.name] = frame.sha256
         points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
         return Verdict(True, facts={"points": len(getattr(found, points))})
@@ -321,17 +325,17 @@ class LiveOscilloscope:
             return one
         if photo == "PHOTO II":
             if self.first is None:
-                return Failure("PHOTO I is not refined")
+                return Failure("PHOTO I is not refined", Code.PREREQUISITE_MISSING)
             two = photo_ii(frame, self.reseau, self.test_object, self.first.camera)
             self.second = None if isinstance(two, Failure) else two
             return two
         if photo == "PHOTO III":
             if self.second is None:
-                return Failure("PHOTO II is not refined")
+                return Failure("PHOTO II is not refined", Code.PREREQUISITE_MISSING)
             three = photo_iii(frame, self.second.instrument, self.reseau)
             self.third = None if isinstance(three, Failure) else three
             return three
-        return Failure(f"{photo} is no photograph of this procedure")
+        return Failure(f"{photo} is no photograph of this procedure", Code.UNKNOWN_STEP)
 
     def progress(self) -> dict[str, float]:
         """Sigma of the refined image coordinates, where there is a correction."""

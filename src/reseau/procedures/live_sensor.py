@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
-from ..adjust import Failure
 from ..archive import Verdict
 from ..core.data import Frame
 from ..core.errors import EstimationError, UsageError
+from ..core.failure import Failure
 from ..core.provenance import Provenance
 from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
 

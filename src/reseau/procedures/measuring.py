@@ -10,9 +10,9 @@ from functools import partial
 
 import cv2
 
-from ..adjust import Failure
 from ..core.data import Frame, ImagePoints
 from ..core.errors import EstimationError
+from ..core.failure import Failure
 from ..core.processes import process_context
 from ..core.threads import always_one_thread, one_thread
 from ..io import ReseauDesign, TestfieldDesign

@@ -14,8 +14,8 @@ from typing import Self
 
 import numpy as np
 
-from ..adjust import Failure
 from ..core.data import Array
+from ..core.failure import Code, Failure
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
 
@@ -91,7 +91,8 @@ class Mount:
         if best.off_deg > _WORST_DEG:
             return Failure(
                 f"the axes {TILT}, {ROLL} and {CAMERA_ROLL} do not turn board and camera as they should: "
-                f"poses are {best.off_deg:.0f}° off"
+                f"poses are {best.off_deg:.0f}° off",
+                Code.INCONSISTENT,
             )
         return best
 

@@ -14,8 +14,8 @@ from typing import Literal, Self
 
 import numpy as np
 
-from ..adjust import Failure
 from ..core.data import Frame, ImagePoints
+from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure import (
     PinDetections,
@@ -61,7 +61,7 @@ class _Refined:
     """What a step gives where it does not fail."""
 
     def required(self) -> Self:
-        """The result itself; see :meth:`reseau.adjust.Failure.required`."""
+        """The result itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
 
@@ -282,7 +282,7 @@ def photo_iii(
     else:
         body = photo
     if not len(body):
-        return Failure("the photograph shows no echo of a body")
+        return Failure("the photograph shows no echo of a body", Code.NOT_FOUND)
     registration = None
     if marks is not None:
         registered = register(marks, reseau, instrument.camera)

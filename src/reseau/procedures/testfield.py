@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from ..adjust import Failure
 from ..core.data import Frame, ImagePoints
 from ..core.errors import UsageError
+from ..core.failure import Failure
 from ..io import TestfieldDesign
 from ..measure import TestfieldOptions, TestfieldResult, measure_testfield
 

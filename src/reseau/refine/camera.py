@@ -12,10 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..adjust import Adjustment, Elimination, Failure, Options
+from ..adjust import Adjustment, Elimination, Options
 from ..calibration.document import Calibration, Covariance, Quantity
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import (
     carried,
@@ -68,7 +69,7 @@ class CameraCorrection:
         return True
 
     def required(self) -> CameraCorrection:
-        """The correction itself; see :meth:`reseau.adjust.Failure.required`."""
+        """The correction itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     def apply(self, points: ImagePoints) -> ImagePoints:
@@ -253,12 +254,15 @@ def correct_camera(
     if len(known) < 4:
         return Failure(
             f"{len(known)} of {len(points)} points are marks with coordinates in design {design.name!r}; "
-            "four are needed at least"
+            "four are needed at least",
+            Code.TOO_FEW_POINTS,
         )
     marks = points.select(known)
     plane = np.array([coordinates[name][:2] for name in known], dtype=np.float64)
     if on_one_line(plane):
-        return Failure(f"the {len(known)} marks lie on one line and determine nothing across it")
+        return Failure(
+            f"the {len(known)} marks lie on one line and determine nothing across it", Code.COLLINEAR
+        )
     sigma = np.array([coordinates[name][2] for name in known])
     systems = _common_system(marks, plane, design)
     if isinstance(systems, Failure):
@@ -340,7 +344,9 @@ def defining_marks(
         at = next(p for p in design.points if p.id == name)
         designed = np.array([at.x, at.y], dtype=np.float64)
         if not np.isfinite(designed).all():
-            return Failure(f"mark {name!r} defines the common system and has no coordinates in the design")
+            return Failure(
+                f"mark {name!r} defines the common system and has no coordinates in the design", Code.NO_DATUM
+            )
         if name in row_of:
             ends.append((marks.xy[row_of[name]], designed))
             continue

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from ..adjust import Adjustment, Failure, GaussMarkov, Parameters, adjust
+from ..adjust import Adjustment, GaussMarkov, Parameters, adjust
 from ..core.data import Array
 from ..core.errors import UsageError
+from ..core.failure import Failure
 
 __all__ = ["CAUSES", "COEFFICIENTS", "CONDITIONS", "Causes", "ConditionTest", "causes_of", "physical_causes"]
 

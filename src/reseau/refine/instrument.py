@@ -13,10 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..adjust import Adjustment, Elimination, Failure, Options
+from ..adjust import Adjustment, Elimination, Options
 from ..calibration.document import Calibration, Covariance, Quantity
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Code, Failure
 from ..core.provenance import canonical_json
 from ..io import ReseauDesign, ReseauMeasurement
 from ..measure.fitting import carried, reduce_mapping, residual_field, tests_of
@@ -120,7 +121,7 @@ class InstrumentCorrection:
         return True
 
     def required(self) -> InstrumentCorrection:
-        """The correction itself; see :meth:`reseau.adjust.Failure.required`."""
+        """The correction itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
@@ -282,7 +283,8 @@ def correct_instrument(
     if len(known) < 4:
         return Failure(
             f"{len(known)} of {len(points)} points are rods with coordinates in design {design.name!r}; "
-            "four are needed at least"
+            "four are needed at least",
+            Code.TOO_FEW_POINTS,
         )
     rods = points.select(known)
     table = np.array([coordinates[name] for name in known], dtype=np.float64)

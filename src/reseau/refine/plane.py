@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..adjust import Failure
 from ..core.data import Array, ImagePoints
+from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import is_mirrored
 from ..optics import Similarity
@@ -67,7 +67,10 @@ def object_plane(refined: ImagePoints, plane: Array, design: ReseauDesign) -> Ob
     local, seen = axes(plane), inverse(refined.xy)
     across = float(local[:, 1] @ local[:, 1])
     if not across > 0:
-        return Failure(f"the rods of design {design.name!r} lie on one line with M and N; λ2 is undetermined")
+        return Failure(
+            f"the rods of design {design.name!r} lie on one line with M and N; λ2 is undetermined",
+            Code.COLLINEAR,
+        )
     scale = np.array([np.hypot(*(n_image - m_image)) / np.hypot(*(n - m)), local[:, 1] @ seen[:, 1] / across])
     a, b = inverse.values[2:]
     system = Similarity(np.array([*m_image, a, -b]))

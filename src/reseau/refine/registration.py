@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from ..adjust import Failure
 from ..core.data import Array, ImagePoints
+from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import carried, fit_mapping
 from ..optics import RationalPolynomial, Similarity
@@ -101,7 +101,8 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     marks, expected = points.select(known).select(usable), expected[usable]
     if len(marks) < 4:
         return Failure(
-            f"{len(marks)} marks of reseau {design.name!r} were measured; four refer it to PHOTO I"
+            f"{len(marks)} marks of reseau {design.name!r} were measured; four refer it to PHOTO I",
+            Code.TOO_FEW_POINTS,
         )
     centre, length = expected.mean(axis=0), float(np.ptp(expected, axis=0).max())
     local = ImagePoints(marks.names, (marks.xy - centre) / length, marks.cov / length**2)

@@ -13,8 +13,9 @@ import numpy as np
 import scipy.stats
 from numpy.typing import ArrayLike
 
-from ..adjust import Adjustment, Failure
+from ..adjust import Adjustment
 from ..core.data import Array, ImagePoints
+from ..core.failure import Code, Failure
 from ..measure.fitting import fit_mapping
 from ..optics import PlaneMapping
 
@@ -77,7 +78,10 @@ def rivals(
             model.with_values(fit.values), fit, points, np.asarray(target, dtype=np.float64)
         )
         if not np.isfinite(found[0]).all():
-            return Failure(f"{len(points)} points leave none to predict with {len(model.names)} parameters")
+            return Failure(
+                f"{len(points)} points leave none to predict with {len(model.names)} parameters",
+                Code.TOO_FEW_POINTS,
+            )
         fits.append(fit)
         errors.append(found[0])
         squares.append(found[1])

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from ..adjust import Failure
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
+from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from .instrument import InstrumentCorrection
 
@@ -118,7 +118,10 @@ def still_standard(
     known = set(stored.pins.names) if same_object else {p.id for p in rods.points if p.x is not None}
     names = [name for name in pins.names if name in known and name in rods.ids]
     if len(names) < 4:
-        return Failure(f"{len(names)} of {len(pins)} points are rods that can be compared; four are needed")
+        return Failure(
+            f"{len(names)} of {len(pins)} points are rods that can be compared; four are needed",
+            Code.TOO_FEW_POINTS,
+        )
     now = pins.select(names)
     change, cov = _against_before(stored, now) if same_object else _against_design(stored, now, rods)
     whole = np.linalg.inv(cov)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..adjust import Failure
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
+from ..core.failure import Failure
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
 from ..optics import PlaneMapping, RationalPolynomial

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from ..adjust import Failure
 from ..core.data import Array
+from ..core.failure import Failure
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 from ..core.provenance import Provenance
 from ..sensor import EdgeSpread, FreeCurve, Linearity, SensorResult

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from ..adjust import Adjustment, CoefficientTest, Failure, NestedTest, compare
+from ..adjust import Adjustment, CoefficientTest, NestedTest, compare
 from ..calibration.document import Quantity
 from ..core.data import Array, Frame, Mask
+from ..core.failure import Code, Failure
 from ..core.threads import one_thread
 from .free import FREQUENCIES, FreeCurve, fit_free
 from .gaussian import EdgePixels, approximate_edge, fit_gaussian
@@ -148,10 +149,10 @@ def measure_edge(
     inside = np.s_[max(top, 0) : top + height, max(left, 0) : left + width]
     pixels = frame.pixels[inside].astype(np.float64)
     if min(pixels.shape) < 16:
-        return Failure("the region of the edge is smaller than 16 pixels")
+        return Failure("the region of the edge is smaller than 16 pixels", Code.TOO_SMALL)
     usable = np.ones(pixels.shape, dtype=bool) if good is None else good[inside]
     if np.mean(pixels[usable] >= frame.full_scale) > _SATURATED:
-        return Failure("its bright side is saturated: expose less")
+        return Failure("its bright side is saturated: expose less", Code.SATURATED)
     noise = None if variance is None else variance[inside]
     across, along = (np.abs(np.diff(pixels, axis=axis)).sum() for axis in (1, 0))
     if along > across:
@@ -159,12 +160,12 @@ def measure_edge(
         noise = None if noise is None else noise.T
     values = approximate_edge(pixels)
     if values is None:
-        return Failure("there is a row without an edge in its region")
+        return Failure("there is a row without an edge in its region", Code.NOT_FOUND)
     if not _contrast(pixels, values) > _LEAST_CONTRAST:
-        return Failure("there is no edge above the noise in its region")
+        return Failure("there is no edge above the noise in its region", Code.LOW_CONTRAST)
     if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
-        return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°")
+        return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°", Code.SLANT)
     around = EdgePixels.of(pixels, usable)
     if noise is not None:
         around = replace(around, sigma=np.sqrt(noise[usable]))

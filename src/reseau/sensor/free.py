@@ -17,8 +17,9 @@ from scipy.interpolate import BSpline
 from scipy.optimize import brentq
 from scipy.stats import f as fisher
 
-from ..adjust import Adjustment, Failure, GaussMarkov, Parameters, adjust
+from ..adjust import Adjustment, GaussMarkov, Parameters, adjust
 from ..core.data import Array
+from ..core.failure import Code, Failure
 from ..core.threads import one_thread
 from .gaussian import ENOUGH, EdgePixels, edge_slope, edge_spread
 
@@ -209,7 +210,9 @@ def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve
     gap = _gap(pixels, base)
     limit = min(1.0, _LIMIT / max(_STEP_PX, _FEWEST * gap))
     if limit < NYQUIST:
-        return Failure("the edge passes too few pixels: take a longer region, or another slant")
+        return Failure(
+            "the edge passes too few pixels: take a longer region, or another slant", Code.TOO_SMALL
+        )
     spline = _Spline(_knots(pixels, base, max(_STEP_PX, _FEWEST * gap)))
     names = ["dark", *(f"a{j}" for j in range(spline.size)), "slope", "bow"]
     start = [base[3], *np.zeros(spline.size), base[1], base[2]]

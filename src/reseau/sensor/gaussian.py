@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from ..adjust import Adjustment, Failure, GaussMarkov, Options, Parameters, adjust
+from ..adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
 from ..core.data import Array, Mask
+from ..core.failure import Failure
 
 __all__ = ["EdgePixels", "approximate_edge", "edge_slope", "edge_spread", "fit_gaussian"]
 

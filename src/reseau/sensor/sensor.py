@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..adjust import Failure
 from ..calibration.document import Calibration, Covariance, Quantity
 from ..core.data import Array, Frame
 from ..core.errors import EstimationError
+from ..core.failure import Failure
 from .correction import SensorCorrection
 from .edge import EdgeSpread, measure_edge
 from .fields import Fields, estimate_fields

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..adjust import Adjustment, Failure, GaussHelmert, GaussMarkov, Options, Parameters, adjust
+from ..adjust import Adjustment, GaussHelmert, GaussMarkov, Options, Parameters, adjust
 from ..core.data import Array, Mask
+from ..core.failure import Code, Failure
 from .fields import Fields
 from .series import SensorSeries
 
@@ -124,7 +125,9 @@ def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
     use = curve.bright & curve.usable & (curve.exposure_us > 0)
     signal, times = curve.signal[use][:, None], curve.exposure_us[use][:, None]
     if len(signal) < 4:
-        return Failure("fewer than four levels of light below saturation: take more exposures")
+        return Failure(
+            "fewer than four levels of light below saturation: take more exposures", Code.TOO_FEW_LEVELS
+        )
     scale = float((signal * times).sum() / (times**2).sum())
 
     def conditions(observed: Array, x: Array) -> Array:
@@ -188,10 +191,15 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
         signal = signal / bend**2
         saturation = None if curve.plateau is None else float(linearity.straight(top)[0][0])
     if (curve.bright & use).sum() < 2 or not np.ptp(signal) > 0:
-        return Failure("fewer than two levels of light below saturation: take shorter exposures")
+        return Failure(
+            "fewer than two levels of light below saturation: take shorter exposures", Code.TOO_FEW_LEVELS
+        )
     slope, floor = np.polyfit(signal, variance, 1, w=1 / curve.variance_sigma[use])
     if not slope > 0:
-        return Failure("the variance does not grow with the light: is it even, and no gamma curve set?")
+        return Failure(
+            "the variance does not grow with the light: is it even, and no gamma curve set?",
+            Code.INCONSISTENT,
+        )
     sigma = np.hypot(curve.variance_sigma[use], slope * curve.signal_sigma[use] * curve.bright[use])
 
     def computed(x: Array) -> Array:

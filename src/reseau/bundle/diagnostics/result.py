@@ -55,7 +55,7 @@ class Result:
         return True
 
     def required(self) -> Result:
-        """The result itself; see :meth:`~reseau.adjust.Failure.required`."""
+        """The result itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     @property

@@ -8,9 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import Failure, data_snooping, robust
+from ...adjust import data_snooping, robust
 from ...adjust.rejection import SnoopingStep
 from ...core.errors import UsageError
+from ...core.failure import Code, Failure
 from ..diagnostics.control import doubtful_control
 from ..diagnostics.remarks import listed, remarks
 from ..diagnostics.result import Result
@@ -192,11 +193,11 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
 
 def _explained(failure: Failure, problem: BundleProblem) -> Failure:
     """A failure to converge, with the observations that look like blunders."""
-    if "nothing determines" in failure.reason:
+    if failure.code is Code.NO_DATUM:
         return failure
     doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""
     if doubt:
-        return Failure(f"{failure.reason}; {doubt}", failure.values, failure.iterations, failure.costs)
+        return replace(failure, reason=f"{failure.reason}; {doubt}", code=Code.DOUBTFUL_CONTROL)
     names = _suspects(problem)
     hint = f"; gross errors are likely in {listed(names)}" if names else ""
-    return Failure(failure.reason + hint, failure.values, failure.iterations, failure.costs)
+    return replace(failure, reason=failure.reason + hint)

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import Failure, VarianceComponents, variance_components
+from ...adjust import VarianceComponents, variance_components
 from ...core.data import Mask, Rows
+from ...core.failure import Failure
 from ..network.network import Network
 from ..solver.problem import BundleFit
 from .adjustment import Options, problem_of

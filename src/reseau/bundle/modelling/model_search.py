@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...adjust import Failure, VarianceComponents
+from ...adjust import VarianceComponents
+from ...core.failure import Failure
 from ..diagnostics.result import Result
 from ..network.network import Network
 from ..solver.problem import BundleFit

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...adjust import Failure
 from ...adjust.significance import CoefficientTest
 from ...core.errors import UsageError
+from ...core.failure import Code, Failure
 from ..diagnostics.result import Result
 from ..network.network import Camera, Network
 from ..solver.problem import BundleFit
@@ -156,5 +156,7 @@ def cross_validation(
         squares += float((v[known] ** 2).sum())
         count += 2 * int(known.sum())
     return (
-        float(np.sqrt(squares / count)) if count else Failure("no point could be predicted without its image")
+        float(np.sqrt(squares / count))
+        if count
+        else Failure("no point could be predicted without its image", Code.NO_REDUNDANCY)
     )

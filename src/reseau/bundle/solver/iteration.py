@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import Failure
+from ...adjust import AdjustmentFailure
 from ...core.data import Rows
+from ...core.failure import Code, Failure
 from .arrow import Singular
 from .system import Linear, System
 from .values import Values
@@ -101,7 +102,9 @@ def iterate(
     linear = system.linearise(start)
     cost, growth, tried = linear.cost, 2.0, 0
     if not np.isfinite(cost):
-        return Failure("the image coordinates have no finite misfits at the approximate values")
+        return Failure(
+            "the image coordinates have no finite misfits at the approximate values", Code.NOT_FINITE
+        )
     radius = _HORIZON * _extent(system, start)
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.further) - redundancy)
     while tried < max_iterations:
@@ -111,7 +114,9 @@ def iterate(
         except Singular:
             damping, growth = max(damping, _LEAST_DAMPING) * 10.0 * growth, growth * 2.0
             if damping > _MOST_DAMPING:
-                return Failure("the normal equations are singular", iterations=tried, costs=tuple(costs))
+                return AdjustmentFailure(
+                    "the normal equations are singular", Code.SINGULAR, iterations=tried, costs=tuple(costs)
+                )
             continue
         offset = np.sqrt(max(step.predicted, 0.0) / rank) / np.sqrt(max(cost, 1e-300) / max(1, redundancy))
         settled = damping <= _SMALL or step.predicted <= 1e-14 * cost

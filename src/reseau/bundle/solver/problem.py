@@ -10,11 +10,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...adjust import Failure
+from ...adjust import AdjustmentFailure
 from ...adjust import Options as AdjustOptions
 from ...adjust.fitted import Fitted
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure
 from ...core.threads import one_thread
 from ..network.network import Network, finite
 from ..network.usable import Usable, usable
@@ -247,20 +248,27 @@ class _Run:
     def adjust(self) -> BundleFit | Failure:
         problem, network = self.problem, self.network
         if not self.usable.images.any():
-            return Failure("no image has three points whose position in space is known or can be computed")
+            return Failure(
+                "no image has three points whose position in space is known or can be computed",
+                Code.TOO_FEW_POINTS,
+            )
         start = self._start()
         freedom = freedom_of(self.system, start, self.usable.points)
         if network.datum == "control" and freedom.defect:
             return Failure(
                 f"rank defect {freedom.defect}: nothing determines {', '.join(freedom.names)}; "
-                "give control points or distances, or a datum that is minimal or free"
+                "give control points or distances, or a datum that is minimal or free",
+                Code.NO_DATUM,
             )
         if network.datum == "minimal":
             self.system.held[held_minimally(freedom, self.unknowns, start)] = True
         counts = self._counts(freedom)
         redundancy = counts[0] - counts[1] + counts[2]
         if redundancy < 0:
-            return Failure(f"{counts[0]} observations for {counts[1]} unknowns and {counts[2]} constraints")
+            return Failure(
+                f"{counts[0]} observations for {counts[1]} unknowns and {counts[2]} constraints",
+                Code.NO_REDUNDANCY,
+            )
         found = iterate(
             self.system, start, redundancy=redundancy, max_iterations=problem.max_iterations,
             tolerance=problem.tolerance, damping=1e-5, watch=problem.watch,
@@ -274,13 +282,17 @@ class _Run:
             if found.converged or again:
                 return again
         if not found.converged:
-            reason = f"has not converged in {found.iterations} iterations"
-            return Failure(reason, iterations=found.iterations, costs=found.costs)
+            reason = f"not converged in {found.iterations} iterations"
+            return AdjustmentFailure(
+                reason, Code.NOT_CONVERGED, iterations=found.iterations, costs=found.costs
+            )
         values, inner = found.values, network.datum == "free" and freedom.defect > 0
         chosen = network.datum_points & self.usable.points
         if inner:
             if int(chosen.sum()) < 3:
-                return Failure("inner constraints need three datum points that are determined")
+                return Failure(
+                    "inner constraints need three datum points that are determined", Code.TOO_FEW_POINTS
+                )
             if network.datum_points.all():
                 chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)

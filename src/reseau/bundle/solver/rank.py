@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...adjust import Failure
+from ...adjust import AdjustmentFailure
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure
 from .arrow import full
 from .datum import Freedom, held_for
 from .system import Linear
@@ -38,14 +39,18 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
     weak = [linear.system.unknowns.network.points[j] for j in weak_points(linear)]
     if weak:
         listed = ", ".join(weak[:_LISTED]) + (" …" if len(weak) > _LISTED else "")
-        return Failure(f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}", costs=costs)
+        return AdjustmentFailure(
+            f"the rays do not determine the point{'s' * (len(weak) > 1)} {listed}",
+            Code.NOT_IDENTIFIED,
+            costs=costs,
+        )
     # Without what a stage ties, more would look undetermined than is.
     vectors = _null_vectors(linear, freedom) if linear.system.ties is None else []
     if not vectors:
-        return Failure("the normal equations are singular to rounding", costs=costs)
+        return AdjustmentFailure("the normal equations are singular to rounding", Code.SINGULAR, costs=costs)
     listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
     reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
-    return Failure(reason, costs=costs, null_space=tuple(vectors))
+    return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
 
 
 def weak_points(linear: Linear) -> Rows:

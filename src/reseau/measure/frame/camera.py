@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array, ImagePoints
+from ...core.failure import Code, Failure
 from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
 from ...optics import RationalPolynomial
 from ..fitting import fit_mapping
@@ -95,7 +95,7 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
     """
     points = found.image_points()
     if not len(points) or found.px_per_mm is None:
-        return Failure("a frame that was declined has no corners to transform")
+        return Failure("a frame that was declined has no corners to transform", Code.DECLINED)
     xy = photo_coordinates(points.xy, found.px_per_mm)
     model = {
         "similarity": RationalPolynomial.similarity,
@@ -143,7 +143,9 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     most = max(set(lying), key=lying.count) if lying else None
     sure = [r for r in sure if r.format_mm == most]
     if len(sure) < _LEAST_FRAMES or most is None:
-        return Failure(f"{len(sure)} oriented frames do not make a roll; it takes {_LEAST_FRAMES}")
+        return Failure(
+            f"{len(sure)} oriented frames do not make a roll; it takes {_LEAST_FRAMES}", Code.TOO_FEW_IMAGES
+        )
     nominal = FrameShape(*most)
     corners = np.array([r.lines.corners for r in sure if r.lines is not None])
     scale = np.array([np.mean(r.px_per_mm or (1.0, 1.0)) for r in sure])

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import Adjustment, Failure, GaussMarkov, Options, Parameters, adjust, robust
+from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust, robust
 from ...core.data import Array, Mask
+from ...core.failure import Code, Failure
 from .outline import crossings_of
 
 __all__ = [
@@ -171,7 +172,9 @@ def adjust_lines(
         Profiles left out of each edge before; reported with the others.
     """
     if sum(edge is None for edge in edges) > (shape is not None):
-        return Failure("fewer than three edges of a known format, or than four of an unknown one")
+        return Failure(
+            "fewer than three edges of a known format, or than four of an unknown one", Code.NOT_FOUND
+        )
     bow, keep = _BOW_PX, np.zeros(0, dtype=bool)
     for _ in range(2):
         problem, bounds = _problem(corners, edges, shape, bow)

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array
+from ...core.failure import Code, Failure
 from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...io.scans import Scan
 from .band import Band, read_band
@@ -216,12 +216,15 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
     if best:
         return best, reduction
     if dark:
-        return Failure("shows nothing: it is of one tone; scan it with more exposure"), reduction
+        return Failure(
+            "shows nothing: it is of one tone; scan it with more exposure", Code.LOW_CONTRAST
+        ), reduction
     formats = ", ".join(f"{w:g}x{h:g}" for w, h in options.formats)
     return Failure(
         f"no frame of the format {formats} stands out from unexposed film on at least three sides; scan it "
         "with a margin of film around, or say its --frame, --dpi or where it is (frames that overlap cannot "
-        "be told apart)"
+        "be told apart)",
+        Code.NOT_FOUND,
     ), reduction
 
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import BatchOptions, Failure, GaussMarkov, Parameters, adjust_batch, robust
+from ...adjust import BatchOptions, GaussMarkov, Parameters, adjust_batch, robust
 from ...core.data import Array
+from ...core.failure import Code, Failure
 from ...io.scans import Scan
 from .band import read_band
 from .border import binned
@@ -126,7 +127,9 @@ def film_plane(
                 targets.append(i * PITCH_MM if k % 2 == 0 else side * _ROWS_MM / 2)
                 signs.append((-1, 1, 1, -1)[k])
     if len(places) < _LEAST:
-        return Failure(f"{len(places)} edges of perforations are seen, and {_LEAST} are needed")
+        return Failure(
+            f"{len(places)} edges of perforations are seen, and {_LEAST} are needed", Code.NOT_FOUND
+        )
     centre = (np.array([scan.width, scan.height]) - 1) / 2
     unit = max(scan.width, scan.height) / 2
     xy, axis, sign = (np.array(places) - centre) / unit, np.array(axes), np.array(signs)

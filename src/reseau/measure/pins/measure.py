@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
+from ...core.failure import Failure
 from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
 from ..measured import Measured
@@ -112,7 +112,9 @@ def measure_pins(
     layout = _laid(design, known, seen.xy[echoes], o)
     if isinstance(layout, Failure):
         return Failure(
-            f"{frame.name}: the rods of design {design.name!r} are not to be found: {layout.reason}"
+            f"the rods of design {design.name!r} are not to be found: {layout.reason}",
+            layout.code,
+            where=frame.name,
         )
     names = tuple(design.ids[i] for i in known)
     work = _Rods(frame, source[known], names, seen, echoes, layout)

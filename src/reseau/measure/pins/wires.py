@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from ...adjust import Failure
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure
 
 __all__ = ["Layout", "LayoutOptions", "Wires", "lay_wires", "nearest_pairs"]
 
@@ -145,14 +145,19 @@ def lay_wires(
     o = options or LayoutOptions()
     points = wires.start[wires.fixed]
     if len(points) < _LEAST:
-        return Failure(f"the pattern has {len(points)} points; {_LEAST} are needed to find it")
+        return Failure(
+            f"the pattern has {len(points)} points; {_LEAST} are needed to find it", Code.TOO_FEW_POINTS
+        )
     if len(seen) < _LEAST:
         return Failure(
-            f"{len(seen)} echoes of {len(wires.ids)} wires; {_LEAST} are needed to tell which is which"
+            f"{len(seen)} echoes of {len(wires.ids)} wires; {_LEAST} are needed to tell which is which",
+            Code.TOO_FEW_POINTS,
         )
     if start is not None:
         near = _refined(wires, seen, *_affinity(points, start[wires.fixed]), o)
-        return near or Failure("the nominal positions have fewer than four echoes about them")
+        return near or Failure(
+            "the nominal positions have fewer than four echoes about them", Code.TOO_FEW_POINTS
+        )
     tried: list[tuple[float, bool, Layout]] = []
     for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
         linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
@@ -164,7 +169,9 @@ def lay_wires(
         # Upright with y up is what is meant where the pattern does not tell: first so, then in any other way.
         tried.append((score, not mirror or factor.real < 0, layout))
     if not tried:
-        return Failure(f"none of the ways to lay the {len(wires.ids)} wires over {len(seen)} echoes fits")
+        return Failure(
+            f"none of the ways to lay the {len(wires.ids)} wires over {len(seen)} echoes fits", Code.NOT_FOUND
+        )
     highest = max(score for score, _, _ in tried)
     alike = sorted((one for one in tried if one[0] > highest - _ALIKE), key=lambda one: (one[1], -one[0]))
     chosen = alike[0][2]

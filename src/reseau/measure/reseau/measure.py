@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
+from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..matching import Matches
@@ -149,7 +149,11 @@ def measure_reseau(
     at, found, judged = measurement.result()
     why_not = _disagreement(source[known], judged, options)
     if why_not:
-        return Failure(f"{frame.name}: design {design.name!r} is not to be found in the frame: {why_not}")
+        return Failure(
+            f"design {design.name!r} is not to be found in the frame: {why_not}",
+            Code.NOT_FOUND,
+            where=frame.name,
+        )
     return _columns(frame, design, known, at, found, judged, measurement.field)
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array, Frame
+from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
@@ -110,8 +110,10 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     least = max(4, min(10, len(source) // 3))
     if best is None or marks < least or best[1].assignment.score < -0.1 * len(source):
         return Failure(
-            f"{frame.name}: design {design.name!r} is not to be found in the frame of "
-            f"{frame.width}×{frame.height} px ({marks} of {len(source)} marks lie as it says)"
+            f"design {design.name!r} is not to be found in the frame of "
+            f"{frame.width}×{frame.height} px ({marks} of {len(source)} marks lie as it says)",
+            Code.NOT_FOUND,
+            where=frame.name,
         )
     return best[1]
 

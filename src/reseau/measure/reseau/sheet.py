@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
-from ...adjust import Failure
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
+from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain, RationalPolynomial
 from ..testfield.lattice import refit, second_order
@@ -125,7 +125,7 @@ def lay_sheet(
     disks = disks.strongest(_STRONGEST * len(numbers))
     assert design.mark.size is not None
     reach = 2 * step / design.mark.size
-    reasons = [f"no disks of {reach / 2:.1f} diameters' distance lie on a lattice"]
+    failure = Failure(f"no disks of {reach / 2:.1f} diameters' distance lie on a lattice", Code.NOT_FOUND)
     shape = (grey.shape[0], grey.shape[1])
     for seed in _seeds(disks, reach):
         nodes, rows, mapping = _grown(*seed, disks, shape, np.ptp(numbers, axis=0).max() + 1)
@@ -133,11 +133,11 @@ def lay_sheet(
             continue
         placed = _read(grey, nodes, rows, mapping, design, numbers, step, mirrored is not False)
         if isinstance(placed, Failure):
-            reasons.append(placed.reason)
+            failure = placed
             continue
         turn, shift, disk = placed
         return SheetPlacement(mapping, turn / step, shift - turn @ start / step, disk)
-    return Failure(reasons[-1])
+    return failure
 
 
 def _numbered(design: ReseauDesign) -> tuple[Array, float, Array]:
@@ -249,13 +249,13 @@ def _read(
         for k in np.flatnonzero(count >= 0.6 * min(len(nodes), len(numbers))):
             found.append((score[k], best[k], turn, shifts[k].astype(np.float64), node[k]))
     if not found:
-        return Failure("the disks found lie nowhere as the design says")
+        return Failure("the disks found lie nowhere as the design says", Code.OTHER_DESIGN)
     found.sort(key=lambda one: -one[0])
     score, agreement, turn, moved, node = found[0]
     if agreement < _LEGIBLE or (len(found) > 1 and score - found[1][0] < _AHEAD):
-        return Failure("its disks were found, but no coded ring tells which is which")
+        return Failure("its disks were found, but no coded ring tells which is which", Code.AMBIGUOUS)
     if (np.linalg.det(_slope(mapping) @ turn) < 0) != mirrored:
-        return Failure("the sheet is seen mirrored")
+        return Failure("the sheet is seen mirrored", Code.MIRRORED)
     return turn, moved, np.where(node >= 0, rows[node], -1)
 
 

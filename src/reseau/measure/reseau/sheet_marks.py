@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjust import Failure
 from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Failure
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse
@@ -77,7 +77,9 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     placed = lay_sheet(grey, disks, design, options.mirrored)
     if isinstance(placed, Failure):
         return Failure(
-            f"{frame.name}: design {design.name!r} is not to be found in the frame: {placed.reason}"
+            f"design {design.name!r} is not to be found in the frame: {placed.reason}",
+            placed.code,
+            where=frame.name,
         )
     valid = screened.valid & (frame.pixels < frame.full_scale)
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()

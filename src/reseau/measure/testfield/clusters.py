@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ...adjust import Failure
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure
 from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
@@ -136,7 +136,7 @@ def read_clusters(
     """
     work = _Clusters(grey, fit, design, response)
     if not work.visible.any():
-        return Failure("no square between the lines is in sight")
+        return Failure("no square between the lines is in sight", Code.NOT_FOUND)
     for _ in range(3):
         found = work.compared(psf_px)
         better = float(np.clip(psf_px + found.widening, 0.5 * psf_px, 2 * psf_px))
@@ -296,16 +296,24 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             votes[decoded.mirrored, decoded.quarter_turns, int(key[0]), int(key[1])] += 1
     in_sight = int(((reading.joint != HIDDEN).sum(axis=1) >= 8).sum())
     if not votes:
-        return Failure(f"{in_sight} squares are in sight, but none is one of the design {design.name!r}")
+        return Failure(
+            f"{in_sight} squares are in sight, but none is one of the design {design.name!r}",
+            Code.OTHER_DESIGN,
+        )
     (mirrored, quarters, *doubled), most = votes.most_common(1)[0]
     others = sum(votes.values()) - most
     # In a mirror every square says something else about the place of the board.
     if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, 0.3 * in_sight):
-        return Failure("shows the testfield in a mirror", iterations=0)
+        return Failure("shows the testfield in a mirror", Code.MIRRORED)
     if others > max(1, 0.2 * most):
-        return Failure(f"{most} squares lie as in the design {design.name!r}, {others} read like it do not")
+        return Failure(
+            f"{most} squares lie as in the design {design.name!r}, {others} read like it do not",
+            Code.INCONSISTENT,
+        )
     if mirrored or most < 0.3 * in_sight:
-        return Failure(f"of {in_sight} squares in sight only {most} are of the design {design.name!r}")
+        return Failure(
+            f"of {in_sight} squares in sight only {most} are of the design {design.name!r}", Code.OTHER_DESIGN
+        )
     return Placement(_quarter(quarters) / design.pitch, np.array(doubled) / 2, most)
 
 

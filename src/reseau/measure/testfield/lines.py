@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjust import Failure
 from ...core.data import Array, Rows
+from ...core.failure import Code, Failure
 
 __all__ = ["Lattice", "Ridges", "find_lattice", "ridge_points"]
 
@@ -129,12 +129,14 @@ def find_lattice(ridges: Ridges) -> Lattice | Failure:
     """
     candidates = _candidates(ridges)
     if len(candidates) < 4:
-        return Failure("no straight lines are to be found")
+        return Failure("no straight lines are to be found", Code.NOT_FOUND)
     families = _families(candidates)
     numbered = [_numbered(family, ridges.darkness.shape) for family in families]
     if min(len(number) for _, number in numbered) < 2:
         found = " and ".join(str(len(number)) for _, number in numbered)
-        return Failure(f"{found} equally spaced straight lines are found; it takes two and two")
+        return Failure(
+            f"{found} equally spaced straight lines are found; it takes two and two", Code.NOT_FOUND
+        )
     (first, i), (second, j) = numbered
     homography = _homography(first, i, second, j)
     middle = np.array([i.mean(), j.mean(), 1.0])

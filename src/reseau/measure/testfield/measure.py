@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ...adjust import Failure
 from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Code, Failure
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches
@@ -137,14 +137,16 @@ def measure_testfield(
     read = seen.read()
     if isinstance(read, Failure):
         # Lines a pixel wide are lost in blur, but not for good.
-        reason, sharp = read.reason, seen.sharpened(noise)
+        failure, sharp = replace(read, where=frame.name), seen.sharpened(noise)
         read = sharp.read()
         if isinstance(read, Failure):
-            return Failure(f"{frame.name}: {reason}")
+            return failure
         seen = sharp
     if seen.another(read):
         return Failure(
-            f"{frame.name}: shows two testfields {design.name!r}; cut the picture so that it shows one"
+            f"shows two testfields {design.name!r}; cut the picture so that it shows one",
+            Code.SEVERAL_TARGETS,
+            where=frame.name,
         )
     lattice, reading, placed = read.lattice, read.reading, read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)

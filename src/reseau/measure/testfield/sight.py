@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjust import Failure
+from ...core.failure import Code, Failure
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..screening import quiet_noise
@@ -87,15 +87,18 @@ class Sight:
         found = find_lattice(ridges)
         if isinstance(found, Failure):
             return found
-        design, why = self.design, ""
+        design, failure = self.design, None
         width, blur = design.lines.width / design.pitch, blur_of(self.psf_px, self.response)
         for lattice in lattices(self.dark, ridges, found, width, blur):
             reading = read_clusters(self.grey, lattice, design, self.psf_px, self.response)
             placed = reading if isinstance(reading, Failure) else locate(reading, design)
             if isinstance(placed, Placement) and isinstance(reading, Reading):
                 return Read(ridges, lattice, reading, placed)
-            why = why or (placed.reason if isinstance(placed, Failure) else "")
-        return Failure(why or "the straight lines found lie in no common lattice")
+            if failure is None and isinstance(placed, Failure):
+                failure = placed
+        if failure is None:
+            failure = Failure("the straight lines found lie in no common lattice", Code.NOT_FOUND)
+        return failure
 
     def another(self, read: Read) -> bool:
         """Whether the testfield is to be found once more beyond the place where it was found."""
