@@ -5,11 +5,35 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
-__all__ = ["ACCENT", "BLUE", "FAINT", "INK", "PALE", "drawing", "to_svg"]
+from .data import Array
+
+__all__ = [
+    "ACCENT",
+    "BLUE",
+    "FAINT",
+    "INK",
+    "PALE",
+    "Panel",
+    "draw_ellipses",
+    "draw_vectors",
+    "drawing",
+    "frame_of",
+    "length",
+    "nice",
+    "plane_axes",
+    "to_svg",
+    "typical_pitch",
+]
+
+Pair = tuple[Array, Array]
 
 INK, FAINT, PALE, ACCENT, BLUE = "#22272b", "#9aa3a8", "#e9edef", "#b3402a", "#2f5d7c"
 
@@ -52,3 +76,176 @@ def to_svg(figure: Figure) -> str:
     figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Options for drawing a plane with vectors.
+
+    Parameters
+    ----------
+    unit : str
+        Of the plane and of the vectors.
+    pitch : float, optional
+        Length of a typical large vector, and margin around the points; by default the distance of
+        neighbouring points.
+    typical : float, optional
+        A typical large vector; by default the 0.9 quantile of those drawn.
+    tolerance : float
+        Radius of a disk drawn under each point, in the scale of its vector; 0 for none.
+    labels : (str, str)
+        Of the axes, as mathematics.
+    """
+
+    unit: str
+    pitch: float | None = None
+    typical: float | None = None
+    tolerance: float = 0.0
+    labels: tuple[str, str] = ("\\bar x", "\\bar y")
+
+
+def nice(value: float) -> float:
+    """Return the largest number 1, 2 or 5 times a power of ten that does not exceed a positive value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
+
+
+def length(value: float, unit: str) -> str:
+    """Return a length with its unit, in micrometres where that is easier to read."""
+    return f"{value * 1000:g} µm" if unit == "mm" and value < 0.1 else f"{value:g} {unit}"
+
+
+def draw_ellipses(
+    axes: Axes, at: Array, cov: Array, colour: str = ACCENT, enlarged: float | None = None
+) -> float:
+    """Draw standard ellipses of points, enlarged.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into; their limits must be set before.
+    at : ndarray (n, 2)
+        Points.
+    cov : ndarray (n, 2, 2)
+        Covariance matrices, in the squared unit of the points.
+    colour : str
+        Of the lines.
+    enlarged : float, optional
+        Factor of enlargement; by default a round one that makes them 4 % of the axes' width in the median.
+
+    Returns
+    -------
+    float
+        The factor of enlargement.
+    """
+    if not len(at):
+        return 1.0
+    variance, axis = np.linalg.eigh(cov)
+    semi = np.sqrt(np.maximum(variance, 0.0))
+    if enlarged is None:
+        width = abs(float(np.diff(axes.get_xlim())[0]))
+        enlarged = nice(max(0.04 * width / max(float(np.median(semi[:, 1])), 1e-12), 1e-3))
+    angle = np.rad2deg(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
+    ellipses = EllipseCollection(
+        2 * enlarged * semi[:, 1],
+        2 * enlarged * semi[:, 0],
+        angle,
+        units="xy",
+        offsets=at,
+        offset_transform=axes.transData,
+    )
+    ellipses.set(facecolor="none", edgecolor=colour, linewidth=0.6)
+    axes.add_collection(ellipses)
+    return enlarged
+
+
+def plane_axes(axes: Axes, panel: Panel, title: str) -> None:
+    """Set equal scales, the title and the label of the x-axis, and hide the upper and right spines."""
+    axes.set_aspect("equal")
+    axes.locator_params(nbins=6)
+    axes.set_title(title, loc="left")
+    axes.set_xlabel(f"${panel.labels[0]}$ / {panel.unit}")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def frame_of(axes: Axes, at: Array, pitch: float, below: float = 2.2) -> None:
+    """Set the limits of a panel, with room for a scale arrow at the bottom."""
+    low, high = at.min(axis=0), at.max(axis=0)
+    axes.set_xlim(low[0] - pitch, high[0] + pitch)
+    axes.set_ylim(low[1] - below * pitch, high[1] + pitch)
+
+
+def typical_pitch(at: Array) -> float:
+    """Return the median distance between neighbouring points."""
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    np.fill_diagonal(distance, np.inf)
+    return float(np.median(distance.min(axis=1)))
+
+
+def draw_vectors(axes: Axes, marks: Pair, check: Pair, panel: Panel, title: str) -> None:
+    """Draw residual vectors at fitted marks and, in red, at check marks, with a scale arrow.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    marks, check : (ndarray (n, 2), ndarray (n, 2))
+        Positions and vectors.
+    panel : Panel
+        Options.
+    title : str
+        Title of the axes.
+    """
+    pitch = panel.pitch or typical_pitch(marks[0])
+    frame_of(axes, np.concatenate([marks[0], check[0]]), pitch)
+    plane_axes(axes, panel, title)
+    _vectors(axes, marks, check, 0.9 * pitch, panel)
+
+
+def _vectors(axes: Axes, marks: Pair, check: Pair, reach: float, panel: Panel) -> None:
+    """Draw vectors, a typical large one as long as `reach`, with a scale arrow at the lower right."""
+    typical = panel.typical or max(float(np.quantile(np.hypot(*marks[1].T), 0.9)), 1e-12)
+    scale = reach / typical
+    if panel.tolerance > 0:
+        at, across = np.concatenate([marks[0], check[0]]), 2 * panel.tolerance * scale
+        disks = EllipseCollection(
+            [across], [across], [0.0], units="xy", offsets=at, offset_transform=axes.transData, zorder=0
+        )
+        disks.set(facecolor=PALE, edgecolor="none")
+        axes.add_collection(disks)
+    for (at, vectors), colour in ((marks, INK), (check, ACCENT)):
+        if not len(at):
+            continue
+        axes.plot(*at.T, ".", color=FAINT, markersize=1.6, zorder=1)
+        axes.quiver(
+            *at.T,
+            *(vectors * scale).T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.0032,
+            headwidth=3.2,
+            headlength=4.2,
+            headaxislength=3.8,
+            color=colour,
+            zorder=2,
+        )
+    _scale_arrow(axes, scale, nice(typical), panel.unit)
+
+
+def _scale_arrow(axes: Axes, scale: float, shown: float, unit: str) -> None:
+    """Draw an arrow at the lower right that is `shown` long in the scale of the vectors."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    x, y = right - 0.02 * (right - left) - shown * scale, low + 0.06 * (high - low)
+    arrow = {"arrowstyle": "-|>", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
+    axes.annotate("", xy=(x + shown * scale, y), xytext=(x, y), arrowprops=arrow)
+    axes.annotate(
+        length(shown, unit),
+        (x, y),
+        xytext=(-4, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=8.5,
+    )

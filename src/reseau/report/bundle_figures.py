@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 
 from ..bundle import Lens, Result
 from ..core.data import Array, Rows
-from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, to_svg
-from .figures import nice
+from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, nice, to_svg
 
 __all__ = ["distortion_figure", "network_figure", "residual_figure"]
 

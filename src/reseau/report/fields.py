@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 
 from ..bundle import FieldDifference, ProjectionField
 from ..core.data import Array
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
-from .figures import nice
+from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, nice, to_svg
 
 __all__ = ["difference_figure", "uncertainty_figure"]
 

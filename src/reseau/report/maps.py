@@ -9,8 +9,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..core.data import Array, ImagePoints
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
-from .figures import Panel, length, nice, plane_axes
+from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, drawing, length, nice, plane_axes, to_svg
 
 __all__ = ["PROBABILITY", "body_map", "draw_body"]
 

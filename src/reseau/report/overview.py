@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, BLUE, drawing
+from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, drawing, length
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import CorrectionFit
-from .figures import Panel, draw_distortion, draw_vectors, length
+from .figures import draw_distortion
 from .maps import draw_body
 from .overlay import preview
 from .photo_iii import errors_of

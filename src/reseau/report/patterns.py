@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from ..bundle import CommonPattern, Result, by_place, by_point, common_pattern
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, FAINT, INK, drawing, to_svg
-from .figures import nice
+from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
 
 __all__ = ["patterns_of"]
 

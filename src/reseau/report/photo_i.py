@@ -9,12 +9,13 @@ from markupsafe import Markup
 
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import UsageError
+from ..core.figures import Panel
 from ..core.numbers import aligned
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI
 from ..refine import CorrectionFit
 from .comparison import similarity_residuals
-from .figures import Panel, distortion_figure, residual_figure
+from .figures import distortion_figure, residual_figure
 from .overlay import Marks, frame_overlay
 from .tables import (
     Estimates,

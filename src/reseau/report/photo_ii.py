@@ -9,6 +9,7 @@ import scipy.special
 from markupsafe import Markup
 
 from ..core.data import Array, Frame
+from ..core.figures import Panel
 from ..core.numbers import aligned, power
 from ..io import ReseauDesign
 from ..optics import RationalPolynomial, wong_display
@@ -16,7 +17,7 @@ from ..procedures.oscilloscope import PhotoII
 from ..refine import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalry, unit_of
 from .equations import equations
 from .factors import FACTORS, correctors, rods_of
-from .figures import Panel, distortion_figure, residual_figure
+from .figures import distortion_figure, residual_figure
 from .overlay import Arcs, Marks, frame_overlay
 from .tables import (
     Estimates,

@@ -1,0 +1,63 @@
+"""What results show of themselves: a short text, a table for notebooks, columns as a data frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from .errors import UsageError
+
+__all__ = ["Display"]
+
+Facts = Sequence[tuple[str, str]]
+Columns = Mapping[str, Sequence[Any]]
+
+
+class Display:
+    """Short texts for a result. Subclasses give facts and, where they have rows, columns.
+
+    A dataclass that inherits from it is declared with ``repr=False``, or its own text would win.
+
+    Examples
+    --------
+    >>> class Found(Display):
+    ...     def _facts(self):
+    ...         return [("points", "12 of 14"), ("sigma", "0.006 px")]
+    >>> Found()
+    <Found: points 12 of 14, sigma 0.006 px>
+    """
+
+    def _facts(self) -> Facts:
+        """Names and values, with units, of what a user wants to see first."""
+        raise NotImplementedError
+
+    def _columns(self) -> Columns:
+        """Columns of equal length by their names, with the unit in the name."""
+        raise UsageError("has no table", where=type(self).__name__)
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{name} {value}".strip() for name, value in self._facts())
+        return f"<{type(self).__name__}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f'<tr><th style="text-align:left">{escape(name)}</th><td>{escape(value)}</td></tr>'
+            for name, value in self._facts()
+        )
+        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+
+    def to_dataframe(self) -> Any:
+        """Return the rows of the result as a pandas data frame.
+
+        Raises
+        ------
+        UsageError
+            When the result has no rows, or pandas is not installed.
+        """
+        columns = self._columns()
+        try:
+            import pandas as pd
+        except ImportError:
+            raise UsageError("needs pandas", where="to_dataframe", do="run `pip install pandas`") from None
+        return pd.DataFrame(dict(columns))
