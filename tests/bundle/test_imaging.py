@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
-from reseau.bundle.solver.further import Further
+from reseau.bundle.solver.observations import OtherObservations
 from reseau.bundle.solver.system import Linear, System, residuals
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Correction, Values
@@ -24,12 +24,12 @@ MODELS = ("brown-object", "opencv", "opencv-8")
 def system_of(world: networks.World) -> tuple[System, Values]:
     network = world.network
     unknowns = Unknowns.of(network, np.ones(len(network.images), dtype=bool))
-    further = Further.of(network, np.ones(len(network.points), dtype=bool), world.xyz)
+    others = OtherObservations.of(network, np.ones(len(network.points), dtype=bool), world.xyz)
     system = System(
         unknowns,
-        further,
+        others,
         Weighting([network.cov]),
-        np.ones(len(further.value)),
+        np.ones(len(others.value)),
         np.zeros(unknowns.size, bool),
     )
     return system, Values.of_cameras(unknowns, world.rotation, world.x0, world.xyz)

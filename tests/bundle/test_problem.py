@@ -13,8 +13,8 @@ import scipy.stats
 from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
 from reseau.adjust import Options as AdjustOptions
 from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
-from reseau.bundle.diagnostics.remarks import remarks
-from reseau.bundle.solver.careful import careful_inverse
+from reseau.bundle.diagnostics.checks import checks
+from reseau.bundle.solver.posterior import inverse_from_rows
 from reseau.bundle.solver.problem import _Run
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
@@ -265,11 +265,11 @@ def test_the_careful_inverse_is_that_of_the_normal_equations() -> None:
     fit = required(world.problem(world.noisy(3), **TOLERANCE))
     normal = fit.linear.normal(0.0)
     held = np.diag(fit.cofactors.reduced) == 0
-    careful = careful_inverse(normal, held)
-    size = np.sqrt(np.diag(careful))
+    from_rows = inverse_from_rows(normal, held)
+    size = np.sqrt(np.diag(from_rows))
     size[held] = 1.0
     np.testing.assert_allclose(
-        careful / np.outer(size, size), fit.cofactors.reduced / np.outer(size, size), rtol=0, atol=1e-8
+        from_rows / np.outer(size, size), fit.cofactors.reduced / np.outer(size, size), rtol=0, atol=1e-8
     )
 
 
@@ -338,7 +338,7 @@ def test_weak_points_carry_no_datum_unless_they_are_chosen() -> None:
     np.testing.assert_allclose(fit.residuals, chosen.residuals, atol=1e-5)
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
     result = Result(world.network, fit, np.zeros(len(xy), dtype=bool))
-    assert any("2 weak points left out of the datum: p24, p25" in said for said in remarks(result))
+    assert any("2 weak points left out of the datum: p24, p25" in said for said in checks(result))
 
 
 def test_large_coordinates_lose_nothing() -> None:

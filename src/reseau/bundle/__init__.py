@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from .diagnostics.between import sigma_between_images
-from .diagnostics.fields import (
+from .diagnostics import (
+    CommonPattern,
     FieldDifference,
+    Lens,
     ProjectionField,
+    Result,
+    by_place,
+    by_point,
     calibration_difference,
+    common_pattern,
     projection_field,
     projection_field_at,
+    sigma_between_images,
 )
-from .diagnostics.lens import Lens
-from .diagnostics.patterns import CommonPattern, by_place, by_point, common_pattern
-from .diagnostics.result import Result
 from .document import searched_document, to_document
 from .modelling.adjustment import Options, adjust_network, problem_of
-from .modelling.calibrated import UNITS, calibration_of
+from .modelling.calibration import UNITS, calibration_of
 from .modelling.components import Kind, estimate_components, reweighted
 from .modelling.model_search import Searched, search_model
-from .network import Additional, Camera, ControlPoints, Network
-from .network.stage import Stage
-from .solver.approximate import Approximate, approximate
-from .solver.problem import BundleFit, BundleProblem
+from .network import Additional, Camera, ControlPoints, Network, Stage
+from .solver import Approximate, BundleFit, BundleProblem, approximate
 
 __all__ = [
     "UNITS",

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.data import Array
-from .diagnostics.between import sigma_between_images
-from .diagnostics.result import Result
+from .diagnostics import Result, sigma_between_images
 from .modelling.model_search import Searched
-from .network.network import finite
+from .network import finite
 
 __all__ = ["SCHEMA", "searched_document", "to_document"]
 

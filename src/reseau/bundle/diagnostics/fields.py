@@ -18,7 +18,7 @@ import scipy.special
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from ...optics.poses import rotation_matrix
-from ..network.network import finite
+from ..network import finite
 from .lens import Lens, own_columns
 from .result import Result
 

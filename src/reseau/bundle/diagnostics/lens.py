@@ -13,7 +13,7 @@ from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from ...io.network import CAMERA_PARAMETERS
 from ...optics import Brown, Derivatives, EbnerCorrection, OpenCV, PixelGrid, PlaneMapping
-from ..network.network import Additional, Camera
+from ..network import Additional, Camera
 from .result import Result
 
 __all__ = ["Lens", "own_columns"]

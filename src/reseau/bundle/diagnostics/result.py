@@ -13,9 +13,8 @@ from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
-from ..network.network import Network
-from ..solver.imaging import EBNER
-from ..solver.problem import BundleFit
+from ..network import Network
+from ..solver import EBNER, BundleFit
 
 __all__ = ["Result"]
 

@@ -12,14 +12,9 @@ from ...adjust import data_snooping, robust
 from ...adjust.rejection import SnoopingStep
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ..diagnostics.control import doubtful_control
-from ..diagnostics.remarks import listed, remarks
-from ..diagnostics.result import Result
-from ..network.network import Network, finite
-from ..solver.approximate import approximate
-from ..solver.problem import BundleFit, BundleProblem
-from ..solver.unknowns import Unknowns
-from ..solver.values import Values
+from ..diagnostics import Result, checks, doubtful_control, listed
+from ..network import Network, finite
+from ..solver import BundleFit, BundleProblem, Unknowns, Values, approximate
 
 __all__ = ["Options", "adjust_network", "problem_of"]
 
@@ -75,7 +70,7 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
     if network.stage is not None:
-        moved, rotation, x0 = network.stage.begun(start.rotation, start.x0)
+        moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
@@ -120,7 +115,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
     doubts = _doubts(problem) if fit.sigma0 > _DOUBT else []
-    return Result(network, fit, rejected, steps, (*notes, *doubts, *remarks(bare)))
+    return Result(network, fit, rejected, steps, (*notes, *doubts, *checks(bare)))
 
 
 def _doubts(problem: BundleProblem) -> list[str]:

@@ -11,8 +11,8 @@ import numpy as np
 from ...adjust import VarianceComponents, variance_components
 from ...core.data import Mask, Rows
 from ...core.failure import Failure
-from ..network.network import Network
-from ..solver.problem import BundleFit
+from ..network import Network
+from ..solver import BundleFit
 from .adjustment import Options, problem_of
 
 __all__ = ["Kind", "estimate_components", "reweighted"]

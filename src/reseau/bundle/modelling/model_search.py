@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from ...adjust import VarianceComponents
 from ...core.failure import Failure
-from ..diagnostics.result import Result
-from ..network.network import Network
-from ..solver.problem import BundleFit
+from ..diagnostics import Result
+from ..network import Network
+from ..solver import BundleFit
 from .adjustment import Options, adjust_network
 from .components import Kind, estimate_components, reweighted
 from .selection import Eliminated, cross_validation, eliminate_parameters

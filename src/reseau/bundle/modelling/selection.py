@@ -9,9 +9,9 @@ import numpy as np
 from ...adjust.significance import CoefficientTest
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ..diagnostics.result import Result
-from ..network.network import Camera, Network
-from ..solver.problem import BundleFit
+from ..diagnostics import Result
+from ..network import Camera, Network
+from ..solver import BundleFit
 from .adjustment import Options, adjust_network, problem_of
 
 __all__ = ["Eliminated", "Selection", "cross_validation", "eliminate_parameters"]

@@ -1,19 +1,17 @@
 """What is adjusted: cameras, images, points and their observations, in columns."""
 
-from .control import ControlPoints
-from .network import Additional, Camera, Network, finite
-from .stage import Moved, Stage, across
-from .usable import Usable, usable
+from .network import Additional, Camera, ControlPoints, Network, Usable, finite, usable
+from .stage import Stage, StageValues, perpendicular
 
 __all__ = [
     "Additional",
     "Camera",
     "ControlPoints",
-    "Moved",
     "Network",
     "Stage",
+    "StageValues",
     "Usable",
-    "across",
     "finite",
+    "perpendicular",
     "usable",
 ]

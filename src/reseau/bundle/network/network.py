@@ -15,9 +15,12 @@ from ...io.network import CAMERA_PARAMETERS, CameraEntry, Network1
 from ...optics import PlaneMapping
 from .stage import Stage
 
-__all__ = ["Additional", "Camera", "Network", "finite"]
+__all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
 
 Datum = Literal["control", "minimal", "free"]
+
+# An image has six unknowns: three points.
+_LEAST_POINTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,6 +307,77 @@ class Network:
         sets = list(dict.fromkeys(labels))
         cameras = tuple(replace(self.cameras[c], id=f"{self.cameras[c].id}/{label}") for c, label in sets)
         return replace(self, cameras=cameras, camera_of=np.array([sets.index(label) for label in labels]))
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Points whose coordinates are known.
+
+    Parameters
+    ----------
+    names : tuple of str (k,)
+        Names.
+    xyz : ndarray (k, 3)
+        Coordinates.
+    sigma : ndarray (k, 3)
+        0 holds a coordinate, NaN leaves it free, otherwise it is an observation.
+    """
+
+    names: tuple[str, ...]
+    xyz: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Usable:
+    """What takes part in an adjustment.
+
+    Parameters
+    ----------
+    observations : ndarray of bool (n,)
+        Image coordinates.
+    images : ndarray of bool (m,)
+        Images with three points at least, whose pose is known approximately.
+    points : ndarray of bool (p,)
+        Points with rays enough for their unknown coordinates, known approximately.
+    """
+
+    observations: Mask
+    images: Mask
+    points: Mask
+
+
+def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
+    """What of a network can be adjusted.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+    counted : ndarray of bool (n,)
+        Image coordinates that have a weight.
+    x0 : ndarray (m, 3)
+        Approximate projection centres, NaN where a pose is not known.
+    xyz : ndarray (p, 3)
+        Approximate coordinates, NaN where a point is not known.
+
+    Notes
+    -----
+    A ray gives two equations, but two rays are needed for three unknown coordinates. Whatever has too few is
+    left out with its rays, and so on until all that remains has enough.
+    """
+    images, points = finite(x0), finite(xyz)
+    unknown = (~network.held & ~network.observed).sum(axis=1)
+    needed = np.where(unknown == 0, 1, np.where(unknown <= 2, 1, 2))
+    rows = counted.copy()
+    while True:
+        rows = rows & images[network.image_of] & points[network.point_of]
+        rays = np.bincount(network.point_of[rows], minlength=len(points))
+        seen = np.bincount(network.image_of[rows], minlength=len(images))
+        fewer_points, fewer_images = points & (rays >= needed), images & (seen >= _LEAST_POINTS)
+        if (fewer_points == points).all() and (fewer_images == images).all():
+            return Usable(rows, images, points)
+        points, images = fewer_points, fewer_images
 
 
 def finite(rows: Array) -> Mask:

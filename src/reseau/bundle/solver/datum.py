@@ -105,11 +105,11 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
     kept = np.flatnonzero(unknowns.kept >= 0)
     whole[kept] = reduced[unknowns.kept[kept, None] + np.arange(3)]
     counted = np.zeros(network.sigma.shape, dtype=bool)
-    at = system.further.slices[1]
-    j, axis = system.further.coordinate[system.sigma_root[at] > 0].T
+    at = system.others.slices[1]
+    j, axis = system.others.coordinate[system.sigma_root[at] > 0].T
     counted[j, axis] = True
     rows = [whole[(network.held | counted) & taking_part[:, None]]]
-    for a, b in system.further.ends[system.sigma_root[system.further.slices[0]] > 0]:
+    for a, b in system.others.ends[system.sigma_root[system.others.slices[0]] > 0]:
         along = values.xyz[b] - values.xyz[a]
         rows.append(along[None] @ (whole[b] - whole[a]))
     if network.stage is not None:

@@ -26,7 +26,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
 _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 # Damping at which the step is as good as undamped, and below which a decrease is rounding.
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
-# Points further off than so many times the extent of the network are at infinity.
+# Points farther off than so many times the extent of the network are at infinity.
 _HORIZON, _NEARLY = 1e8, 0.99
 # A sum of squares that falls by no more than this part in so many corrections creeps.
 _PATIENCE, _CREEP = 25, 1e-6
@@ -106,7 +106,7 @@ def iterate(
             "the image coordinates have no finite misfits at the approximate values", Code.NOT_FINITE
         )
     radius = _HORIZON * _extent(system, start)
-    costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.further) - redundancy)
+    costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.other_misfits) - redundancy)
     while tried < max_iterations:
         tried += 1
         try:
@@ -126,12 +126,12 @@ def iterate(
         if (offset <= tolerance and settled) or cost <= system.floor or near or creeps:
             away = linear.values.beyond(_NEARLY * radius)
             return Iterated(linear, tuple(costs), tried, float(offset), away)
-        trial = linear.values.moved(system.unknowns, step, system.ties)
+        trial = linear.values.moved(system.unknowns, step, system.constraints)
         away = trial.beyond(radius)
         if len(away):
             trial = trial.confined(away, radius)
-        out, further = system.misfits(trial)
-        there = float((out**2).sum() + further @ further)
+        out, others = system.misfits(trial)
+        there = float((out**2).sum() + others @ others)
         flat = step.predicted <= _FLAT * cost and there <= cost * (1.0 + 1e-10)
         gain = (cost - there) / step.predicted if np.isfinite(there) and step.predicted > 0 else -1.0
         if gain > 1e-4 or flat:

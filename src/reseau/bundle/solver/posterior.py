@@ -15,22 +15,25 @@ from ...adjust.reliability import Whitened
 from ...adjust.stochastic import Blocks, Weighting
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, Singular
-from .careful import careful_inverse, is_small
 from .compiled import in_parallel
 from .datum import Freedom, held_for
-from .normal import posterior
+from .normal import SEGMENTS, posterior
 from .rank import PARALLEL
+from .stage_constraints import StageConstraints
 from .system import Linear, Normal
-from .ties import Ties
 
-__all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
+__all__ = ["BlockSolution", "Cofactors", "cofactors_of", "inverse_from_rows"]
 
 # Least pivot of the normal equations scaled to ones that is no rounding.
 _RANK = 1e-14
 # How far the cofactors of the adjusted observations may be from summing to the number of unknowns.
 _EXACT, _INEXACT = 1e-7, 1e-6
-# The same where a stage ties images: frontal views leave the normal equations half of their digits.
-_TIED = 1e-3
+# The same where a stage moves the field: frontal views leave the normal equations half of their digits.
+_STAGED = 1e-3
+# Entries of F that are still a matter of a second.
+_ENTRIES = 20_000_000
+# Singular values below this part of the largest count as zero, as in :mod:`reseau.adjust`.
+_ZERO = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class BlockSolution(Whitened):
 
     @classmethod
     def of(cls, weightings: list[Weighting], whitened: Array, adjusted: list[Array]) -> BlockSolution:
-        """From the weights of image coordinates and of further observations, one after the other."""
+        """From the weights of image coordinates and of other observations, one after the other."""
         influence, cofactors, start = [], [], 0
         for weighting in weightings:
             for root, cofactor in zip(weighting.roots, weighting.cofactors, strict=True):
@@ -99,8 +102,8 @@ class Cofactors:
         Of the points; zero for those held or not adjusted.
     seen : ndarray (n, 2, 2)
         Of the adjusted image coordinates, whitened, by points.
-    further : ndarray
-        Of the further adjusted observations, over their variances.
+    others : ndarray
+        Of the others adjusted observations, over their variances.
     normal : Normal
         Undamped normal equations, which joint cofactors are made of.
     referral : Referral, optional
@@ -110,7 +113,7 @@ class Cofactors:
     reduced: Array
     points: Array
     seen: Array
-    further: Array
+    others: Array
     normal: Normal
     referral: Referral | None = None
 
@@ -177,13 +180,13 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     ends = np.flatnonzero(system.unknowns.kept >= 0)
     still = system.unknowns.kept[ends, None] + np.arange(3)
     held[still[system.movable[ends] == 0]] = True
-    if system.ties is not None:
-        z, points, seen, further = _tied(linear, normal, system.ties, held, taking_part)
+    if system.constraints is not None:
+        z, points, seen, others = _with_stage(linear, normal, system.constraints, held, taking_part)
     else:
         if datum is not None:
             held[held_for(freedom, system.unknowns, diagonal)] = True
             normal.hold(held)
-        z, points, seen, further = _marginal(linear, normal, held, taking_part)
+        z, points, seen, others = _marginal(linear, normal, held, taking_part)
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     referral = None
@@ -191,13 +194,13 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         referral = _referral(normal, freedom, datum & taking_part, z)
         z, points = _in_datum(referral, points)
         points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    return Cofactors(z, points, seen, further, normal, referral)
+    return Cofactors(z, points, seen, others, normal, referral)
 
 
 def _marginal(
     linear: Linear, normal: Normal, held: Mask, taking_part: Mask
 ) -> tuple[Array, Array, Array, Array]:
-    """Cofactors of reduced unknowns, points, image coordinates and further observations in some datum.
+    """Cofactors of reduced unknowns, points, image coordinates and other observations in some datum.
 
     Those of the adjusted observations sum to the number of unknowns. Where they do not, the normal equations
     have lost digits, and the inverse is had from the rows of the observations instead.
@@ -222,42 +225,42 @@ def _marginal(
         missing = np.inf
     if normal.least < PARALLEL:
         raise Singular
-    if is_small(linear):
-        found = _with_inverse(linear, normal, careful_inverse(normal, held), held, taking_part)
+    if _is_small(linear):
+        found = _with_inverse(linear, normal, inverse_from_rows(normal, held), held, taking_part)
         missing = abs(_total(found) - free)
     if not missing < _INEXACT * max(1.0, system.unknowns.size / 1000.0):
         raise Singular
     return found
 
 
-def _tied(
-    linear: Linear, normal: Normal, ties: Ties, columns: Mask, taking_part: Mask
+def _with_stage(
+    linear: Linear, normal: Normal, stage: StageConstraints, columns: Mask, taking_part: Mask
 ) -> tuple[Array, Array, Array, Array]:
-    """The same where a stage ties images.
+    """The same where a stage moves the field.
 
     Raises
     ------
     Singular
         When the observations do not determine the unknowns.
     """
-    held = ties.held(columns)
-    tied = normal.tied(ties, held)
-    arrow = Arrow.factorise(np.zeros((0, 1)), tied.matrix)
+    held = stage.held(columns)
+    own = normal.constrained(stage, held)
+    arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
-    found = _with_inverse(linear, normal, tied.back @ q @ tied.back.T, columns, taking_part)
-    slopes = normal.stage_slopes(ties)
+    found = _with_inverse(linear, normal, own.back @ q @ own.back.T, columns, taking_part)
+    slopes = normal.stage_slopes(stage)
     found[3][-len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
-    if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _TIED:
+    if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _STAGED:
         raise Singular
     return found
 
 
 def _total(found: tuple[Array, Array, Array, Array]) -> float:
     """Sum of the cofactors of the adjusted observations, whitened."""
-    _, _, seen, further = found
-    return float(np.trace(seen, axis1=1, axis2=2).sum() + further.sum())
+    _, _, seen, others = found
+    return float(np.trace(seen, axis1=1, axis2=2).sum() + others.sum())
 
 
 def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
@@ -284,15 +287,15 @@ def _with_inverse(
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    return z, points, seen, _further(linear, z, points)
+    return z, points, seen, _others(linear, z, points)
 
 
-def _further(linear: Linear, z: Array, points: Array) -> Array:
+def _others(linear: Linear, z: Array, points: Array) -> Array:
     """Cofactors of distances, observed coordinates and interior orientation, over their variances."""
     system = linear.system
     hats = np.zeros(len(system.sigma_root))
-    j, axis = system.further.coordinate.T
-    _, coordinates, _ = system.further.slices
+    j, axis = system.others.coordinate.T
+    _, coordinates, _ = system.others.slices
     hats[coordinates] = points[j, axis, axis]
     _, _, rows, columns = system.prior_column
     hats[rows] = z[columns, columns]
@@ -339,3 +342,73 @@ def _cross(linear: Linear, point: int) -> Array:
         for start, width, column in zip(pattern.start[k], pattern.width[k], pattern.column[k], strict=True):
             w[start : start + width] += linear.rows[k, :, column : column + width].T @ b
     return w
+
+
+def _is_small(linear: Linear) -> bool:
+    """Whether the rows of all observations can be held as a full matrix."""
+    return 2 * len(linear.misfits) * linear.system.unknowns.size <= _ENTRIES
+
+
+def inverse_from_rows(normal: Normal, held: Mask) -> Array:
+    """S⁻¹ (u, u) from the rows of the observations, without S; zero for what is held.
+
+    The rows F = A − B V⁻¹ Wᵀ of all observations, points eliminated, have FᵀF = S. Their QR factors know S to
+    the root of its condition: what S loses to rounding, F keeps (Golub & Van Loan, *Matrix Computations*,
+    ch. 5).
+
+    Parameters
+    ----------
+    normal : Normal
+        Undamped normal equations, whose V⁻¹ are used.
+    held : ndarray of bool (u,)
+        Reduced unknowns that are held.
+
+    Raises
+    ------
+    Singular
+        When the rows do not determine the others.
+    """
+    rows = _reduced_rows(normal)[:, ~held]
+    length = np.sqrt((rows**2).sum(axis=0))
+    if not (length > 0).all():
+        raise Singular
+    triangle = np.linalg.qr(rows / length, mode="r")
+    _, singular, vt = np.linalg.svd(triangle)
+    if len(singular) < len(length) or singular[-1] <= _ZERO * singular[0]:
+        raise Singular
+    factor = (vt.T / singular) / length[:, None]
+    inverse = np.zeros((len(held), len(held)))
+    inverse[np.ix_(~held, ~held)] = factor @ factor.T
+    return inverse
+
+
+def _reduced_rows(normal: Normal) -> Array:
+    """F (N, u): all observations by the reduced unknowns, points eliminated."""
+    linear, system = normal.linear, normal.linear.system
+    pattern, last, u = system.pattern, linear.rows.shape[2] - 3, system.unknowns.size
+    point = system.seen.point
+    a = np.zeros((len(point), 2, u))
+    for s in range(SEGMENTS):
+        wide = int(pattern.width[:, s].max(initial=0))
+        for i in range(wide):
+            at = np.flatnonzero(pattern.width[:, s] > i)
+            a[at, :, pattern.start[at, s] + i] = linear.rows[at, :, pattern.column[at, s] + i]
+    b = linear.rows[:, :, last:]
+    cross = np.zeros((len(linear.prior), 3, u))
+    np.add.at(cross, point, np.swapaxes(b, 1, 2) @ a)
+    through = normal.inverse @ cross
+    through[pattern.eliminated == 0] = 0.0
+    image = (a - b @ through[point]).reshape(-1, u)
+    j, axis = system.others.coordinate.T
+    _, coordinates, _ = system.others.slices
+    root = system.sigma_root
+    # An observed coordinate is a row with B alone, or a column of its own where its point is kept.
+    observed = -root[coordinates][:, None] * through[j, axis]
+    own = np.zeros((len(root), u))
+    rows_kept, columns_kept, rows_interior, columns_interior = system.prior_column
+    own[rows_kept, columns_kept] = root[rows_kept]
+    own[rows_interior, columns_interior] = root[rows_interior]
+    for k, column, slope in linear.distance_slopes():
+        own[k, column] = slope
+    own[coordinates] += observed
+    return np.concatenate([image, own])

@@ -17,12 +17,11 @@ from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
-from ..network.network import Network, finite
-from ..network.usable import Usable, usable
+from ..network import Network, Usable, finite, usable
 from .arrow import Singular
 from .datum import Freedom, freedom_of, held_minimally, similarity_onto
-from .further import Further
 from .iteration import Iterated, iterate
+from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
 from .rank import creeping_points, steady_points, undetermined, weak_points
 from .system import Linear, System, residuals
@@ -82,32 +81,32 @@ class BundleProblem:
         return centre
 
     @cached_property
-    def further(self) -> Further:
+    def others(self) -> OtherObservations:
         """Observations other than image coordinates, of all points; coordinates from the centre."""
         every = np.ones(len(self.network.points), dtype=bool)
-        return Further.of(self.network, every, self.network.xyz - self.centre)
+        return OtherObservations.of(self.network, every, self.network.xyz - self.centre)
 
     @cached_property
     def observations(self) -> NDArray[Any]:
         """All observations (N,); coordinates are reckoned from the centre."""
-        return np.concatenate([self.network.xy.ravel(), self.further.value])
+        return np.concatenate([self.network.xy.ravel(), self.others.value])
 
     @property
     def covariance(self) -> list[Array]:
         """Covariances: blocks (n, 2, 2), and standard deviations."""
-        return [self.network.cov, self.further.sigma]
+        return [self.network.cov, self.others.sigma]
 
     @cached_property
     def marks(self) -> NDArray[np.intp]:
         """The two coordinates of an image point leave together."""
-        n, more = len(self.network.xy), len(self.further.value)
+        n, more = len(self.network.xy), len(self.others.value)
         return np.concatenate([np.repeat(np.arange(n), 2), n + np.arange(more)])
 
     @cached_property
     def groups(self) -> NDArray[np.intp]:
         """The object point of each observation: errors of different points hardly know of each other."""
         points = len(self.network.points)
-        more = points + np.arange(len(self.further.value))
+        more = points + np.arange(len(self.others.value))
         return np.concatenate([np.repeat(self.network.point_of, 2), more])
 
     def with_weights(self, weights: ArrayLike | None) -> Self:
@@ -216,34 +215,34 @@ class _Run:
             distance_of=whole.distance_of[bars],
             distance=whole.distance[bars],
         )
-        more = problem.further
+        more = problem.others
         used = np.bincount(whole.camera_of[self.usable.images], minlength=len(whole.cameras)) > 0
         coordinate, interior = part[more.coordinate[:, 0]], used[more.interior[:, 0]]
         read = self.usable.images[more.reading]
         axis = np.ones(more.across.shape[1], dtype=bool)
-        self.in_further = np.concatenate([bars, coordinate, interior, read, axis])
+        self.in_others = np.concatenate([bars, coordinate, interior, read, axis])
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
-                np.where(self.in_further, weights[2 * n :], 0.0),
+                np.where(self.in_others, weights[2 * n :], 0.0),
             ]
         )
         self.weighting = Weighting([whole.cov], self.weights[: 2 * n])
         self.unknowns = Unknowns.of(self.network, self.usable.images)
-        further = Further(
+        others = OtherObservations(
             self.network.distance_of,
             more.coordinate[coordinate],
             more.interior[interior],
             more.reading[read],
             more.across,
-            more.value[self.in_further],
-            more.sigma[self.in_further],
+            more.value[self.in_others],
+            more.sigma[self.in_others],
         )
         mine = Weighting(
             [self.network.cov], self.weights[: 2 * n].reshape(n, 2)[self.usable.observations].ravel()
         )
-        factors = self.weights[2 * n :][self.in_further]
-        self.system = System(self.unknowns, further, mine, factors, self.unknowns.dropped.copy())
+        factors = self.weights[2 * n :][self.in_others]
+        self.system = System(self.unknowns, others, mine, factors, self.unknowns.dropped.copy())
 
     def adjust(self) -> BundleFit | Failure:
         problem, network = self.problem, self.network
@@ -339,7 +338,7 @@ class _Run:
         observations = int((self.weights > 0).sum())
         free = ~network.held & part[:, None]
         kept = self.unknowns.kept >= 0
-        size = self.unknowns.size if self.system.ties is None else self.system.ties.size
+        size = self.unknowns.size if self.system.constraints is None else self.system.constraints.size
         unknowns = size - int(self.unknowns.dropped.sum()) - 3 * int(kept.sum()) + int(free.sum())
         return observations, unknowns, freedom.defect if network.datum != "control" else 0
 
@@ -368,12 +367,12 @@ class _Run:
         hats[rows] = cofactors.seen
         residuals = self._residuals(linear.values)
         counted = np.where(self.weights > 0, residuals, 0.0)
-        further = np.zeros(len(self.in_further))
-        further[self.in_further] = cofactors.further
-        second = Weighting([self.problem.further.sigma[:, None, None] ** 2], self.weights[2 * n :])
-        weightings = [self.weighting, second] if len(further) else [self.weighting]
+        others = np.zeros(len(self.in_others))
+        others[self.in_others] = cofactors.others
+        second = Weighting([self.problem.others.sigma[:, None, None] ** 2], self.weights[2 * n :])
+        weightings = [self.weighting, second] if len(others) else [self.weighting]
         whitened = np.concatenate([self.weighting.whiten(counted[: 2 * n]), second.whiten(counted[2 * n :])])
-        solution = BlockSolution.of(weightings, whitened, [hats, further[:, None, None]][: len(weightings)])
+        solution = BlockSolution.of(weightings, whitened, [hats, others[:, None, None]][: len(weightings)])
         centre, values = self.problem.centre, linear.values
         xyz = np.where(self.usable.points[:, None], values.xyz + centre, np.nan)
         xyz = np.where(whole.held & self.usable.points[:, None], whole.xyz, xyz)
@@ -407,6 +406,6 @@ class _Run:
         rows = np.flatnonzero(self.usable.images[whole.image_of] & self.usable.points[whole.point_of])
         v = np.full((len(whole.xy), 2), np.nan)
         v[rows] = residuals(whole, self.unknowns, rows, values)
-        more = self.problem.further
-        further = np.where(self.in_further, more.computed(values) - more.value, np.nan)
-        return np.concatenate([v.ravel(), further])
+        more = self.problem.others
+        others = np.where(self.in_others, more.computed(values) - more.value, np.nan)
+        return np.concatenate([v.ravel(), others])

@@ -44,8 +44,8 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
             Code.NOT_IDENTIFIED,
             costs=costs,
         )
-    # Without what a stage ties, more would look undetermined than is.
-    vectors = _null_vectors(linear, freedom) if linear.system.ties is None else []
+    # Without the constraints of a stage, more would look undetermined than is.
+    vectors = _null_vectors(linear, freedom) if linear.system.constraints is None else []
     if not vectors:
         return AdjustmentFailure("the normal equations are singular to rounding", Code.SINGULAR, costs=costs)
     listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)

@@ -14,7 +14,7 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ...optics import Brown, OpenCV, PixelGrid
 from ...optics.poses import rotation_matrix
-from ..network.network import Camera, Network
+from ..network import Camera, Network
 
 __all__ = ["Pair", "Resection", "directions", "intersect", "relative_orientation", "resect"]
 

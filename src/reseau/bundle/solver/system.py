@@ -9,13 +9,13 @@ import numpy as np
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
 from ...optics import PlaneMapping
-from ..network.network import Network
+from ..network import Network
 from .arrow import Arrow, full
 from .compiled import chunks_of, in_parallel
-from .further import Further
 from .imaging import BROWN_IMAGE, BROWN_OBJECT, MAPPING, OPENCV, Interior, Seen, derive, mapped, misfit
 from .normal import Sums, assemble, reduce_sides, substitute
-from .ties import Tied, Ties
+from .observations import OtherObservations
+from .stage_constraints import Constrained, StageConstraints
 from .unknowns import Unknowns
 from .values import Correction, Values
 
@@ -34,21 +34,21 @@ class System:
     ----------
     unknowns : Unknowns
         Columns.
-    further : Further
+    others : OtherObservations
         Observations other than image coordinates.
     weighting : Weighting
         Of the image coordinates, in the order of the network.
     factors : ndarray
-        On the weights of the further observations.
+        On the weights of the other observations.
     held : ndarray of bool (u,)
         Reduced unknowns that are held.
     """
 
     def __init__(
-        self, unknowns: Unknowns, further: Further, weighting: Weighting, factors: Array, held: Mask
+        self, unknowns: Unknowns, others: OtherObservations, weighting: Weighting, factors: Array, held: Mask
     ) -> None:
         network, order = unknowns.network, unknowns.order
-        self.unknowns, self.further, self.held = unknowns, further, held
+        self.unknowns, self.others, self.held = unknowns, others, held
         image = network.image_of[order]
         extra = unknowns.extra_of[image]
         roots = weighting.roots[0].matrices
@@ -56,10 +56,10 @@ class System:
             image, network.point_of[order], network.camera_of[image], extra,
             np.ascontiguousarray(network.xy[order]), np.ascontiguousarray(roots[order]),
         )  # fmt: skip
-        self.sigma_root = np.sqrt(factors) / further.sigma
+        self.sigma_root = np.sqrt(factors) / others.sigma
         self.movable = np.where(network.held, 0.0, 1.0)
         self.pattern = unknowns.pattern
-        self.ties = None if network.stage is None else Ties(unknowns, network.stage)
+        self.constraints = None if network.stage is None else StageConstraints(unknowns, network.stage)
         self.chunks = chunks_of(unknowns.first)
         self.interior = _interior(network, unknowns)
 
@@ -74,7 +74,7 @@ class System:
         return self.interior._replace(values=values.cameras, extra=values.extra)
 
     def misfits(self, values: Values) -> tuple[Array, Array]:
-        """Weighted misfits of the image coordinates (n, 2), by points, and of the further observations."""
+        """Weighted misfits of the image coordinates (n, 2), by points, and of the other observations."""
         out = np.empty((len(self.seen.image), 2))
         at, cameras, first = values.orientation, self.cameras(values), self.unknowns.first
         in_parallel(
@@ -83,7 +83,7 @@ class System:
         for mapping, _, rows in self.mappings(values):
             xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows])
             out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
-        return out, (self.further.computed(values) - self.further.value) * self.sigma_root
+        return out, (self.others.computed(values) - self.others.value) * self.sigma_root
 
     def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
         """Cameras that are not compiled, their numbers, and the rows of their observations."""
@@ -120,25 +120,25 @@ class System:
             out[own] = self._weighted(own, (xy - self.seen.xy[own])[:, :, None])[:, :, 0]
             rows[own, :, : 6 + count] = self._weighted(own, np.concatenate([by_pose, free], axis=2))
             rows[own, :, -3:] = self._weighted(own, b)
-        further = (self.further.computed(values) - self.further.value) * self.sigma_root
-        return Linear(self, values, rows, out, further)
+        others = (self.others.computed(values) - self.others.value) * self.sigma_root
+        return Linear(self, values, rows, out, others)
 
     @cached_property
     def prior_column(self) -> tuple[Rows, Rows, Rows, Rows]:
-        """Where further observations act on reduced unknowns.
+        """Where other observations act on reduced unknowns.
 
         Rows of observed coordinates of kept points, their columns; rows of observed interior orientation,
         their columns.
         """
-        unknowns, (_, coordinates, interior) = self.unknowns, self.further.slices
-        kept = unknowns.kept[self.further.coordinate[:, 0]]
+        unknowns, (_, coordinates, interior) = self.unknowns, self.others.slices
+        kept = unknowns.kept[self.others.coordinate[:, 0]]
         rows = np.flatnonzero(kept >= 0)
-        c, parameter = self.further.interior.T
+        c, parameter = self.others.interior.T
         place = [int(np.flatnonzero(unknowns.free[i] == p)[0]) for i, p in zip(c, parameter, strict=True)]
         used = unknowns.camera[c] >= 0
         return (
             coordinates.start + rows,
-            kept[rows] + self.further.coordinate[rows, 1],
+            kept[rows] + self.others.coordinate[rows, 1],
             interior.start + np.flatnonzero(used),
             (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
         )
@@ -153,51 +153,48 @@ class Linear:
         Weighted derivatives of the image coordinates, by points; those by the point in the last three.
     misfits : ndarray (n, 2)
         Weighted misfits.
-    further : ndarray
-        Weighted misfits of the further observations.
+    other_misfits : ndarray
+        Weighted misfits of the other observations.
     """
 
-    def __init__(self, system: System, values: Values, rows: Array, misfits: Array, further: Array) -> None:
-        self.system, self.values, self.rows, self.misfits, self.further = (
-            system,
-            values,
-            rows,
-            misfits,
-            further,
-        )
+    def __init__(
+        self, system: System, values: Values, rows: Array, misfits: Array, other_misfits: Array
+    ) -> None:
+        self.system, self.values = system, values
+        self.rows, self.misfits, self.other_misfits = rows, misfits, other_misfits
 
     @property
     def cost(self) -> float:
         """vᵀPv."""
-        return float((self.misfits**2).sum() + self.further @ self.further)
+        return float((self.misfits**2).sum() + self.other_misfits @ self.other_misfits)
 
     @cached_property
     def prior(self) -> Array:
         """Weights of observed coordinates of eliminated points, and weighted misfits (p, 3, 2)."""
-        network, further = self.system.unknowns.network, self.system.further
+        network, others = self.system.unknowns.network, self.system.others
         prior = np.zeros((len(network.points), 3, 2))
         untouched = (network.rays == 0)[:, None] & ~network.observed
         prior[..., 0] = np.where((self.system.movable == 0) | untouched, 1.0, 0.0)
-        at = further.slices[1]
-        j, axis = further.coordinate.T
+        at = others.slices[1]
+        j, axis = others.coordinate.T
         root = self.system.sigma_root[at]
         prior[j, axis, 0] += root**2
         # An observed coordinate that was left out of a point that nothing else holds.
         prior[j, axis, 0] = np.where(
             (prior[j, axis, 0] == 0) & (network.rays[j] == 0), 1.0, prior[j, axis, 0]
         )
-        prior[j, axis, 1] = root * self.further[at]
+        prior[j, axis, 1] = root * self.other_misfits[at]
         return prior
 
-    def _add_further(self, sums: Sums) -> None:
+    def _add_others(self, sums: Sums) -> None:
         """Distances, and coordinates and parameters observed among the reduced unknowns."""
         system = self.system
         bands, kept = len(sums.band), system.unknowns.kept
         rows, columns, rows_interior, columns_interior = system.prior_column
         for row, column in zip([*rows, *rows_interior], [*columns, *columns_interior], strict=True):
-            _add(sums, int(column), system.sigma_root[row], float(self.further[row]), bands)
+            _add(sums, int(column), system.sigma_root[row], float(self.other_misfits[row]), bands)
         for k, column, slope in self.distance_slopes():
-            gradient = slope * self.further[k]
+            gradient = slope * self.other_misfits[k]
             sums.gradient[column] += gradient
             sums.diagonal[column] += slope**2
             sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
@@ -209,7 +206,7 @@ class Linear:
     def distance_slopes(self) -> list[tuple[int, Rows, Array]]:
         """For each distance its number, the six columns it touches, and its weighted derivatives (6,)."""
         system, slopes = self.system, []
-        for k, (a, b) in enumerate(system.further.ends):
+        for k, (a, b) in enumerate(system.others.ends):
             along = self.values.xyz[b] - self.values.xyz[a]
             along = along / np.linalg.norm(along) * system.sigma_root[k]
             slope = np.concatenate([-along * system.movable[a], along * system.movable[b]])
@@ -243,7 +240,7 @@ class Linear:
         for other in parts[1:]:
             for mine, theirs in zip(sums, other, strict=True):
                 mine += theirs
-        self._add_further(sums)
+        self._add_others(sums)
         sums.reduced[:] += sums.gradient
         for column in np.flatnonzero(system.held):
             _hold(sums, int(column))
@@ -280,27 +277,27 @@ class Normal:
         """
         return Arrow.factorise(self.sums.band, self.sums.border)
 
-    def tied(self, ties: Ties, held: Mask | None = None) -> Tied:
-        """The same in the unknowns proper, of which some (size,) may be held."""
-        linear, slopes = self.linear, self.stage_slopes(ties)
-        matrix, last = full(self.sums.band, self.sums.border), linear.further[-len(slopes) :]
-        return ties.tied(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
+    def constrained(self, stage: StageConstraints, held: Mask | None = None) -> Constrained:
+        """The same in the independent unknowns, of which some (size,) may be held."""
+        linear, slopes = self.linear, self.stage_slopes(stage)
+        matrix, last = full(self.sums.band, self.sums.border), linear.other_misfits[-len(slopes) :]
+        return stage.constrained(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
 
-    def stage_slopes(self, ties: Ties) -> Array:
-        """Weighted derivatives of a stage's readings and axis, the last of the further observations."""
-        system, further = self.linear.system, self.linear.system.further
-        root = system.sigma_root[further.readings.start :]
-        return ties.slopes(self.linear.values.stage, further.across, root)
+    def stage_slopes(self, stage: StageConstraints) -> Array:
+        """Weighted derivatives of a stage's readings and axis, the last of the other observations."""
+        system, others = self.linear.system, self.linear.system.others
+        root = system.sigma_root[others.readings.start :]
+        return stage.slopes(self.linear.values.stage, others.across, root)
 
     def correction(self) -> Correction:
         """The correction the normal equations give; raises Singular."""
-        ties, q, by_stage = self.linear.system.ties, None, 0.0
-        if ties is None:
+        constraints, q, by_stage = self.linear.system.constraints, None, 0.0
+        if constraints is None:
             y = self.factorise().solve(-self.sums.reduced)
         else:
-            tied = self.tied(ties)
-            q = Arrow.factorise(np.zeros((0, 1)), tied.matrix).solve(-tied.gradient)
-            y, by_stage = tied.back @ q, float(tied.own @ q)
+            own = self.constrained(constraints)
+            q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
+            y, by_stage = own.back @ q, float(own.own @ q)
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
         gradient = self.sums.gradient @ y + float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())

@@ -10,7 +10,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ...core.data import Mask, Rows
-from ..network.network import Network
+from ..network import Network
 from .imaging import CAMERA_WIDTH, EBNER
 from .normal import SEGMENTS, Pattern, locals_of
 

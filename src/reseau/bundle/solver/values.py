@@ -8,9 +8,9 @@ import numpy as np
 
 from ...core.data import Array, Rows
 from ...optics.poses import rotation_matrix
-from ..network.stage import Moved
+from ..network import StageValues
 from .imaging import EBNER, Orientation
-from .ties import Ties
+from .stage_constraints import StageConstraints
 from .unknowns import Unknowns
 
 __all__ = ["Correction", "Values"]
@@ -18,7 +18,7 @@ __all__ = ["Correction", "Values"]
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """A correction of the unknowns, and what it promises.
+    """A correction of the unknowns and the decrease it predicts.
 
     Parameters
     ----------
@@ -28,14 +28,14 @@ class Correction:
         Of the eliminated points.
     predicted : float
         Decrease of the weighted sum of squares, to first order.
-    tied : ndarray, optional
-        Of the unknowns proper, where a stage ties images.
+    independent : ndarray, optional
+        Of the independent unknowns, where a stage moves the field.
     """
 
     reduced: Array
     points: Array
     predicted: float
-    tied: Array | None = None
+    independent: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Values:
         Parameters of the cameras, padded.
     extra : ndarray (e, 12)
         Sets of additional parameters; one row at least.
-    stage : Moved, optional
+    stage : StageValues, optional
         Readings of a stage, and its axis.
     """
 
@@ -63,7 +63,7 @@ class Values:
     xyz: Array
     cameras: Array
     extra: Array
-    stage: Moved | None = None
+    stage: StageValues | None = None
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
@@ -89,7 +89,9 @@ class Values:
         xyz[points] *= radius / np.linalg.norm(xyz[points], axis=1, keepdims=True)
         return replace(self, xyz=xyz)
 
-    def moved(self, unknowns: Unknowns, step: Correction, ties: Ties | None = None) -> Values:
+    def moved(
+        self, unknowns: Unknowns, step: Correction, constraints: StageConstraints | None = None
+    ) -> Values:
         """The values after a correction; rotations turn about the axes of their camera."""
         y = step.reduced
         images = unknowns.pose >= 0
@@ -106,6 +108,6 @@ class Values:
         kept = np.flatnonzero(unknowns.kept >= 0)
         xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
         x0, stage = self.x0 + pose[:, 3:], self.stage
-        if ties is not None and stage is not None and step.tied is not None:
-            stage, x0 = ties.stepped(stage, self.x0, y, step.tied)
+        if constraints is not None and stage is not None and step.independent is not None:
+            stage, x0 = constraints.stepped(stage, self.x0, y, step.independent)
         return Values(rotation, x0, xyz, cameras, extra, stage)

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ..network.network import Network
-from ..network.stage import across
+from ..network import Network, perpendicular
 from .values import Values
 
-__all__ = ["Further"]
+__all__ = ["OtherObservations"]
 
 
 @dataclass(frozen=True, eq=False)
-class Further:
+class OtherObservations:
     """Observations that are no image coordinates: distances, coordinates, interior orientation, readings.
 
     Parameters
@@ -44,7 +43,7 @@ class Further:
     sigma: Array
 
     @classmethod
-    def of(cls, network: Network, active: Mask, xyz: Array) -> Further:
+    def of(cls, network: Network, active: Mask, xyz: Array) -> OtherObservations:
         """Those of a network; coordinates `xyz` (p, 3) are reduced ones, of points that take part."""
         interior = [
             (c, camera.names.index(name), camera.sigma[name])
@@ -57,7 +56,7 @@ class Further:
         j, axis = coordinate.T
         stage = network.stage
         read = np.zeros(0) if stage is None else stage.reading
-        across_axis = np.zeros((3, 0)) if stage is None else across(stage.axis)
+        across_axis = np.zeros((3, 0)) if stage is None else perpendicular(stage.axis)
         tilts = across_axis.shape[1]
         return cls(
             network.distance_of,

@@ -9,7 +9,7 @@ import scipy.sparse
 
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
-from ..network.network import Network, finite
+from ..network import Network, finite
 from .datum import similarity_onto
 from .spatial import directions, intersect, relative_orientation, resect
 from .values import Values

@@ -10,13 +10,13 @@ import scipy.special
 from ...adjust import critical_w
 from ...core.data import Rows
 from ...core.errors import UsageError
-from ..network.network import Network
-from ..solver.problem import BundleFit
-from .between import sigma_between_images
+from ..network import Network
+from ..solver import BundleFit
+from .image_scatter import sigma_between_images
 from .patterns import by_place, common_pattern
 from .result import Result
 
-__all__ = ["LISTED", "gaps", "listed", "remarks"]
+__all__ = ["LISTED", "checks", "gaps", "listed"]
 
 LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
@@ -78,7 +78,7 @@ def gaps(network: Network, fit: BundleFit) -> list[str]:
     return found
 
 
-def remarks(result: Result) -> list[str]:
+def checks(result: Result) -> list[str]:
     """Correlations, weak points, uncovered corners, test values, and the global test."""
     network, fit = result.network, result.fit
     return [

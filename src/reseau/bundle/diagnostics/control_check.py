@@ -8,12 +8,8 @@ from itertools import combinations, islice
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ..network.network import Network, finite
-from ..solver.approximate import approximate
-from ..solver.datum import similarity_onto
-from ..solver.problem import BundleFit, BundleProblem
-from ..solver.unknowns import Unknowns
-from ..solver.values import Values
+from ..network import Network, finite
+from ..solver import BundleFit, BundleProblem, Unknowns, Values, approximate, similarity_onto
 
 __all__ = ["doubtful_control"]
 

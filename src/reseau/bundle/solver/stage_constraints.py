@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ..network.stage import Moved, Stage, across
+from ..network import Stage, StageValues, perpendicular
 from .unknowns import Unknowns
 
-__all__ = ["Tied", "Ties"]
+__all__ = ["Constrained", "StageConstraints"]
 
 
-class Tied(NamedTuple):
-    """Normal equations of the unknowns proper.
+class Constrained(NamedTuple):
+    """Normal equations of the independent unknowns.
 
     T (u, size) is `back`; then come the matrix (size, size), and gradients (size,): the readings', and all.
     """
@@ -34,17 +34,18 @@ class Tied(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Ties:
-    """How the reduced unknowns of images hang on those of poses and stage.
+class StageConstraints:
+    """The reduced unknowns of images as functions of the unknowns of poses and stage.
 
-    The unknowns proper are those that are no pose's, the six of each pose, the readings, two of the axis.
+    The independent unknowns are those that belong to no pose, six for each pose, the readings, and two for
+    the axis.
 
     Parameters
     ----------
     unknowns : Unknowns
         Columns of the reduced normal equations, an orientation for each image.
     stage : Stage
-        What ties them.
+        What moves the field.
     """
 
     unknowns: Unknowns
@@ -75,38 +76,38 @@ class Ties:
 
     @cached_property
     def size(self) -> int:
-        """Number of unknowns proper."""
+        """Number of independent unknowns."""
         return int(self.pose.max()) + 6 + len(self.images) + 2
 
-    def matrix(self, moved: Moved) -> Array:
+    def matrix(self, moved: StageValues) -> Array:
         """T (u, size) at some values."""
         t = np.zeros((self.unknowns.size, self.size))
         t[self.others, np.arange(len(self.others))] = 1.0
         row = self.unknowns.pose[self.images, None] + np.arange(6)
         t[row, self.pose[:, None] + np.arange(6)] = 1.0
         t[row[:, 3:], self.readings[:, None]] = -moved.axis
-        bends = -moved.reading[self.images, None, None] * across(moved.axis)
+        bends = -moved.reading[self.images, None, None] * perpendicular(moved.axis)
         t[row[:, 3:, None], self.size - 2 + np.arange(2)] = bends
         return t
 
-    def tied(
+    def constrained(
         self,
-        moved: Moved | None,
+        moved: StageValues | None,
         s: Array,
         gradient: Array,
-        further: Array,
+        slopes: Array,
         misfits: Array,
         held: Mask | None,
-    ) -> Tied:
-        """Normal equations of the unknowns proper.
+    ) -> Constrained:
+        """Normal equations of the independent unknowns.
 
         Parameters
         ----------
-        moved : Moved
+        moved : StageValues
             Values of the stage.
         s, gradient : ndarray (u, u), (u,)
-            Reduced normal equations of the images as if nothing tied them.
-        further : ndarray (a + 2, size)
+            Reduced normal equations of the images as if the images were independent.
+        slopes : ndarray (a + 2, size)
             Weighted derivatives of readings and angles of the axis, see :meth:`slopes`.
         misfits : ndarray (a + 2,)
             Their weighted misfits.
@@ -114,24 +115,24 @@ class Ties:
             Unknowns that are held.
         """
         assert moved is not None
-        t, own = self.matrix(moved), further.T @ misfits
-        matrix = t.T @ s @ t + further.T @ further
+        t, own = self.matrix(moved), slopes.T @ misfits
+        matrix = t.T @ s @ t + slopes.T @ slopes
         if held is not None:
             matrix[held], matrix[:, held] = 0.0, 0.0
             matrix[held, held] = 1.0
-        return Tied(t, matrix, own, t.T @ gradient + own)
+        return Constrained(t, matrix, own, t.T @ gradient + own)
 
-    def slopes(self, moved: Moved | None, nominal: Array, root: Array) -> Array:
+    def slopes(self, moved: StageValues | None, nominal: Array, root: Array) -> Array:
         """Derivatives (a + 2, size) of readings and angles of the axis, times roots (a + 2,) of weights."""
         assert moved is not None
         slopes, a = np.zeros((len(root), self.size)), len(self.images)
         slopes[np.arange(a), self.readings] = 1.0
-        slopes[a:, -2:] = nominal.T @ across(moved.axis)
+        slopes[a:, -2:] = nominal.T @ perpendicular(moved.axis)
         return slopes * root[:, None]
 
-    def stepped(self, moved: Moved, x0: Array, y: Array, q: Array) -> tuple[Moved, Array]:
+    def stepped(self, moved: StageValues, x0: Array, y: Array, q: Array) -> tuple[StageValues, Array]:
         """Readings, axis and projection centres (m, 3) after a correction y = T q."""
-        images, by_axis = self.images, across(moved.axis) @ q[-2:]
+        images, by_axis = self.images, perpendicular(moved.axis) @ q[-2:]
         reading = moved.reading.copy()
         reading[images] += q[self.readings]
         axis = moved.axis + by_axis
@@ -141,10 +142,10 @@ class Ties:
         rest += reading[images, None] * moved.axis + moved.reading[images, None] * by_axis
         x0 = x0.copy()
         x0[images] = rest - reading[images, None] * axis
-        return Moved(reading, axis), x0
+        return StageValues(reading, axis), x0
 
     def held(self, columns: Mask) -> Mask:
-        """Unknowns proper (size,) that are held where reduced unknowns (u,) are that belong to no pose."""
+        """Return which independent unknowns (size,) are held, from the held reduced unknowns (u,)."""
         held = np.zeros(self.size, dtype=bool)
         held[: len(self.others)] = columns[self.others]
         return held

@@ -9,9 +9,8 @@ import numpy as np
 
 from ...calibration.document import Calibration, Covariance, Quantity
 from ...core.errors import UsageError
-from ..diagnostics.between import sigma_between_images
-from ..diagnostics.result import Result
-from ..network.network import Camera
+from ..diagnostics import Result, sigma_between_images
+from ..network import Camera
 
 __all__ = ["UNITS", "calibration_of"]
 
