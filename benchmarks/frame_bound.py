@@ -20,9 +20,9 @@ from frames import CASES, SEEDS
 
 from reseau.core.data import Array
 from reseau.io.scans import Scan, scan_of
-from reseau.measure.frame import FrameOptions, orient_frames
-from reseau.measure.frame.band import read_band
-from reseau.measure.frame.companion import ends_with_line
+from reseau.measure.film import FrameOptions, orient_frames
+from reseau.measure.film.adjacent_lines import ends_with_line
+from reseau.measure.film.border import read_band
 from reseau_sims.filmframe import Beside, FilmFrame
 
 LIMIT_PX = 0.33

@@ -26,7 +26,7 @@ from real_frames import print_real
 
 from reseau.core.data import Array
 from reseau.io.scans import open_scan, scan_of
-from reseau.measure.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
+from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
 from reseau.procedures.frame import helped
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

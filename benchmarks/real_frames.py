@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from reseau.core.data import Array
 from reseau.io.images import write_image
 from reseau.io.scans import Scan, open_scan
-from reseau.measure.frame import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
+from reseau.measure.film import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
 from reseau.report.frames import contact_sheet, frame_tile
 
 __all__ = ["print_real"]

@@ -34,7 +34,7 @@ KILLS = int(os.environ.get("RESEAU_KILLS", "200"))
 POSES = paper_steps()[:12]
 FRAMES = 40
 HEAVY = (
-    "reseau.optics.single",
+    "reseau.optics.compiled",
     "reseau.bundle.solver.compiled",
     "reseau.measure.testfield.measure",
     "reseau.bundle.modelling.adjustment",

@@ -8,7 +8,7 @@ import pytest
 
 from reseau.core.data import Array
 from reseau.io.scans import scan_of
-from reseau.measure.frame import FrameOptions, FrameResult, Roll, orient_frames, roll_of
+from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
 from reseau.procedures.frame import helped
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

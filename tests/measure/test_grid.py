@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from reseau.measure.reseau.candidates import Candidates
-from reseau.measure.reseau.grid import GridOptions, assign, lay_out
+from reseau.measure.reseau.placement import GridOptions, assign, lay_out
 
 WIDTH, HEIGHT = 900, 700
 VALID = np.ones((HEIGHT, WIDTH), dtype=bool)

@@ -8,9 +8,16 @@ import pytest
 from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.measure.screening import quiet_noise
-from reseau.measure.testfield.lattice import LatticeFit, lattices, refit, second_order
-from reseau.measure.testfield.lines import Lattice, find_lattice, ridge_points
-from reseau.measure.testfield.profiles import blur_of
+from reseau.measure.testfield.lattice import (
+    Lattice,
+    LatticeFit,
+    find_lattice,
+    lattices,
+    refit,
+    ridge_points,
+    second_order,
+)
+from reseau.measure.testfield.line_profiles import blur_of
 from reseau_sims import FieldBench, Station
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.measure import MatchOptions, match
-from reseau.measure.matching.matcher import SIZE
-from reseau.measure.matching.patches import Patches
+from reseau.measure.matching.matcher import SIZE, Patches
 from reseau.measure.matching.shapes import GrownOutline
 from reseau.optics.formation import Outline, PixelResponse, draw, mark_outline
 

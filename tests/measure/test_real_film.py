@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.io.scans import open_scan
-from reseau.measure.frame import PITCH_MM, FrameOptions, edge_of, film_plane, orient_frames
+from reseau.measure.film import PITCH_MM, FrameOptions, edge_of, film_plane, orient_frames
 
 STILLS = {
     "fac_neg.jpg": ((24.0, 36.0), [[106, 80], [2795, 88], [2800, 4185], [108, 4180]]),

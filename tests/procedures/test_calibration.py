@@ -8,7 +8,7 @@ import pytest
 from reseau.core.data import Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
-from reseau.measure.measured import Measured
+from reseau.measure.points import Measured
 from reseau.procedures.calibration import Calibrated, CameraModel, calibrate_camera
 from reseau_sims import FieldBench, Station
 

@@ -153,8 +153,8 @@ def _write(
     design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
 ) -> None:
     """Write drawings and design where they are wanted, either all of them or none, and say so."""
+    from ..designs.drawing import design_pdf, design_svg
     from ..io import write_whole
-    from ..report.drawing import design_pdf, design_svg
 
     to_stdout = out is not None and str(out) == "-"
     out = None if to_stdout else out

@@ -1,4 +1,4 @@
-"""Fit a mapping of `optics` to measured points: plane transformations, polynomials, models of displays."""
+"""Fit a plane mapping of `optics` to measured points: transformations, polynomials, display models."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 def mapping_problem(
     model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
 ) -> GaussHelmert:
-    """Write down the conditions model(point) = target for points that carry the errors.
+    """Set up the conditions model(point) = target; the points carry the errors.
 
     Parameters
     ----------
@@ -38,15 +38,28 @@ def mapping_problem(
     points : ImagePoints
         Measured points (n) with covariances: the observations.
     target : array_like (n, 2)
-        What they are to be mapped to.
+        Coordinates to which the points are mapped.
     target_sigma : array_like, optional
-        Standard deviation of the target's coordinates, a number or (n, 2). It is carried to the points
-        through the model's derivatives at the approximate values.
+        Standard deviation of the target's coordinates, a number or (n, 2). It is propagated to the points
+        with the derivatives of the model at the approximate values.
+
+    Returns
+    -------
+    GaussHelmert
+        The problem, to be solved with :func:`reseau.adjust.adjust`.
 
     Raises
     ------
     UsageError
         When target and points differ in number.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
+    >>> points = ImagePoints(tuple("abcd"), square, np.tile(0.01 * np.eye(2), (4, 1, 1)))
+    >>> mapping_problem(RationalPolynomial.affine(), points, 2 * square + 1).parameters.names
+    ('a1', 'b1', 'c1', 'a2', 'b2', 'c2')
     """
     goal = np.asarray(target, dtype=np.float64)
     if goal.shape != (len(points), 2):
@@ -71,9 +84,10 @@ def mapping_problem(
 def fit_mapping(
     model: PlaneMapping, points: ImagePoints, target: ArrayLike, target_sigma: ArrayLike = 0.0
 ) -> Adjustment | Failure:
-    """Adjust all parameters of a model; see `mapping_problem`.
+    """Adjust all parameters of a model; see :func:`mapping_problem`.
 
-    A rational polynomial needs no approximate values: it begins from a linear solution where that is nearer.
+    A rational polynomial needs no approximate values: the adjustment starts from a linear solution if that
+    fits better than the given values.
     """
     shortage = _shortage(model, points)
     if shortage is not None:
@@ -92,18 +106,18 @@ def reduce_mapping(
     keep: Iterable[str] = (),
     options: Options | None = None,
 ) -> Elimination | Failure:
-    """Adjust a model and drop its insignificant parameters one by one; see `mapping_problem`.
+    """Adjust a model and drop its insignificant parameters one by one; see :func:`mapping_problem`.
 
     Parameters
     ----------
     alpha : float
-        Level of the tests.
+        Significance level of the tests.
     criterion : {"t", "chi2", "F"}
-        The test; χ² takes the points' covariances at their word.
+        Kind of test; χ² assumes that the covariances of the points are correct.
     keep : iterable of str
-        Parameters that are not dropped.
+        Parameters that are never dropped.
     options : Options, optional
-        How to adjust.
+        Options of the adjustment.
     """
     shortage = _shortage(model, points)
     if shortage is not None:
@@ -113,10 +127,10 @@ def reduce_mapping(
 
 
 def _begun(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:
-    """The model at values that take the points nearer to the target, if a linear solution has such.
+    """The model with approximate values from a linear solution, if these fit better than the given ones.
 
-    N/(1 + D) + P = T is linear in the parameters of N, D and P when it is multiplied with 1 + D and D·P is
-    left out, the product of two small things.
+    N/(1 + D) + P = T multiplied by 1 + D is linear in the parameters of N, D and P if the product D·P of two
+    small quantities is neglected.
     """
     goal = np.asarray(target, dtype=np.float64)
     if not isinstance(model, RationalPolynomial) or goal.shape != points.xy.shape:
@@ -142,13 +156,13 @@ def _begun(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> Plane
 
 
 def on_one_line(xy: Array) -> bool:
-    """Whether points (n, 2) lie on one line, to rounding."""
+    """Whether points (n, 2) lie on one line, within rounding."""
     spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
     return len(xy) < 3 or bool(spread[1] <= 1e-9 * spread[0])
 
 
 def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
-    """A failure where there are fewer coordinates than parameters."""
+    """A failure if there are fewer coordinates than parameters."""
     if 2 * len(points) < len(model.names):
         return Failure(
             f"{len(points)} points give {2 * len(points)} coordinates, "
@@ -159,7 +173,7 @@ def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
 
 
 def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
-    """Tests of every coefficient, dropped ones first in their order, as in a calibration file."""
+    """Tests of every coefficient, dropped ones first in their order, as written in a calibration file."""
     dropped = [(step.test, "dropped") for step in elimination.steps]
     kept = [(test, "kept") for test in elimination.kept]
     return tuple(
@@ -183,24 +197,24 @@ def residual_field(
     target_sigma: ArrayLike = 0.0,
     trials: int = 499,
 ) -> SmoothField | None:
-    """What a fitted model leaves, as a smooth field on top of it, and the test whether it is needed.
+    """Residuals of a fitted model as a smooth field, with a test of whether the field is needed.
 
     Parameters
     ----------
     model : PlaneMapping
         The model at its estimates.
     points, target, target_sigma
-        What it was fitted to.
+        What the model was fitted to.
     residuals : ndarray (n, 2)
         Mapped minus target.
     trials : int
-        Simulated sets of residuals: what the adjustment leaves of the points' errors alone.
+        Number of simulated sets of residuals, drawn from the errors of the points alone.
 
     Returns
     -------
     SmoothField or None
-        Over the targets; its `need` is the probability, per axis, that errors alone would ask as much for a
-        field. None with fewer than 20 points.
+        Field over the targets. Its `need` is the probability, per axis, that errors of the points alone
+        produce such a field. None with fewer than 20 points.
     """
     if len(points) < 20:
         return None
@@ -216,12 +230,12 @@ def residual_field(
 
 
 def carried(mapping: PlaneMapping, points: ImagePoints) -> ImagePoints:
-    """Points carried through a mapping with their covariances; the mapping itself counts as free of error."""
+    """Points transformed by a mapping, with propagated covariances; the mapping counts as free of error."""
     value, slope, _ = mapping.derivatives(points.xy)
     return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
 
 
 def is_mirrored(first: Array, second: Array) -> bool:
-    """Whether two sets of the same points (n, 2) differ in handedness, by the affinity between them."""
+    """Whether two sets of the same points (n, 2) differ in handedness, from the affinity between them."""
     affine = np.linalg.lstsq(first - first.mean(axis=0), second - second.mean(axis=0), rcond=None)[0]
     return bool(np.linalg.det(affine) < 0)

@@ -1,4 +1,4 @@
-"""What of a frame can be measured in: lost lines, bit errors, uneven borders, and how noisy the rest is."""
+"""Screening of a frame before measurement: valid pixels, levelled borders, and noise of the grey values."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from ..core.errors import ImageError
 __all__ = ["Screened", "quiet_noise", "screen"]
 
 _BORDER = 3
-"""Outermost lines of a frame whose level is compared with that of the lines inside."""
+"""Outermost lines of a frame whose level is compared with that of the lines further inside."""
 _ALONG = 41
-"""Length of the running median along a border, several marks long."""
+"""Length of the running median along a border: several times the size of a mark."""
 _BLOCK = 6
-"""Side of the blocks of pixels in which noise is looked at."""
+"""Side of the blocks of pixels in which the noise is estimated."""
 _SPIKE = 6.0
-"""Noise widths by which a single pixel must leave the range of its neighbours to be a bit error."""
+"""A pixel is a bit error if it leaves the range of its neighbours by more than this many noise sigmas."""
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A frame made ready to be measured in.
+    """A frame prepared for measurement.
 
     Parameters
     ----------
     grey : ndarray (h, w), float32
-        Grey values, borders levelled.
+        Grey values with levelled borders.
     valid : ndarray (h, w) of bool
-        Pixels that carry an image.
+        Pixels that carry image content.
     noise : float
-        Standard deviation of the grey values, quantisation included.
+        Standard deviation of the grey values, including quantisation.
     """
 
     grey: NDArray[np.float32]
@@ -45,21 +45,21 @@ class Screened:
 
 
 def screen(frame: Frame, run: int | None) -> Screened:
-    """Find the pixels that carry an image, level the borders, estimate the noise.
+    """Find the valid pixels of a frame, level its borders, and estimate its noise.
 
     Parameters
     ----------
     frame : Frame
         The frame.
-    run : int
-        Length in pixels from which a straight run of the least or greatest grey value counts as lost; several
-        times the size of a mark. None where marks shine on a black ground: nothing black is lost there, and
-        no border is uneven.
+    run : int or None
+        Minimum length in pixels of a straight run of the lowest grey value that counts as lost pixels; choose
+        several times the size of a mark. None for bright marks on a black background: then no pixels are
+        treated as lost, and borders are not levelled.
 
     Raises
     ------
     ImageError
-        When the frame is all of one grey, or almost all of it black or saturated.
+        When all pixels have the same grey value, or almost all are black or saturated.
     """
     pixels = frame.pixels
     low, high = float(pixels.min()), float(pixels.max())
@@ -67,21 +67,25 @@ def screen(frame: Frame, run: int | None) -> Screened:
         colour = "black" if low == 0 else "saturated" if high >= frame.full_scale else "of one grey"
         raise ImageError(f"is all {colour}", where=frame.name, do="check exposure and shutter")
     if (share := float(np.mean(pixels >= frame.full_scale))) > 0.9:
-        raise ImageError(f"is saturated over {share:.0%} of its area", where=frame.name, do="expose it less")
+        raise ImageError(
+            f"is saturated over {share:.0%} of its area", where=frame.name, do="reduce the exposure"
+        )
     grey = pixels.astype(np.float32)
     if run is None:
         valid = np.ones(pixels.shape, dtype=bool)
         return Screened(grey, valid, _noise(pixels, valid))
     valid = ~_lost(pixels, run)
     if (share := float(np.mean(valid & (pixels > low)))) < 0.02:
-        raise ImageError(f"is black over {1 - share:.0%} of its area", where=frame.name, do="expose it more")
+        raise ImageError(
+            f"is black over {1 - share:.0%} of its area", where=frame.name, do="increase the exposure"
+        )
     noise = _noise(pixels, valid)
     valid &= ~_spikes(grey, noise)
     return Screened(_level_borders(grey, valid), valid, noise)
 
 
 def _lost(pixels: NDArray[Any], run: int) -> Mask:
-    """Lost telemetry, masked borders, dead lines: straight runs of the least grey value."""
+    """Mask of lost telemetry, masked borders and dead lines: straight runs of the lowest grey value."""
     extreme = (pixels == pixels.min()).astype(np.uint8)
     rows, columns = (
         cv2.morphologyEx(extreme, cv2.MORPH_OPEN, np.ones(size, np.uint8)) > 0
@@ -92,8 +96,8 @@ def _lost(pixels: NDArray[Any], run: int) -> Mask:
 
 
 def _noise(pixels: NDArray[Any], valid: Mask) -> float:
-    """Robust standard deviation from second differences along the lines, where all three pixels are valid."""
-    rows = slice(None, None, max(1, len(pixels) // 256))  # some hundred lines tell it well enough
+    """Robust standard deviation from second differences along the lines where all three pixels are valid."""
+    rows = slice(None, None, max(1, len(pixels) // 256))  # a few hundred lines are enough
     grey, seen = pixels[rows].astype(np.float32), valid[rows]
     usable = seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
     bend = (grey[:, 1:-1] - (grey[:, :-2] + grey[:, 2:]) / 2)[usable]
@@ -105,20 +109,20 @@ def _noise(pixels: NDArray[Any], valid: Mask) -> float:
 
 
 def quiet_noise(grey: NDArray[np.float32]) -> float:
-    """Standard deviation of the noise in the quietest tenth of a frame, where the rest is full of targets."""
+    """Standard deviation of the noise in the quietest tenth of a frame that is otherwise full of targets."""
     bend = grey[:, 1:-1] - (grey[:, :-2] + grey[:, 2:]) / 2
     side = _BLOCK
     rows, columns = bend.shape[0] // side, bend.shape[1] // side
     if not rows or not columns:
         return float(np.std(bend) / np.sqrt(1.5))
     blocks = bend[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    # The least tenth of standard deviations from 36 values is an eighth too small.
+    # The lowest decile of standard deviations from 36 values is too small by one eighth.
     quiet = float(1.12 * np.quantile(blocks.std(axis=(1, 3)), 0.1) / np.sqrt(1.5))
     return max(quiet, float(1 / np.sqrt(12))) if float(grey.max()) > 1 else quiet
 
 
 def _spikes(grey: NDArray[np.float32], noise: float) -> Mask:
-    """Bit errors: single pixels that leave the range of their neighbours by more than that range."""
+    """Mask of bit errors: single pixels that leave the range of their neighbours by more than that range."""
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
     high, low = cv2.dilate(grey, ring), cv2.erode(grey, ring)
@@ -128,22 +132,22 @@ def _spikes(grey: NDArray[np.float32], noise: float) -> Mask:
 
 
 def _level_borders(grey: NDArray[np.float32], valid: Mask) -> NDArray[np.float32]:
-    """Bring the outermost lines to the level of those inside.
+    """Bring the outermost lines to the level of the lines further inside.
 
-    The first and last lines of a scanned tube are brighter or darker than the rest; their running median
-    along the border, which no mark moves, tells by how much.
+    The first and last lines of a scanned camera tube are brighter or darker than the rest. The running median
+    along the border measures this difference; marks do not affect it.
     """
     if min(grey.shape) < 8 * _BORDER:
         return grey
     levelled = grey.copy()
-    for turned, mask in ((levelled, valid), (levelled.T, valid.T)):  # views: what is set in them is kept
+    for turned, mask in ((levelled, valid), (levelled.T, valid.T)):  # views: assignments change `levelled`
         for lines in (turned, turned[::-1]):
             inside = _running_median(np.median(lines[_BORDER : 3 * _BORDER], axis=0))
             usable = mask.mean() > 0.5
             for line in lines[:_BORDER]:
                 level = _running_median(line)
                 gain = np.where((level > 0) & usable, inside / np.maximum(level, 1e-6), 1.0)
-                # Only a border effect is taken off, not shading or a scene that ends there.
+                # Correct a border effect only, not shading or a scene that ends at the border.
                 uneven = np.median(np.abs(np.log(np.clip(gain, 0.1, 10)))) > 0.05
                 if uneven:
                     line *= np.clip(gain, 0.1, 10).astype(np.float32)

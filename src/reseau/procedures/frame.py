@@ -15,7 +15,7 @@ from dataclasses import replace
 from ..core.failure import Failure
 from ..io import FrameCorners, FrameOrientation
 from ..io.scans import Scan
-from ..measure.frame import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
+from ..measure.film import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
 
 __all__ = ["FrameOptions", "FrameResult", "Roll", "described", "helped", "orient_scan", "roll_of"]
 

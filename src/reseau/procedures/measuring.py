@@ -17,7 +17,7 @@ from ..core.processes import process_context
 from ..core.threads import always_one_thread, one_thread
 from ..io import ReseauDesign, TestfieldDesign
 from ..measure import TestfieldOptions, measure_reseau, measure_testfield
-from ..measure.measured import Measured
+from ..measure.points import Measured
 
 __all__ = ["Measurer", "measured_in_order", "measurer_of"]
 

@@ -1,4 +1,19 @@
-"""Sharpness by a slanted edge: its free modulation transfer, and whether a Gaussian describes it.
+"""An edge with a Gaussian point-spread function: where it runs, its grey values, its width.
+
+Its image is formed as that of all targets is: a Gaussian folded with the square of the pixel, which along the
+edge's normal is a trapezoid. The edge may be bent a little, as distortion bends it: x = offset + slope·y +
+bow·(y² − q)/k², with y from the middle row, q the mean of y², and k half the height of the region; the bow is
+how far the middle of the edge lies from its chord (px).
+
+The modulation transfer of an edge without any assumption on the point-spread function (ISO 12233).
+
+The edge-spread function is that of the Gaussian plus the integral of a spline, adjusted by least squares to
+all pixels at their distances from the edge, together with the edge's slope and bow. Its derivative is the
+line-spread function, whose Fourier transform is a closed form: no bins, no differences, no window, so none of
+their biases. Knots are close where the edge is, and farther apart with the distance from it, where blur
+changes slowly: what noise brings in there stays at low frequencies.
+
+Sharpness by a slanted edge: its free modulation transfer, and whether a Gaussian describes it.
 
 A straight edge between dark and bright, slanted by a few degrees, is seen at every distance from the centre
 of a pixel (ISO 12233).
@@ -6,21 +21,513 @@ of a pixel (ISO 12233).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.optimize import brentq
+from scipy.special import ndtr
+from scipy.stats import f as fisher
 
-from ..adjust import Adjustment, CoefficientTest, NestedTest, compare
+from ..adjust import (
+    Adjustment,
+    CoefficientTest,
+    GaussMarkov,
+    NestedTest,
+    Options,
+    Parameters,
+    adjust,
+    compare,
+)
 from ..calibration.document import Quantity
 from ..core.data import Array, Frame, Mask
 from ..core.failure import Code, Failure
 from ..core.threads import one_thread
-from .free import FREQUENCIES, FreeCurve, fit_free
-from .gaussian import EdgePixels, approximate_edge, fit_gaussian
 
-__all__ = ["EdgeSpread", "measure_edge"]
+__all__ = [
+    "FREQUENCIES",
+    "EdgePixels",
+    "EdgeSpread",
+    "FreeCurve",
+    "approximate_edge",
+    "edge_slope",
+    "edge_spread",
+    "fit_free",
+    "fit_gaussian",
+    "measure_edge",
+]
+
+_NEAR_PX = 8.0
+"""From the approximate edge, where its gradient is looked for."""
+_ROUNDS = 3
+_SHARPEST_PX = 0.02
+"""Width at which that of an edge is held that shows none."""
+ENOUGH = Options(tolerance=1e-7)
+"""What is left to correct, in standard deviations."""
+_Integral = Callable[[Array, float], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePixels:
+    """Pixels of a region whose edge is nearly upright.
+
+    Parameters
+    ----------
+    x, y : ndarray (n,)
+        Column, and row from the middle one.
+    grey : ndarray (n,)
+        Grey values.
+    sigma : ndarray (n,)
+        Their standard deviations; to a common factor.
+    size : (int, int)
+        Height and width of the region.
+    """
+
+    x: Array
+    y: Array
+    grey: Array
+    sigma: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, pixels: Array, good: Mask) -> EdgePixels:
+        """Of a region (height, width); those that are not good are left out."""
+        rows, columns = np.mgrid[: pixels.shape[0], : pixels.shape[1]].astype(np.float64)
+        rows -= (pixels.shape[0] - 1) / 2
+        height, width = pixels.shape
+        return cls(columns[good], rows[good], pixels[good], np.ones(int(good.sum())), (height, width))
+
+    def part(self, keep: Mask) -> EdgePixels:
+        """Some of them."""
+        return EdgePixels(self.x[keep], self.y[keep], self.grey[keep], self.sigma[keep], self.size)
+
+    def distance(self, offset: float, slope: float, bow: float = 0.0) -> Array:
+        """From the edge, along its normal."""
+        turned = slope + 2 * bow * self.y / self.half**2
+        distance: Array = self.aside(offset, slope, bow) / np.hypot(1.0, turned)
+        return distance
+
+    def aside(self, offset: float, slope: float, bow: float) -> Array:
+        """From the edge, along the row."""
+        aside: Array = self.x - offset - slope * self.y - bow * self.bent
+        return aside
+
+    @property
+    def bent(self) -> Array:
+        """What a bow of one moves the edge by."""
+        return self.bent_at(self.y)
+
+    @property
+    def half(self) -> float:
+        """Half the height of the region."""
+        return self.size[0] / 2
+
+    def bent_at(self, y: Array) -> Array:
+        """What a bow of one moves the edge by in rows."""
+        bent: Array = (y**2 - (self.size[0] ** 2 - 1) / 12) / self.half**2
+        return bent
+
+    def turning(self, offset: float, slope: float, bow: float) -> tuple[Array, Array]:
+        """Derivatives of the distance by slope and bow."""
+        turned, aside = slope + 2 * bow * self.y / self.half**2, self.aside(offset, slope, bow)
+        width = np.hypot(1.0, turned)
+        lean = aside * turned / width**3
+        return -self.y / width - lean, -self.bent / width - 2 * self.y / self.half**2 * lean
+
+
+def approximate_edge(pixels: Array) -> Array | None:
+    """Edge by the centroids of the gradient in each row, and grey values beside it; None without an edge.
+
+    Returns
+    -------
+    ndarray (6,) or None
+        Values of the parameters of :func:`fit_gaussian`.
+    """
+    gradient = np.diff(pixels, axis=1)
+    sign = np.sign(gradient.sum())
+    weight = np.clip(sign * gradient, 0, None) ** 2
+    if not weight.sum(axis=1).min() > 0:
+        return None
+    x = np.arange(gradient.shape[1], dtype=np.float64) + 0.5
+    rows = np.arange(len(pixels), dtype=np.float64) - (len(pixels) - 1) / 2
+    slope, offset = _line(weight, x, rows)
+    for _ in range(_ROUNDS):  # far from the edge there is noise alone
+        near = weight * (np.abs(x - offset - slope * rows[:, None]) < _NEAR_PX)
+        if not near.sum(axis=1).min() > 0:
+            break
+        slope, offset = _line(near, x, rows)
+    low, high = np.percentile(pixels, [10, 90])
+    sides = (low, high) if sign > 0 else (high, low)
+    return np.array([offset, slope, 0.0, *sides, 0.7])
+
+
+def _line(weight: Array, x: Array, rows: Array) -> tuple[float, float]:
+    centre = (weight * x).sum(axis=1) / weight.sum(axis=1)
+    slope, offset = np.polyfit(rows, centre, 1)
+    return float(slope), float(offset)
+
+
+def fit_gaussian(
+    pixels: EdgePixels, values: Array, reach_px: float, *, bow: bool = False
+) -> Adjustment | Failure:
+    """Adjust edge, grey values and width to the pixels near the edge.
+
+    Parameters
+    ----------
+    pixels : EdgePixels
+        With weights by their sigmas; the noise itself is found by them.
+    values : ndarray (6,)
+        Approximate `offset` (px), `slope`, `bow` (px), `dark`, `bright` (grey values of the left and right
+        side), `psf` (px, one sigma).
+    reach_px : float
+        From the edge, up to which pixels take part.
+    bow : bool
+        Whether the edge may be bent; otherwise the bow is held.
+    """
+    # Which pixels are near enough depends on where the edge is.
+    for _ in range(_ROUNDS if np.isfinite(reach_px) else 0):
+        fit = _fitted(pixels, values, reach_px, bow)
+        if isinstance(fit, Failure):
+            return fit
+        values = fit.values
+    return _fitted(pixels, values, reach_px, bow)
+
+
+def _fitted(pixels: EdgePixels, values: Array, reach_px: float, bow: bool) -> Adjustment | Failure:
+    part = pixels.part(np.abs(pixels.distance(*values[:3])) < reach_px)
+    parameters = Parameters(["offset", "slope", "bow", "dark", "bright", "psf"], values)
+    free = parameters if bow else parameters.fix("bow")
+    edge = GaussMarkov(
+        lambda p: _formed(part, p), part.grey, part.sigma, free, lambda p: _derivatives(part, p)
+    )
+    found = adjust(edge, ENOUGH)
+    if isinstance(found, Failure) and abs(found.values.get("psf", np.inf)) < _SHARPEST_PX:
+        # The width takes part by its square alone, which would be negative here.
+        return adjust(edge.with_parameters(free.fix("psf", at=_SHARPEST_PX)), ENOUGH)
+    return found
+
+
+def _formed(pixels: EdgePixels, p: Array) -> Array:
+    slant = np.arctan(p[1])
+    spread = edge_spread(pixels.distance(*p[:3]), abs(p[5]), np.cos(slant), abs(np.sin(slant)))
+    formed: Array = p[3] + (p[4] - p[3]) * spread
+    return formed
+
+
+def _derivatives(pixels: EdgePixels, p: Array) -> Array:
+    """Of :func:`_formed` by its parameters (n, 6)."""
+    slant, width, step = np.arctan(p[1]), abs(p[5]), p[4] - p[3]
+    c, s = np.cos(slant), abs(np.sin(slant))
+    d = pixels.distance(*p[:3])
+    spread, rise = edge_spread(d, width, c, s), edge_slope(d, width, c, s)
+    by_slope, by_bow = pixels.turning(*p[:3])
+    by_offset = -1 / np.hypot(1.0, p[1] + 2 * p[2] * pixels.y / pixels.half**2)
+    # The trapezoid turns with the slope, too.
+    wide, narrow, near = (c + s) / 2, (c - s) / 2, _close(d, width)
+    dc, ds = -np.sin(slant) * c**2, np.sign(p[1]) * c**3
+    by_wide, by_narrow = (_once(near + at, width) - _once(near - at, width) for at in (wide, narrow))
+    turned = (by_wide * (dc + ds) / 2 - by_narrow * (dc - ds) / 2) / (c * s) - spread * (dc / c + ds / s)
+    by_width = np.sign(p[5]) * width * _folded(_never, d, width, c, s)
+    columns = [rise * by_offset, rise * by_slope + turned, rise * by_bow]
+    return np.column_stack([*(step * column for column in columns), 1 - spread, spread, step * by_width])
+
+
+def edge_spread(d: Array, sigma: float, c: float, s: float) -> Array:
+    """Share of the bright side in a pixel at a distance: the step folded with a Gaussian and the trapezoid
+    that the unit square is when seen along a normal with the components c and s.
+    """
+    return _folded(_twice, d, sigma, c, s)
+
+
+def edge_slope(d: Array, sigma: float, c: float, s: float) -> Array:
+    """Derivative of :func:`edge_spread` by the distance: the line-spread function."""
+    return _folded(_once, d, sigma, c, s)
+
+
+def _folded(integral: _Integral, d: Array, sigma: float, c: float, s: float) -> Array:
+    d, s = _close(d, sigma), max(s, 1e-3)  # along the rows the trapezoid is a square, which it is nearly here
+    wide, narrow = (c + s) / 2, (c - s) / 2
+    ends = integral(d + wide, sigma) - integral(d + narrow, sigma) - integral(d - narrow, sigma)
+    folded: Array = (ends + integral(d - wide, sigma)) / (c * s)
+    return folded
+
+
+def _close(d: Array, sigma: float) -> Array:
+    """Distances no farther than where all has risen: beyond, differences of squares would be rounding."""
+    reach = 9 * sigma + 1.5
+    close: Array = np.clip(d, -reach, reach)
+    return close
+
+
+def _never(u: Array, sigma: float) -> Array:
+    """The normal distribution of this width itself."""
+    integral: Array = ndtr(u / max(sigma, 1e-6))
+    return integral
+
+
+def _once(u: Array, sigma: float) -> Array:
+    """The first integral of the normal distribution of this width."""
+    width = max(sigma, 1e-6)
+    density = np.exp(-0.5 * (u / width) ** 2) / np.sqrt(2 * np.pi)
+    integral: Array = u * ndtr(u / width) + width * density
+    return integral
+
+
+def _twice(u: Array, sigma: float) -> Array:
+    """The second integral of the normal distribution of this width."""
+    width = max(sigma, 1e-6)
+    density = np.exp(-0.5 * (u / width) ** 2) / np.sqrt(2 * np.pi)
+    integral: Array = ((u**2 + width**2) * ndtr(u / width) + u * width * density) / 2
+    return integral
+
+
+FREQUENCIES: Array = np.arange(33) / 32
+"""Cycles per pixel at which the curve is told."""
+NYQUIST = 0.5
+_STEP_PX = 0.25
+"""Between knots at the edge; they reproduce a line spread to 1e-4 up to one cycle per pixel."""
+_FEWEST = 1.5
+"""Knots are at least so many times as far apart as the widest gap between the pixels' distances."""
+_GROWTH, _WIDEST_PX = 1.25, 2.0
+_LIMIT = 0.375
+"""Cycles per distance of knots up to which a spline follows."""
+_SHORT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class _Spline:
+    """Quadratic B-splines that vanish at the ends, and their integrals."""
+
+    knots: Array
+
+    @property
+    def size(self) -> int:
+        return len(self.knots) - 3
+
+    @cached_property
+    def _lines(self) -> BSpline:
+        k = self.knots
+        # Splines with knots beyond the ends have no part; those within are then whole.
+        wide = np.concatenate([k[0] - [3.0, 2.0, 1.0], k, k[-1] + [1.0, 2.0, 3.0]])
+        chosen = np.zeros((len(wide) - 3, self.size))
+        chosen[3 : 3 + self.size] = np.eye(self.size)
+        return BSpline(wide, chosen, 2)
+
+    @cached_property
+    def _integrals(self) -> BSpline:
+        return self._lines.antiderivative()
+
+    def lines(self, d: Array) -> Array:
+        """Values (n, size) at distances."""
+        inside = (d >= self.knots[0]) & (d <= self.knots[-1])
+        found: Array = np.where(inside[:, None], self._lines(np.clip(d, self.knots[0], self.knots[-1])), 0.0)
+        return found
+
+    def integrals(self, d: Array) -> Array:
+        """Integrals (n, size) from the first knot."""
+        start, end = self.knots[0], self.knots[-1]
+        found: Array = self._integrals(np.clip(d, start, end)) - self._integrals(start)
+        return found
+
+    def transforms(self, frequency: Array) -> Array:
+        """Fourier transforms (m, size), exact but for rounding: no piece has more than two periods."""
+        nodes, weights = np.polynomial.legendre.leggauss(20)
+        half = np.diff(self.knots) / 2
+        at = ((self.knots[1:] + self.knots[:-1]) / 2)[:, None] + half[:, None] * nodes
+        weighed = self.lines(at.ravel()) * (half[:, None] * weights).reshape(-1, 1)
+        transformed: Array = np.exp(-2j * np.pi * np.outer(frequency, at.ravel())) @ weighed
+        return transformed
+
+
+@dataclass(frozen=True, eq=False)
+class FreeCurve:
+    """What an edge tells of the modulation transfer by itself; the pixel's own square is in it.
+
+    Parameters
+    ----------
+    fit : Adjustment
+        Of `dark` (grey value), the coefficients `a0` … of the line spread beyond the Gaussian, `slope` and,
+        where it is free, `bow`.
+    spline : object
+        That they belong to.
+    base : ndarray (6,)
+        Values of the Gaussian edge; see :func:`~reseau.sensor.edge.fit_gaussian`.
+    limit : float
+        Frequency (cycles per pixel) up to which the distances of the pixels resolve the curve.
+    """
+
+    fit: Adjustment
+    spline: _Spline
+    base: Array
+    limit: float
+
+    @property
+    def _coefficients(self) -> tuple[Array, Array]:
+        names = tuple(f"a{j}" for j in range(self.spline.size))
+        return np.array([self.fit[name] for name in names]), self.fit.covariance_of(*names)
+
+    def transfer(self, frequency: Array | float) -> tuple[Array, Array]:
+        """Optical transfer (m,), complex about the edge, and the covariance (m, 2, 2) of its two parts.
+
+        Notes
+        -----
+        With A the step and ĝ the transform of the Gaussian edge, aⱼ and b̂ⱼ those of the spline,
+        Z(f) = (A ĝ(f) + Σ aⱼ b̂ⱼ(f)) / (A + Σ aⱼ b̂ⱼ(0)), and ∂Z/∂aⱼ = (b̂ⱼ(f) − Z b̂ⱼ(0)) / (A + …).
+        """
+        f = np.atleast_1d(np.asarray(frequency, dtype=np.float64))
+        a, cov = self._coefficients
+        step, c, s = self._step
+        gaussian = np.exp(-2 * (np.pi * self.base[5] * f) ** 2) * np.sinc(f * c) * np.sinc(f * s)
+        with one_thread():  # the same sums however many processors there are
+            lines, areas = self.spline.transforms(f), self.spline.transforms(np.zeros(1)).real[0]
+        whole = step + float(areas @ a)
+        z = (step * gaussian + lines @ a) / whole
+        by = (lines - z[:, None] * areas) / whole
+        parts = np.stack([by.real, by.imag], axis=1)
+        return z, np.einsum("mik,kl,mjl->mij", parts, cov, parts)
+
+    @property
+    def _step(self) -> tuple[float, float, float]:
+        """Of the Gaussian edge: grey values, and the components of its normal."""
+        slant = np.arctan(self.base[1])
+        return float(self.base[4] - self.base[3]), float(np.cos(slant)), float(abs(np.sin(slant)))
+
+    def mtf(self, frequency: Array | float) -> tuple[Array, Array]:
+        """Modulation transfer at frequencies (cycles per pixel, along the normal), and its sigmas.
+
+        Notes
+        -----
+        The modulus of an estimate with noise is too large: |Z|² by both variances. That along Z is the
+        modulus' own; of the one across it is freed, |Z|² − σ²₊, and is zero where that is negative.
+        """
+        z, cov = self.transfer(frequency)
+        along = np.where(np.abs(z) > _SHORT, z / np.maximum(np.abs(z), _SHORT), 1.0)
+        u = np.stack([along.real, along.imag], axis=1)
+        across = np.stack([-along.imag, along.real], axis=1)
+        own, other = (np.einsum("mi,mij,mj->m", v, cov, v) for v in (u, across))
+        return np.sqrt(np.maximum(np.abs(z) ** 2 - other, 0.0)), np.sqrt(np.maximum(own, 0.0))
+
+    @property
+    def mtf50(self) -> tuple[float, float] | None:
+        """Frequency at which half of the modulation is left, and its sigma; None where there is none."""
+
+        def above(frequency: float) -> float:
+            return float(self.mtf(frequency)[0][0]) - 0.5
+
+        grid = np.linspace(0.0, self.limit, 129)
+        below = np.flatnonzero(self.mtf(grid)[0] < 0.5)
+        if not len(below):
+            return None
+        low, high = float(grid[below[0] - 1]), float(grid[below[0]])
+        half = float(brentq(above, low, high, xtol=1e-10))
+        slope = (above(half + 1e-4) - above(half - 1e-4)) / 2e-4
+        return half, float(self.mtf(half)[1][0]) / max(abs(slope), _SHORT)
+
+    @property
+    def nyquist(self) -> tuple[float, float]:
+        """Modulation transfer at half a cycle per pixel, and its sigma."""
+        value, sigma = self.mtf(NYQUIST)
+        return float(value[0]), float(sigma[0])
+
+    def line_spread(self, distance: Array) -> tuple[Array, Array]:
+        """Line-spread function (1/px) at distances from the edge, and that of the Gaussian it is beyond."""
+        step, c, s = self._step
+        a, _ = self._coefficients
+        gaussian = edge_slope(distance, abs(self.base[5]), c, s)
+        whole = step + float(self.spline.integrals(self.spline.knots[-1:])[0] @ a)
+        return (step * gaussian + self.spline.lines(distance) @ a) / whole, gaussian
+
+    def ends(self) -> tuple[float, float]:
+        """How much of the step still rises in the outer quarters of the region (share), and the probability
+        that noise alone has it so: blur that reaches beyond the region, or uneven light.
+        """
+        a, cov = self._coefficients
+        k, step = self.spline.knots, self._step[0]
+        at = np.array([k[0], 0.75 * k[0], 0.75 * k[-1], k[-1]])
+        values = self.spline.integrals(at)
+        rises = np.stack([values[1] - values[0], values[3] - values[2]])
+        found, spread = rises @ a, rises @ cov @ rises.T
+        statistic = float(found @ np.linalg.pinv(spread) @ found) / 2
+        return float(np.abs(found).sum() / abs(step)), float(fisher.sf(statistic, 2, self.fit.redundancy))
+
+
+def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve | Failure:
+    """Adjust the free curve to pixels.
+
+    Parameters
+    ----------
+    pixels : EdgePixels
+        All that take part.
+    base : ndarray (6,)
+        The Gaussian edge among them; see :func:`~reseau.sensor.edge.fit_gaussian`.
+    bow : bool
+        Whether the edge may be bent.
+    """
+    gap = _gap(pixels, base)
+    limit = min(1.0, _LIMIT / max(_STEP_PX, _FEWEST * gap))
+    if limit < NYQUIST:
+        return Failure(
+            "the edge passes too few pixels: take a longer region, or another slant", Code.TOO_SMALL
+        )
+    spline = _Spline(_knots(pixels, base, max(_STEP_PX, _FEWEST * gap)))
+    names = ["dark", *(f"a{j}" for j in range(spline.size)), "slope", "bow"]
+    start = [base[3], *np.zeros(spline.size), base[1], base[2]]
+    parameters = Parameters(names, start)
+    slant = np.arctan(base[1])
+    shape = abs(float(base[5])), float(np.cos(slant)), float(abs(np.sin(slant)))
+    step = float(base[4] - base[3])
+
+    def computed(p: Array) -> Array:
+        d = pixels.distance(base[0], p[-2], p[-1])
+        formed: Array = p[0] + step * edge_spread(d, *shape) + spline.integrals(d) @ p[1:-2]
+        return formed
+
+    def jacobian(p: Array) -> Array:
+        d = pixels.distance(base[0], p[-2], p[-1])
+        rise = step * edge_slope(d, *shape) + spline.lines(d) @ p[1:-2]
+        turned = [rise * by for by in pixels.turning(base[0], p[-2], p[-1])]
+        return np.column_stack([np.ones_like(d), spline.integrals(d), *turned])
+
+    problem = GaussMarkov(
+        computed, pixels.grey, pixels.sigma, parameters if bow else parameters.fix("bow"), jacobian
+    )
+    fit = adjust(problem, ENOUGH)
+    return fit if isinstance(fit, Failure) else FreeCurve(fit, spline, base, limit)
+
+
+def _gap(pixels: EdgePixels, base: Array) -> float:
+    """The widest gap between the distances of pixels from the edge, of whatever row."""
+    rows = np.unique(pixels.y)
+    edge = base[0] + base[1] * rows + base[2] * pixels.bent_at(rows)
+    phases = np.sort(np.mod(edge, 1.0))
+    gaps = np.diff(phases, append=phases[0] + 1.0)
+    return float(gaps.max() / np.hypot(1.0, base[1]))
+
+
+def _knots(pixels: EdgePixels, base: Array, step: float) -> Array:
+    """Close within what a blur of the Gaussian's width can reach, then farther and farther apart, to where
+    half of the rows end; what is beyond is flat.
+    """
+    d = pixels.distance(*base[:3])
+    rows = np.unique(pixels.y, return_inverse=True)[1]
+    ends = np.zeros((2, int(rows.max()) + 1))
+    np.minimum.at(ends[0], rows, d)
+    np.maximum.at(ends[1], rows, d)
+    left, right = np.median(ends, axis=1)
+    core = 3 * abs(float(base[5])) + 1.0
+    return np.concatenate([-_side(-float(left), core, step)[::-1], [0.0], _side(float(right), core, step)])
+
+
+def _side(reach: float, core: float, step: float) -> Array:
+    at, wide = [step], step
+    while at[-1] + 1.5 * wide < reach:
+        at.append(at[-1] + wide)
+        wide = min(wide * _GROWTH, max(_WIDEST_PX, step)) if at[-1] > core else step
+    return np.append(at, max(reach, at[-1] + step))
+
 
 _REACH_PX, _REACH_PSF = 8.0, 4.0
 """From the edge, up to which pixels take part in the Gaussian: the larger one, in pixels and in widths."""

@@ -1,6 +1,7 @@
-"""What a mark looks like: the door through which the matcher has images formed.
+"""Shapes of marks: the interface through which the matcher has images of marks formed.
 
-A shape has a place, a width of the point-spread function, and parameters of its form, all 0 to begin with.
+The image of a shape depends on its position, the width of the point-spread function, and parameters of form
+that start at 0.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ __all__ = ["FormedShape", "GrownOutline", "Shape", "Some", "Window"]
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Pixels in which images are formed, a window for each mark.
+    """Pixels in which images are formed: one window for each mark.
 
     Parameters
     ----------
     columns, rows : ndarray (k, c), (k, r)
-        Their coordinates.
+        Coordinates of the columns and rows, pixels.
     response : PixelResponse
-        The pixel.
+        Response of a pixel.
     """
 
     columns: Array
@@ -33,37 +34,37 @@ class Window:
     response: PixelResponse
 
     def select(self, at: Rows) -> Window:
-        """Windows of some of the marks."""
+        """Windows of the marks `at`."""
         return Window(self.columns[at], self.rows[at], self.response)
 
 
 class Shape(Protocol):
-    """Images of marks as functions of place (px), width of the point-spread function (px) and form."""
+    """Images of marks as functions of position (px), width of the point-spread function (px) and form."""
 
     @property
     def parameters(self) -> int:
-        """Number of parameters of the form; all are 0 to begin with."""
+        """Number of parameters of the form, all of which start at 0."""
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
-        """Share (m, r, c) of each pixel that the marks `at` take, at (m, 2), of widths (m,), forms (m, p)."""
+        """Share (m, r, c) of each pixel covered by the marks `at` at (m, 2), widths (m,), forms (m, p)."""
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
-        """The same, and its derivatives (m, 3 + p, r, c) by x, y, width and the parameters of the form."""
+        """Image, and its derivatives (m, 3 + p, r, c) with respect to x, y, width and the form."""
 
 
 @dataclass(frozen=True, eq=False)
 class GrownOutline:
-    """Plane shapes, whose outlines are multiplied by 1 + Σ p_i F_i.
+    """Plane shapes whose outlines are multiplied by 1 + Σ p_i F_i.
 
     Parameters
     ----------
     nodes : Outline
-        Outlines (k, j, 2) in pixels around the point that is to be measured; where one has fewer nodes, the
-        rest is nought. Those in single precision have their images formed in it, some eight times as fast.
+        Outlines (k, j, 2) in pixels around the point to be measured, padded with zeros where an outline has
+        fewer nodes. Outlines in single precision are formed in single precision, about eight times faster.
     generators : ndarray (p, 2, 2)
-        The F.
+        The generators F_i.
     """
 
     nodes: Outline
@@ -102,8 +103,8 @@ class GrownOutline:
         return Outline(nodes + xy[:, None, :], tangents)
 
     def _compiled(self, xy: Array, width: Array, form: Array, at: Rows, window: Window, parts: int) -> Array:
-        """Share, and what derivatives there is room for, (m, parts, r, c)."""
-        from ...optics.single import formed  # takes half a second, which not every command needs
+        """Share and as many of its derivatives as `parts` asks for, (m, parts, r, c)."""
+        from ...optics.compiled import formed  # takes half a second to import; not every command needs it
 
         corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
         images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
@@ -121,14 +122,14 @@ class GrownOutline:
 
 @dataclass(frozen=True, eq=False)
 class Some:
-    """Some marks of a shape, as a shape.
+    """A subset of the marks of a shape, itself a shape.
 
     Parameters
     ----------
     whole : Shape
-        All of them.
+        Shape of all marks.
     rows : ndarray of int (k,)
-        Which ones.
+        Indices of the marks in the subset.
     """
 
     whole: Shape
@@ -152,16 +153,16 @@ class Some:
 
 @dataclass(frozen=True, eq=False)
 class FormedShape:
-    """A shape whose images have been formed at one place already, in the windows in which it is matched.
+    """A shape whose images have already been formed at one position, in the windows of the matching.
 
     Parameters
     ----------
     shape : Shape
         The k marks.
     xy, width : ndarray (k, 2), (k,)
-        Where and how wide; the form was nought.
+        Position and width at which the images were formed; the form was 0.
     share, slopes : ndarray (k, r, c), (k, 3 + p, r, c)
-        The image and its derivatives.
+        Images and their derivatives.
     """
 
     shape: Shape

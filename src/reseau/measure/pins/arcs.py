@@ -72,13 +72,13 @@ class ArcShape:
         )
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
-        """See :class:`reseau.refine.shapes.Shape`."""
+        """See :class:`reseau.measure.matching.shapes.Shape`."""
         return self.arcs(width, form, at).image(xy, window.columns, window.rows)
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
-        """See :class:`reseau.refine.shapes.Shape`."""
+        """See :class:`reseau.measure.matching.shapes.Shape`."""
         image, parts = self.arcs(width, form, at).derivatives(xy, window.columns, window.rows)
         parts[:, 4] /= self.start.along[at, None, None]
         return image, parts

@@ -12,7 +12,7 @@ from ...core.errors import UsageError
 from ...core.failure import Failure
 from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
-from ..measured import Measured
+from ..points import Measured
 from .detection import PinDetections, PinOptions, find_pins
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
@@ -45,7 +45,7 @@ class PinResult(Measured):
     Parameters
     ----------
     correlation, strength, length, thickness, curvature, tilt : ndarray (n,)
-        As in :class:`reseau.refine.PinDetections`; NaN where not measured.
+        As in :class:`reseau.measure.pins.PinDetections`; NaN where not measured.
     detections : PinDetections
         All spots of the frame.
     notes : tuple of str
@@ -80,7 +80,7 @@ def measure_pins(
     options : PinOptions, optional
         How.
     others : sequence of Frame
-        Further frames of the sequence, see :func:`reseau.refine.find_pins`.
+        Further frames of the sequence, see :func:`reseau.measure.find_pins`.
     hidden : ndarray (h, w) of bool, optional
         Pixels that wires of a reseau cover, where they are known.
 

@@ -1,4 +1,4 @@
-"""Where in a frame there may be marks: the formed mark as a matched filter, with missing pixels left out."""
+"""Candidates for marks in a frame: a matched filter with the formed mark that ignores missing pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...core.data import Array, Mask
 __all__ = ["Candidates", "find_candidates"]
 
 _BACKGROUND_PX = 41
-"""Side of the square whose mean is taken off first; wide against a mark, narrow against shading."""
+"""Side of the square whose mean is subtracted first: larger than a mark, smaller than shading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Candidates:
 def find_candidates(
     pixels: NDArray[Any], valid: Mask, template: Array, least_t: float = 4.0, most: int = 4000
 ) -> Candidates:
-    """Fit the template with an amplitude and a constant at every pixel and keep the significant maxima.
+    """Fit a template with amplitude and constant at every pixel, and keep the significant maxima.
 
     The least-squares amplitude of a template in the window around a pixel, and its standard deviation from
     the residuals in that window, are ratios of correlations of the frame with template, template² and 1.
@@ -49,13 +49,13 @@ def find_candidates(
     pixels : ndarray (h, w)
         Grey values.
     valid : ndarray (h, w) of bool
-        Pixels that carry an image; the others take no part.
+        Pixels that carry an image; others are ignored.
     template : ndarray (k, k)
         Formed image of the mark in its polarity, k odd.
     least_t : float
-        Least amplitude in units of its standard deviation.
+        Minimum amplitude over its standard deviation.
     most : int
-        At most so many candidates.
+        Maximum number of candidates.
     """
     w = valid.astype(np.float32)
     y = pixels.astype(np.float32) * w
@@ -65,7 +65,7 @@ def find_candidates(
     sum_t, sum_tt, sum_ty = _correlate(w, template), _correlate(w, template**2), _correlate(y, template)
     n = np.maximum(n, 1)
     spread = sum_tt - sum_t**2 / n
-    # Less than a fifth of the mark in sight says nothing.
+    # Less than one fifth of a mark is not enough.
     in_sight = spread > 0.2 * (template**2).sum() - template.sum() ** 2 / template.size * 0.2
     spread = np.where(in_sight, spread, 1)
     amplitude = np.where(in_sight, (sum_ty - sum_t * sum_y / n) / spread, 0)
@@ -90,7 +90,7 @@ def _correlate(image: NDArray[Any], kernel: Array) -> NDArray[np.float32]:
 
 
 def _vertex(t: NDArray[np.float32], row: Any, column: Any, down: int, right: int) -> Array:
-    """Offset of the vertex of the parabola through three neighbours, within half a pixel."""
+    """Offset of the vertex of the parabola through three neighbours, limited to half a pixel."""
     h, w = t.shape
     before = t[np.maximum(row - down, 0), np.maximum(column - right, 0)].astype(np.float64)
     after = t[np.minimum(row + down, h - 1), np.minimum(column + right, w - 1)].astype(np.float64)

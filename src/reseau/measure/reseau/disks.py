@@ -1,4 +1,4 @@
-"""Disks seen in any perspective: dark or bright ellipses of a frame, whatever their size."""
+"""Find disks seen in any perspective: ellipses of a frame, of any size."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from ...core.data import Array, Mask
 
 __all__ = ["Disks", "find_disks"]
 
+
 _SIDES_PX = (25, 51, 101)
-"""Sides of the squares in which half way between the darkest and the brightest is the threshold."""
+"""Sides of the squares; the threshold in each is the mean of its darkest and brightest grey value."""
 _SMALL = 8000
-"""Sums of so large whole numbers, and their doubles, are whole numbers of 16 bits."""
+"""Integers up to this size, their sums and their doubles fit into 16 bits."""
 _LEAST_AREA = 30
 _LEAST_CONTRAST = 10.0
-"""Contrast in standard deviations of the noise from which on a square holds anything."""
+"""Minimum contrast of a square, in standard deviations of the noise."""
 _ELLIPTIC = 0.97
-"""Least area over that of the ellipse of the same second moments: 1 for ellipses, 0.955 for squares."""
+"""Minimum area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for squares."""
 _NARROWEST = 0.2
-"""Least ratio of the axes."""
+"""Minimum ratio of the axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +37,9 @@ class Disks:
     xy : ndarray (m, 2)
         Centres in pixels, good to about 0.3 px.
     form : ndarray (m, 2, 2)
-        Symmetric matrices that carry the unit circle to each ellipse.
+        Symmetric matrices that map the unit circle to each ellipse.
     t : ndarray (m,)
-        Contrast times the root of the number of pixels over the noise: the strongest come first.
+        Contrast times the square root of the number of pixels, over the noise; in descending order.
     """
 
     xy: Array
@@ -49,16 +50,16 @@ class Disks:
         return len(self.xy)
 
     def strongest(self, count: int) -> Disks:
-        """So many of them at most."""
+        """At most `count` of the strongest ellipses."""
         return Disks(self.xy[:count], self.form[:count], self.t[:count])
 
 
 def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     """Find the dark ellipses of a frame.
 
-    In squares of several sizes the frame is cut half way between what is darkest and brightest there. Of all
-    connected parts those stay whose area is that of the ellipse of their second moments, which of all plane
-    figures have the largest: moments tell a disk in perspective from arcs, letters and crossings.
+    The frame is thresholded in squares of several sizes, half way between the darkest and the brightest value
+    of each. A connected component is kept if its area is that of the ellipse of its second moments, the
+    largest of all figures with these moments: this separates disks in perspective from arcs and letters.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     found, values, before = [], _compact(grey), 1
     low = high = values
     for side in _SIDES_PX:
-        square = np.ones((side - before + 1,) * 2, np.uint8)  # what is darkest in a square of squares
+        square = np.ones((side - before + 1,) * 2, np.uint8)  # minimum over a square of squares
         low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
         contrast = high - low
         dark = (values + values < low + high) & (contrast > _LEAST_CONTRAST * noise) & valid
@@ -88,7 +89,7 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
 
 
 def _compact(grey: NDArray[Any]) -> NDArray[Any]:
-    """Grey values as small whole numbers where they are such: what follows is then three times as fast."""
+    """Grey values as small integers where possible: the following steps are then three times as fast."""
     if not max(-grey.min(), grey.max()) <= _SMALL:
         return grey
     whole = grey.astype(np.int16)
@@ -96,8 +97,8 @@ def _compact(grey: NDArray[Any]) -> NDArray[Any]:
 
 
 def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
-    """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic parts."""
-    from .parts import part_sums  # takes half a second, which not every command needs
+    """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic components."""
+    from .components import part_sums  # takes half a second to import; not every command needs it
 
     h, w = mask.shape
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
@@ -117,7 +118,7 @@ def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array,
 
 
 def _once(xy: Array, radius: Array, quality: Array) -> Mask:
-    """Of parts found in squares of several sizes the most elliptic."""
+    """Mask that keeps the most elliptic of components found in squares of several sizes."""
     keep = np.ones(len(xy), dtype=bool)
     near = KDTree(xy).query_ball_point(xy, 0.5 * radius)
     for k in np.argsort(-quality, kind="stable"):

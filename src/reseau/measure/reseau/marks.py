@@ -1,4 +1,4 @@
-"""Two rounds of matching for the marks of a frame, and the verdict on every one of them."""
+"""Matching of the marks of a frame in two rounds, and the tests of every mark."""
 
 from __future__ import annotations
 
@@ -11,50 +11,55 @@ from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
-from .placing import Placement
+from .placement import Placement
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
 
 _UNMODELLED_PX = 0.07
-"""What positions scatter beyond their own sigmas in real frames; balances the weights of a field's points."""
+"""Scatter of positions in real frames beyond their own sigmas; balances the weights in fields."""
 _LEARN_FROM = 50
-"""So many of the strongest marks tell what a mark of this frame looks like."""
+"""Number of strongest marks from which the appearance of a mark in this frame is learnt."""
 _SEEN = 0.1
-"""Share of a mark that must lie on pixels that carry an image."""
+"""Minimum share of a mark on pixels that carry an image."""
 _BLURRED = 1.55
-"""Widths of the others' point-spread function from which a mark counts as blurred: it is something else."""
+"""A mark counts as blurred from this multiple of the others' point-spread function: it is another object."""
 _LIKE_OTHERS = 4.0
 """Spreads by which the contrast of a mark may differ from that of the others."""
 
 
 @dataclass(frozen=True)
 class ReseauOptions:
-    """How a reseau is measured.
+    """Options of the measurement of a reseau.
 
     Parameters
     ----------
     nominal : bool
-        Whether the design's nominal positions are used, where it has them.
+        Whether to use the nominal positions of the design, if it has them.
     nominal_within_px : float, optional
-        How far they may be off, where that is known; by default by any smooth distortion and up to a pitch.
+        Uncertainty of the nominal positions; by default any smooth distortion and a shift of up to one pitch.
     mirrored : bool, optional
-        See :class:`reseau.refine.grid.GridOptions`.
+        See :class:`reseau.measure.reseau.placement.GridOptions`.
     max_rotation_deg : float
-        Largest rotation of the design in the image, where there are no nominal positions.
+        Largest rotation of the design in the image, used without nominal positions.
     mark_px : float, optional
         Size of a mark in the image (width of the line for a line grid); by default from the design.
     psf_px : float
-        First guess of the width (one sigma) of the point-spread function; estimated.
+        Approximate width (one sigma) of the point-spread function; it is estimated.
     row_jitter_px : float
-        Standard deviation of the shift of single rows, where known.
+        Standard deviation of the shift of single rows, if known.
     fill : float
-        Light-sensitive part of the pitch of the pixels along either axis, 0 to 1, where known.
+        Light-sensitive share of the pixel pitch along either axis, 0 to 1, if known.
     least_t : float
-        Least contrast of a mark in units of its standard deviation.
+        Minimum contrast of a mark over its standard deviation.
     most_sigma_px : float
-        Largest standard deviation of a coordinate that still counts as measured.
+        Largest standard deviation of a coordinate that is accepted.
     neighbour_px : float
-        Largest deviation, per axis, from what the neighbours predict.
+        Largest deviation, per axis, from the prediction of the neighbours.
+
+    Examples
+    --------
+    >>> ReseauOptions(mark_px=3.0, least_t=5.0).least_t
+    5.0
     """
 
     nominal: bool = True
@@ -72,7 +77,7 @@ class ReseauOptions:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Positions, covariances, reasons against, leave-one-out deviations, predictions of all marks."""
+    """Positions, covariances, reasons against, leave-one-out deviations and predictions of all marks."""
 
     xy: Array
     cov: Array
@@ -82,7 +87,7 @@ class Verdict:
 
 
 class MarkMeasurement:
-    """The two rounds of matching, and the verdict on every mark."""
+    """The two rounds of matching, and the tests of every mark."""
 
     def __init__(
         self, frame: Frame, design: ReseauDesign, source: Array, placed: Placement, options: ReseauOptions
@@ -99,10 +104,10 @@ class MarkMeasurement:
         self.extent_px = self.px_per_unit * (3.0 * self.size if mark.shape == "line-grid" else self.size)
 
     def result(self) -> tuple[Rows, Matches, Verdict]:
-        """Match, learn, match again, judge."""
+        """Match, learn the appearance of marks, match again, test."""
         placed = self.assignment
         has = placed.candidate >= 0
-        # The strongest tell what a mark looks like here, and where exactly to look for the others.
+        # The strongest marks show what a mark looks like here, and where exactly to look for the others.
         strongest = np.flatnonzero(has)[np.argsort(placed.candidate[has], kind="stable")[:_LEARN_FROM]]
         first = self._match(
             strongest, placed.at[strongest], self._first_options(), 0.3 if self.free_size else 0.1
@@ -112,7 +117,7 @@ class MarkMeasurement:
         found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
         self._refit(at, found)
         judged = self._judged(at, found)
-        # Where a mark was missed, its neighbours now say better where to look.
+        # Look again for missed marks where their neighbours predict them.
         again = np.flatnonzero((judged.why[at] != "") & (found.seen > _SEEN))
         if 0 < len(again) < len(at):
             found = found.replaced(again, self._match_all(at[again], judged.predicted[at[again]]))
@@ -120,7 +125,7 @@ class MarkMeasurement:
         return at, found, judged
 
     def _near_frame(self, xy: Array) -> Mask:
-        """Marks of which something may be in the frame."""
+        """Mask of marks that may lie in the frame, at least in part."""
         margin = self.extent_px / 2 + 1.0
         limits = np.array([self.frame.width, self.frame.height]) - 1 + margin
         return np.asarray(((xy > -margin) & (xy < limits)).all(axis=1))
@@ -136,17 +141,17 @@ class MarkMeasurement:
         )
 
     def _outline(self, at: Rows, options: MatchOptions) -> Outline:
-        """Outlines of the marks `at` in pixels, as the field maps them."""
+        """Outlines of the marks `at` in pixels, mapped by the field."""
         psf_px = float(np.max(options.psf_px))
         jacobian = self.field.jacobian(self.source[at])
         mark = self.design.mark
         width = self.size if mark.shape == "line-grid" else mark.line_width
-        # The wires of a crossing end where the window does not see it, turned by whatever angle.
+        # Wires of a crossing are cut off outside the window, whatever its rotation.
         reach = (1.5 * max(options.half) + 8 * psf_px) / self.px_per_unit
         outline = mark_outline(mark.shape, self.size, width, 0.8 * psf_px / self.px_per_unit, reach).affine(
             jacobian
         )
-        # A mapping that mirrors turns the direction of travel around.
+        # A mirroring mapping reverses the direction of the outline.
         return Outline(outline.xy, outline.dxy * np.sign(np.linalg.det(jacobian))[:, None, None])
 
     def _match(self, at: Rows, start: Array, options: MatchOptions, size_sigma: float) -> Matches:
@@ -162,7 +167,7 @@ class MarkMeasurement:
         )
 
     def _refit(self, at: Rows, found: Matches) -> None:
-        """The field through the marks beyond doubt; that of the candidates was coarse."""
+        """Fit the field through the reliable marks; the field of the candidates was coarse."""
         near = np.abs(found.xy - self.predicted[at]).max(axis=1) < max(3.0, self.extent_px)
         sure = _sure(found) & near
         if sure.sum() >= 10:
@@ -171,7 +176,7 @@ class MarkMeasurement:
             self.predicted = self.field(self.source)
 
     def _learn(self, first: Matches, start: Array) -> None:
-        """What the marks of this frame look like: width, contrast, size; and its noise."""
+        """Learn width, contrast, size and noise of the marks of this frame."""
         sure = _sure(first)
         self.variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
         if sure.sum() < 5:
@@ -187,7 +192,7 @@ class MarkMeasurement:
         self.extent_px *= 1 + growth
 
     def _match_all(self, at: Rows, start: Array) -> Matches:
-        """Match with what has been learnt; amid a scene with a curved background, where that is better."""
+        """Match with the learnt appearance; with a curved background where that is better."""
         options = replace(
             self._first_options(),
             psf_px=self.psf_px,
@@ -222,7 +227,7 @@ class MarkMeasurement:
         return Verdict(xy, cov, why, deviation, self.field(self.source))
 
     def _objections(self, at: Rows, found: Matches) -> list[tuple[Mask, str]]:
-        """What speaks against a mark in its own image, the gravest first."""
+        """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
@@ -246,23 +251,23 @@ class MarkMeasurement:
         ]
 
     def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
-        """Reject, the worst first, what lies where its neighbours do not have it; fit the field anew."""
+        """Reject marks that deviate from the prediction of their neighbours, the worst first."""
         deviation = np.full(xy.shape, np.nan)
         limit = self.options.neighbour_px
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = self._relative(cov[good])
-            # The length found first serves all rounds; where there is none yet, the likeliest is taken.
+            # The length scale found first is used in all rounds; without one, the likeliest is chosen.
             length = self.field.length if np.isfinite(self.field.length) else None
             self.field = SmoothField.fit(self.source[good], xy[good], sigma=relative, length=length)
             deviation[:] = np.nan
             deviation[good], sigma = self.field.leave_one_out()
-            # Where the neighbours themselves do not know to a pixel, they cannot object.
+            # A prediction that is uncertain by more than a pixel cannot reject a mark.
             excess = (np.abs(deviation[good]) / np.maximum(limit, 3 * sigma)).max(axis=1)
             worst = int(excess.argmax())
             if excess[worst] <= 1:
                 break
             off = np.hypot(*deviation[good[worst]])
-            why[good[worst]] = f"{off:.1f} px off the prediction of its neighbours"
+            why[good[worst]] = f"{off:.1f} px from the position predicted by its neighbours"
         deviation[why != ""] = np.nan
         return deviation
 
@@ -274,18 +279,18 @@ class MarkMeasurement:
 
 
 def _sure(found: Matches) -> Mask:
-    """Matches beyond doubt."""
+    """Mask of reliable matches."""
     sure: Mask = found.converged & (found.t > 8) & (found.seen > 0.9) & (found.rejected < 0.2)
     return sure
 
 
 def _robust(values: Array, least: float) -> tuple[float, float]:
-    """Median and a robust spread, not below `least`."""
+    """Median and a robust measure of spread, at least `least`."""
     median = float(np.median(values))
     return median, max(least, 1.4826 * float(np.median(np.abs(values - median))))
 
 
 def _size(cov: Array) -> Array:
-    """Root of the trace of covariances, infinite where not known."""
+    """Square root of the trace of covariances, infinite where unknown."""
     size: Array = np.sqrt(np.nan_to_num(np.trace(cov, axis1=1, axis2=2), nan=np.inf, posinf=np.inf))
     return size

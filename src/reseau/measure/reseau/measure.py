@@ -1,10 +1,13 @@
 """Measure the marks of a reseau in one frame.
 
-Screened frame → candidates by matched filter → the design laid over them → every mark matched with its formed
-image, twice: first to learn what the marks of this frame look like (width of the point-spread function,
-contrast, size), then with that as prior knowledge → each mark judged by its own image and by its neighbours.
-A mark that is not there, or cannot be told from its surroundings, is reported as not found, with the reason.
-A sheet of disks with coded rings is laid over the frame by these; see :mod:`reseau.refine.sheet`.
+1. Screen the frame and find candidates by matched filter.
+2. Fit the design to the candidates.
+3. Match every mark with its formed image, twice: the first round estimates what the marks of this frame look
+   like (width of the point-spread function, contrast, size); the second uses that as prior knowledge.
+4. Test each mark by its own image and by its neighbours. A mark that is missing or not distinct from its
+   surroundings is reported as not found, with the reason.
+
+A sheet of disks with coded rings is found by its rings; see :mod:`reseau.measure.reseau.sheet`.
 """
 
 from __future__ import annotations
@@ -20,30 +23,29 @@ from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..matching import Matches
-from ..measured import Measured
-from .grid import GridOptions, spacing
+from ..points import Measured
 from .marks import MarkMeasurement, ReseauOptions, Verdict
-from .placing import PlacingOptions, place
-from .sheet_marks import measure_sheet
+from .placement import GridOptions, PlacingOptions, place, spacing
+from .sheet import measure_sheet
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
 _DISTORTED = 0.03
-"""Part of the spacing of the marks by which they may lie off their prediction, on the average."""
+"""Largest rms deviation of marks from their prediction, as a share of their spacing."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReseauResult(Measured):
-    """The marks of a reseau in one frame; `deviation` is from what all *other* marks predict (leave-one-out).
+    """Marks of a reseau in one frame; `deviation` is from the prediction by all other marks.
 
     Parameters
     ----------
     psf_px : ndarray (n,)
         Width of the point-spread function of each match, NaN where there was none.
     field : SmoothField
-        From the design to the image: a polynomial and a local model on top.
+        Smooth mapping from the design to the image: a polynomial with a local model on top.
     notes : tuple of str
-        What the user should know.
+        Notes for the user.
     """
 
     psf_px: Array
@@ -51,12 +53,12 @@ class ReseauResult(Measured):
     notes: tuple[str, ...] = ()
 
     def need(self, trials: int = 499, seed: int = 0) -> Array:
-        """Probability, per axis (2,), that white noise alone would ask as much for the local model."""
+        """Probability, per axis (2,), that white noise alone would require an equally strong local model."""
         f = self.field
         return SmoothField.fit(f.source, f.target, sigma=f.sigma, trials=trials, seed=seed).need
 
     def shadow(self, design: ReseauDesign, shape: tuple[int, int], margin_px: float = 2.0) -> Mask:
-        """Pixels that the reseau hides from what lies behind it.
+        """Mask of the pixels that the reseau hides from what lies behind it.
 
         Parameters
         ----------
@@ -65,7 +67,7 @@ class ReseauResult(Measured):
         shape : tuple
             Height and width of the frame.
         margin_px : float
-            Added on either side of a wire or around a mark, for the blur.
+            Margin on either side of a wire or around a mark, for the blur.
 
         Returns
         -------
@@ -82,12 +84,12 @@ class ReseauResult(Measured):
                 cv2.circle(hidden, tuple(int(c) for c in np.rint(centre)), (width + 1) // 2, 1, -1)
             return hidden > 0
         low, high = xy.min(axis=0), xy.max(axis=0)
-        along = np.linspace(-0.06, 1.06, 120)[:, None] * (high - low) + low  # wires run on to their frame
+        along = np.linspace(-0.06, 1.06, 120)[:, None] * (high - low) + low  # wires extend to their frame
         for axis in (0, 1):
             for at in np.unique(np.round(xy[:, axis], 9)):
                 line = along.copy()
                 line[:, axis] = at
-                # Four binary digits behind the point make a smooth line.
+                # Coordinates with four binary digits after the point make a smooth line.
                 bent = np.rint(self.field(line) * 16).astype(np.int32)
                 cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
         return hidden > 0
@@ -102,23 +104,23 @@ def measure_reseau(
     ----------
     frame : Frame
         A frame that shows the reseau, whole or in part, in front of any scene. A sheet of disks with coded
-        rings may be turned and tilted as it likes.
+        rings may be rotated and tilted by any angle.
     design : ReseauDesign
         The reseau, with or without nominal positions in the image.
     options : ReseauOptions, optional
-        How.
+        Options of the measurement.
 
     Returns
     -------
     ReseauResult or Failure
-        A failure (falsy) when the design is not to be found in the frame.
+        A failure (falsy) if the design is not found in the frame.
 
     Raises
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
     UsageError
-        When the design has neither coordinates nor nominal positions to go by.
+        When the design has neither coordinates nor nominal positions.
     """
     options = options or ReseauOptions()
     source = _source(design)
@@ -150,36 +152,34 @@ def measure_reseau(
     why_not = _disagreement(source[known], judged, options)
     if why_not:
         return Failure(
-            f"design {design.name!r} is not to be found in the frame: {why_not}",
-            Code.NOT_FOUND,
-            where=frame.name,
+            f"design {design.name!r} was not found in the frame: {why_not}", Code.NOT_FOUND, where=frame.name
         )
     return _columns(frame, design, known, at, found, judged, measurement.field)
 
 
 def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str:
-    """Why what was measured is not this design: its marks do not lie together as they should; else nothing.
+    """Why the measured marks are not those of this design; empty if they agree with it.
 
-    Specks and patterns of a scene look like marks one by one. Laid over enough of them the design finds some
-    near its marks, but no smooth field goes through these.
+    Single specks and patterns of a scene look like marks. Among many of them the design finds some near its
+    marks, but no smooth field fits these.
     """
     good = np.flatnonzero(judged.why == "")
     if len(good) < 4:
         return f"{len(good)} marks could be measured"
     if np.isfinite(judged.deviation[good]).all():
         off = np.sqrt((judged.deviation[good] ** 2).mean(axis=0)).max()
-    elif len(good) > 4:  # too few for the neighbours to judge one another, but not for a plane
+    elif len(good) > 4:  # too few to predict each other, but enough to test a plane mapping
         off = SmoothField.fit(source[good], judged.xy[good], degree=1, local=False).noise.max()
     else:
         return ""
-    # Few marks of a strongly distorted image do not predict each other to a pixel.
+    # A few marks of a strongly distorted image do not predict each other to one pixel.
     if off <= max(options.neighbour_px, _DISTORTED * spacing(judged.predicted)):
         return ""
-    return f"{len(good)} places look like its marks, but lie {off:.1f} px off each other's prediction"
+    return f"{len(good)} places look like its marks, but deviate by {off:.1f} px from each other's prediction"
 
 
 def _source(design: ReseauDesign) -> Array:
-    """Plane coordinates to go by: those of the design, or nominal positions where it has none."""
+    """Plane coordinates of the design, or its nominal positions if it has none."""
     if np.isfinite(design.xy).all(axis=1).sum() >= 4:
         return design.xy
     return design.nominal_px
@@ -194,7 +194,7 @@ def _columns(
     judged: Verdict,
     field: SmoothField,
 ) -> ReseauResult:
-    """Spread over all marks of the design, those without coordinates among them."""
+    """Spread results over all marks of the design, including those without coordinates."""
     good = judged.why == ""
     judged.xy[~good], judged.cov[~good] = np.nan, np.nan
     n = len(design.points)

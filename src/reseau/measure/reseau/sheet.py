@@ -1,16 +1,17 @@
-"""A sheet of disks found in a photograph at any rotation and tilt, and numbered by its coded rings.
+"""Sheets of disks with coded rings: find and number the disks at any rotation and tilt, and measure them.
 
-An ellipse tells how its surroundings are foreshortened, but for a rotation; with one neighbour the rotation
-too. From such a beginning the lattice of the disks grows outwards, disk by disk, while the mapping from it to
-the image is adjusted. Which node of the lattice is which disk of the design is then a matter of whole
-numbers: for every quarter turn, reflection and shift it is counted how many disks lie where the design has
-them, and compared how dark the rings around them are.
+An ellipse determines the foreshortening of its surroundings except for a rotation; one neighbour determines
+the rotation. From such a seed the lattice of the disks grows outwards, disk by disk, while the mapping from
+the lattice to the image is adjusted. The assignment of lattice nodes to disks of the design is an integer
+problem: for every quarter turn, reflection and shift, the disks that agree with the design are counted, and
+the darkness of the rings around them is compared with their codes.
+
+The image of every disk is formed with the mapping through all disks, to second order, and matched. The
+estimate is therefore the image of its centre, not the centre of its ellipse.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -20,50 +21,56 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain, RationalPolynomial
+from ...optics.field import SmoothField
+from ...optics.formation import Outline, PixelResponse
+from ..matching import Matches, MatchOptions, grey_variance, match
+from ..screening import Screened, screen
 from ..testfield.lattice import refit, second_order
-from .disks import Disks
-from .grid import spacing
+from ..testfield.targets import merged
+from .disks import Disks, find_disks
+from .marks import ReseauOptions
+from .placement import spacing
 
-__all__ = ["SheetPlacement", "lay_sheet", "through"]
+__all__ = ["SheetPlacement", "lay_sheet", "measure_sheet", "through"]
 
 _STRONGEST = 4
-"""So many times the disks of the design are looked at; the rest are specks."""
+"""Number of ellipses examined, as a multiple of the disks of the design; others are specks."""
 _SEEDS = 6
-"""So many beginnings are tried."""
+"""Number of seeds that are tried."""
 _GATE = 0.25
-"""How far a disk may lie off its node, in steps of the lattice."""
+"""Largest distance of a disk from its node, in steps of the lattice."""
 _FROM = 1.6
-"""How far from a disk of the lattice the next are looked for, in steps."""
+"""Distance from a disk of the lattice within which the next are searched, in steps."""
 _ANGLES = 72
 _RINGS = 6.0
-"""Disks in their places that weigh as much as one ring that is read without fault."""
+"""Number of disks at their places that weigh as much as one ring read without error."""
 _LEGIBLE = 0.5
-"""Least agreement of a ring with what the design says, from -1 (the opposite) to 1."""
+"""Minimum agreement of a ring with the design, from -1 (opposite) to 1."""
 _AHEAD = 2.0
-"""By how much the best numbering must be ahead of the next, in disks."""
+"""Minimum lead of the best numbering over the second best, in disks."""
 _POINT_PX = 0.1
 _MIDDLE = 0.5
 _ENOUGH = 30
-"""Disks in the middle of the frame from which on these alone tell the projectivity."""
+"""Number of disks in the centre of the frame from which the projectivity is estimated from these alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class SheetPlacement:
-    """A sheet laid over the disks of a frame.
+    """Position of a sheet on the disks of a frame.
 
     Parameters
     ----------
     mapping : Chain
-        From lattice coordinates to the image.
+        Mapping from lattice coordinates to the image.
     frame, origin : ndarray (2, 2), (2,)
         Lattice coordinates are `frame` times those of the design, plus `origin`.
     disk : ndarray of int (n,)
-        Row of the ellipse of each disk of the design, -1 where there is none.
+        Index of the ellipse of each disk of the design, -1 where there is none.
     """
 
     mapping: Chain
@@ -73,7 +80,7 @@ class SheetPlacement:
 
 
 def through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
-    """The mapping through points: a projectivity and, the more there are, a polynomial of higher degree.
+    """Mapping through points: a projectivity and a polynomial whose degree grows with the number of points.
 
     Parameters
     ----------
@@ -85,7 +92,7 @@ def through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
     near = np.hypot(*(xy - middle).T) < _MIDDLE * half
-    # The lens distorts least there: what is left to the polynomial is then the distortion alone.
+    # Distortion of the lens is smallest there; the polynomial then models the distortion alone.
     some = near if near.sum() >= _ENOUGH and np.ptp(at[near], axis=0).min() > 1 else np.ones_like(near)
     found: Any = cv2.findHomography(at[some], xy[some])[0]
     straight = RationalPolynomial.projective()
@@ -113,19 +120,24 @@ def lay_sheet(
     design : ReseauDesign
         Disks on a regular grid, some with coded rings.
     mirrored : bool, optional
-        Whether the design has the handedness of the image (x right, y down; False) or the other (True, and by
-        default).
+        Whether the design has the handedness of the image (x right, y down; False) or the opposite (True,
+        the default).
+
+    Returns
+    -------
+    SheetPlacement or Failure
+        A failure if the sheet is not found.
 
     Raises
     ------
     UsageError
-        When the design's disks stand on no regular grid.
+        When the disks of the design do not form a regular grid.
     """
     numbers, step, start = _numbered(design)
     disks = disks.strongest(_STRONGEST * len(numbers))
     assert design.mark.size is not None
     reach = 2 * step / design.mark.size
-    failure = Failure(f"no disks of {reach / 2:.1f} diameters' distance lie on a lattice", Code.NOT_FOUND)
+    failure = Failure(f"no disks at a distance of {reach / 2:.1f} diameters form a lattice", Code.NOT_FOUND)
     shape = (grey.shape[0], grey.shape[1])
     for seed in _seeds(disks, reach):
         nodes, rows, mapping = _grown(*seed, disks, shape, np.ptp(numbers, axis=0).max() + 1)
@@ -141,7 +153,7 @@ def lay_sheet(
 
 
 def _numbered(design: ReseauDesign) -> tuple[Array, float, Array]:
-    """Whole numbers (n, 2) of the disks on their grid, its step, and where it begins."""
+    """Integer coordinates (n, 2) of the disks on their grid, its step, and its origin."""
     xy = design.xy
     step = spacing(xy[np.isfinite(xy).all(axis=1)])
     start = xy[np.isfinite(xy).all(axis=1)][0]
@@ -154,7 +166,7 @@ def _numbered(design: ReseauDesign) -> tuple[Array, float, Array]:
 
 
 def _seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
-    """Ellipses with neighbours on a lattice around them, and the images (2, 2) of its first steps."""
+    """Ellipses with neighbours on a lattice around them, and the images (2, 2) of its unit steps."""
     if len(disks) < 6:
         return
     most = min(25, len(disks))
@@ -186,7 +198,7 @@ def _seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
 def _grown(
     seed: int, slope: Array, disks: Disks, shape: tuple[int, int], extent: float
 ) -> tuple[Array, Rows, Chain]:
-    """Nodes (m, 2) of the lattice that a seed begins, the disks on them, and the mapping to the image."""
+    """Nodes (m, 2) of the lattice grown from a seed, the disks on them, and the mapping to the image."""
     count = int(extent)
     grid = np.array(list(product(range(-count, count + 1), repeat=2)), dtype=np.float64)
     tree, size = KDTree(disks.xy), np.log(np.linalg.det(disks.form))
@@ -199,7 +211,7 @@ def _grown(
         predicted, slopes, _ = second_order(mapping, beside)
         pixels = np.linalg.svd(slopes, compute_uv=False)[:, 1]
         gap, row = tree.query(predicted)
-        # The area of an ellipse goes with that of the mesh around it.
+        # The area of an ellipse is proportional to that of the mesh around it.
         alike = np.abs(size[row] - size[seed] - np.log(np.abs(np.linalg.det(slopes) / np.linalg.det(slope))))
         taken = (gap < _GATE * pixels) & (alike < 0.7)
         order = np.argsort(gap / pixels + 1e6 * ~taken, kind="stable")
@@ -224,7 +236,7 @@ def _read(
     step: float,
     mirrored: bool,
 ) -> tuple[Array, Array, Rows] | Failure:
-    """Turn and shift of the design on the lattice, and the ellipse of each of its disks."""
+    """Rotation and shift of the design on the lattice, and the ellipse of each of its disks."""
     rings = design.rings
     assert rings is not None
     dark = _darkness(grey, nodes, mapping, design, step)
@@ -249,11 +261,11 @@ def _read(
         for k in np.flatnonzero(count >= 0.6 * min(len(nodes), len(numbers))):
             found.append((score[k], best[k], turn, shifts[k].astype(np.float64), node[k]))
     if not found:
-        return Failure("the disks found lie nowhere as the design says", Code.OTHER_DESIGN)
+        return Failure("the disks found do not agree with the design at any position", Code.OTHER_DESIGN)
     found.sort(key=lambda one: -one[0])
     score, agreement, turn, moved, node = found[0]
     if agreement < _LEGIBLE or (len(found) > 1 and score - found[1][0] < _AHEAD):
-        return Failure("its disks were found, but no coded ring tells which is which", Code.AMBIGUOUS)
+        return Failure("its disks were found, but no coded ring identifies them", Code.AMBIGUOUS)
     if (np.linalg.det(_slope(mapping) @ turn) < 0) != mirrored:
         return Failure("the sheet is seen mirrored", Code.MIRRORED)
     return turn, moved, np.where(node >= 0, rows[node], -1)
@@ -262,9 +274,9 @@ def _read(
 def _tables(
     nodes: Array, mapping: Chain, corner: Rows, ahead: int, shape: tuple[int, int]
 ) -> tuple[Rows, Mask]:
-    """The lattice from a corner on: the row of each node that was found, and which others are in sight.
+    """Lattice as tables: the index of each node that was found, and which other nodes are in the frame.
 
-    Far from those found the projectivity alone tells the latter.
+    Far from the nodes found, the projectivity alone predicts the others.
     """
     wide, high = (nodes.max(axis=0) - corner).astype(np.intp) + ahead + 1
     row_of = np.full((wide, high), -1, dtype=np.intp)
@@ -293,7 +305,7 @@ def _turns() -> list[Array]:
 def _darkness(
     grey: NDArray[np.float32], nodes: Array, mapping: Chain, design: ReseauDesign, step: float
 ) -> Array:
-    """How dark it is where a ring would be, from 0 as the ground to 1 as the disk, (m, angles)."""
+    """Darkness at the places of a ring, from 0 (background) to 1 (disk), (m, angles)."""
     rings, size = design.rings, design.mark.size
     assert rings is not None
     assert size is not None
@@ -312,7 +324,7 @@ def _darkness(
 
 
 def _sectors(sectors: tuple[tuple[float, float], ...], turn: Array) -> Array:
-    """What a ring shows at the angles of the lattice, 1 in its sectors and 0 elsewhere."""
+    """Expected ring at the angles of the lattice, 1 in its sectors and 0 elsewhere."""
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     x, y = turn.T @ np.stack([np.cos(angle), np.sin(angle)])
     degrees = np.rad2deg(np.arctan2(y, x))
@@ -322,8 +334,311 @@ def _sectors(sectors: tuple[tuple[float, float], ...], turn: Array) -> Array:
 
 
 def _agreement(dark: Array, expected: Array) -> Array:
-    """How far rings are as codes say (m, c): 1 where so, 0 on an empty ground, -1 for the opposite."""
-    # Means, so that codes of many and of few dark sectors weigh alike.
+    """Agreement of rings with codes (m, c): 1 if equal, 0 on an empty background, -1 if opposite."""
+    # Means, so that codes with many and with few dark sectors have equal weight.
     on, off = (part / np.maximum(part.sum(axis=1, keepdims=True), 1) for part in (expected, 1 - expected))
     agreement: Array = dark @ (on - off).T
     return agreement
+
+
+_FORM = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+"""Growth, stretch along an axis, stretch along a diagonal: paper is not plane. None moves the centre."""
+_FORM_SIGMA = np.array([0.1, 0.03, 0.03])
+_CLASS_PX = 4
+"""Step of the window sizes."""
+_GROUND_PX = 5
+"""Background shown by a window around its disk, pixels."""
+_EDGE_PX = 3
+"""Pixels next to a ring that its blur may reach."""
+_OWN_PX = 2
+"""Pixels next to a disk that its own blur reaches."""
+_SLOPE = 0.3
+"""Standard deviation of the change of contrast from the centre of a disk to the edge of its window, caused by
+reflected light."""
+_SEEN = 0.95
+_UNEASY = 1.4
+"""Multiple of the usual residuals from which a curved background is tried."""
+_BLURRED, _GROWN, _BENT = 1.8, 0.2, 0.12
+"""Tolerances of sharpness (factor), size and shape (shares) of a disk."""
+_BULGED = 0.3
+"""Largest deviation of a disk from its neighbours' prediction, in radii: paper bulges."""
+_UNMODELLED_PX = 0.05
+"""Scatter of positions beyond their own sigmas: the sheet is not plane."""
+_NODES_PX = 1.1
+"""Distance of nodes on an outline, in widths of the point-spread function."""
+
+
+def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) -> dict[str, Any] | Failure:
+    """Measure the disks of a sheet with coded rings, at any rotation and tilt.
+
+    Parameters
+    ----------
+    frame : Frame
+        A photograph.
+    design : ReseauDesign
+        The sheet.
+    options : ReseauOptions
+        Options of the measurement.
+
+    Returns
+    -------
+    dict or Failure
+        Columns of :class:`reseau.measure.reseau.ReseauResult`.
+    """
+    screened = screen(frame, None)
+    grey = screened.grey if design.polarity == "dark" else -screened.grey
+    disks = find_disks(grey, screened.valid, screened.noise)
+    placed = lay_sheet(grey, disks, design, options.mirrored)
+    if isinstance(placed, Failure):
+        return Failure(
+            f"design {design.name!r} was not found in the frame: {placed.reason}",
+            placed.code,
+            where=frame.name,
+        )
+    valid = screened.valid & (frame.pixels < frame.full_scale)
+    return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
+
+
+def _arc(start: float, end: float) -> Array:
+    """Points (40, 2) on the unit circle from one angle to another, degrees."""
+    angle = np.deg2rad(np.linspace(start, end, 40))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Appearance of the disks of this frame."""
+
+    psf_px: float
+    size: float
+    variance: tuple[float, float] | None
+
+
+class _Sheet:
+    """The two rounds of matching, and the tests of every disk."""
+
+    def __init__(
+        self,
+        image: Frame,
+        screened: Screened,
+        disks: Disks,
+        design: ReseauDesign,
+        placed: SheetPlacement,
+        options: ReseauOptions,
+    ) -> None:
+        assert design.mark.size is not None
+        self.image, self.screened, self.design, self.options = image, screened, design, options
+        self.frame, self.mapping = placed.frame, placed.mapping
+        self.origin = placed.origin
+        self.at = design.xy @ placed.frame.T + placed.origin
+        self.found = placed.disk >= 0
+        self.start = np.where(self.found[:, None], disks.xy[placed.disk], self.mapping(self.at))
+        self.look = _Look(options.psf_px, design.mark.size, None)
+
+    def columns(self) -> dict[str, Any]:
+        """Columns of the result."""
+        rows = np.flatnonzero(self.found)
+        first = self._match(rows)
+        sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
+        self._learn(first, rows, sure)
+        rows = self._in_sight()
+        found = self._match_all(rows)
+        why, field = self._judged(rows, found)
+        again = np.flatnonzero((why != "") & (found.seen > 0.5))
+        if 0 < len(again) < len(rows) and field is not None:
+            # Look again for missed disks where their neighbours predict them.
+            self.start[rows[again]] = field(self._straight(rows[again]))
+            good = why == ""
+            found = merged(
+                [np.flatnonzero(good | (found.seen <= 0.5)), again],
+                [found.select(good | (found.seen <= 0.5)), self._match_all(rows[again])],
+            )
+            why, field = self._judged(rows, found)
+        return self._spread(rows, found, why, field)
+
+    def _straight(self, rows: Rows) -> Array:
+        """Images by the projectivity alone, the source coordinates of smooth fields."""
+        return self.mapping.first(self.at[rows])
+
+    def _in_sight(self) -> Rows:
+        """Indices of disks whose centres lie in the frame."""
+        h, w = self.screened.grey.shape
+        inside = ((self.start > 0) & (self.start < (w - 1, h - 1))).all(axis=1)
+        return np.flatnonzero(inside)
+
+    def _outline(self, rows: Rows) -> Outline:
+        """Images of the disks around the images of their centres."""
+        _, slope, bend = second_order(self.mapping, self.at[rows])
+        scale = float(np.linalg.norm(slope @ self.frame, ord=2, axis=(1, 2)).max())
+        flat = Outline.circle(self.look.size / 2, _NODES_PX * self.look.psf_px / scale)
+        step, tangent = flat.xy @ self.frame.T, flat.dxy @ self.frame.T
+        # F(s + d) − F(s) = J d + ½ d H d, and its derivative J + H d.
+        nodes = np.einsum("kab,jb->kja", slope, step) + 0.5 * np.einsum("kabc,jb,jc->kja", bend, step, step)
+        tangents = np.einsum("kab,jb->kja", slope, tangent) + np.einsum(
+            "kabc,jb,jc->kja", bend, step, tangent
+        )
+        return Outline(nodes, tangents).oriented().single()
+
+    def _match(self, rows: Rows, background: int = 1) -> Matches:
+        """Match disks, grouped by window size."""
+        outline, start = self._outline(rows), self.start[rows]
+        reach = np.abs(outline.xy).max(axis=1)
+        sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
+        of = of.ravel()
+        valid = self.screened.valid & ~self._rings()
+        parts, found = [], []
+        for k, size in enumerate(sizes):
+            part = np.flatnonzero(of == k)
+            half = size * _CLASS_PX + _GROUND_PX
+            options = MatchOptions(
+                half_px=(int(half[0]), int(half[1])),
+                psf_px=self.look.psf_px,
+                psf_log_sigma=0.5,
+                response=PixelResponse(self.options.fill),
+                polarity=self.design.polarity,
+                row_jitter_px=self.options.row_jitter_px,
+                settled=0.05,
+                contrast_slope=_SLOPE,
+                background=background,
+                variance=self.look.variance,
+            )
+            found.append(
+                match(
+                    self.screened.grey,
+                    valid,
+                    Outline(outline.xy[part], outline.dxy[part]),
+                    start[part],
+                    options,
+                    noise=self.screened.noise,
+                    form=_FORM,
+                    form_sigma=_FORM_SIGMA,
+                )
+            )
+            parts.append(part)
+        return merged(parts, found)
+
+    def _rings(self) -> Mask:
+        """Mask of the pixels of coded rings, which do not belong to the background."""
+        hidden, own = np.zeros((2, *self.screened.grey.shape), dtype=np.uint8)
+        rings = self.design.rings
+        assert rings is not None
+        for name, sectors in rings.sectors.items():
+            centre = self.design.xy[self.design.ids.index(name)]
+            self._fill(own, self.look.size / 2 * _arc(0, 360) + centre)
+            for start, end in sectors:
+                arc = _arc(start, end)
+                edge = np.concatenate([rings.inner / 2 * arc, rings.outer / 2 * arc[::-1]])
+                self._fill(hidden, edge + centre)
+        # At strong tilt a ring comes close to its disk; pixels between them are assigned to the disk.
+        hidden, own = (
+            cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8))
+            for mask, reach in ((hidden, _EDGE_PX), (own, _OWN_PX))
+        )
+        return np.asarray((hidden > 0) & (own == 0))
+
+    def _fill(self, mask: NDArray[np.uint8], corners: Array) -> None:
+        """Fill the image of a polygon of the sheet."""
+        xy = self.mapping(corners @ self.frame.T + self.origin)
+        if np.abs(xy).max() < 1e5:  # otherwise the mapping is extrapolated far beyond the disks
+            cv2.fillPoly(mask, [np.rint(xy).astype(np.int32)], 1)
+
+    def _learn(self, first: Matches, rows: Rows, sure: Mask) -> None:
+        """Learn mapping, sharpness, size and noise from the reliable disks."""
+        if sure.sum() < 6:
+            return
+        rows = rows[sure]
+        self.mapping = through(self.at[rows], first.xy[sure], self.screened.grey.shape)
+        self.look = _Look(
+            float(np.median(first.psf_px[sure])),
+            self.look.size * (1 + float(np.median(first.form[sure, 0]))),
+            grey_variance(self.screened.grey, self.start[rows], first.residuals[sure]),
+        )
+        self.start = np.where(self.found[:, None], self.start, self.mapping(self.at))
+        self.start[rows] = first.xy[sure]
+
+    def _match_all(self, rows: Rows) -> Matches:
+        """Match disks; on an uneven background with a curved one if that is better."""
+        found = self._match(rows)
+        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
+        uneasy = ~found.converged | (found.noise > _UNEASY * ordinary) | (found.rejected > 0.05)
+        if not uneasy.any():
+            return found
+        curved = self._match(rows[uneasy], background=2)
+        better = curved.converged & ~(curved.noise > 0.9 * found.noise[uneasy])
+        keep = ~uneasy
+        keep[uneasy] = ~better
+        parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
+        return merged(parts, [found.select(keep), curved.select(better)])
+
+    def _objections(self, found: Matches) -> list[tuple[Mask, str]]:
+        """Objections to disks from their own images, the most serious first."""
+        o = self.options
+        sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
+        strong = found.converged & (found.t > 8)
+        ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
+        return [
+            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame"),
+            (~found.converged, "the match does not converge"),
+            (~(found.t >= o.least_t) | (found.contrast <= 0), "no disk stands out from its surroundings"),
+            (found.psf_px > _BLURRED * ordinary, "blurred unlike the other disks"),
+            (np.abs(found.form[:, 0]) > _GROWN, "of another size than the other disks"),
+            (np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT, "its outline is not that of a disk"),
+            (found.correlation < 0.8, "the image is not that of a disk"),
+            (found.rejected > 0.25, "partly hidden or disturbed"),
+            (~(sigma <= o.most_sigma_px), "too uncertain"),
+        ]
+
+    def _judged(self, rows: Rows, found: Matches) -> tuple[Array, SmoothField | None]:
+        """Reason why each disk is rejected, and the field through the others."""
+        why = np.full(len(rows), "", dtype=object)
+        for mask, reason in self._objections(found):
+            why[mask & (why == "")] = reason
+        source, field = self._straight(rows), None
+        variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
+        slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
+        radius = self.look.size / 2 * np.sqrt(np.abs(np.linalg.det(slope)))
+        while (good := np.flatnonzero(why == "")).size >= 10:
+            relative = np.sqrt(variance[good] / np.median(variance[good]))
+            length = field.length if field is not None and np.isfinite(field.length) else None
+            field = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
+            deviation, sigma = field.leave_one_out()
+            limit = np.maximum(np.maximum(self.options.neighbour_px, _BULGED * radius[good, None]), 4 * sigma)
+            excess = (np.abs(deviation) / limit).max(axis=1)
+            worst = int(excess.argmax())
+            if excess[worst] <= 1:
+                break
+            distance = np.hypot(*deviation[worst])
+            why[good[worst]] = f"{distance:.1f} px from the position predicted by its neighbours"
+        return why, field
+
+    def _spread(self, rows: Rows, found: Matches, why: Array, field: SmoothField | None) -> dict[str, Any]:
+        """Columns over all disks of the design."""
+        n, good = len(self.at), why == ""
+        ok, reasons = np.zeros(n, dtype=bool), np.full(n, "outside the frame", dtype=object)
+        ok[rows], reasons[rows] = good, why
+        predicted, deviation = self.mapping(self.at), np.full((n, 2), np.nan)
+        if field is not None:
+            predicted[rows] = field(self._straight(rows))
+            deviation[rows[good]] = field.leave_one_out()[0]
+
+        def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
+            full = np.full((n, *values.shape[1:]), np.nan)
+            full[rows[keep]] = values[keep]
+            return full
+
+        if field is not None and good.sum() >= 10:
+            design = SmoothField.fit(self.design.xy[rows[good]], found.xy[good])
+        else:
+            design = SmoothField.fit(self.design.xy, self.mapping(self.at), local=False)
+        return {
+            "image": self.image.name,
+            "sha256": self.image.sha256,
+            "ids": self.design.ids,
+            "field": design,
+            "xy": spread(found.xy, good),
+            "cov": spread(found.cov, good),
+            "ok": ok,
+            "why": tuple(reasons),
+            "predicted": predicted,
+            "deviation": deviation,
+        } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}

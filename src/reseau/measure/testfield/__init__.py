@@ -1,4 +1,4 @@
-"""A coded testfield in one frame: its lines, its squares read by their code, its targets measured."""
+"""Measurement of a coded testfield in one frame: find its lines, read its squares, measure its targets."""
 
 from .measure import TestfieldOptions, TestfieldResult, measure_testfield
 

@@ -1,8 +1,8 @@
-"""A coded testfield in a frame: its lines found, its squares read, its targets measured.
+"""Measure a coded testfield in a frame: find its lines, read its squares, measure its targets.
 
-The steps are those of Vosselman and Förstner (section 3): straight lines from the Laplacian by Hough and
-adjustment, the targets of every square between them classified, the squares numbered by topology, and the
-targets located by least-squares matching. What cannot be measured is reported so, with the reason.
+The steps are those of Vosselman and Förstner (section 3): straight lines from the Laplacian, the Hough
+transform and adjustment; classification of the targets in every square; numbering of the squares by topology;
+location of the targets by least-squares matching. Targets that are not measured are reported with the reason.
 """
 
 from __future__ import annotations
@@ -17,61 +17,64 @@ from ...core.failure import Code, Failure
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches
-from ..measured import Measured
+from ..points import Measured
 from ..screening import quiet_noise, screen
-from .clusters import Reading
 from .lattice import LatticeFit, refit, slope_of
-from .light import Light
-from .sight import Sight
-from .targets import Scene, match_targets, merged
+from .recognition import Reading, Sight
+from .targets import Light, Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
 _LEAST_FIRST, _MOST_FIRST = 8, 36
-"""How many large targets are matched first, to know the mapping and the sharpness better."""
+"""Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness."""
 _FEW, _AGAIN = 0.05, 4
-"""Share of targets beyond the lines, or not measured, for which it is worth looking again; how often."""
+"""Share of targets not measured for which another round is made; maximum number of rounds."""
 _FAR = 4.5
-"""Standard deviations that a target may be off where all targets together have it."""
+"""Largest deviation of a target from the mapping through all targets, in standard deviations."""
 _WIDE = 0.1
-"""Part of the frame around it in which targets are looked for that reach into it."""
+"""Margin around the frame, relative to its size, in which targets are considered that reach into it."""
 _BEYOND = 1.0
-"""How far beyond the lines found, in steps of the lattice, the mapping through them still serves."""
+"""Distance beyond the lines, in lattice steps, up to which the mapping through them is reliable."""
 _SETTLED_PX = 0.1
-"""Changes of what the mapping predicts below which it need not be looked at farther out."""
+"""Change of the predictions, in pixels, below which learning is not continued further outwards."""
 _UNMODELLED_PX = 0.03
-"""What positions scatter about a mapping of third degree beyond their own sigmas."""
+"""Scatter of positions about a mapping of third degree beyond their own sigmas."""
 _SEEN = 0.95
-"""Share of a target that must lie on pixels that carry an image."""
+"""Minimum share of a target on pixels that carry an image."""
 _UNEASY = 1.4
-"""Times the ordinary residuals from which on the ground is tried curved."""
+"""Multiple of the usual residuals from which a curved background is tried."""
 _UNLIKE = 2.0
-"""Times the ordinary residuals from which on an image is that of something else."""
+"""Multiple of the usual residuals from which an image is that of another object."""
 _BLURRED, _PALE, _GROWN = 1.5, 0.25, 0.15
-"""How sharpness, contrast and size of a target may differ from those of the others, as shares."""
+"""Tolerances of sharpness (factor), contrast and size (shares) of a target relative to the others."""
 
 
 @dataclass(frozen=True)
 class TestfieldOptions:
-    """How a testfield is measured.
+    """Options of the measurement of a testfield.
 
     Parameters
     ----------
     psf_px : float
-        First guess of the width (one sigma) of the point-spread function; estimated.
+        Approximate width (one sigma) of the point-spread function; it is estimated.
     row_jitter_px : float
-        Standard deviation of the shift of single rows, where known.
+        Standard deviation of the shift of single rows, if known.
     fill : float
-        Light-sensitive part of the pitch of the pixels along either axis, 0 to 1, where known.
+        Light-sensitive share of the pixel pitch along either axis, 0 to 1, if known.
     least_t : float
-        Least contrast of a target in units of its standard deviation.
+        Minimum contrast of a target over its standard deviation.
     most_sigma_px : float
-        Largest standard deviation of a coordinate that still counts as measured.
+        Largest standard deviation of a coordinate that is accepted.
     neighbour_px : float
-        Least deviation from the mapping through all targets for which one may be declined.
+        Minimum deviation from the mapping through all targets for which a target is rejected.
+
+    Examples
+    --------
+    >>> TestfieldOptions(psf_px=1.0).least_t
+    8.0
     """
 
-    __test__ = False  # not one for pytest
+    __test__ = False  # prevents collection by pytest
     psf_px: float = 0.8
     row_jitter_px: float = 0.0
     fill: float = 1.0
@@ -82,21 +85,21 @@ class TestfieldOptions:
 
 @dataclass(frozen=True, eq=False)
 class TestfieldResult(Measured):
-    """The targets of a testfield in one frame: `xy` are images of centroids, `deviation` from a mapping.
+    """Targets of a testfield in one frame: `xy` are images of centroids, `deviation` is from a mapping.
 
     Parameters
     ----------
     psf_px : ndarray (n,)
         Width of the point-spread function of each match, NaN where there was none.
     lattice : LatticeFit
-        The straight lines as they were adjusted.
+        The adjusted straight lines.
     reading : Reading
-        What the clusters were taken for.
+        Classification of the clusters.
     squares : int
-        Number of clusters that were read and agree.
+        Number of clusters that were read and agree with each other.
     """
 
-    __test__ = False  # not one for pytest, which collects what is named so
+    __test__ = False  # prevents collection by pytest
     psf_px: Array
     lattice: LatticeFit
     reading: Reading
@@ -115,19 +118,19 @@ def measure_testfield(
     design : TestfieldDesign
         The testfield.
     options : TestfieldOptions, optional
-        How.
+        Options of the measurement.
 
     Returns
     -------
     TestfieldResult or Failure
-        A failure (falsy) where the design is not to be found in the frame.
+        A failure (falsy) if the design is not found in the frame.
 
     Raises
     ------
     ImageError
         When the frame is all of one grey, or almost all saturated.
     UsageError
-        When the design's squares have no sixteen targets in a grid.
+        When the squares of the design do not consist of sixteen targets in a grid.
     """
     options = options or TestfieldOptions()
     screened = screen(frame, None)
@@ -136,7 +139,7 @@ def measure_testfield(
     seen = Sight(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     read = seen.read()
     if isinstance(read, Failure):
-        # Lines a pixel wide are lost in blur, but not for good.
+        # Lines of one pixel width may be recovered from a blurred frame by sharpening.
         failure, sharp = replace(read, where=frame.name), seen.sharpened(noise)
         read = sharp.read()
         if isinstance(read, Failure):
@@ -144,7 +147,7 @@ def measure_testfield(
         seen = sharp
     if seen.another(read):
         return Failure(
-            f"shows two testfields {design.name!r}; cut the picture so that it shows one",
+            f"shows two testfields {design.name!r}; crop the image to one of them",
             Code.SEVERAL_TARGETS,
             where=frame.name,
         )
@@ -177,7 +180,7 @@ def measure_testfield(
 
 
 class _Measurement:
-    """The two rounds of matching, and the verdict on every target."""
+    """The two rounds of matching, and the tests of every target."""
 
     def __init__(self, scene: Scene, lattice: LatticeFit, options: TestfieldOptions) -> None:
         self.scene, self.options = scene, options
@@ -187,7 +190,7 @@ class _Measurement:
         self._place()
 
     def _place(self) -> None:
-        """Where the mapping has the targets, and which of them are in the frame."""
+        """Predict the positions of the targets, and select those in the frame."""
         scene = self.scene
         self.predicted = scene.mapping(self.at)
         h, w = scene.grey.shape
@@ -204,7 +207,7 @@ class _Measurement:
         self.inside = ((xy > reach - 0.5) & (xy < size - 0.5 - reach)).all(axis=1)
 
     def _unfolded(self, at: Array) -> Mask:
-        """Whether, from the middle of the lattice to these places, the mapping keeps its orientation.
+        """Whether the mapping keeps its orientation from the middle of the lattice to these places.
 
         A polynomial folds back beyond the points that it was adjusted to.
         """
@@ -224,7 +227,7 @@ class _Measurement:
             good = why == ""
             if good.mean() > 1 - _FEW or good.sum() < _MOST_FIRST:
                 break
-            # Now that many are known, so is the mapping, and what neighbours take of the light.
+            # With many targets known, the mapping and the light of neighbours are known better.
             self._learn_from(found, good, wanted)
             wanted = self.rows[self.inside]
             found = self._matched()
@@ -253,7 +256,7 @@ class _Measurement:
     def _learn_outwards(self) -> None:
         """Learn mapping, light and sharpness from some of the large targets, matched first.
 
-        It begins between the lines, where the mapping is known, and goes on outwards from there.
+        Start between the lines, where the mapping is known, and continue outwards.
         """
         for beyond in (_BEYOND, np.inf):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
@@ -279,19 +282,19 @@ class _Measurement:
             self._learn_from(first, sure, self.rows[some])
 
     def _learn_from(self, first: Matches, sure: Mask, rows: Rows) -> None:
-        """Mapping, light and sharpness from targets that were matched."""
+        """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
         mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)
         light = Light.through(first.xy[sure], first.level[sure], amplitude[sure], scene.light.size)
         psf_px = float(np.median(first.psf_px[sure]))
-        # What neighbours take of the light was not known well yet: the quieter ones tell the noise.
+        # The light of neighbours was not known well yet: the targets with small residuals give the noise.
         noise = float(np.quantile(first.noise[sure], 0.2))
         self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
     def _matched(self) -> Matches:
-        """All targets matched; where the ground is uneven, with a curved one if that is better."""
+        """Match all targets; on an uneven background with a curved one if that is better."""
         found = match_targets(self.scene, self.rows, self.inside)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
         uneasy = ~found.converged | (found.noise > _UNEASY * ordinary) | (found.rejected > 0.02)
@@ -307,7 +310,7 @@ class _Measurement:
         return merged(rows, [found.select(keep), curved.select(better)])
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
-        """Why each of the wanted targets is not measured, and where the mapping through all has them."""
+        """Reason why each target is rejected, and the positions predicted by the mapping through all."""
         why = np.full(len(wanted), "", dtype=object)
         for mask, reason in self._objections(found):
             why[mask & (why == "")] = reason
@@ -316,16 +319,16 @@ class _Measurement:
             mapping = refit(mapping, self.at[wanted[good]], found.xy[good], _UNMODELLED_PX)
         predicted = mapping(self.at)
         off = np.hypot(*(found.xy - predicted[wanted]).T)
-        # Half of the distances in a plane are below 1.18 standard deviations of a coordinate.
+        # The median distance in a plane is 1.18 standard deviations of a coordinate.
         ordinary = float(np.median(off[good])) / 1.18 if good.any() else 0.0
         sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
         limit = np.maximum(self.options.neighbour_px, _FAR * np.hypot(ordinary, np.nan_to_num(sigma)))
         for k in np.flatnonzero(good & (off > limit)):
-            why[k] = f"{off[k]:.2f} px off where all targets together have it"
+            why[k] = f"{off[k]:.2f} px from the position predicted by all targets together"
         return why, predicted
 
     def _objections(self, found: Matches) -> list[tuple[Mask, str]]:
-        """What speaks against a target in its own image, the gravest first."""
+        """Objections to targets from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         sure = found.converged & (found.t > o.least_t)
@@ -335,7 +338,7 @@ class _Measurement:
             float(np.median(values[sure])) for values in (found.psf_px, found.contrast, found.noise)
         )
         return [
-            (found.seen < _SEEN, "hidden, dazzled or beyond the edge of the frame"),
+            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame"),
             (~found.converged, "the match does not converge"),
             (~(found.t >= o.least_t), "no target stands out from its surroundings"),
             (found.rejected > 0.1, "partly hidden"),

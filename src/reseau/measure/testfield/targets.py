@@ -1,8 +1,9 @@
-"""Targets of a testfield matched with their formed images, all of a frame together.
+"""Matching of the targets of a testfield with their formed images, all of a frame together.
 
-A target's image is formed as the mapping through the lines has it there, to second order: the image of its
-centroid is estimated, so that the perspective, which puts the centroid of the image elsewhere, does no harm.
-What its neighbours and the lines take of the light in its window is formed too, and taken off.
+The image of a target is formed with the mapping through the lines, to second order. The estimate is the image
+of its centroid, so the offset of the centroid of the image caused by perspective does no harm. The light
+attenuated or added by neighbours and lines within a window is formed, too, and subtracted. The illumination
+of the board is modelled by polynomials over the frame.
 """
 
 from __future__ import annotations
@@ -19,22 +20,72 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, Some, Window, match
-from .images import form_targets
 from .lattice import slope_of
-from .light import Light
-from .profiles import blur_of, crossings, strip
+from .line_profiles import blur_of, crossings, strip
+from .target_images import form_targets
 
-__all__ = ["Scene", "match_targets", "merged"]
+__all__ = ["Light", "Scene", "match_targets", "merged"]
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Illumination of a testfield, as polynomials of second degree over the frame.
+
+    Parameters
+    ----------
+    level, contrast : ndarray (6,)
+        Coefficients of the grey value of the background, and of the contrast of a mark.
+    size : (float, float)
+        Width and height of the frame.
+    """
+
+    level: Array
+    contrast: Array
+    size: tuple[float, float]
+
+    @classmethod
+    def through(cls, xy: Array, level: Array, contrast: Array, size: tuple[float, float]) -> Light:
+        """Fit to values at points (n, 2), twice: the second time without outliers."""
+        design = _quadratic(xy, size)
+        found = []
+        for values in (level, contrast):
+            keep = np.isfinite(values)
+            for _ in range(3):
+                fitted: Array = np.linalg.lstsq(design[keep], values[keep], rcond=1e-6)[0].astype(np.float64)
+                off = np.abs(values - design @ fitted)
+                keep = np.isfinite(values) & (off <= 4 * np.nanmedian(off[keep]) + 1e-9)
+            found.append(fitted)
+        return cls(found[0], found[1], size)
+
+    def at(self, xy: Array) -> tuple[Array, Array]:
+        """Level and contrast (n,) at points (n, 2)."""
+        design = _quadratic(xy, self.size)
+        return design @ self.level, design @ self.contrast
+
+    def contrast_over(self, shape: tuple[int, int]) -> Array:
+        """Contrast of every pixel of a frame (h, w)."""
+        u, v = (2 * np.arange(n) / size - 1 for n, size in zip(shape[::-1], self.size, strict=True))
+        one, by_u, by_v, by_uu, by_uv, by_vv = self.contrast
+        over: Array = (
+            (one + by_u * u + by_uu * u * u) + np.outer(v, by_v + by_uv * u) + (by_vv * v * v)[:, None]
+        )
+        return over
+
+
+def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
+    u, v = (2 * xy / np.array(size) - 1).T
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+
 
 _AT_ONCE = 100
-"""Targets that are matched together: what their images take stays in a processor's cache."""
+"""Number of targets matched together; their images fit into the cache of a processor."""
 _FLAT, _LEAST_FLAT = 0.2, 500
-"""Flat is where the jitter of rows is this part of the noise or less; so many such pixels tell the noise."""
+"""A pixel is flat if the jitter of rows is at most this share of the noise; minimum number of flat pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A frame, and what is known of the testfield in it when targets are matched.
+    """A frame and everything known about the testfield in it, for matching targets.
 
     Parameters
     ----------
@@ -45,17 +96,17 @@ class Scene:
     noise : float
         Standard deviation of the grey values.
     design : TestfieldDesign
-        What stands on the board.
+        The testfield.
     mapping : Chain
         From lattice coordinates to the image.
     frame, origin : ndarray (2, 2), (2,)
         Lattice coordinates are `frame` times those of the design, plus `origin`.
     light : Light
-        How it is lit.
+        Illumination.
     psf_px : float
         Width of the point-spread function.
     response : PixelResponse
-        The pixel.
+        Response of a pixel.
     row_jitter_px : float
         Standard deviation of the shift of a row.
     """
@@ -89,17 +140,17 @@ def match_targets(
     rows : ndarray of int (k,)
         All targets whose light falls into the frame.
     inside : ndarray of bool (k,)
-        Which of them are wanted.
+        Which of them to measure.
     background : int
-        Degree of the polynomial that the ground around each is.
+        Degree of the polynomial of the background around each target.
     searching : bool
-        Whether those in whose windows something is amiss are searched for, and it; see
+        Whether to search for blunders in windows with large residuals; see
         :func:`reseau.measure.matching.match`.
 
     Returns
     -------
     Matches
-        Of the n that are wanted, in their order; residuals are in windows of the largest size.
+        The n measured targets, in their order; residuals have the size of the largest window.
     """
     if not inside.all():
         rows, inside = _around(scene, rows, inside)
@@ -110,8 +161,8 @@ def match_targets(
 
 
 def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
-    """Of the targets those that are wanted, and those whose light falls into the windows of these."""
-    # Two windows overlap no farther than targets stand apart in their squares, and half as far again.
+    """Targets to measure, and those whose light falls into the windows of these."""
+    # Windows overlap by at most 1.5 times the distance of targets within a square.
     xy = scene.lattice(scene.design.xy[rows])
     step = np.abs(scene.frame).max() * np.sqrt(scene.design.pitch**2 / 16)
     size = max(scene.design.targets.size) * np.abs(scene.frame).max()
@@ -125,7 +176,7 @@ def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Targets of like size: those wanted (n,), half their windows, what each takes or adds, their images."""
+    """Targets of similar size: those to measure (n,), half windows, light of each, formed images."""
 
     rows: Rows
     half: Rows
@@ -134,7 +185,7 @@ class _Part:
 
 
 class _Canvas:
-    """Light that the marks of a testfield take or add, and the matching of each without the others."""
+    """Light that the marks of a testfield attenuate or add, and matching of each without the others."""
 
     def __init__(
         self, scene: Scene, images: GrownOutline, xy: Array, reach: Array, large: Mask, wanted: Mask
@@ -153,7 +204,7 @@ class _Canvas:
                     self.parts.append(self._lay(some, half, wanted=True))
 
     def _lay(self, part: Rows, half: Rows, *, wanted: bool = False) -> _Part:
-        """Lay the light of some targets on the whole; of those wanted the derivatives are formed as well."""
+        """Add the light of some targets to the sum; derivatives are formed for those to be measured."""
         (h, w), xy = self.total.shape, self.xy[part]
         centre = np.rint(xy)
         right, down = (np.arange(-n, n + 1.0) for n in half)
@@ -175,14 +226,14 @@ class _Canvas:
         return _Part(part, half, own, formed)
 
     def match(self, background: int, searching: bool) -> tuple[list[Rows], list[Matches]]:
-        """Match small and large targets in windows of one size each: their rows, and what was found."""
+        """Match small and large targets in windows of one size each: their indices and matches."""
         noise = self._noise()
         return [part.rows for part in self.parts], [
             self._match(part, background, noise, searching) for part in self.parts
         ]
 
     def _noise(self) -> float:
-        """Noise where the image is flat: elsewhere the jitter of the rows would pass for it."""
+        """Noise where the image is flat; elsewhere the jitter of rows would add to it."""
         scene = self.scene
         if scene.row_jitter_px == 0:
             return scene.noise
@@ -237,7 +288,7 @@ class _Canvas:
 
 
 def _line_light(scene: Scene) -> Array:
-    """Grey values that the lines take or add, (h, w)."""
+    """Grey values that the lines attenuate or add, (h, w)."""
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones(h * w)
     x0, y0, x1, y1 = lines.extent
@@ -257,11 +308,11 @@ def _line_light(scene: Scene) -> Array:
                 continue
             width = (beside - middle)[np.rint(line.along).astype(np.intp)]
             half = 0.5 * np.abs((width * line.normal).sum(axis=1))
-            # A line may run at 45° to the rows or columns that it is followed along.
+            # A line may run at 45° to the rows or columns along which it is followed.
             reach = int(np.ceil((3.5 * blur + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min()))
             row, column, distance = line.around(reach)
             share = strip(distance, half[:, None], blur)
-            # Its ends are blurred likewise.
+            # The ends of the line are blurred, too.
             ends = np.sort(middle[[0, -1], line.axis])
             share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
             keep = (row >= 0) & (row < h) & (column >= 0) & (column < w)
@@ -271,7 +322,7 @@ def _line_light(scene: Scene) -> Array:
 
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
-    """Matches of several parts in the order of their rows; smaller windows are filled up with NaN."""
+    """Matches of several parts in the order of their rows; smaller windows are padded with NaN."""
     order = np.argsort(np.concatenate(parts), kind="stable")
     most = np.max([matches.residuals.shape[1:] for matches in found], axis=0)
     columns: dict[str, Any] = {}

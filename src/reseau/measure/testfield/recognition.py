@@ -1,15 +1,19 @@
-"""The clusters of a testfield read: every target by the likelihood of its formed image, squares by the code.
+"""Recognition of a testfield in a frame: lines found, targets classified, squares read by their code.
 
-The image of each kind of target is formed as the lattice of lines has it at each square, and every target is
-compared with all of them: the sum of squares that is left when contrast, brightness, a small shift and the
-sharpness are adjusted is its likelihood. Of a cluster it is known that every kind stands in it twice. The
-likeliest arrangement of that sort is an assignment problem, and is solved as one.
+The image of each kind of target is formed with the lattice of lines at each square, and every target is
+compared with all of them. The residual sum of squares, after adjustment of contrast, brightness, a small
+shift and the sharpness, gives its likelihood. In a cluster every kind occurs twice; the likeliest such
+arrangement is the solution of an assignment problem.
+
+Where blur hides lines of one pixel width, the frame is first sharpened with a Wiener filter (Gonzalez and
+Woods, *Digital Image Processing*, 5.8). The sharpened frame serves for recognition only; targets are measured
+in the original.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -24,40 +28,42 @@ from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
-from .images import flat_outline, stacked
-from .lattice import LatticeFit
+from ..screening import quiet_noise
+from .lattice import LatticeFit, Ridges, find_lattice, lattices, ridge_points, straightened
+from .line_profiles import blur_of
+from .target_images import flat_outline, stacked
 
-__all__ = ["Kinds", "Placement", "Reading", "locate", "read_clusters"]
+__all__ = ["Kinds", "Placement", "Read", "Reading", "Sight", "locate", "read_clusters"]
 
 _ALIKE = 0.06
-"""Relative difference of local frames below which one set of formed images serves for both."""
+"""Relative difference of local frames below which they share one set of formed images."""
 _SHIFT_PX = 0.4
-"""Standard deviation of what a target is off the place where the lines have it."""
+"""Standard deviation of the distance of a target from its position predicted by the lines."""
 _UNLIKE, _UNEXPLAINED = 4.0, 0.3
-"""A target is none of the design's where more is left than so many times the ordinary noise, and than this
-part of what is seen."""
+"""A target is unknown if its residual variance exceeds this multiple of the usual noise and this share of the
+variance of the image."""
 _WIDTH_PX = 0.2
-"""How well the width of the point-spread function must be known for targets to be told apart."""
+"""Required accuracy of the width of the point-spread function for classification."""
 _LEAST_VARIANCE = 1e-6
-"""Square of the grey values that are left where an image of a few pixels fits exactly."""
+"""Residual variance assumed where an image of a few pixels fits exactly."""
 _FAINT = 0.3
-"""Part of the ordinary contrast below which there is no target."""
+"""Minimum contrast of a target relative to the usual contrast."""
 _ANGLE = 7.5
-"""Directions of targets are told apart to this, in degrees."""
+"""Resolution of the directions of targets, degrees."""
 _SYMMETRY = {"square": 90.0, "cross": 90.0, "triangle": 120.0, "circle": np.inf}
 
 
 @dataclass(frozen=True, eq=False)
 class Kinds:
-    """Targets of a design as they may appear, in columns.
+    """Kinds of targets of a design in all possible rotations, in columns.
 
     Parameters
     ----------
     shape : tuple of str (k,)
     size, angle : ndarray (k,)
-        Millimetres and degrees.
+        Size in millimetres, direction in degrees.
     symbol : ndarray of int (k,)
-        As in :attr:`TestfieldDesign.symbols`.
+        Symbol of the code, as in :attr:`TestfieldDesign.symbols`.
     """
 
     shape: tuple[str, ...]
@@ -68,7 +74,7 @@ class Kinds:
     @classmethod
     @lru_cache(maxsize=16)
     def of(cls, design: TestfieldDesign) -> Kinds:
-        """The kinds of a design, turned by all quarters."""
+        """The kinds of a design, rotated by multiples of 90°."""
         found: dict[tuple[int, float, float], str] = {}
         targets = design.targets
         for shape, size, angle, symbol in zip(
@@ -83,7 +89,7 @@ class Kinds:
         return cls(tuple(found.values()), columns[1], columns[2], columns[0].astype(np.intp))
 
     def outline(self, spacing: float) -> Outline:
-        """Outlines (k, j, 2) in millimetres; where one has fewer nodes, the rest weighs nothing."""
+        """Outlines (k, j, 2) in millimetres, padded with nodes of zero weight."""
         return stacked(
             [flat_outline(*kind, spacing) for kind in zip(self.shape, self.size, self.angle, strict=True)]
         )
@@ -91,23 +97,23 @@ class Kinds:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The clusters as they were read, in columns over the s squares in sight.
+    """Classified clusters, in columns over the s visible squares.
 
     Parameters
     ----------
     cell : ndarray of int (s, 2)
         Lattice coordinates of their lower left corners.
     alone, joint : ndarray of int (s, 16)
-        What each target is taken for, by its own likelihood and by that of the cluster; rows from the upper
+        Symbol of each target, from its own likelihood and from that of the cluster; row by row from the upper
         left of the lattice.
     decoded : tuple of Decoded (s,)
-        What the code makes of the latter.
+        Result of decoding `joint`.
     xy : ndarray (s, 16, 2)
-        Where the lines have the targets.
+        Positions of the targets predicted by the lines.
     level, contrast : ndarray (s, 16)
-        Grey values around each target, and what it takes of them or adds; NaN where there is none.
+        Grey value around each target, and its contrast; NaN where there is none.
     psf_px : float
-        Width of the point-spread function that serves best.
+        Best width of the point-spread function.
     """
 
     cell: Rows
@@ -132,11 +138,11 @@ def read_clusters(
     Returns
     -------
     Reading or Failure
-        A failure where no square is in sight.
+        A failure if no square is visible.
     """
     work = _Clusters(grey, fit, design, response)
     if not work.visible.any():
-        return Failure("no square between the lines is in sight", Code.NOT_FOUND)
+        return Failure("no square between the lines is visible", Code.NOT_FOUND)
     for _ in range(3):
         found = work.compared(psf_px)
         better = float(np.clip(psf_px + found.widening, 0.5 * psf_px, 2 * psf_px))
@@ -152,8 +158,8 @@ def read_clusters(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Minus log-likelihoods (s, 16, 8) of the symbols, and of none of them (s, 16); level and contrast
-    (s, 16); change of width wanted."""
+    """Negative log-likelihoods (s, 16, 8) of the symbols and of none of them (s, 16); level and contrast
+    (s, 16); required change of the width."""
 
     cost: Array
     none: Array
@@ -163,7 +169,7 @@ class _Comparison:
 
 
 class _Clusters:
-    """The targets between the lines, and what they are compared with."""
+    """The targets between the lines, and their comparison with the formed images of all kinds."""
 
     def __init__(
         self, grey: NDArray[np.float32], fit: LatticeFit, design: TestfieldDesign, response: PixelResponse
@@ -190,7 +196,7 @@ class _Clusters:
         self.seen = cv2.remap(
             grey, flat[..., 0], flat[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         ).reshape(*self.xy.shape[:2], -1)
-        # What is nearer to a neighbour than to the target is not looked at.
+        # Pixels that are nearer to a neighbour than to the target are ignored.
         on_board = np.einsum("gij,nj->gni", np.linalg.inv(self.frames), offset)
         self.own = (np.abs(on_board) <= self.step / 2).all(axis=2)
 
@@ -203,7 +209,7 @@ class _Clusters:
         for group, own in enumerate(self.own):
             of = self.group == group
             seen = self.seen[of][..., own].astype(np.float64)
-            # By what of the image lies in the space of each design: a = q r, x = r⁻¹ qᵀ l, v² = l² − (qᵀ l)².
+            # Projection onto the column space of each design: a = q r, x = r⁻¹ qᵀ l, v² = l² − (qᵀ l)².
             q, r = np.linalg.qr(design[group][:, own])
             part = (seen.reshape(-1, seen.shape[2]) @ np.swapaxes(q, 1, 2).reshape(-1, q.shape[1]).T).reshape(
                 *seen.shape[:2], *q.shape[::2]
@@ -226,13 +232,13 @@ class _Clusters:
         return _Comparison(np.stack(by_symbol, axis=2), none, level, np.abs(contrast), widening)
 
     def classified(self, found: _Comparison) -> tuple[Rows, Rows]:
-        """Symbols (s, 16) of the targets, each by itself, and all of a cluster together."""
+        """Symbols (s, 16) of the targets, each by itself, and jointly for a cluster."""
         cost = np.where(self.visible[..., None], found.cost, np.inf)
         cost = np.minimum(cost, 1e6 * found.none.max())
         alone = np.where(cost.min(axis=2) < found.none, cost.argmin(axis=2), HIDDEN)
         joint = np.full(alone.shape, HIDDEN)
         for square, each in enumerate(cost):
-            # Every symbol twice, or none of them.
+            # Each symbol occurs twice, or the target is unknown.
             choices = np.concatenate(
                 [np.repeat(each, 2, axis=1), np.repeat(found.none[square, :, None], 16, axis=1)], axis=1
             )
@@ -258,7 +264,7 @@ class _Clusters:
 
 
 def _grouped(frames: Array) -> tuple[Rows, Array]:
-    """Groups of like local frames (s, 2, 2): which group each is of, and the frames of the groups."""
+    """Groups of similar local frames (s, 2, 2): group of each frame, and the frames of the groups."""
     kept: list[Any] = []
     group = np.zeros(len(frames), dtype=np.intp)
     for k, frame in enumerate(frames):
@@ -272,7 +278,7 @@ def _grouped(frames: Array) -> tuple[Rows, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where on the board the lattice of lines lies: lattice = frame · design + origin."""
+    """Position of the lattice on the board: lattice = frame · design + origin."""
 
     frame: Array
     origin: Array
@@ -280,12 +286,12 @@ class Placement:
 
 
 def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
-    """Put the lattice on the board by what most clusters say.
+    """Determine the position of the lattice on the board from the majority of the clusters.
 
     Returns
     -------
     Placement or Failure
-        A failure where no cluster can be read, they contradict each other, or the image is mirrored.
+        A failure if no cluster can be read, if they contradict each other, or if the image is mirrored.
     """
     votes: Counter[tuple[bool, int, int, int]] = Counter()
     for cell, decoded in zip(reading.cell, reading.decoded, strict=True):
@@ -297,26 +303,133 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
     in_sight = int(((reading.joint != HIDDEN).sum(axis=1) >= 8).sum())
     if not votes:
         return Failure(
-            f"{in_sight} squares are in sight, but none is one of the design {design.name!r}",
+            f"{in_sight} squares are visible, but none belongs to the design {design.name!r}",
             Code.OTHER_DESIGN,
         )
     (mirrored, quarters, *doubled), most = votes.most_common(1)[0]
     others = sum(votes.values()) - most
-    # In a mirror every square says something else about the place of the board.
+    # In a mirrored image the squares contradict each other about the position.
     if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, 0.3 * in_sight):
-        return Failure("shows the testfield in a mirror", Code.MIRRORED)
+        return Failure("shows the testfield mirrored", Code.MIRRORED)
     if others > max(1, 0.2 * most):
         return Failure(
-            f"{most} squares lie as in the design {design.name!r}, {others} read like it do not",
+            f"{most} squares agree with the design {design.name!r}, but {others} contradict them",
             Code.INCONSISTENT,
         )
     if mirrored or most < 0.3 * in_sight:
         return Failure(
-            f"of {in_sight} squares in sight only {most} are of the design {design.name!r}", Code.OTHER_DESIGN
+            f"only {most} of {in_sight} visible squares belong to the design {design.name!r}",
+            Code.OTHER_DESIGN,
         )
     return Placement(_quarter(quarters) / design.pitch, np.array(doubled) / 2, most)
 
 
 def _quarter(turns: int) -> Array:
-    """Rotation by quarters, x into y."""
+    """Rotation matrix for a number of quarter turns from x to y."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), turns)
+
+
+_BLURRED_PX, _SHARP_PX = 1.8, 0.7
+"""Width of the point-spread function removed from a blurred frame, and of the one that replaces it."""
+_LEAST_POWER = 2e-3
+"""Minimum power of the noise relative to that of the image in sharpening."""
+_ELSEWHERE = 0.2
+"""Share of ridge points beyond a testfield from which a second testfield is searched."""
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """Recognized testfield: lattice of lines, clusters, and position on the board."""
+
+    ridges: Ridges
+    lattice: LatticeFit
+    reading: Reading
+    placed: Placement
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A frame in which a testfield is searched.
+
+    Parameters
+    ----------
+    grey, dark : ndarray (h, w), float32
+        Grey values, and the same with dark lines on a bright background.
+    design : TestfieldDesign
+        The testfield.
+    psf_px : float
+        Approximate width of the point-spread function.
+    response : PixelResponse
+        Response of a pixel.
+    taken_px2 : float
+        Variance of the point-spread function that was removed by sharpening.
+    """
+
+    grey: NDArray[np.float32]
+    dark: NDArray[np.float32]
+    design: TestfieldDesign
+    psf_px: float
+    response: PixelResponse
+    taken_px2: float = 0.0
+
+    def sharpened(self, noise: float) -> Sight:
+        """The frame sharpened by removing most of an assumed blur; `noise` is its noise."""
+        power = max(_LEAST_POWER, (noise / max(float(self.grey.std()), 1e-9)) ** 2)
+        grey, dark = (_sharpened(image, power) for image in (self.grey, self.dark))
+        return replace(self, grey=grey, dark=dark, psf_px=1.0, taken_px2=_BLURRED_PX**2 - _SHARP_PX**2)
+
+    def blurred(self, psf_px: float) -> float:
+        """Width of the point-spread function in the original frame, from the width in this one."""
+        return float(np.sqrt(psf_px**2 + self.taken_px2))
+
+    def read(self, ridges: Ridges | None = None) -> Read | Failure:
+        """First of the lattices through the lines whose squares are those of the design.
+
+        Parameters
+        ----------
+        ridges : Ridges, optional
+            Ridge points in which lines are searched; all of the frame by default.
+        """
+        ridges = ridges or ridge_points(self.dark, quiet_noise(self.dark))
+        found = find_lattice(ridges)
+        if isinstance(found, Failure):
+            return found
+        design, failure = self.design, None
+        width, blur = design.lines.width / design.pitch, blur_of(self.psf_px, self.response)
+        for lattice in lattices(self.dark, ridges, found, width, blur):
+            reading = read_clusters(self.grey, lattice, design, self.psf_px, self.response)
+            placed = reading if isinstance(reading, Failure) else locate(reading, design)
+            if isinstance(placed, Placement) and isinstance(reading, Reading):
+                return Read(ridges, lattice, reading, placed)
+            if failure is None and isinstance(placed, Failure):
+                failure = placed
+        if failure is None:
+            failure = Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
+        return failure
+
+    def another(self, read: Read) -> bool:
+        """Whether a second testfield is visible beyond the one that was read."""
+        x0, y0, x1, y1 = self.design.lines.extent
+        corners = (
+            np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) @ read.placed.frame.T + read.placed.origin
+        )
+        # Keep a margin of half a square; the projectivity is accurate enough to locate the border.
+        low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
+        at = straightened(read.lattice.mapping, read.ridges.xy)
+        beyond = ((at < low) | (at > high)).any(axis=1)
+        if beyond.mean() < _ELSEWHERE:
+            return False
+        rest = replace(read.ridges, xy=read.ridges.xy[beyond], normal=read.ridges.normal[beyond])
+        return not isinstance(self.read(rest), Failure)
+
+
+def _sharpened(grey: NDArray[np.float32], power: float) -> NDArray[np.float32]:
+    """An image with one Gaussian blur replaced by another; `power` is the relative power of the noise."""
+    (h, w), margin = grey.shape, min(int(4 * _BLURRED_PX + 4), min(grey.shape) - 1)
+    wide = np.pad(grey, margin, mode="reflect")
+    down, across = np.fft.fftfreq(wide.shape[0])[:, None], np.fft.rfftfreq(wide.shape[1])
+    before, after = (
+        np.exp(-2 * (np.pi * sigma) ** 2 * (down**2 + across**2)) for sigma in (_BLURRED_PX, _SHARP_PX)
+    )
+    found = np.fft.irfft2(np.fft.rfft2(wide) * after * before / (before**2 + power), s=wide.shape)
+    return found[margin : margin + h, margin : margin + w].astype(np.float32)

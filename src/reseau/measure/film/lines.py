@@ -16,7 +16,7 @@ import numpy as np
 from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust, robust
 from ...core.data import Array, Mask
 from ...core.failure import Code, Failure
-from .outline import crossings_of
+from .search import crossings_of
 
 __all__ = [
     "EdgeData",

@@ -1,4 +1,4 @@
-"""Images of the targets of a testfield, formed as they stand on the board and as the frame shows that."""
+"""Formed images of the targets of a testfield, in the perspective of a frame."""
 
 from __future__ import annotations
 
@@ -18,42 +18,42 @@ from .lattice import second_order
 __all__ = ["flat_outline", "form_targets", "stacked"]
 
 _SPACING = 1.1
-"""Distance of nodes on an outline in widths of the point-spread function: good to 1e-4 of the light."""
+"""Distance of nodes on an outline in widths of the point-spread function; accurate to 1e-4 of the light."""
 
 
 @lru_cache(maxsize=256)
 def flat_outline(shape: str, size: float, angle: float, spacing: float) -> Outline:
-    """A target's outline in millimetres: the same for all frames, as near as the number of nodes goes."""
+    """Outline of a target in millimetres, cached by kind and spacing of the nodes."""
     return target_outline(shape, size, angle, spacing)
 
 
 def form_targets(
     design: TestfieldDesign, rows: Rows, mapping: Chain, frame: Array, at: Array, psf_px: float
 ) -> tuple[GrownOutline, Array, Array]:
-    """The images of targets around the images of their centroids.
+    """Images of targets around the images of their centroids.
 
     Parameters
     ----------
     rows : ndarray of int (k,)
-        Targets of the design.
+        Indices of targets of the design.
     mapping : Chain
         From lattice coordinates to the image.
     frame : ndarray (2, 2)
-        Lattice coordinates of a millimetre along x and y of the design, in columns.
+        Lattice coordinates of one millimetre along x and y of the design, in columns.
     at : ndarray (k, 2)
         Lattice coordinates of the centroids.
 
     Returns
     -------
     images : GrownOutline
-        They all grow by a share.
+        Shapes with a common parameter of scale.
     xy : ndarray (k, 2)
         Images of the centroids.
     reach : ndarray (k, 2)
         Half the width and half the height of each image.
     """
     value, slope, bend = second_order(mapping, at)
-    # Nodes are as near to each other as they must be where a millimetre is longest in the image.
+    # The spacing of nodes is determined where a millimetre is largest in the image.
     scale = float(np.linalg.norm(slope @ frame, ord=2, axis=(1, 2)).max())
     targets = design.targets
     keys = [(targets.shape[k], targets.size[k], targets.angle[k]) for k in rows]
@@ -80,7 +80,7 @@ def form_targets(
 
 
 def stacked(outlines: list[Outline]) -> Outline:
-    """Single outlines as one of many (k, j, 2), the shorter ones filled up with nodes of no weight."""
+    """Outlines stacked to one (k, j, 2), padded with nodes of zero weight."""
     most = max(len(outline.xy) for outline in outlines)
     xy, dxy = np.zeros((2, len(outlines), most, 2))
     for k, outline in enumerate(outlines):

@@ -1,9 +1,9 @@
-"""Which candidate is which mark: the design laid over the candidates, with or without prior positions.
+"""Find where a design lies in a frame: assign candidates to the marks of its grid.
 
-With prior positions only a common shift is voted for. Without them, pairs of neighbours vote for scale,
-rotation and handedness, and pairs of candidate and mark for the shift. From there both go the same way: a
-polynomial from the design to the image grows in degree, and outwards from where it is sure, while the gate
-narrows.
+With approximate positions only a common shift is voted for. Without them, pairs of neighbours vote for scale,
+rotation and handedness, and pairs of candidate and mark vote for the shift. Both cases continue in the same
+way: a polynomial from the design to the image grows in degree, and outwards from its reliable part, while the
+search radius decreases.
 """
 
 from __future__ import annotations
@@ -17,31 +17,35 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Code, Failure
+from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
-from .candidates import Candidates
+from ...optics.formation import coverage, mark_outline
+from ..screening import Screened, screen
+from .candidates import Candidates, find_candidates
 
-__all__ = ["Assignment", "GridOptions", "assign", "lay_out"]
+__all__ = ["Assignment", "GridOptions", "Placement", "PlacingOptions", "assign", "lay_out", "place"]
 
 _NEIGHBOURS = 6
 _NEARLY = 0.75
-"""Share of the marks from which a layout is the right one but for a step of the grid."""
+"""Share of the marks from which a layout is correct except for a shift by steps of the grid."""
 
 
 @dataclass(frozen=True)
 class GridOptions:
-    """What is known of the grid in the image.
+    """What is known about the grid in the image.
 
     Parameters
     ----------
     max_rotation : float
         Largest rotation of the design against the image (rad).
     mirrored : bool, optional
-        Whether the design has the handedness of the image (x right, y down; False) or the other (True); None:
-        to be found out. A grid symmetric in itself does not tell; then the handedness of nominal positions is
-        taken, and without them that of a design with y up.
+        Whether the design has the handedness of the image (x right, y down; False) or the opposite (True);
+        None to determine it. A symmetric grid does not determine it; then the handedness of the nominal
+        positions is used, or without them that of a design with y up.
     hypotheses : int
-        So many peaks of the vote for scale and rotation are followed.
+        Number of peaks of the vote for scale and rotation that are followed.
     """
 
     max_rotation: float = np.deg2rad(12.0)
@@ -56,15 +60,15 @@ class Assignment:
     Parameters
     ----------
     field : SmoothField
-        From the design to the image.
+        Mapping from the design to the image.
     predicted : ndarray (n, 2)
-        Where the field has each mark.
+        Position of each mark predicted by the field.
     candidate : ndarray of int (n,)
-        Row of the candidate of each mark, -1 where there is none.
+        Index of the candidate of each mark, -1 where there is none.
     at : ndarray (n, 2)
         Position of that candidate, NaN where there is none.
     missed : int
-        Marks that should be in sight and have no candidate.
+        Number of marks that should be visible and have no candidate.
     """
 
     field: SmoothField
@@ -75,7 +79,7 @@ class Assignment:
 
     @property
     def score(self) -> float:
-        """Marks found, less half of those missed."""
+        """Number of marks found, minus half the number missed."""
         return int((self.candidate >= 0).sum()) - 0.5 * self.missed
 
 
@@ -92,28 +96,28 @@ def assign(
     shifts: int = 4,
     within_px: float | None = None,
 ) -> Assignment | None:
-    """Give marks their candidates, beginning from approximate positions.
+    """Assign candidates to marks, starting from approximate positions.
 
     Parameters
     ----------
     source : ndarray (n, 2)
         Design coordinates.
     start : ndarray (n, 2)
-        Approximate positions in pixels: any smooth distortion and a common shift of up to one pitch away.
+        Approximate positions in pixels, correct up to any smooth distortion and a shift of up to one pitch.
     candidates : Candidates
-        What looks like a mark.
+        Places that look like a mark.
     valid : ndarray (h, w) of bool
-        Pixels that carry an image; a mark is missed only there.
+        Pixels that carry an image; only there can a mark count as missed.
     shifts : int
-        At most so many common shifts are tried: a grid that lies half a pitch away or more agrees almost as
-        well with one of its neighbours in the place of each mark, but misses those at its border.
+        Maximum number of common shifts that are tried. A grid shifted by half a pitch or more agrees almost
+        as well with neighbours in the place of its marks, but misses the marks at its border.
     within_px : float, optional
-        How far the approximate positions may be off at most, where that is known; no shift is tried then.
+        Largest error of the approximate positions, if known; then no shifts are tried.
 
     Returns
     -------
     Assignment or None
-        None when too few marks found a candidate.
+        None if too few marks found a candidate.
     """
     if len(candidates) < 4:
         return None
@@ -124,7 +128,7 @@ def assign(
         found = _assigned(source, start + shift, candidates, valid, pitch, 0.2 * pitch)
         if found is None:
             continue
-        # Half a pitch off, wires have something of a crossing everywhere, but nothing strong.
+        # At a shift of half a pitch, wires look a little like crossings everywhere, but nowhere strongly.
         strength = found.score + float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
         if best is None or strength > best[0] + 0.75:
             best = strength, found
@@ -134,7 +138,7 @@ def assign(
 def _assigned(
     source: Array, start: Array, candidates: Candidates, valid: Mask, pitch: float, widest: float
 ) -> Assignment | None:
-    """Give marks their candidates, beginning from positions that a smooth distortion alone makes wrong."""
+    """Assign candidates to marks whose approximate positions are wrong by a smooth distortion only."""
     centre = _densest(start, candidates, pitch)
     far = np.hypot(*(start - centre).T)
     tree, predicted, gate = KDTree(candidates.xy), start, widest
@@ -160,7 +164,7 @@ def _assigned(
 
 
 def _in_sight(xy: Array, valid: Mask) -> Mask:
-    """Which positions lie on pixels that carry an image, two pixels from the border at least."""
+    """Mask of positions on pixels that carry an image, at least two pixels from the border."""
     limits = np.array(valid.shape[::-1])
     inside = ((xy > 1) & (xy < limits - 2)).all(axis=1)
     column, row = np.clip(np.rint(np.nan_to_num(xy)), 0, limits - 1).astype(np.intp).T
@@ -169,12 +173,12 @@ def _in_sight(xy: Array, valid: Mask) -> Mask:
 
 
 def _common_shifts(start: Array, candidates: Candidates, pitch: float, count: int) -> Iterator[Array]:
-    """Shifts, of at most a pitch, on which most pairs of start and candidate agree, the likeliest first."""
+    """Shifts of at most one pitch that most pairs of start and candidate support, the likeliest first."""
     offset = (candidates.xy[None] - start[:, None]).reshape(-1, 2)
     weight = np.broadcast_to(np.minimum(candidates.t, 15.0), (len(start), len(candidates))).ravel()
     near = (np.abs(offset) < pitch).all(axis=1)
     votes, (x, y) = _vote(offset[near], weight[near], [(-pitch, pitch)] * 2, max(1.0, pitch / 40), 2.0)
-    # Of two shifts with like support the smaller is meant: a grid agrees with itself at every pitch.
+    # Of two shifts with similar support take the smaller: a grid agrees with itself at every pitch.
     votes *= 1 - 0.3 * np.hypot(x[:, None], y[None]) / (1.5 * pitch)
     most = votes.max()
     for _ in range(count):
@@ -192,7 +196,7 @@ def _vote(
     width: float | tuple[float, float],
     blur: float,
 ) -> tuple[Array, tuple[Array, Array]]:
-    """A smoothed two-dimensional histogram and the centres of its bins."""
+    """Smoothed two-dimensional histogram, and the centres of its bins."""
     widths = (width, width) if isinstance(width, float) else width
     bins = [max(3, int((high - low) / w)) for (low, high), w in zip(limits, widths, strict=True)]
     votes, x, y = np.histogram2d(values[:, 0], values[:, 1], bins=bins, range=limits, weights=weight)
@@ -201,7 +205,7 @@ def _vote(
 
 
 def _densest(start: Array, candidates: Candidates, pitch: float) -> Array:
-    """A mark around which most of its fellows have a candidate where they should."""
+    """Position of a mark most of whose neighbours have a candidate at their predicted places."""
     has = KDTree(candidates.xy).query(start)[0] < 0.2 * pitch
     near = KDTree(start).query(start, k=min(9, len(start)))[1]
     score = has[near].sum(axis=1) - 1e-3 * np.hypot(*(start - start.mean(axis=0)).T) / pitch
@@ -210,7 +214,7 @@ def _densest(start: Array, candidates: Candidates, pitch: float) -> Array:
 
 
 def _nearest(tree: KDTree, candidates: Candidates, predicted: Array, gate: float, reached: Mask) -> Rows:
-    """The likeliest candidate within the gate of each mark: strong, and near."""
+    """Likeliest candidate within the search radius of each mark: strong, and near."""
     distance, row = tree.query(predicted, k=min(4, len(candidates)), distance_upper_bound=gate)
     likely = np.append(candidates.t, 0.0)[row] / (
         1 + 3 * (np.where(np.isfinite(distance), distance, 0) / gate) ** 2
@@ -218,7 +222,7 @@ def _nearest(tree: KDTree, candidates: Candidates, predicted: Array, gate: float
     best = likely.argmax(axis=1)
     each = np.arange(len(predicted))
     rows = np.where((likely[each, best] > 0) & reached, row[each, best], -1)
-    # No candidate serves two marks: the nearer one keeps it.
+    # A candidate cannot serve two marks: the nearer one keeps it.
     order = np.lexsort((distance[each, best], rows))
     again = np.append(False, (rows[order][1:] == rows[order][:-1]) & (rows[order][1:] >= 0))
     rows[order[again]] = -1
@@ -228,7 +232,7 @@ def _nearest(tree: KDTree, candidates: Candidates, predicted: Array, gate: float
 def _robust_field(
     source: Array, rows: Rows, candidates: Candidates, degree: int
 ) -> tuple[SmoothField, float] | None:
-    """A polynomial through marks and their candidates, blunders left out, and its scatter in pixels."""
+    """Polynomial through marks and their candidates, blunders rejected, and its scatter in pixels."""
     has = np.flatnonzero(rows >= 0)
     least = (degree + 1) * (degree + 2) // 2 + 3
     if len(has) < least:
@@ -237,7 +241,7 @@ def _robust_field(
     for _ in range(6):
         try:
             field = SmoothField.fit(source[has[kept]], image[kept], degree=degree, local=False)
-        except np.linalg.LinAlgError:  # marks of one row alone
+        except np.linalg.LinAlgError:  # marks of a single row
             return None
         distance = np.hypot(*(field(source[has]) - image).T)
         scatter = max(float(np.median(distance[kept])) / 1.18, 0.15)
@@ -249,32 +253,32 @@ def _robust_field(
 
 
 def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOptions) -> Assignment | None:
-    """Find the design among candidates without prior positions.
+    """Find the design among candidates without approximate positions.
 
     Parameters
     ----------
     source : ndarray (n, 2)
         Design coordinates.
     candidates : Candidates
-        What looks like a mark; false ones may outnumber the marks three to one.
+        Places that look like a mark; false ones may be three times as many as the marks.
     valid : ndarray (h, w) of bool
         Pixels that carry an image.
     options : GridOptions
-        What is known.
+        What is known about the grid.
 
     Returns
     -------
     Assignment or None
-        The one with the highest score; None when no hypothesis gathers marks.
+        The assignment with the highest score; None if no hypothesis finds enough marks.
     """
     strong = _strongest(candidates, 4 * len(source))
     if len(strong) < 8 or len(source) < 8:
         return None
-    # Along a wire much looks a little like a crossing: where all vote, that may outvote the crossings; where
-    # the strongest alone do, a scene behind the marks may. So the ones first and then the others.
+    # Many places along a wire look somewhat like a crossing: with all candidates voting, they may outvote the
+    # crossings; with the strongest only, a scene behind the marks may. Therefore first one, then the other.
     electorates = (_strongest(candidates, 3 * len(source) // 2), strong)
     best: Assignment | None = None
-    # y up first: where both explain the image alike, the first is kept.
+    # Hypotheses with y up come first: of two that explain the image equally, the first is kept.
     for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
         plane = source * [1, -1 if mirrored else 1]
         for start in chain.from_iterable(_starts(plane, voters, options) for voters in electorates):
@@ -285,16 +289,16 @@ def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOpt
                 found = _climbed(found, source, strong, valid)
             if best is None or found.score > best.score + 0.75:
                 best = found
-            # What no step of the grid betters, and nearly all marks bear out, is not bettered elsewhere.
+            # If no grid step improves it and nearly all marks support it, no other hypothesis is better.
             if found.score > _NEARLY * len(source):
                 break
     return best
 
 
 def _climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
-    """The design moved by steps of its grid as long as that gathers more marks.
+    """Move the design by steps of its grid as long as that assigns more marks.
 
-    A regular design laid one pitch off finds a candidate for all marks but those of a row.
+    A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
     """
     offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
     grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
@@ -314,7 +318,7 @@ def _strongest(candidates: Candidates, count: int) -> Candidates:
 
 
 def _starts(plane: Array, voters: Candidates, options: GridOptions) -> Iterator[Array]:
-    """Positions of the marks to begin from, the likeliest first."""
+    """Start positions of the marks, the likeliest first."""
     for similarity in _similarities(plane, voters, options):
         yield from _shifted(plane, similarity, voters)
 
@@ -325,7 +329,7 @@ def _complex(xy: Array) -> NDArray[np.complex128]:
 
 
 def _similarities(plane: Array, candidates: Candidates, options: GridOptions) -> list[complex]:
-    """Scales and rotations, as complex factors, that turn neighbours of the design into neighbours seen."""
+    """Scales and rotations, as complex factors, that map design neighbours to neighbouring candidates."""
 
     def steps(xy: Array, count: int) -> NDArray[np.complex128]:
         z = _complex(xy)
@@ -334,7 +338,7 @@ def _similarities(plane: Array, candidates: Candidates, options: GridOptions) ->
         return vectors
 
     designed, seen = steps(plane, _NEIGHBOURS), steps(candidates.xy, _NEIGHBOURS)
-    # Equal steps of a regular design vote with their number, once.
+    # Equal steps of a regular design vote once, weighted with their number.
     grain = np.abs(designed).min() / 50
     designed, weight = np.unique(np.round(designed / grain), return_counts=True)
     ratio = (seen[:, None] / (designed * grain)).ravel()
@@ -357,7 +361,7 @@ def _similarities(plane: Array, candidates: Candidates, options: GridOptions) ->
 
 
 def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[Array]:
-    """Positions of the marks for the shifts on which most pairs of mark and candidate agree."""
+    """Positions of the marks for the shifts supported by most pairs of mark and candidate."""
     turned = similarity * _complex(plane)
     offset = (_complex(candidates.xy)[:, None] - turned).ravel()
     pitch = abs(similarity) * spacing(plane)
@@ -373,3 +377,143 @@ def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[
         starts.append(np.stack([moved.real, moved.imag], axis=1))
         votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
     return starts
+
+
+_TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
+"""Sizes of a mark in the image that are tried if the size is unknown."""
+
+
+@dataclass(frozen=True)
+class PlacingOptions:
+    """What is known about a design in a frame.
+
+    Parameters
+    ----------
+    nominal : ndarray (n, 2), optional
+        Approximate positions in pixels.
+    within_px : float, optional
+        Uncertainty of the approximate positions, if known.
+    mark_px : float, optional
+        Size of a mark in the image.
+    psf_px : float
+        Width of the point-spread function.
+    grid : GridOptions
+        What is known about the grid, used without approximate positions.
+    """
+
+    nominal: Array | None
+    within_px: float | None
+    mark_px: float | None
+    psf_px: float
+    grid: GridOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Position of a design in a frame.
+
+    Parameters
+    ----------
+    screened : Screened
+        The screened frame.
+    assignment : Assignment
+        Marks with their candidates and the field through them.
+    mark_px : float
+        Approximate size of a mark in the image; the width of the line for a line grid.
+    """
+
+    screened: Screened
+    assignment: Assignment
+    mark_px: float
+
+
+def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions) -> Placement | Failure:
+    """Find the design in the frame; tries several mark sizes and keeps the best.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    design : ReseauDesign
+        The design, for the shape of its marks.
+    source : ndarray (n, 2)
+        Plane coordinates of the marks.
+    options : PlacingOptions
+        What is known about it.
+
+    Returns
+    -------
+    Placement or Failure
+        A failure if the design is not found.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+    """
+    mark = design.mark
+    size = mark.line_width if mark.shape == "line-grid" else mark.size
+    best: tuple[float, Placement] | None = None
+    for mark_px in _sizes(source, size, options):
+        screened = screen(frame, run=max(15, round(4 * mark_px)))
+        template = _template(design, mark_px, options.psf_px)
+        if len(template) > min(frame.pixels.shape):
+            continue
+        candidates = find_candidates(screened.grey, screened.valid, template)
+        found = _lay(source, size, candidates, screened, mark_px, options)
+        if found is None:
+            continue
+        strength = float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
+        if best is None or strength + found.score > best[0]:
+            best = (strength + found.score, Placement(screened, found, mark_px))
+        # All marks found, at the size of the design: no other size can be better.
+        if size is not None and found.score >= len(source) - 1:
+            break
+    marks = 0 if best is None else int((best[1].assignment.candidate >= 0).sum())
+    least = max(4, min(10, len(source) // 3))
+    if best is None or marks < least or best[1].assignment.score < -0.1 * len(source):
+        return Failure(
+            f"design {design.name!r} was not found in the frame of "
+            f"{frame.width}×{frame.height} px ({marks} of {len(source)} marks agree with it)",
+            Code.NOT_FOUND,
+            where=frame.name,
+        )
+    return best[1]
+
+
+def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[float, ...]:
+    if options.mark_px is not None:
+        return (options.mark_px,)
+    if options.nominal is not None and size is not None:
+        return (max(1.5, size * spacing(options.nominal) / spacing(source)),)
+    return _TRIAL_PX
+
+
+def _template(design: ReseauDesign, mark_px: float, psf_px: float) -> Array:
+    """Formed image of an upright mark of this size."""
+    mark, width = design.mark, mark_px
+    if mark.shape == "cross" and mark.size and mark.line_width:
+        width = mark_px * mark.line_width / mark.size
+    half = int(np.ceil((1.5 * mark_px + 2 if mark.shape == "line-grid" else mark_px / 2) + 4))
+    pixels = np.arange(-half, half + 1.0)
+    outline = mark_outline(mark.shape, mark_px, width, 0.5 * psf_px, 2.0 * half)
+    share = coverage(outline, pixels, pixels, psf_px)
+    return -share if design.polarity == "dark" else share
+
+
+def _lay(
+    source: Array,
+    size: float | None,
+    candidates: Candidates,
+    screened: Screened,
+    mark_px: float,
+    options: PlacingOptions,
+) -> Assignment | None:
+    if options.nominal is not None:
+        return assign(source, options.nominal, candidates, screened.valid, within_px=options.within_px)
+    found = lay_out(source, candidates, screened.valid, options.grid)
+    if found is None or size is None or options.mark_px is not None:
+        return found
+    # A pattern of the scene may fit the grid, but not with marks of another size than the design's.
+    ratio = size * spacing(found.predicted) / spacing(source) / mark_px
+    return found if 0.5 < ratio < 2.0 else None

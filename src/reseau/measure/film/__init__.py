@@ -1,8 +1,8 @@
 """The inner orientation of scanned film frames from their four edges."""
 
-from .camera import Kind, Roll, roll_of, transformed
 from .orientation import FrameOptions, FrameResult, orient_frames
 from .perforations import PITCH_MM, FilmPlane, edge_of, film_plane
+from .roll import Kind, Roll, roll_of, transformed
 
 __all__ = [
     "PITCH_MM",

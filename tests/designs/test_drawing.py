@@ -10,8 +10,8 @@ import pytest
 
 from reseau.core.errors import UsageError
 from reseau.designs import coded_testfield, regular_reseau, standard_reseau
+from reseau.designs.drawing import design_pdf, design_svg
 from reseau.io import Mark
-from reseau.report.drawing import design_pdf, design_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -9,12 +9,18 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ...core.data import Array, Mask
-from .band import Band
-from .border import Film
-from .companion import Companion, edge_beside_line
+from .adjacent_lines import (
+    FEW_DRAWN,
+    Companion,
+    Sharp,
+    common_widths,
+    drawn_by_lines,
+    edge_beside_line,
+    sharp_steps,
+)
+from .border import Band, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
-from .sharpness import FEW_DRAWN, Sharp, common_widths, drawn_by_lines, sharp_steps
 
 __all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
 

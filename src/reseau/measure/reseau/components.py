@@ -1,4 +1,4 @@
-"""Sums over the connected parts of a frame, compiled: one pass over its pixels."""
+"""Sums over connected components of a frame, compiled: one pass over its pixels."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ __all__ = ["part_sums"]
 
 @numba.njit(cache=True, nogil=True)
 def part_sums(labels: NDArray[Any], count: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Sums over parts, and their extents.
+    """Moments and extents of connected components.
 
     Parameters
     ----------
     labels : ndarray (h, w) of int
-        To which part each pixel belongs; 0 is the ground.
+        Component of each pixel; 0 is the background.
     count : int
-        Number of the parts, the ground included.
+        Number of components, including the background.
 
     Returns
     -------
     sums : ndarray (6, count)
-        Of 1, x, y, x², xy, y² over the pixels of each; all nought for the ground.
+        Sums of 1, x, y, x², xy, y² over the pixels of each component; 0 for the background.
     extent : ndarray (4, count) of int
         First and last column, first and last row of each.
     """

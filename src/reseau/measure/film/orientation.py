@@ -12,11 +12,10 @@ from ...core.data import Array
 from ...core.failure import Code, Failure
 from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...io.scans import Scan
-from .band import Band, read_band
+from .border import Band, read_band
 from .channel import FAR, Channel, channels_by_contrast, measure_channel
 from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
-from .outline import FrameGuess
-from .search import search_frames
+from .search import FrameGuess, search_frames
 
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
 

@@ -1,4 +1,4 @@
-"""What was measured in one frame, and what was not: the common part of all results."""
+"""Measured points of one frame: the columns that all results of a measurement share."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ __all__ = ["Measured"]
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The points of a design in one frame, in columns over all n of them.
+    """Points of a design measured in one frame, in columns over all n points of the design.
 
     Parameters
     ----------
     image, sha256 : str
-        The frame.
+        Name and hash of the frame.
     ids : tuple of str (n,)
-        Their names.
+        Names of the points.
     xy : ndarray (n, 2)
         Image coordinates in pixels, NaN where not measured.
     cov : ndarray (n, 2, 2)
         Covariances in px², NaN where not measured.
     ok : ndarray of bool (n,)
-        Which were measured.
+        Which points were measured.
     why : tuple of str (n,)
-        Why not, empty where measured.
+        Reason why a point was not measured; empty where it was.
     predicted : ndarray (n, 2)
-        Where the others have each.
+        Image coordinates predicted from the other points.
     deviation : ndarray (n, 2)
-        Measured minus predicted; NaN where not measured, or where there are too few others to predict.
+        Measured minus predicted; NaN where not measured, or where too few other points are known.
     contrast, t, noise : ndarray (n,)
-        Of each match, see :class:`reseau.measure.matching.Matches`; NaN where there was none.
+        Quality of each match, see :class:`reseau.measure.matching.Matches`; NaN where there was no match.
     """
 
     image: str
@@ -63,12 +63,12 @@ class Measured:
         return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
 
     def rms(self) -> Array:
-        """Deviation from the prediction, root mean square per axis (2,); NaN where there is none."""
+        """Root mean square deviation from the prediction, per axis (2,); NaN without predictions."""
         known = self.deviation[np.isfinite(self.deviation).all(axis=1)]
         return np.sqrt((known**2).mean(axis=0)) if len(known) else np.full(2, np.nan)
 
     def measurement(self) -> ReseauMeasurement:
-        """The result as the document that others read."""
+        """The result as a document."""
         return ReseauMeasurement.from_columns(
             self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
         )

@@ -19,8 +19,7 @@ from scipy.special import ndtr
 
 from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
-from .band import Band
-from .border import Border, Film, binned, border_of, row_median
+from .border import Band, Border, Film, binned, border_of, row_median
 
 __all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_function"]
 

@@ -17,8 +17,7 @@ from ...adjust import BatchOptions, GaussMarkov, Parameters, adjust_batch, robus
 from ...core.data import Array
 from ...core.failure import Code, Failure
 from ...io.scans import Scan
-from .band import read_band
-from .border import binned
+from .border import binned, read_band
 from .edges import measure_profiles, profile_function
 from .lines import robust_line
 

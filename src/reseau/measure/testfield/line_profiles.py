@@ -77,16 +77,16 @@ def crossings(xy: Array, along: Array, shape: tuple[int, int], beyond: float = 0
     xy : ndarray (m, 2)
         Points along the line, in and beyond the frame.
     along : ndarray (m,)
-        What parameter they have.
+        Parameter of the line at these points.
     shape : (int, int)
         Height and width of the frame.
     beyond : float
-        How far beyond its ends the line is followed, pixels.
+        Distance by which the line is extended beyond its ends, pixels.
 
     Returns
     -------
     Crossings or None
-        None where there are none.
+        None if the line does not cross the frame.
     """
     way = np.empty_like(xy)
     way[1:-1], way[0], way[-1] = xy[2:] - xy[:-2], xy[1] - xy[0], xy[-1] - xy[-2]
@@ -105,12 +105,12 @@ def crossings(xy: Array, along: Array, shape: tuple[int, int], beyond: float = 0
 
 
 def blur_of(psf_px: float, response: PixelResponse) -> float:
-    """Width (one sigma) of a blurred edge: a pixel's square has its variance in whatever direction."""
+    """Width (one sigma) of a blurred edge; the square of a pixel has the same variance in all directions."""
     return float(np.hypot(psf_px, response.fill / np.sqrt(12)))
 
 
 def strip(distance: Array, half_width: Array, blur: float) -> Array:
-    """Share of pixels that a strip takes, by their distances from its middle; all in pixels."""
+    """Share of pixels covered by a strip, from their distances to its centre line; all in pixels."""
     share: Array = ndtr((distance + half_width) / blur) - ndtr((distance - half_width) / blur)
     return share
 
@@ -118,7 +118,7 @@ def strip(distance: Array, half_width: Array, blur: float) -> Array:
 def located(
     grey: NDArray[np.float32], line: Crossings, half_width: Array, blur: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """How far a dark line is off its crossings, (n,) in pixels across, and which of these could be told."""
+    """Offsets (n,) of a dark line from its crossings, in pixels across, and a mask of determined ones."""
     h, w = grey.shape
     row, column, distance = line.around(_REACH)
     inside = ((row >= 0) & (row < h) & (column >= 0) & (column < w)).all(axis=1)
@@ -127,7 +127,7 @@ def located(
     slope = (np.exp(-0.5 * near**2) - np.exp(-0.5 * far**2)) / (np.sqrt(2 * np.pi) * blur)
     design = np.stack([np.ones_like(slope), strip(distance, half_width[:, None], blur), slope], axis=2)
     normal = np.swapaxes(design, 1, 2) @ design
-    normal[:, [0, 1, 2], [0, 1, 2]] += 1e-9  # where the pixels lie so that they tell nothing
+    normal[:, [0, 1, 2], [0, 1, 2]] += 1e-9  # regularizes where the pixels do not determine the profile
     x = np.linalg.solve(normal, np.swapaxes(design, 1, 2) @ seen[..., None])[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = x[:, 2] / x[:, 1]

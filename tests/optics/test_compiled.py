@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from reseau.optics.compiled import formed
 from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives
-from reseau.optics.single import formed
 from reseau.optics.targets import target_outline
 
 
