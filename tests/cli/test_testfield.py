@@ -64,4 +64,4 @@ def test_a_frame_without_the_testfield_is_said_to_be_so(reseau: Run, tmp_path: P
     coded_testfield().write(tmp_path / "field.json")
     status, out, err = reseau("measure", "testfield", tmp_path / "ramp.png", "-d", tmp_path / "field.json")
     assert (status, out) == (1, "")
-    assert "ramp.png: no straight lines are to be found" in err
+    assert "ramp.png: no straight lines were found" in err

@@ -244,7 +244,7 @@ def test_a_frame_without_the_reseau_is_a_failure_with_the_reason(kind, nominal):
         assert not result
         assert isinstance(result, Failure)
         assert result.code is Code.NOT_FOUND
-        assert str(result).startswith("clutter.png: design 'reseau' is not to be found")
+        assert str(result).startswith("clutter.png: design 'reseau' was not found")
         assert "\n" not in result.reason
 
 

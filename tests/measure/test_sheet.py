@@ -12,6 +12,7 @@ import pytest
 from reseau.cli import run
 from reseau.core.data import Frame
 from reseau.core.errors import FormatError
+from reseau.core.failure import Code
 from reseau.designs import coded_sheet
 from reseau.io import ReseauDesign, ReseauMeasurement
 from reseau.io.images import read_frame, write_image
@@ -63,7 +64,8 @@ def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
 def test_a_sheet_whose_rings_are_hidden_has_no_numbers() -> None:
     result = measure_reseau(sheets.form(sheets.Camera(10.0, 20.0), rings=False).frame, sheets.DESIGN)
     assert not result
-    assert "no coded ring tells" in result.reason
+    assert result.code is Code.AMBIGUOUS
+    assert "no coded ring identifies them" in result.reason
 
 
 def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
@@ -71,14 +73,15 @@ def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
     turned = Frame(np.ascontiguousarray(formed.frame.pixels[:, ::-1]), 255.0)
     result = measure_reseau(turned, sheets.DESIGN)
     assert not result
-    assert "mirrored" in result.reason
+    assert result.code is Code.MIRRORED
 
 
 def test_a_frame_without_a_sheet_is_a_failure_with_a_reason() -> None:
     noise = np.random.default_rng(1).normal(128, 6, (600, 800)).clip(0, 255).astype(np.uint8)
     result = measure_reseau(Frame(noise, 255.0), sheets.DESIGN)
     assert not result
-    assert "is not to be found" in result.reason
+    assert result.code is Code.NOT_FOUND
+    assert result.reason
 
 
 def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the_design() -> None:

@@ -21,7 +21,7 @@ def test_every_recording_is_measured_or_declined_by_its_name() -> None:
         TestfieldOptions(fill=0.8),
     )
     assert list(found.measured) == [station.name for station in stations]
-    assert found.declined == {"empty": "empty: no straight lines are to be found"}
+    assert found.declined == {"empty": "empty: no straight lines were found"}
     for (name, points), station in zip(found.points(), stations, strict=True):
         truth = bench.truth(station)
         rows = [truth.names.index(target) for target in points.names]
