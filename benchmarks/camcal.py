@@ -28,7 +28,7 @@ from shared import of_the_tests
 from reseau.bundle import Network, adjust_network
 from reseau.core.data import Array, Frame
 from reseau.io import ReseauDesign
-from reseau.io.images import Channel, read_frame
+from reseau.io.images import Channel, read_image
 from reseau.io.network import Network1
 from reseau.measure import ReseauResult, measure_reseau
 from reseau.optics.formation import Outline
@@ -58,7 +58,7 @@ class Photograph:
 
 def measure(path: Path, design: ReseauDesign, theirs: dict[str, Array], channel: Channel) -> Photograph:
     cv2.setNumThreads(1)
-    frame = read_frame(path, channel)
+    frame = read_image(path, channel)
     start = time.perf_counter()
     result = measure_reseau(frame, design)
     wall = time.perf_counter() - start
@@ -67,7 +67,7 @@ def measure(path: Path, design: ReseauDesign, theirs: dict[str, Array], channel:
     # Their origin is the corner of a pixel, ours its centre.
     marks = np.array([theirs.get(name, np.full(2, np.nan)) for name in design.ids]) - 0.5
     shift, radius = ellipses(result, design)
-    centre = centroids(read_frame(path), result.xy + shift, radius)
+    centre = centroids(read_image(path), result.xy + shift, radius)
     return Photograph(path.name, result, marks, result.xy + shift, centre, wall)
 
 

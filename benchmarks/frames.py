@@ -25,7 +25,8 @@ from cruz import cruz_corners
 from real_frames import print_real
 
 from reseau.core.data import Array
-from reseau.io.scans import open_scan, scan_of
+from reseau.io.images import open_scan
+from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
 from reseau.procedures.frame import helped
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame

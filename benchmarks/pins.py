@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from reseau.core.data import Array, Frame, ImagePoints
-from reseau.io.images import read_frame, write_image
+from reseau.io.images import read_image, write_image
 from reseau.measure import PinDetections, Wires, find_pins, lay_wires
 from reseau.measure.fitting import fit_mapping
 from reseau.optics import RationalPolynomial
@@ -144,7 +144,7 @@ def sequence(folder: Path, name: str, overlay: Path | None, others: int) -> Tall
     """Measure all frames of a sequence."""
     reference = json.loads((folder / f"{name}.reference.json").read_text("utf-8"))
     tally = Tally()
-    frames = [read_frame(folder / record["image"]) for record in reference["frames"]]
+    frames = [read_image(folder / record["image"]) for record in reference["frames"]]
     pictured = len(frames) // 3
     for k, (record, frame) in enumerate(zip(reference["frames"], frames, strict=True)):
         apart = [

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reseau.core.data import Array
-from reseau.io.images import write_image
-from reseau.io.scans import Scan, open_scan
+from reseau.io.images import open_scan, write_image
+from reseau.io.scans import Scan
 from reseau.measure.film import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
 from reseau.report.frames import contact_sheet, frame_tile
 

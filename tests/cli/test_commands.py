@@ -17,7 +17,7 @@ import tifffile
 
 from reseau.calibration.document import Calibration
 from reseau.io import ReseauDesign, ReseauMeasurement
-from reseau.io.images import read_frame, write_image
+from reseau.io.images import read_image, write_image
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -121,7 +121,7 @@ def test_a_corrected_image_has_its_marks_in_place(
     out = tmp_path / f"out{Path(name).suffix}"
     status, text, _ = reseau("apply", calibration, tmp_path / name, "-o", out, "--scale", 5, "--json")
     assert status == 0
-    raster, frame = json.loads(text), read_frame(out)
+    raster, frame = json.loads(text), read_image(out)
     assert frame.pixels.dtype == dtype
     assert (frame.width, frame.height) == (raster["width"], raster["height"])
     origin = photo.grid.xy[photo.grid.ids.index(photo.grid.origin)]

@@ -1,4 +1,4 @@
-"""Image files: values kept, headers asked first, damage told."""
+"""Image files: values are kept, headers are checked first, damage is reported."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tifffile
 
 from reseau.core.errors import ImageError, InputError
 from reseau.core.provenance import sha256_of
-from reseau.io.images import MAX_PIXELS, read_frame, write_image
+from reseau.io.images import MAX_PIXELS, read_image, write_image
 
 GREY8 = np.random.default_rng(1).integers(0, 256, (40, 60)).astype(np.uint8)
 GREY16 = np.random.default_rng(2).integers(0, 65536, (40, 60)).astype(np.uint16)
@@ -19,12 +19,10 @@ GREY16 = np.random.default_rng(2).integers(0, 65536, (40, 60)).astype(np.uint16)
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("pixels", [GREY8, GREY16], ids=["8-bit", "16-bit"])
-def test_grey_values_survive_the_way_to_the_file_and_back(
-    tmp_path: Path, suffix: str, pixels: np.ndarray
-) -> None:
+def test_grey_values_are_written_and_read_unchanged(tmp_path: Path, suffix: str, pixels: np.ndarray) -> None:
     path = tmp_path / f"a{suffix}"
     write_image(path, pixels)
-    frame = read_frame(path)
+    frame = read_image(path)
     np.testing.assert_array_equal(frame.pixels, pixels)
     assert frame.pixels.dtype == pixels.dtype
     assert frame.full_scale == np.iinfo(pixels.dtype).max
@@ -34,7 +32,7 @@ def test_grey_values_survive_the_way_to_the_file_and_back(
 def test_a_jpeg_is_read_as_its_grey_values(tmp_path: Path) -> None:
     smooth = np.tile(np.arange(60, dtype=np.uint8) * 4, (40, 1))
     write_image(tmp_path / "a.jpg", smooth)
-    assert np.abs(read_frame(tmp_path / "a.jpg").pixels.astype(int) - smooth).max() <= 3
+    assert np.abs(read_image(tmp_path / "a.jpg").pixels.astype(int) - smooth).max() <= 3
 
 
 def test_colour_becomes_its_luma(tmp_path: Path) -> None:
@@ -44,17 +42,17 @@ def test_colour_becomes_its_luma(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", rgb)
     tifffile.imwrite(tmp_path / "a.tif", rgb, photometric="rgb")
     for name in ("a.png", "a.tif"):
-        assert (read_frame(tmp_path / name).pixels == luma).all()
+        assert (read_image(tmp_path / name).pixels == luma).all()
 
 
 def test_tiff_of_other_kinds(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "white.tif", GREY8, photometric="miniswhite")
-    np.testing.assert_array_equal(read_frame(tmp_path / "white.tif").pixels, 255 - GREY8)
+    np.testing.assert_array_equal(read_image(tmp_path / "white.tif").pixels, 255 - GREY8)
     tifffile.imwrite(tmp_path / "signed.tif", np.full((4, 4), -5, dtype=np.int16))
-    assert read_frame(tmp_path / "signed.tif").pixels[0, 0] == -5
+    assert read_image(tmp_path / "signed.tif").pixels[0, 0] == -5
     tifffile.imwrite(tmp_path / "long.tif", np.zeros((4, 4), dtype=np.uint32))
     with pytest.raises(ImageError, match="uint32"):
-        read_frame(tmp_path / "long.tif")
+        read_image(tmp_path / "long.tif")
 
 
 def test_a_huge_image_is_refused_by_its_header(tmp_path: Path) -> None:
@@ -63,7 +61,7 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path: Path) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR" + side + side + bytes(29))
     with pytest.raises(ImageError, match=f"100000×100000 pixels, more than {MAX_PIXELS:,}"):
-        read_frame(path)
+        read_image(path)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
@@ -73,22 +71,22 @@ def test_truncated_images_are_refused(tmp_path: Path, suffix: str, part: float) 
     whole = (tmp_path / f"a{suffix}").read_bytes()
     (tmp_path / f"b{suffix}").write_bytes(whole[: int(len(whole) * part)])
     with pytest.raises(ImageError, match=rf"b\{suffix}: is a (truncated|damaged)"):
-        read_frame(tmp_path / f"b{suffix}")
+        read_image(tmp_path / f"b{suffix}")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"%PDF-1.4", bytes(1000)])
-def test_what_is_no_image_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_an_image_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(ImageError, match=r"a\.png: is no PNG, JPEG, TIFF or BMP"):
-        read_frame(path)
+    with pytest.raises(ImageError, match=r"a\.png: is not a PNG, JPEG, TIFF or BMP"):
+        read_image(path)
 
 
-def test_what_is_not_there_cannot_be_read(tmp_path: Path) -> None:
+def test_a_missing_file_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        read_frame(tmp_path / "none.png")
+        read_image(tmp_path / "none.png")
     with pytest.raises(InputError, match="cannot be read"):
-        read_frame(tmp_path)
+        read_image(tmp_path)
 
 
 def test_only_images_are_written(tmp_path: Path) -> None:

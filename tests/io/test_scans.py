@@ -1,4 +1,4 @@
-"""Scans: every way of storing pixels gives the same windows, and what cannot be measured in is named."""
+"""Scans: windows do not depend on how a file stores its pixels; unsupported kinds are named."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 import tifffile
 
 from reseau.core.errors import ImageError, InputError
-from reseau.io.images import write_image
-from reseau.io.scans import open_scan
+from reseau.io.images import open_scan, write_image
 
 RNG = np.random.default_rng(0)
 RGB = RNG.integers(0, 256, (300, 210, 3)).astype(np.uint8)
@@ -33,7 +32,7 @@ DEEP = RNG.integers(0, 65536, (300, 210)).astype(np.uint16)
         (DEEP, {"photometric": "miniswhite"}),
     ],
 )
-def test_windows_of_a_tiff_are_the_pixels_however_they_are_stored(
+def test_windows_of_a_tiff_do_not_depend_on_its_storage(
     pixels: Any, how: dict[str, Any], tmp_path: Path
 ) -> None:
     stored = np.moveaxis(pixels, -1, 0) if how.get("planarconfig") and pixels.ndim == 3 else pixels
@@ -51,7 +50,7 @@ def test_windows_of_a_tiff_are_the_pixels_however_they_are_stored(
         assert seen.dtype == pixels.dtype
 
 
-def test_an_overview_averages_and_says_where_its_pixels_are(tmp_path: Path) -> None:
+def test_an_overview_averages_and_keeps_the_pixel_centres(tmp_path: Path) -> None:
     ramp = np.arange(210, dtype=np.uint16)[None] + 1000 * np.ones((300, 1), dtype=np.uint16)
     tifffile.imwrite(tmp_path / "a.tif", ramp.astype(np.uint16))
     small, r = open_scan(tmp_path / "a.tif").overview(100)
@@ -71,7 +70,7 @@ def test_other_images_have_their_channels_in_the_order_of_their_names(name: str,
     np.testing.assert_allclose(scan.window(0, 40, 0, 50).mean(axis=(0, 1)), [10, 100, 200], atol=2)
 
 
-def test_what_cannot_be_measured_in_is_named_and_what_would_help(tmp_path: Path) -> None:
+def test_unsupported_kinds_are_named_with_a_remedy(tmp_path: Path) -> None:
     def tiff(name: str, pixels: Any, **how: Any) -> Path:
         tifffile.imwrite(tmp_path / name, pixels, **how)
         return tmp_path / name
@@ -79,9 +78,9 @@ def test_what_cannot_be_measured_in_is_named_and_what_would_help(tmp_path: Path)
     cmyk = tiff("cmyk.tif", np.zeros((20, 20, 4), np.uint8), photometric="separated")
     colours = np.zeros((3, 256), np.uint16)
     palette = tiff("palette.tif", np.zeros((20, 20), np.uint8), photometric="palette", colormap=colours)
-    bits = tiff("bits.tif", np.zeros((20, 20), bool))
-    real = tiff("real.tif", np.zeros((20, 20), np.float32))
-    for path, what in ((cmyk, "CMYK"), (palette, "palette"), (bits, "1 bit"), (real, "32 bit floating")):
+    long = tiff("long.tif", np.zeros((20, 20), np.uint32))
+    wave = tiff("wave.tif", np.zeros((20, 20), np.complex64))
+    for path, what in ((cmyk, "CMYK"), (palette, "palette"), (long, "type uint32"), (wave, "type complex64")):
         with pytest.raises(ImageError, match=f"{path.name}: .*{what}.*; convert it"):
             open_scan(path)
     whole = tiff("whole.tif", DEEP)
@@ -92,11 +91,11 @@ def test_what_cannot_be_measured_in_is_named_and_what_would_help(tmp_path: Path)
     with pytest.raises(InputError, match="cannot be read"):
         open_scan(tmp_path / "none.tif")
     (tmp_path / "text.png").write_text("no image")
-    with pytest.raises(ImageError, match="no PNG, JPEG, TIFF or BMP"):
+    with pytest.raises(ImageError, match="is not a PNG, JPEG, TIFF or BMP"):
         open_scan(tmp_path / "text.png")
 
 
-def test_a_resolution_nobody_measured_is_none(tmp_path: Path) -> None:
+def test_an_unknown_resolution_is_none(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", DEEP)
     assert open_scan(tmp_path / "a.png").dpi is None
     tifffile.imwrite(tmp_path / "a.tif", DEEP)

@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates
 
 from reseau.core.data import Array, Frame, Mask
 from reseau.io import ReseauDesign
-from reseau.io.images import read_frame
+from reseau.io.images import read_image
 from reseau.measure.screening import screen
 from reseau.optics.field import SmoothField
 from reseau.optics.resampling import on_lattice
@@ -103,7 +103,7 @@ def load(name: str, directory: Path | None = None) -> RealFrame:
     corrected = next(directory.glob(f"{name}*GEOM*.tif"), None)
     return RealFrame(
         name,
-        read_frame(directory / f"{name}.png"),
+        read_image(directory / f"{name}.png"),
         design,
         others,
         None if corrected is None else tifffile.imread(corrected).astype(float),

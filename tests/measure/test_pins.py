@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from reseau.core.data import Array, Frame
 from reseau.core.errors import ImageError, UsageError
 from reseau.io import ReseauDesign
-from reseau.io.images import read_frame
+from reseau.io.images import read_image
 from reseau.measure import PinOptions, Wires, find_pins, lay_wires, measure_pins
 from reseau.optics import Arcs
 
@@ -371,7 +371,7 @@ def test_real_frames_have_every_wire_that_plus_found(
     reference = json.loads((folder / f"{sequence}.reference.json").read_text("utf-8"))
     deviation = []
     for record in reference["frames"][::every]:
-        seen = find_pins(read_frame(folder / record["image"]), PinOptions())
+        seen = find_pins(read_image(folder / record["image"]), PinOptions())
         points = record["points"]
         wires = np.array(list(points.values()) if isinstance(points, dict) else points, float).reshape(-1, 2)
         known = np.concatenate([wires, np.array(record.get("candidates", []), float).reshape(-1, 3)[:, :2]])

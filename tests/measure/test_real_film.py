@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.io.scans import open_scan
+from reseau.io.images import open_scan
 from reseau.measure.film import PITCH_MM, FrameOptions, edge_of, film_plane, orient_frames
 
 STILLS = {

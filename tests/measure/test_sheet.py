@@ -15,7 +15,7 @@ from reseau.core.errors import FormatError
 from reseau.core.failure import Code
 from reseau.designs import coded_sheet
 from reseau.io import ReseauDesign, ReseauMeasurement
-from reseau.io.images import read_frame, write_image
+from reseau.io.images import read_image, write_image
 from reseau.measure import ReseauResult, measure_reseau
 
 from . import camcal, sheets
@@ -118,7 +118,7 @@ def test_in_photographs_every_disk_that_another_program_found_is_measured_and_nu
 ) -> None:
     folder = reference_data("testfield_camcal")
     design, theirs = camcal.design(folder), camcal.marks(folder)[number - 1]
-    result = measure_reseau(read_frame(camcal.photographs(folder)[number - 1], "green"), design)
+    result = measure_reseau(read_image(camcal.photographs(folder)[number - 1], "green"), design)
     assert isinstance(result, ReseauResult)
     rows = [design.ids.index(name) for name in theirs]
     assert result.ok[rows].all()

@@ -77,14 +77,14 @@ def _image(
     from ..calibration.document import Calibration
     from ..core.errors import UsageError
     from ..core.provenance import Provenance, canonical_json, sha256_of
-    from ..io.images import read_frame
+    from ..io.images import read_image
     from ..refine import CorrectedImage, write_corrected
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
     out = out or source.with_name(f"{source.stem}-corrected{source.suffix}")
     suffix_of(writable(out), _IMAGES)
-    frame = read_frame(source)
+    frame = read_image(source)
     validity = Calibration.read(calibration).validity
     plan = CorrectedImage.plan(correction, (frame.width, frame.height), validity.get("extent"), scale)
     with progress(f"resampling {source.name}", plan.bands) as step:

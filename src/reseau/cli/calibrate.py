@@ -195,14 +195,14 @@ def _frames(
     paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs one after the other, or what was measured in them."""
-    from ..io.images import read_frame
+    from ..io.images import read_image
 
     for path in paths:
         step(f"measuring {path.name}")
         if is_points(path):
             yield path.name, read_measurement(path).image_points()
         else:
-            yield corrected(read_frame(path, channel.value), sensor)
+            yield corrected(read_image(path, channel.value), sensor)
 
 
 def _model(pitch: float | None, side: str, free: str) -> CameraModel:

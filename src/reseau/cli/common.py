@@ -78,9 +78,9 @@ def parsed_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
 
 def read_photo(path: Path) -> Frame | ImagePoints:
     """An image, or the image coordinates that were measured in one."""
-    from ..io.images import read_frame
+    from ..io.images import read_image
 
-    return read_measurement(path).image_points() if is_points(path) else read_frame(path)
+    return read_measurement(path).image_points() if is_points(path) else read_image(path)
 
 
 def required(found: T | Failure, where: object) -> T:

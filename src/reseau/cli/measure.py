@@ -61,7 +61,7 @@ def reseau(
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
     from ..io import ReseauDesign
-    from ..io.images import read_frame
+    from ..io.images import read_image
     from ..measure import ReseauOptions, measure_reseau
 
     suffix = _suffix(out)
@@ -70,7 +70,7 @@ def reseau(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = corrected(read_frame(image, channel.value), sensor)
+        frame = corrected(read_image(image, channel.value), sensor)
         options = ReseauOptions(mark_px=mark_px, row_jitter_px=row_jitter)
         with progress(f"measuring {image.name}", 1):
             result = required(measure_reseau(frame, target, options), image)
@@ -95,7 +95,7 @@ def pins(
 ) -> None:
     """Measure the rods of an ultrasonic test object."""
     from ..io import ReseauDesign
-    from ..io.images import read_frame
+    from ..io.images import read_image
     from ..measure import PinOptions, measure_pins
 
     suffix = _suffix(out)
@@ -105,8 +105,8 @@ def pins(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = corrected(read_frame(image), sensor)
-        others = [corrected(read_frame(path), sensor) for path in also or []]
+        frame = corrected(read_image(image), sensor)
+        others = [corrected(read_image(path), sensor) for path in also or []]
         options = PinOptions(most_length_px=max_length_px, max_rotation_deg=max_rotation)
         with progress(f"measuring {image.name}", 1):
             result = required(measure_pins(frame, target, options, others), image)
@@ -128,7 +128,7 @@ def coded_field(
 ) -> None:
     """Measure the targets of a coded testfield."""
     from ..io import TestfieldDesign
-    from ..io.images import read_frame
+    from ..io.images import read_image
     from ..measure import TestfieldOptions, measure_testfield
 
     suffix = _suffix(out)
@@ -137,7 +137,7 @@ def coded_field(
     if is_points(image):
         found = read_measurement(image)
     else:
-        frame = corrected(read_frame(image), sensor)
+        frame = corrected(read_image(image), sensor)
         with progress(f"measuring {image.name}", 1):
             options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
             result = required(measure_testfield(frame, target, options), image)

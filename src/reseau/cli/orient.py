@@ -161,7 +161,7 @@ def _options(job: _Job) -> FrameOptions:
 def _run(job: _Job, before: _Done | None = None) -> _Done:
     """Orient the frames of one image and write what came of them; in a process of its own."""
     from ..io import FrameCorners
-    from ..io.scans import open_scan
+    from ..io.images import open_scan
     from ..procedures.frame import described, helped, orient_scan
 
     try:

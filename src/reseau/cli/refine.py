@@ -59,10 +59,10 @@ class _Files:
 
     def frames(self) -> list[Frame | None]:
         """The photographs in their order; None for those that are given as coordinates."""
-        from ..io.images import read_frame
+        from ..io.images import read_image
 
         paths = (self.photo_i, self.photo_ii, *self.photo_iii)
-        return [None if path is None or is_points(path) else read_frame(path) for path in paths]
+        return [None if path is None or is_points(path) else read_image(path) for path in paths]
 
 
 def refine(

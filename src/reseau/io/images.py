@@ -1,7 +1,18 @@
-"""Image files in and out: PNG, JPEG and TIFF, 8 and 16 bit, bounded in memory."""
+"""Image files: one reader for whole frames and for windows of scans, and a writer.
+
+Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and the first page of a TIFF with grey or RGB
+samples of 1, 8 or 16 bit, signed 16 bit, or floating point, uncompressed or in a compression that tifffile
+decodes. Grey values are never rescaled; an alpha channel is ignored, and so is an orientation tag: pixel
+coordinates are those of the sensor.
+
+An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
+are decoded.
+"""
 
 from __future__ import annotations
 
+import mmap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,100 +20,156 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.data import Frame
-from ..core.errors import ImageError, InputError
+from ..core.errors import ImageError, InputError, UsageError
 from ..core.provenance import sha256_of
 from . import write_whole
+from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
-__all__ = ["MAX_PIXELS", "Channel", "decoded", "read_frame", "write_image"]
+__all__ = ["MAX_PIXELS", "Channel", "open_scan", "read_image", "write_image"]
 
 MAX_PIXELS = 500_000_000
-"""The largest image that is read whole; the header is asked before a pixel is decoded."""
+"""The largest image that is read whole; its header is checked before a pixel is decoded."""
 
-_GREY = np.array([0.114, 0.587, 0.299])  # Rec. 601 luma, in OpenCV's order blue, green, red
-
+_LUMA = {"blue": 0.114, "green": 0.587, "red": 0.299}
+"""Weights of Rec. 601, in the order in which they are summed."""
+_HELD, _AROUND = 50_000_000, 65_536
+"""Bytes of a mapped file that are held in memory, and bytes that a system maps around one that is read."""
+_HELP = "convert it to grey or RGB of 8 or 16 bit"
+_AGAIN = "copy or scan it again"
 
 Channel = Literal["luma", "red", "green", "blue"]
-_BGR: tuple[Channel, ...] = ("blue", "green", "red")
 
 
-def read_frame(path: Path | str, channel: Channel = "luma") -> Frame:
-    """Read an image file as a grey frame; values keep their scale.
+def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
+    """Read an image file as a grey frame.
 
     Parameters
     ----------
     path : path
-        PNG, JPEG, TIFF (any size and compression that tifffile knows) or BMP.
+        PNG, JPEG, BMP or TIFF; see :mod:`reseau.io.images` for the kinds of TIFF.
     channel : {"luma", "red", "green", "blue"}
-        What is taken of a colour image. A lens images colours at slightly different scales; in one channel
-        that shifts nothing.
+        What is taken of a colour image. A lens images colours at slightly different scales; a single channel
+        avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
+
+    Returns
+    -------
+    Frame
+        Grey values in the scale of the file.
 
     Raises
     ------
     InputError
         When the file cannot be read.
     ImageError
-        When it is no image, a damaged one, or larger than `MAX_PIXELS`.
+        When it is not an image, damaged, of an unsupported kind, or larger than `MAX_PIXELS`.
+    UsageError
+        When there is no such channel.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_image(Path(folder) / "flat.png", np.full((4, 6), 200, dtype=np.uint8))
+    ...     frame = read_image(Path(folder) / "flat.png")
+    >>> frame.name, frame.width, frame.height, frame.full_scale
+    ('flat.png', 6, 4, 255.0)
     """
     path = Path(path)
+    if channel != "luma" and channel not in _LUMA:
+        raise UsageError("is not a channel", where=channel, do="use luma, red, green or blue")
     digest = sha256_of(path)
-    with path.open("rb") as stream:
-        magic = stream.read(32)
-    if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        pixels, full_scale = _read_tiff(path, channel)
+    scan = open_scan(path)
+    _check_size(path, scan.width, scan.height)
+    pixels = scan.window(0, scan.height, 0, scan.width)
+    if len(scan.channels) == 1:
+        grey = np.array(pixels[:, :, 0])
+    elif channel != "luma":
+        grey = np.array(pixels[:, :, scan.channels.index(channel)])
     else:
-        pixels, full_scale = _read_coded(path, magic, channel)
-    return Frame(pixels, full_scale, path.name, digest)
+        grey = _luma(pixels, scan.channels)
+    return Frame(grey, scan.full_scale, path.name, digest)
 
 
-def _too_large(path: Path, width: int, height: int) -> None:
+def _luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
+    grey = np.zeros(pixels.shape[:2], dtype=np.float32)
+    for name, weight in _LUMA.items():
+        grey += np.float32(weight) * pixels[:, :, channels.index(name)]
+    return grey if pixels.dtype.kind == "f" else np.rint(grey).astype(pixels.dtype)
+
+
+def open_scan(path: Path | str) -> Scan:
+    """Open an image file to read it window by window.
+
+    Parameters
+    ----------
+    path : path
+        As for :func:`read_image`; a TIFF may have any size.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    ImageError
+        When it is not an image, damaged, or of an unsupported kind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_image(Path(folder) / "flat.tif", np.full((400, 600), 9, dtype=np.uint16))
+    ...     scan = open_scan(Path(folder) / "flat.tif")
+    ...     scan.channels, scan.window(100, 102, 200, 203).shape
+    (('grey',), (2, 3, 1))
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            magic = stream.read(64)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _open_tiff(path)
+    pixels = _decoded(path, magic)
+    _check_least(path, pixels.shape[1], pixels.shape[0])
+    if pixels.ndim == 3:
+        pixels = pixels[:, :, 2::-1] if pixels.shape[2] >= 3 else pixels[:, :, :1]
+    return scan_of(pixels, path.name, _coded_dpi(magic))
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise ImageError(f"has {width}×{height} pixels, more than {MAX_PIXELS:,}", where=path, do="crop it")
 
 
-def _full_scale(dtype: np.dtype[Any], path: Path) -> float:
-    if dtype.kind == "u" and dtype.itemsize <= 2:
-        return float(np.iinfo(dtype).max)
-    if dtype == np.int16:  # as planetary archives store 12 and more bits
-        return 32767.0
-    if dtype.kind == "f":
-        return 1.0
-    raise ImageError(f"has grey values of type {dtype}", where=path, do="convert it to 8 or 16 bit grey")
+def _check_least(path: Path, width: int, height: int) -> None:
+    if min(width, height) < 2:
+        raise ImageError(f"has {width}×{height} pixels, fewer than 2×2", where=path)
 
 
-def _read_tiff(path: Path, channel: Channel) -> tuple[NDArray[Any], float]:
-    import tifffile
+# PNG, JPEG and BMP
 
+
+def _decoded(path: Path, magic: bytes) -> NDArray[Any]:
+    """Pixels of a PNG, JPEG or BMP with the given first bytes: (h, w), or (h, w, c) in the order BGR."""
+    import cv2
+
+    _check_size(path, *_header_size(magic, path))
+    coded = np.fromfile(path, dtype=np.uint8)
+    # The decoder fills the missing part of a truncated file with grey, silently: check the end mark.
+    end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(magic[:2], b"")
+    if end not in coded[-4096:].tobytes():
+        raise ImageError("is a truncated image", where=path, do=_AGAIN)
     try:
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages.first
-            _too_large(path, page.imagewidth, page.imagelength)
-            colour = tifffile.PHOTOMETRIC(page.photometric).name
-            if colour not in ("MINISBLACK", "MINISWHITE", "RGB"):
-                raise ImageError(f"is a TIFF of colour {colour}", where=path, do="convert it to grey or RGB")
-            pixels = page.asarray()
-    except ImageError:
-        raise
-    except Exception as error:  # tifffile and its codecs raise of every kind on damaged files
-        raise ImageError(f"is a damaged TIFF ({error})", where=path) from None
-    if pixels.dtype == bool:
-        pixels = pixels.astype(np.uint8) * np.uint8(255)
-    full_scale = _full_scale(pixels.dtype, path)
-    if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
-        pixels = _grey(pixels[:, :, 2::-1], channel)
-    return (np.iinfo(pixels.dtype).max - pixels if colour == "MINISWHITE" else pixels), full_scale
-
-
-def _grey(bgr: NDArray[Any], channel: Channel) -> NDArray[Any]:
-    if channel != "luma":
-        return np.ascontiguousarray(bgr[:, :, _BGR.index(channel)])
-    grey = np.zeros(bgr.shape[:2], dtype=np.float32)
-    for k, weight in enumerate(_GREY):
-        grey += np.float32(weight) * bgr[:, :, k]
-    return grey if bgr.dtype.kind == "f" else np.rint(grey).astype(bgr.dtype)
+        pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ImageError("is a damaged image", where=path, do=_AGAIN)
+    return np.asarray(pixels)
 
 
 def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
-    """Width and height that the header of a PNG, JPEG or BMP promises."""
+    """Width and height stated in the header of a PNG, JPEG or BMP."""
     if magic.startswith(b"\x89PNG\r\n\x1a\n"):
         return int.from_bytes(magic[16:20], "big"), int.from_bytes(magic[20:24], "big")
     if magic.startswith(b"BM"):
@@ -119,48 +186,219 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
                     sizes = stream.read(5)
                     return int.from_bytes(sizes[3:5], "big"), int.from_bytes(sizes[1:3], "big")
                 stream.seek(length - 2, 1)
-        raise ImageError("is a damaged JPEG", where=path)
-    raise ImageError("is no PNG, JPEG, TIFF or BMP image", where=path)
+        raise ImageError("is a damaged JPEG", where=path, do=_AGAIN)
+    raise ImageError("is not a PNG, JPEG, TIFF or BMP image", where=path)
 
 
-def _read_coded(path: Path, magic: bytes, channel: Channel) -> tuple[NDArray[Any], float]:
-    pixels = decoded(path, magic)
-    full_scale = _full_scale(pixels.dtype, path)
-    return (_grey(pixels, channel) if pixels.ndim == 3 else pixels), full_scale
+def _coded_dpi(magic: bytes) -> float | None:
+    """Resolution of a JFIF header, or of a PNG with ``pHYs`` as its second chunk; others are not read."""
+    if magic[6:11] == b"JFIF\0":
+        unit, density = magic[13], int.from_bytes(magic[14:16], "big")
+        # Programs that do not know the resolution write 72 or 96.
+        known = unit in (1, 2) and density not in (0, 1, 72, 96)
+        return density * (1.0 if unit == 1 else 2.54) if known else None
+    if magic[37:41] == b"pHYs" and magic[49:50] == b"\x01":
+        return int.from_bytes(magic[41:45], "big") * 0.0254 or None
+    return None
 
 
-def decoded(path: Path, magic: bytes) -> NDArray[Any]:
-    """Pixels of a PNG, JPEG or BMP with the given first bytes: (h, w), or (h, w, c) in the order BGR.
+# TIFF
 
-    Raises
-    ------
-    ImageError
-        When it is none of these, damaged, truncated or too large.
-    """
-    import cv2
 
-    _too_large(path, *_header_size(magic, path))
-    coded = np.fromfile(path, dtype=np.uint8)
-    # The decoder fills what a truncated file lacks with grey and says nothing: ask for the end mark.
-    end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(magic[:2], b"")
-    if end not in coded[-4096:].tobytes():
-        raise ImageError("is a truncated image", where=path, do="copy it anew")
+def _open_tiff(path: Path) -> Scan:
+    import tifffile
+
     try:
-        pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise ImageError("is a damaged image", where=path)
-    return np.asarray(pixels)
+        with tifffile.TiffFile(path) as tiff:
+            page: Any = tiff.pages.first
+            full_scale = _usable(page, path)
+            mapped = page.is_memmappable and page.dtype.kind != "b"
+            # The file must hold all data: reading a mapping beyond the end of its file is a bus error.
+            if mapped:
+                ends = [page.dataoffsets[0] + page.nbytes]
+            else:
+                ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)]
+            if not ends or max(ends) > path.stat().st_size:
+                raise ImageError("is a truncated TIFF", where=path, do=_AGAIN)
+            window = _mapped(page, path) if mapped else _decoding(page, path)
+            dpi = _tiff_dpi(page)
+    except ImageError:
+        raise
+    except Exception as error:  # tifffile and its codecs raise exceptions of every kind on damaged files
+        raise ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN) from None
+    dtype = np.dtype(np.uint8 if page.dtype.kind == "b" else page.dtype)
+    return Scan(
+        path.name,
+        page.imagewidth,
+        page.imagelength,
+        CHANNELS[_colours(page)],
+        full_scale,
+        dpi,
+        dtype,
+        _as_stored(window, page, path, dtype, full_scale),
+    )
+
+
+def _usable(page: Any, path: Path) -> float:
+    """Full scale of a page; raises when its kind is not supported."""
+    import tifffile
+
+    colour = tifffile.PHOTOMETRIC(page.photometric).name
+    if colour not in ("MINISBLACK", "MINISWHITE", "RGB", "YCBCR"):
+        known = {"SEPARATED": "CMYK", "PALETTE": "a palette"}.get(colour, colour)
+        raise ImageError(f"is a TIFF of colour {known}", where=path, do=_HELP)
+    coding = tifffile.COMPRESSION(page.compression).name
+    # Codecs for photographs return RGB; others would return the luminance as red.
+    if colour == "YCBCR" and coding in (
+        "NONE",
+        "LZW",
+        "DEFLATE",
+        "ADOBE_DEFLATE",
+        "PACKBITS",
+        "LZMA",
+        "ZSTD",
+    ):
+        raise ImageError("is a TIFF of colour YCBCR that is not a JPEG", where=path, do=_HELP)
+    if page.dtype is None:
+        raise ImageError(f"has grey values of {page.bitspersample} bit", where=path, do=_HELP)
+    dtype = np.dtype(page.dtype)
+    full_scale = 255.0 if dtype.kind == "b" else full_scale_of(dtype, path)
+    if page.samplesperpixel not in (1, 2, 3, 4) or page.imagedepth > 1:
+        raise ImageError(f"is a TIFF of {page.samplesperpixel} samples per pixel", where=path, do=_HELP)
+    _check_least(path, page.imagewidth, page.imagelength)
+    return full_scale
+
+
+def _colours(page: Any) -> int:
+    return 3 if page.samplesperpixel >= 3 else 1
+
+
+def _as_stored(window: Window, page: Any, path: Path, dtype: np.dtype[Any], full_scale: float) -> Window:
+    """Windows with bits as 0 and 255, with black at zero, and with finite values."""
+    bits, real = page.dtype.kind == "b", dtype.kind == "f"
+    inverted: Callable[[NDArray[Any]], NDArray[Any]] | None = None
+    if page.photometric == 0:  # white is zero
+        top = full_scale if real else np.iinfo(dtype).max
+        inverted = lambda values: np.asarray(top - values, dtype=dtype)  # noqa: E731
+    if not bits and not real and inverted is None:
+        return window
+
+    def stored(t: int, b: int, le: int, r: int) -> NDArray[Any]:
+        values = window(t, b, le, r)
+        if bits:
+            values = values.astype(np.uint8) * np.uint8(255)
+        if real and not np.isfinite(values).all():
+            raise ImageError("contains grey values that are not finite", where=path.name)
+        return values if inverted is None else inverted(values)
+
+    return stored
+
+
+def _mapped(page: Any, path: Path) -> Window:
+    """Windows of an uncompressed image, mapped into memory."""
+    order = ">" if page.parent.byteorder == ">" else "<"
+    kind = np.dtype(page.dtype).newbyteorder(order)
+    whole = np.memmap(path, dtype=kind, mode="r", offset=page.dataoffsets[0], shape=page.shape)
+    pixels = _channels_last(whole, page)
+    row, touched = whole.nbytes // page.imagelength, 0
+
+    def window(top: int, bottom: int, left: int, right: int) -> NDArray[Any]:
+        nonlocal touched
+        touched += (bottom - top) * min(row, pixels.itemsize * pixels.shape[2] * (right - left) + 2 * _AROUND)
+        if touched > _HELD and hasattr(mmap, "MADV_DONTNEED"):
+            # The pages stay in the system's cache but no longer count as this process's; views stay valid.
+            whole._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+            touched = 0
+        return np.asarray(pixels[top:bottom, left:right]).astype(page.dtype, copy=False)
+
+    return window
+
+
+def _channels_last(pixels: NDArray[Any], page: Any) -> NDArray[Any]:
+    if pixels.ndim == 2:
+        return pixels[:, :, None]
+    planes = page.planarconfig == 2 and page.samplesperpixel > 1
+    last = np.moveaxis(pixels, 0, -1) if planes else pixels
+    return last[:, :, : _colours(page)]
+
+
+def _decoding(page: Any, path: Path) -> Window:
+    """Windows of a compressed image: decode the strips or tiles they touch, and keep the last ones."""
+    high, wide = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
+    high = min(high, page.imagelength) if not page.is_tiled else high
+    across = -(-page.imagewidth // wide)
+    down = -(-page.imagelength // high)
+    planes = page.samplesperpixel if page.planarconfig == 2 else 1
+    channels = _colours(page)
+    tables, header, kept = page.jpegtables, page.jpegheader, dict[int, NDArray[Any]]()
+    decode = page.decode  # made while the file is open: the decoder of JPEG looks into it
+
+    def segment(index: int) -> NDArray[Any]:
+        if index not in kept:
+            try:
+                with path.open("rb") as stream:
+                    stream.seek(page.dataoffsets[index])
+                    coded = stream.read(page.databytecounts[index])
+            except OSError as error:
+                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+            try:
+                found = decode(coded, index, jpegtables=tables, jpegheader=header)[0]
+            except Exception as error:
+                raise ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN) from None
+            # Enough for one row of segments.
+            while len(kept) >= max(2 * across * planes, 4):
+                kept.pop(next(iter(kept)))
+            empty = np.full((high, wide, channels), page.nodata, page.dtype)
+            kept[index] = empty if found is None else found[0]
+        return kept[index]
+
+    def window(top: int, bottom: int, left: int, right: int) -> NDArray[Any]:
+        out = np.zeros((bottom - top, right - left, channels), dtype=page.dtype)
+        for i in range(top // high, -(-bottom // high)):
+            for j in range(left // wide, -(-right // wide)):
+                for plane in range(min(planes, channels)):
+                    part = segment((plane * down + i) * across + j)
+                    y0, y1 = max(top, i * high), min(bottom, i * high + part.shape[0])
+                    x0, x1 = max(left, j * wide), min(right, j * wide + part.shape[1])
+                    if y1 <= y0 or x1 <= x0:
+                        continue
+                    seen = part[y0 - i * high : y1 - i * high, x0 - j * wide : x1 - j * wide]
+                    where = slice(plane, plane + 1) if planes > 1 else slice(None)
+                    out[y0 - top : y1 - top, x0 - left : x1 - left, where] = seen[:, :, :channels]
+        return out
+
+    return window
+
+
+def _tiff_dpi(page: Any) -> float | None:
+    tag, unit = page.tags.get("XResolution"), page.tags.get("ResolutionUnit")
+    if tag is None or unit is None or int(unit.value) not in (2, 3):
+        return None
+    over, under = tag.value
+    dpi = over / under * (1.0 if int(unit.value) == 2 else 2.54) if under else 0.0
+    return float(dpi) if dpi > 1 and dpi not in (72.0, 96.0) else None
 
 
 def write_image(path: Path | str, pixels: NDArray[Any]) -> None:
-    """Write a grey (h, w) or RGB (h, w, 3) image, whole or not at all; the suffix says the kind.
+    """Write an image, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The suffix selects the format: PNG, JPEG or TIFF.
+    pixels : ndarray (h, w) or (h, w, 3)
+        Grey or RGB values of 8 or 16 bit.
 
     Raises
     ------
     InputError
-        When the suffix is none of PNG, JPEG, TIFF, or the place cannot be written to.
+        When the suffix is none of these, or the file cannot be written.
+
+    Examples
+    --------
+    >>> write_image("frame.gif", np.zeros((4, 6), dtype=np.uint8))
+    Traceback (most recent call last):
+    reseau.core.errors.InputError: frame.gif: has no suffix of an image; use .png, .jpg or .tif
     """
     import cv2
 

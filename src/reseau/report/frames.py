@@ -46,20 +46,23 @@ def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
     import tifffile
 
     grey = len(scan.channels) == 1
-    kind = np.dtype(np.uint8 if scan.full_scale == 255 else np.uint16)
     shape = (scan.height, scan.width) if grey else (scan.height, scan.width, 3)
     draft = path.with_name(f".{path.name}.draft")
     resolution = None if scan.dpi is None else (scan.dpi, scan.dpi)
     try:
         image = tifffile.memmap(
-            draft, shape=shape, dtype=kind, photometric="minisblack" if grey else "rgb", resolution=resolution
+            draft,
+            shape=shape,
+            dtype=scan.dtype,
+            photometric="minisblack" if grey else "rgb",
+            resolution=resolution,
         )
         for top in range(0, scan.height, _STRIPE):
             bottom = min(top + _STRIPE, scan.height)
             part = scan.window(top, bottom, 0, scan.width)
             image[top:bottom] = part[:, :, 0] if grey else part
         for xy in np.concatenate(list(corners)) if corners else ():
-            _mark(image, xy, int(scan.full_scale))
+            _mark(image, xy, scan.full_scale)
         image.flush()
         del image
         draft.replace(path)
@@ -68,7 +71,7 @@ def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
         raise InputError(f"cannot be written ({error.strerror})", where=path) from None
 
 
-def _mark(image: NDArray[Any], xy: Array, white: int) -> None:
+def _mark(image: NDArray[Any], xy: Array, white: float) -> None:
     column, row = (int(v) for v in np.rint(xy))
     h, w = image.shape[:2]
     for away in (*range(-7, -1), *range(2, 8)):
