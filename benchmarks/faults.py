@@ -20,10 +20,10 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "faults.md")
     parser.add_argument("--exchanges", type=int, default=0, help="of each driver with 1 %% faults")
     asked = parser.parse_args()
-    which = ["-k", "a_fault_is_survived"]
+    which = ["-k", "a_fault_gives"]
     if asked.exchanges:
         os.environ["RESEAU_EXCHANGES"] = str(asked.exchanges)
-        which = ["-k", "a_fault_is_survived or endurance", "-m", "slow or not slow"]
+        which = ["-k", "a_fault_gives or endurance", "-m", "slow or not slow"]
     battery = str(ROOT / "tests" / "drivers" / "test_battery.py")
     status = pytest.main(["-q", "-n", "2", *which, battery, "--evidence", str(asked.out.resolve())])
     print(asked.out.read_text())

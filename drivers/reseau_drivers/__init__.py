@@ -1,1 +1,1 @@
-"""Drivers: what talks to hardware. The first ones arrive with the instruments they drive."""
+"""Drivers of oscilloscopes, cameras, ultrasonic scanners and turntables, and codecs of their protocols."""

@@ -1,4 +1,4 @@
-"""Byte streams to instruments: serial ports, TCP, UDP, with a deadline for everything; and talk over them."""
+"""Byte streams to instruments (serial ports, TCP, UDP) with time limits, and message exchange over them."""
 
 from __future__ import annotations
 
@@ -26,35 +26,41 @@ _CHUNK = 65536
 
 
 class Link(Protocol):
-    """A stream of bytes; simulators in the same process have one of their own."""
+    """Stream of bytes to an instrument; simulators in the same process implement it too."""
 
     def open(self, deadline: Deadline) -> None:
-        """Open it anew; nothing of an earlier stream is left."""
+        """Open the stream; an open one is closed before and its data are discarded."""
 
     def close(self) -> None:
-        """Close it, if it is open."""
+        """Close the stream if it is open."""
 
     def write(self, data: bytes, deadline: Deadline) -> None:
-        """Send all of it."""
+        """Send all bytes."""
 
     def pending(self) -> bool:
-        """Whether bytes have come that were not read yet."""
+        """Whether bytes have arrived that were not read yet."""
 
     def read(self, deadline: Deadline) -> bytes:
-        """What has come; waits for something until the deadline, and is empty after it."""
+        """Return the bytes received; wait for some until the deadline, and return none after it."""
 
 
 class SerialLink:
-    """A serial port.
+    """Serial port.
 
     Parameters
     ----------
     port : str
-        Device, as ``/dev/ttyUSB0``.
+        Device, such as ``/dev/ttyUSB0``.
     baud : int
-        8 bits, no parity, one stop bit.
+        Speed (baud), with 8 bits, no parity, one stop bit.
     xonxoff : bool
-        Whether both sides may ask the other to wait.
+        Whether to use software flow control.
+
+    Examples
+    --------
+    >>> SerialLink("/dev/ttyUSB0", 9600).read(Deadline(1.0))
+    Traceback (most recent call last):
+    reseau.core.errors.ConnectionLost: /dev/ttyUSB0 is not open
     """
 
     def __init__(self, port: str, baud: int, *, xonxoff: bool = False) -> None:
@@ -62,7 +68,7 @@ class SerialLink:
         self._serial: serial.Serial | None = None
 
     def open(self, deadline: Deadline) -> None:
-        """Open the port for oneself alone."""
+        """Open the port with exclusive access."""
         self.close()
         try:
             self._serial = serial.Serial(
@@ -80,11 +86,12 @@ class SerialLink:
             number = error.errno if isinstance(error, OSError) else None
             why = os.strerror(number) if number else str(error)
             raise ConnectionLost(
-                f"{self._port} cannot be opened ({why})", do="is it plugged in, and free?"
+                f"{self._port} cannot be opened ({why})",
+                do="check the cable, and whether another program uses it",
             ) from None
 
     def close(self) -> None:
-        """Close the port, if it is open."""
+        """Close the port if it is open."""
         port, self._serial = self._serial, None
         if port is not None:
             with suppress(OSError):
@@ -92,7 +99,7 @@ class SerialLink:
                 port.close()
 
     def write(self, data: bytes, deadline: Deadline) -> None:
-        """Send all of it."""
+        """Send all bytes."""
         port = self._opened()
         try:
             port.write_timeout = max(0.01, deadline.left)
@@ -103,18 +110,18 @@ class SerialLink:
             raise ConnectionLost(f"{self._port} went away ({error})", do="is it plugged in?") from None
 
     def read(self, deadline: Deadline) -> bytes:
-        """What has come, or nothing after the deadline."""
+        """Return the bytes received; none after the deadline."""
         port = self._opened()
         try:
             port.timeout = deadline.left
             first = port.read(1)
             return bytes(first) + (bytes(port.read(min(port.in_waiting, _CHUNK))) if first else b"")
-        # pyserial lets a TypeError out where another thread closes the port while it is read.
+        # pyserial raises TypeError when another thread closes the port during a read.
         except (OSError, TypeError) as error:
             raise ConnectionLost(f"{self._port} went away ({error})", do="is it plugged in?") from None
 
     def pending(self) -> bool:
-        """Whether bytes have come that were not read yet."""
+        """Whether bytes have arrived that were not read yet."""
         port = self._opened()
         try:
             return bool(port.in_waiting)
@@ -128,12 +135,18 @@ class SerialLink:
 
 
 class TcpLink:
-    """A TCP connection.
+    """TCP connection.
 
     Parameters
     ----------
     host, port : str, int
-        Of the instrument.
+        Address of the instrument.
+
+    Examples
+    --------
+    >>> TcpLink("192.0.2.7", 5025).pending()
+    Traceback (most recent call last):
+    reseau.core.errors.ConnectionLost: 192.0.2.7:5025 is not open
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -141,14 +154,14 @@ class TcpLink:
         self._socket: socket.socket | None = None
 
     def open(self, deadline: Deadline) -> None:
-        """Connect anew."""
+        """Connect; an existing connection is closed before."""
         self.close()
         try:
             self._socket = socket.create_connection(self._address, timeout=max(0.01, deadline.left))
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except OSError as error:
             raise ConnectionLost(
-                f"{self._where} cannot be reached ({error})", do="is it switched on, and the address right?"
+                f"{self._where} cannot be reached ({error})", do="check power and address"
             ) from None
 
     @property
@@ -156,7 +169,7 @@ class TcpLink:
         return f"{self._address[0]}:{self._address[1]}"
 
     def close(self) -> None:
-        """Disconnect, if connected."""
+        """Close the connection if there is one."""
         connection, self._socket = self._socket, None
         if connection is not None:
             # Closing alone does not wake a thread that waits for bytes.
@@ -165,7 +178,7 @@ class TcpLink:
             connection.close()
 
     def write(self, data: bytes, deadline: Deadline) -> None:
-        """Send all of it."""
+        """Send all bytes."""
         connection = self._opened()
         try:
             connection.settimeout(max(0.01, deadline.left))
@@ -176,7 +189,7 @@ class TcpLink:
             raise ConnectionLost(f"{self._where} went away ({error})") from None
 
     def read(self, deadline: Deadline) -> bytes:
-        """What has come, or nothing after the deadline."""
+        """Return the bytes received; none after the deadline."""
         connection = self._opened()
         try:
             connection.settimeout(max(0.001, deadline.left))
@@ -190,7 +203,7 @@ class TcpLink:
         return data
 
     def pending(self) -> bool:
-        """Whether bytes have come that were not read yet."""
+        """Whether bytes have arrived that were not read yet."""
         return bool(select.select([self._opened()], [], [], 0)[0])
 
     def _opened(self) -> socket.socket:
@@ -200,12 +213,18 @@ class TcpLink:
 
 
 class UdpLink:
-    """Datagrams to and from one peer, read as one stream; any of them may get lost on the way.
+    """Datagrams to and from one peer, read as one stream; datagrams may be lost.
 
     Parameters
     ----------
     host, port : str, int
-        Of the instrument, or of what passes its bytes on.
+        Address of the instrument or of a relay.
+
+    Examples
+    --------
+    >>> UdpLink("192.0.2.7", 9092).pending()
+    Traceback (most recent call last):
+    reseau.core.errors.ConnectionLost: udp 192.0.2.7:9092 is not open
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -217,7 +236,7 @@ class UdpLink:
         return f"udp {self._address[0]}:{self._address[1]}"
 
     def open(self, deadline: Deadline) -> None:
-        """Take a port of one's own: what is still under way to the one before is lost."""
+        """Open a new port, so that datagrams to the previous one are discarded."""
         self.close()
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(
@@ -228,11 +247,11 @@ class UdpLink:
         except OSError as error:
             self.close()
             raise ConnectionLost(
-                f"{self._where} cannot be reached ({error})", do="is the address right?"
+                f"{self._where} cannot be reached ({error})", do="check the address"
             ) from None
 
     def close(self) -> None:
-        """Let go of the port, if there is one."""
+        """Close the port if it is open."""
         held, self._socket = self._socket, None
         if held is not None:
             # Closing alone does not wake a thread that waits for bytes.
@@ -252,11 +271,11 @@ class UdpLink:
             raise ConnectionLost(f"{self._where} does not listen ({error})", do="is it on?") from None
 
     def pending(self) -> bool:
-        """Whether datagrams have come that were not read yet."""
+        """Whether datagrams have arrived that were not read yet."""
         return bool(select.select([self._opened()], [], [], 0)[0])
 
     def read(self, deadline: Deadline) -> bytes:
-        """A datagram, or nothing after the deadline."""
+        """Return a datagram; nothing after the deadline."""
         held = self._opened()
         try:
             held.settimeout(max(0.001, deadline.left))
@@ -276,26 +295,41 @@ class UdpLink:
 
 
 def serial_ports() -> tuple[str, ...]:
-    """Serial ports of this machine; found by its entry point."""
+    """List the serial ports of this computer; entry point ``serial``.
+
+    Examples
+    --------
+    >>> isinstance(serial_ports(), tuple)
+    True
+    """
     return tuple(sorted(port.device for port in list_ports.comports()))
 
 
 def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -> Link:
-    """The link of an address.
+    """Return the link for an address.
 
     Parameters
     ----------
     address : str or Link
-        ``tcp://host:port``, ``udp://host:port``, a serial device, or a link, which is passed through.
+        ``tcp://host:port``, ``udp://host:port``, a serial device, or a link (returned as it is).
     baud : int
-        Of a serial device; ``device@baud`` says another one.
+        Speed of a serial device; the address ``device@baud`` overrides it.
     xonxoff : bool
-        Of a serial device.
+        Software flow control of a serial device.
 
     Raises
     ------
     UsageError
-        When it is no address.
+        If the address is not valid.
+
+    Examples
+    --------
+    >>> type(link_to("tcp://192.0.2.7:4000")).__name__, type(link_to("/dev/ttyUSB0@9600")).__name__
+    ('TcpLink', 'SerialLink')
+    >>> link_to("http://host:80")
+    Traceback (most recent call last):
+    reseau.core.errors.UsageError: http://host:80: is not a valid address; write tcp://host:port or
+    udp://host:port
     """
     if not isinstance(address, str):
         return address
@@ -303,11 +337,13 @@ def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -
     if slashes:
         host, _, port = rest.rpartition(":")
         if scheme not in _NETWORK or not host or not port.isdigit() or int(port) > 65535:
-            raise UsageError("is no address", where=address, do="write tcp://host:port or udp://host:port")
+            raise UsageError(
+                "is not a valid address", where=address, do="write tcp://host:port or udp://host:port"
+            )
         return _NETWORK[scheme](host.strip("[]"), int(port))
     device, at, speed = address.partition("@")
     if not device or (at and not speed.isdigit()):
-        raise UsageError("is no address", where=address, do="write a serial device, or device@baud")
+        raise UsageError("is not a valid address", where=address, do="write a serial device, or device@baud")
     return SerialLink(device, int(speed) if at else baud, xonxoff=xonxoff)
 
 
@@ -315,19 +351,26 @@ _NETWORK: dict[str, Callable[[str, int], Link]] = {"tcp": TcpLink, "udp": UdpLin
 
 
 class MessageLink(Generic[M]):
-    """Messages over a link.
+    """Exchange of messages over a link.
 
     Parameters
     ----------
     link : Link
         Carries the bytes.
     decoder : Decoder
-        Of what the instrument says.
+        Decodes the messages of the instrument.
 
     Attributes
     ----------
     ignored : int
-        Messages that were no answer to what had been asked, and damaged ones.
+        Number of damaged messages and of messages that were not the expected answer.
+
+    Examples
+    --------
+    >>> from reseau_drivers.codecs.stream import LineDecoder
+    >>> messages = MessageLink(link_to("tcp://192.0.2.7:4000"), LineDecoder())
+    >>> messages.ignored
+    0
     """
 
     def __init__(self, link: Link, decoder: Decoder[M]) -> None:
@@ -336,32 +379,41 @@ class MessageLink(Generic[M]):
         self.ignored = 0
 
     def open(self, deadline: Deadline) -> None:
-        """Open the link anew."""
+        """Open the link; an open one is closed before."""
         self._link.open(deadline)
         self._decoder.reset()
         self._received.clear()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the link."""
         self._link.close()
 
     def send(self, data: bytes, deadline: Deadline) -> None:
-        """Send bytes, and wait for nothing."""
+        """Send bytes without waiting for an answer."""
         self._link.write(data, deadline)
 
     def query(self, data: bytes, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
-        """Send a question and wait for its answer; other messages are passed over.
+        """Send a query and wait for its answer; other messages are ignored.
+
+        Parameters
+        ----------
+        data : bytes
+            Encoded query.
+        is_answer : callable
+            Whether a message is the answer.
+        deadline : Deadline
+            Time limit.
 
         Raises
         ------
         DeadlineError
-            When no answer came in time.
+            If no answer arrives in time.
         ProtocolError
-            When nothing but damaged ones came in time.
+            If only damaged messages arrive in time.
         ConnectionLost
-            When the link broke.
+            If the connection is lost.
         """
-        # What is there before the question is no answer to it: one that came twice, or was given up.
+        # Messages that arrived before the query do not answer it: repeated or abandoned answers.
         while self._link.pending() and not deadline.expired:
             self.ignored += len(self._decoder.feed(self._link.read(deadline)))
         self.ignored += len(self._received)
@@ -382,8 +434,9 @@ class MessageLink(Generic[M]):
                 self.ignored += 1
             if deadline.expired:
                 if damaged is not None:
-                    raise ProtocolError(f"its answer was damaged ({damaged})", do="check cable and speed")
+                    raise ProtocolError(f"the answer was damaged ({damaged})", do="check cable and baud rate")
                 raise DeadlineError(
-                    f"did not answer within {deadline.seconds:g} s", do="is it switched on, and free?"
+                    f"did not answer within {deadline.seconds:g} s",
+                    do="check power, and whether another program uses it",
                 )
             self._received += self._decoder.feed(self._link.read(deadline))

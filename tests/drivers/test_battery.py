@@ -47,7 +47,7 @@ def _nothing_is_left_open(_libraries_are_loaded: None, request: pytest.FixtureRe
 
 
 @pytest.mark.parametrize(("driver", "transport", "kind", "at"), CELLS)
-def test_a_fault_is_survived_or_said_in_time(
+def test_a_fault_gives_the_right_result_or_an_error_in_time(
     driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
 ) -> None:
     script = FaultScript()
@@ -78,7 +78,7 @@ def test_a_fault_is_survived_or_said_in_time(
 @pytest.mark.parametrize(
     ("driver", "transport"), [key for key in RIGS if key[1] not in ("in process", "usbtmc", "udp")]
 )
-def test_a_cable_pulled_and_plugged_in_again(driver: str, transport: str) -> None:
+def test_reconnection_after_a_cable_was_pulled(driver: str, transport: str) -> None:
     with rig(driver, transport) as found:
         assert found.server is not None
         found.server.hang_up()

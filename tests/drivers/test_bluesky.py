@@ -141,7 +141,7 @@ def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], eng
         engine(bp.rel_scan([], tilt, -5.0, 5.0, 3), kept)
         assert tilt.position == pytest.approx(20.0, abs=2e-3)
         assert [event["table_tilt"] for event in events[4:]] == pytest.approx([15, 20, 25], abs=2e-3)
-        with pytest.raises(SettingError, match=r"axis tilt of table.*beyond"):
+        with pytest.raises(SettingError, match=r"axis tilt of table.*outside"):
             engine(bps.mv(tilt, 91.0))
         with pytest.raises(SettingError):
             tilt.check_value(-1.0)

@@ -47,12 +47,12 @@ def camera(device: VideoCamera) -> Iterator[Cam]:
     assert device.body.violations == []
 
 
-def test_it_is_a_camera_by_the_protocol(camera: Cam) -> None:
+def test_the_driver_satisfies_the_camera_protocol(camera: Cam) -> None:
     assert isinstance(camera, Camera)
 
 
 @pytest.mark.parametrize("stamps", [{}, {"start_of_exposure": True}, {"webcam": True}])
-def test_no_frame_began_before_it_was_asked_for(stamps: dict[str, bool]) -> None:
+def test_exposures_start_after_the_request(stamps: dict[str, bool]) -> None:
     device = VideoCamera(SimulatedCamera(), **stamps)
     with v4l2("camera", device.open, settings={"exposure_us": 3000.0, "rate": 200.0}) as camera:
         for shift in range(30):
@@ -69,7 +69,7 @@ def test_no_frame_began_before_it_was_asked_for(stamps: dict[str, bool]) -> None
         assert device.body.violations == []
 
 
-def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
+def test_the_time_of_an_exposure_has_an_uncertainty() -> None:
     for at_start, within in ((True, 1e-4), (False, 6e-3)):
         device = VideoCamera(SimulatedCamera(), start_of_exposure=at_start)
         with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
@@ -78,7 +78,7 @@ def test_the_time_of_an_exposure_is_told_with_its_uncertainty() -> None:
             assert abs((datetime.now(UTC) - shot.taken).total_seconds()) < 1.0
 
 
-def test_the_stamps_of_a_webcam_are_no_starts_of_exposures() -> None:
+def test_webcam_stamps_are_not_taken_as_starts_of_exposures() -> None:
     # The kernel's driver says that they are; they are when the first packet of a frame came.
     device = VideoCamera(SimulatedCamera(), webcam=True)
     with v4l2("camera", device.open, settings={"exposure_us": 2000.0, "rate": 100.0}) as camera:
@@ -86,7 +86,7 @@ def test_the_stamps_of_a_webcam_are_no_starts_of_exposures() -> None:
         assert "first packet" in camera.check(5.0)["clock"]
 
 
-def test_a_series_has_every_frame_once_and_says_which_are_fresh(device: VideoCamera, camera: Cam) -> None:
+def test_a_series_has_every_frame_once_with_its_freshness(device: VideoCamera, camera: Cam) -> None:
     camera.expose()
     time.sleep(0.1)  # as many frames as there are buffers wait now; what came besides is lost
     shots = list(camera.frames(12))
@@ -98,7 +98,7 @@ def test_a_series_has_every_frame_once_and_says_which_are_fresh(device: VideoCam
 
 
 @pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "SRGGB8"])
-def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, name: str) -> None:
+def test_frames_are_bit_exact_with_their_colour_pattern(device: VideoCamera, name: str) -> None:
     with v4l2("camera", device.open, settings={"format": name, "exposure_us": 2000.0}) as camera:
         shot = camera.expose()
         assert (shot.pixels == StripeScene()(device.view)).all()
@@ -108,7 +108,7 @@ def test_frames_are_bit_exact_and_colour_names_its_pattern(device: VideoCamera, 
         assert len(shot.raw) == (shot.pixels.size * 2 if name == "YUYV" else 0)
 
 
-def test_frames_are_to_the_bit_what_the_world_drew() -> None:
+def test_frames_equal_the_simulated_image() -> None:
     frame = World.standard(seed=5).photo_i()
     device = VideoCamera(SimulatedCamera(StillScene(frame), frame.width, frame.height))
     with v4l2("camera", device.open, settings={"exposure_us": 10_000.0}, seconds=10.0) as camera:
@@ -141,17 +141,17 @@ def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCam
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"gain": 99.0}, "gain 99 is beyond its 0…24"),
-        ({"exposure_us": 2e6}, "beyond its 1…10000"),
-        ({"brightness": 300}, "brightness 300 is beyond its 0…255"),
+        ({"gain": 99.0}, "gain 99 is outside 0…24"),
+        ({"exposure_us": 2e6}, "is outside 1…10000"),
+        ({"brightness": 300}, "brightness 300 is outside 0…255"),
         ({"width": 4000}, "delivers 96×64 GREY, not 4000×64"),
         ({"format": "SBGGR8"}, "it offers GREY, Y10, Y12, Y16, YUYV, MJPEG, SRGGB8"),
         ({"rate": 5000.0}, "frames in a second"),
-        ({"left": 8, "top": 4, "width": 32, "height": 16, "rate": 50.0, "gain": 99.0}, "gain 99 is beyond"),
-        ({"gain": 3.0, "brightness": 300}, "brightness 300 is beyond its 0…255"),
+        ({"left": 8, "top": 4, "width": 32, "height": 16, "rate": 50.0, "gain": 99.0}, "gain 99 is outside"),
+        ({"gain": 3.0, "brightness": 300}, "brightness 300 is outside 0…255"),
     ],
 )
-def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
+def test_unsupported_settings_raise_and_change_nothing(
     device: VideoCamera, camera: Cam, changes: dict[str, Any], said: str
 ) -> None:
     camera.expose()
@@ -163,7 +163,7 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert camera.reconnections == 1
 
 
-def test_what_is_left_to_the_camera_is_as_it_was_found(device: VideoCamera, camera: Cam) -> None:
+def test_default_settings_restore_the_original_values(device: VideoCamera, camera: Cam) -> None:
     camera.configure(exposure_us=0.0)
     device.controls[uapi.GAIN] = 7
     before, period = device.view, device.period
@@ -176,20 +176,20 @@ def test_what_is_left_to_the_camera_is_as_it_was_found(device: VideoCamera, came
     assert camera.expose().pixels.shape == (64, 96)
 
 
-def test_one_that_refuses_its_first_settings_is_not_kept_open(device: VideoCamera) -> None:
+def test_a_camera_that_refuses_its_first_settings_is_closed(device: VideoCamera) -> None:
     refused = v4l2("refused", device.open, settings={"gain": 99.0})
-    with pytest.raises(RefusedError, match="gain 99 is beyond"):
+    with pytest.raises(RefusedError, match="gain 99 is outside"):
         refused.connect()
     assert device.nodes == 0
 
 
-def test_wrong_settings_are_refused_before_anything_is_sent(camera: Cam) -> None:
+def test_invalid_settings_raise_before_anything_is_sent(camera: Cam) -> None:
     for changes in ({"format": "RGB"}, {"exposure_us": -1.0}, {"colour": 3}, {"width": 1.5}):
         with pytest.raises(SettingError):
             camera.configure(**changes)
 
 
-def test_unplugged_and_plugged_in_again_it_is_set_as_before(device: VideoCamera, camera: Cam) -> None:
+def test_settings_are_restored_after_unplugging(device: VideoCamera, camera: Cam) -> None:
     camera.configure(gain=6, exposure_us=1000.0)
     camera.expose()
     device.plugged_in = False
@@ -202,7 +202,7 @@ def test_unplugged_and_plugged_in_again_it_is_set_as_before(device: VideoCamera,
     assert camera.reconnections == 2
 
 
-def test_another_process_s_camera_is_refused_and_left_alone(device: VideoCamera, camera: Cam) -> None:
+def test_a_camera_of_another_process_is_refused_and_unchanged(device: VideoCamera, camera: Cam) -> None:
     first = camera.expose()
     other = v4l2("other", device.open)
     with pytest.raises(RefusedError, match="another process"):
@@ -219,7 +219,7 @@ def test_another_process_s_camera_is_refused_and_left_alone(device: VideoCamera,
 @pytest.mark.parametrize(
     ("kind", "lost"), [("dropped", 1), ("truncated", 1), ("corrupted", 1), ("repeated", 0), ("late", None)]
 )
-def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
+def test_lost_and_damaged_frames_are_counted_and_not_returned(
     device: VideoCamera, camera: Cam, kind: Any, lost: int | None
 ) -> None:
     script = device.body.script
@@ -236,7 +236,7 @@ def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
         assert shots[-1].dropped - before.dropped == lost
 
 
-def test_a_stuck_camera_is_given_up_in_time_and_started_anew(device: VideoCamera, camera: Cam) -> None:
+def test_a_stuck_camera_raises_in_time_and_restarts(device: VideoCamera, camera: Cam) -> None:
     camera.expose()
     device.body.script.fault_at(device.body.script.count, Fault("stuck"))
     with pytest.raises(DeadlineError, match="no new frame within"):
@@ -244,7 +244,7 @@ def test_a_stuck_camera_is_given_up_in_time_and_started_anew(device: VideoCamera
     assert camera.expose().fresh
 
 
-def test_a_stamp_from_the_future_is_not_believed(device: VideoCamera, camera: Cam) -> None:
+def test_a_stamp_in_the_future_is_rejected(device: VideoCamera, camera: Cam) -> None:
     camera.expose()
     device.body.script.fault_at(device.body.script.count + 1, Fault("out of range"))
     with pytest.raises(ProtocolError, match="from now"):
@@ -252,14 +252,14 @@ def test_a_stamp_from_the_future_is_not_believed(device: VideoCamera, camera: Ca
     assert camera.expose().fresh
 
 
-def test_numbers_of_32_bits_wrap_without_a_gap() -> None:
+def test_frame_numbers_of_32_bits_wrap_without_a_gap() -> None:
     device = VideoCamera(SimulatedCamera(), first=(1 << 32) - 3)
     with v4l2("camera", device.open, settings={"exposure_us": 2000.0}) as camera:
         numbers = [shot.sequence for shot in camera.frames(8)]
         assert [b - a for a, b in itertools.pairwise(numbers)] == [1] * 7
 
 
-def test_an_exposure_that_takes_longer_than_one_waits_ends_in_time(camera: Cam) -> None:
+def test_an_exposure_longer_than_the_deadline_ends_in_time(camera: Cam) -> None:
     camera.configure(exposure_us=1e6)
     began = time.monotonic()
     with pytest.raises(DeadlineError):
@@ -282,7 +282,7 @@ def test_stop_from_another_thread_ends_an_exposure(device: VideoCamera, camera: 
     stopping.join()
 
 
-def test_the_self_test_tells_rate_losses_clock_and_dark_noise(device: VideoCamera, camera: Cam) -> None:
+def test_the_self_test_reports_rate_losses_clock_and_dark_noise(device: VideoCamera, camera: Cam) -> None:
     camera.configure(rate=50.0)
     before = camera.settings
     found = camera.check(5.0)
@@ -305,7 +305,7 @@ class _Noisy:
         return np.rint(50 + 1000 * view.light + noise).astype(np.uint16)
 
 
-def test_the_self_test_measures_what_is_there(device: VideoCamera, camera: Cam) -> None:
+def test_the_self_test_measures_known_noise(device: VideoCamera, camera: Cam) -> None:
     device.body.point_at(_Noisy())
     camera.configure(format="Y16", rate=50.0)
     script = device.body.script
@@ -319,21 +319,21 @@ def test_the_self_test_measures_what_is_there(device: VideoCamera, camera: Cam) 
     assert noise == pytest.approx(np.hypot(3.0, 12**-0.5), abs=0.15)
 
 
-def test_a_reading_is_what_bluesky_takes(camera: Cam) -> None:
+def test_a_reading_has_the_form_of_bluesky(camera: Cam) -> None:
     camera.trigger().wait(2.0)
     reading, kinds = camera.read(), camera.describe()
     assert set(reading) == set(kinds)
     assert kinds["camera_image"]["shape"] == [64, 96]
 
 
-def test_a_node_that_is_none_or_no_camera_is_said() -> None:
+def test_a_missing_node_or_one_that_is_not_a_camera_raises() -> None:
     with pytest.raises(ConnectionLost, match="cannot be opened"):
         v4l2("camera", "/dev/no-such-video").connect()
     with pytest.raises(RefusedError, match="query"):
         v4l2("camera", "/dev/null").connect()
 
 
-def test_that_aravis_is_missing_is_said_with_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_aravis_raises_with_instructions(monkeypatch: pytest.MonkeyPatch) -> None:
     library = importlib.import_module("reseau_drivers.camera.aravis")._library
     library.cache_clear()
     monkeypatch.setitem(sys.modules, "gi", None)
@@ -368,7 +368,7 @@ class _Clocked:
 
 
 @pytest.mark.parametrize("name", ["TimestampLatch", "GevTimestampControlLatch"])
-def test_a_camera_s_clock_is_read_where_it_can_be(name: str) -> None:
+def test_the_clock_of_a_camera_is_read_if_possible(name: str) -> None:
     source = cameras.Aravis("127.0.0.1")
     source._camera = _Clocked(name, runs=True)
     found = source._latched()
@@ -382,7 +382,7 @@ def test_a_camera_s_clock_is_read_where_it_can_be(name: str) -> None:
     source._camera = None
 
 
-def test_a_camera_that_tells_nothing_of_itself_is_trusted_with_nothing() -> None:
+def test_unknown_exposure_and_period_widen_the_interval() -> None:
     device = VideoCamera(SimulatedCamera())
     # In automatic mode the exposure may be as long as the period, and it is not told.
     with v4l2("camera", device.open) as camera:
@@ -390,5 +390,5 @@ def test_a_camera_that_tells_nothing_of_itself_is_trusted_with_nothing() -> None
         assert math.isnan(shot.exposure_us)
         assert shot.taken_within_s == pytest.approx(0.01, abs=1e-3)
     device.period = uapi.Interval(0, 0)
-    with v4l2("camera", device.open) as camera, pytest.raises(DeadlineError, match="may have begun before"):
+    with v4l2("camera", device.open) as camera, pytest.raises(DeadlineError, match="may have started before"):
         camera.expose(0.4)

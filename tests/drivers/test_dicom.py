@@ -77,7 +77,7 @@ def file(path: Path, *regions: Any, pixels: Any = PICTURE, syntax: Any = None, *
     return path
 
 
-def test_a_frame_comes_with_the_millimetres_of_its_region(tmp_path: Path) -> None:
+def test_a_frame_has_the_pixel_size_of_its_region(tmp_path: Path) -> None:
     with dicom_files("files", str(file(tmp_path / "a.dcm", region()))) as scanner:
         assert isinstance(scanner, UltrasonicScanner)
         assert str(scanner.connect()) == "ACME Echo 3 1.2"
@@ -97,7 +97,7 @@ def test_a_frame_comes_with_the_millimetres_of_its_region(tmp_path: Path) -> Non
         assert scanner.describe()["files_section"]["shape"] == list(SIZE)
 
 
-def test_the_physical_origin_is_carried_to_the_frame(tmp_path: Path) -> None:
+def test_the_physical_origin_is_converted_to_pixels(tmp_path: Path) -> None:
     told = {
         "ReferencePixelX0": 28,
         "ReferencePixelY0": 5,
@@ -112,21 +112,19 @@ def test_the_physical_origin_is_carried_to_the_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"RegionLocationMaxX1": 600}, "beyond the frame"),
-        ({"RegionLocationMaxY1": 50}, "beyond the frame"),
-        ({"RegionLocationMinX0": 70, "RegionLocationMaxX1": 90}, "beyond the frame"),
-        ({"RegionLocationMinX0": 50, "RegionLocationMaxX1": 20}, "beyond the frame"),
-        ({"RegionLocationMaxX1": None}, "beyond the frame"),
+        ({"RegionLocationMaxX1": 600}, "outside the frame"),
+        ({"RegionLocationMaxY1": 50}, "outside the frame"),
+        ({"RegionLocationMinX0": 70, "RegionLocationMaxX1": 90}, "outside the frame"),
+        ({"RegionLocationMinX0": 50, "RegionLocationMaxX1": 20}, "outside the frame"),
+        ({"RegionLocationMaxX1": None}, "outside the frame"),
         ({"PhysicalUnitsXDirection": 4}, "no section in centimetres"),
         ({"RegionSpatialFormat": 3}, "no section in centimetres"),
-        ({"PhysicalDeltaX": 0.0}, "beyond belief"),
-        ({"PhysicalDeltaY": math.nan}, "beyond belief"),
-        ({"PhysicalDeltaY": None}, "beyond belief"),
+        ({"PhysicalDeltaX": 0.0}, "implausible pixel size"),
+        ({"PhysicalDeltaY": math.nan}, "implausible pixel size"),
+        ({"PhysicalDeltaY": None}, "implausible pixel size"),
     ],
 )
-def test_a_region_that_cannot_be_meant_gives_pixels(
-    tmp_path: Path, changes: dict[str, Any], why: str
-) -> None:
+def test_an_implausible_region_gives_no_pixel_size(tmp_path: Path, changes: dict[str, Any], why: str) -> None:
     with DicomFiles("files", file(tmp_path / "a.dcm", region(**changes))) as scanner:
         assert why in scanner.check()["pixels"]
         scan = scanner.scan()
@@ -134,13 +132,13 @@ def test_a_region_that_cannot_be_meant_gives_pixels(
         assert (scan.pixels == PICTURE).all()
 
 
-def test_other_tags_than_regions_are_not_taken_for_millimetres(tmp_path: Path) -> None:
+def test_only_regions_give_a_pixel_size(tmp_path: Path) -> None:
     with DicomFiles("files", file(tmp_path / "a.dcm", PixelSpacing=[0.3, 0.3])) as scanner:
         assert scanner.check()["pixels"] == "unknown: no regions"
         assert scanner.scan().mm_per_px is None
 
 
-def test_the_pixel_behind_the_last_is_let_pass_as_many_makers_write_it(tmp_path: Path) -> None:
+def test_a_region_may_end_one_pixel_after_the_frame(tmp_path: Path) -> None:
     whole = region(
         RegionLocationMinX0=0, RegionLocationMinY0=0, RegionLocationMaxX1=64, RegionLocationMaxY1=48
     )
@@ -148,7 +146,7 @@ def test_the_pixel_behind_the_last_is_let_pass_as_many_makers_write_it(tmp_path:
         assert scanner.scan().region_px == (0, 0, 63, 47)
 
 
-def test_regions_agree_or_one_is_chosen(tmp_path: Path) -> None:
+def test_regions_with_different_scales_need_a_choice(tmp_path: Path) -> None:
     left, right = region(RegionLocationMaxX1=30), region(RegionLocationMinX0=33)
     spectrum = region(RegionSpatialFormat=3, PhysicalUnitsXDirection=4, PhysicalUnitsYDirection=7)
     coarse, outside = region(PhysicalDeltaX=0.03), region(RegionLocationMaxX1=600)
@@ -165,12 +163,12 @@ def test_regions_agree_or_one_is_chosen(tmp_path: Path) -> None:
     with dicom_files("files", str(path), settings={"region": 1}) as scanner:
         assert scanner.scan().mm_per_px == pytest.approx((0.3, 0.25))
         scanner.configure(region=2)
-        assert "no region 2" in scanner.check()["pixels"]
+        assert "region 2 does not exist" in scanner.check()["pixels"]
         with pytest.raises(SettingError):
             scanner.configure(region=100)
 
 
-def test_frames_of_a_folder_come_in_their_order(tmp_path: Path) -> None:
+def test_frames_of_a_folder_are_in_order(tmp_path: Path) -> None:
     loop = np.stack([np.roll(PICTURE, k, axis=1) for k in range(3)])
     file(tmp_path / "b.dcm", region(), pixels=loop, NumberOfFrames=3)
     file(tmp_path / "a.dcm", region())
@@ -181,7 +179,7 @@ def test_frames_of_a_folder_come_in_their_order(tmp_path: Path) -> None:
     assert all((got == np.roll(PICTURE, k, axis=1)).all() for got, k in zip(seen, (0, 0, 1, 2), strict=True))
 
 
-def test_what_is_grey_in_other_ways_is_made_grey(tmp_path: Path) -> None:
+def test_other_photometric_interpretations_are_converted(tmp_path: Path) -> None:
     colour = np.stack([PICTURE] * 3, axis=-1)
     rle = pydicom.dcmread(file(tmp_path / "raw", region()))
     rle.compress(RLELossless)
@@ -209,7 +207,7 @@ def test_what_is_grey_in_other_ways_is_made_grey(tmp_path: Path) -> None:
             assert (scanner.scan().pixels == PICTURE).all(), name
 
 
-def test_jpeg_is_read_with_its_loss(tmp_path: Path) -> None:
+def test_jpeg_is_decoded(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2")
     smooth = cv2.GaussianBlur(PICTURE, (0, 0), 3)
     data = cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -219,10 +217,10 @@ def test_jpeg_is_read_with_its_loss(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("syntax", [JPEGLSLossless, MPEG2MPML])
-def test_what_is_not_readable_is_named(tmp_path: Path, syntax: Any) -> None:
+def test_unsupported_compressions_are_named(tmp_path: Path, syntax: Any) -> None:
     path = file(tmp_path / "a.dcm", region(), pixels=encapsulate([bytes(64)]), syntax=syntax)
     scanner = DicomFiles("files", path)
-    with pytest.raises(ProtocolError, match=rf"{syntax.name.split('/')[0].strip()}.*not readable here"):
+    with pytest.raises(ProtocolError, match=rf"{syntax.name.split('/')[0].strip()}.*cannot be decoded"):
         scanner.scan()
 
 
@@ -234,15 +232,13 @@ def test_what_is_not_readable_is_named(tmp_path: Path, syntax: Any) -> None:
             "examples_ybr_color.dcm",
             "SonoSite, Inc. Turbo",
             30,
-            "beyond the frame of 320×240 px lies (84, 31, 595, 414)",
+            "region (84, 31, 595, 414) outside the frame of 320×240 px",
         ),
-        ("examples_palette.dcm", "", 1, "beyond the frame of 800×350 px lies (120, 60, 800, 518)"),
+        ("examples_palette.dcm", "", 1, "region (120, 60, 800, 518) outside the frame of 800×350 px"),
         ("examples_rgb_color.dcm", "G.E. Medical Systems LOGIQ 700 4121885", 1, "no regions"),
     ],
 )
-def test_real_files_give_pixels_and_never_wrong_millimetres(
-    name: str, maker: str, frames: int, why: str
-) -> None:
+def test_real_files_give_pixels_and_no_wrong_pixel_size(name: str, maker: str, frames: int, why: str) -> None:
     path = Path(pydicom.__file__).parent / "data" / "test_files" / name
     if not path.exists():
         pytest.skip(f"pydicom came without {name}")
@@ -258,7 +254,7 @@ def test_real_files_give_pixels_and_never_wrong_millimetres(
         assert np.median(scan.pixels) < 60 < scan.pixels.max()
 
 
-def test_what_is_no_image_costs_one_line(tmp_path: Path) -> None:
+def test_invalid_files_raise_one_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     whole = file(tmp_path / "whole", region()).read_bytes()
     (tmp_path / "cut").write_bytes(whole[:-100])
@@ -273,12 +269,12 @@ def test_what_is_no_image_costs_one_line(tmp_path: Path) -> None:
     file(tmp_path / "many", region(), NumberOfFrames=2_000_000_000)
     for name, said in {
         "cut": "cannot be decoded",
-        "head": "no DICOM image",
-        "text": "no DICOM image",
-        "nothing": "no DICOM image",
+        "head": "is not a DICOM image",
+        "text": "is not a DICOM image",
+        "nothing": "is not a DICOM image",
         "huge": "states a frame of 64×65535",
         "many": "states 2000000000 frames",
-        "empty": "holds no DICOM image",
+        "empty": "contains no DICOM image",
     }.items():
         with pytest.raises(ProtocolError, match=said) as caught:
             DicomFiles("files", tmp_path / name).scan()
@@ -287,7 +283,7 @@ def test_what_is_no_image_costs_one_line(tmp_path: Path) -> None:
         DicomFiles("files", tmp_path / "none").connect()
 
 
-def test_files_stand_on_a_bench(tmp_path: Path) -> None:
+def test_files_are_an_instrument_on_a_bench(tmp_path: Path) -> None:
     path = file(tmp_path / "a.dcm", region())
     text = f'schema = "reseau-bench/1"\n[instruments.scans]\ndriver = "dicom"\naddress = "{path}"\n'
     with Bench(BenchFile.parse_toml(text, where="bench.toml")) as bench:

@@ -68,7 +68,7 @@ def camera(simulated: GigeCamera) -> Iterator[Cam]:
 
 
 @pytest.mark.parametrize("name", ["Mono8", "Mono16"])
-def test_frames_are_to_the_bit_what_the_world_drew(simulated: GigeCamera, name: str) -> None:
+def test_frames_equal_the_simulated_image(simulated: GigeCamera, name: str) -> None:
     frame = World.standard(seed=5).photo_i()
     simulated.body.point_at(StillScene(frame))
     size = {"width": frame.width, "height": frame.height, "format": name, "exposure_us": 10_000.0}
@@ -80,7 +80,7 @@ def test_frames_are_to_the_bit_what_the_world_drew(simulated: GigeCamera, name: 
         assert shot.full_scale == {"Mono8": 255, "Mono16": 65535}[name]
 
 
-def test_it_looks_into_the_laboratory(simulated: GigeCamera) -> None:
+def test_the_camera_images_the_laboratory(simulated: GigeCamera) -> None:
     laboratory = Laboratory(World.standard(seed=5))
     laboratory.expose("screen")  # what takes long is computed now, not while the camera is controlled
     simulated.body.point_at(LaboratoryScene(laboratory))
@@ -93,7 +93,7 @@ def test_it_looks_into_the_laboratory(simulated: GigeCamera) -> None:
 
 
 @pytest.mark.parametrize("name", ["BayerRG8", "BayerGR8"])
-def test_colour_stays_raw_and_names_its_pattern(simulated: GigeCamera, camera: Cam, name: str) -> None:
+def test_colour_stays_raw_with_its_pattern(simulated: GigeCamera, camera: Cam, name: str) -> None:
     camera.configure(format=name)
     shot = camera.expose()
     assert shot.pattern == {"BayerRG8": "RGGB", "BayerGR8": "GRBG"}[name]
@@ -101,7 +101,7 @@ def test_colour_stays_raw_and_names_its_pattern(simulated: GigeCamera, camera: C
 
 
 @pytest.mark.parametrize("trigger", ["off", "software"])
-def test_no_frame_began_before_it_was_asked_for(simulated: GigeCamera, camera: Cam, trigger: str) -> None:
+def test_exposures_start_after_the_request(simulated: GigeCamera, camera: Cam, trigger: str) -> None:
     camera.configure(trigger=trigger)
     for shift in range(12):
         simulated.body.point_at(pattern(shift))
@@ -111,7 +111,7 @@ def test_no_frame_began_before_it_was_asked_for(simulated: GigeCamera, camera: C
     assert camera.skipped > 0 or trigger != "off"
 
 
-def test_a_frame_that_waited_somewhere_is_not_fresh(simulated: GigeCamera, camera: Cam) -> None:
+def test_a_delayed_frame_is_not_fresh(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     time.sleep(0.2)
     simulated.body.point_at(pattern(5))
@@ -134,15 +134,15 @@ def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, came
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"gain": 99.0}, "gain 99 is beyond its 0…10"),
-        ({"exposure_us": 1.0}, "exposure_us 1 is beyond its 10…"),
-        ({"rate": 5e4}, "rate 50000 is beyond"),
+        ({"gain": 99.0}, "gain 99 is outside 0…10"),
+        ({"exposure_us": 1.0}, "exposure_us 1 is outside 10…"),
+        ({"rate": 5e4}, "rate 50000 is outside"),
         ({"width": 2048, "left": 8}, "has 2048×2048 pixels, and none of 2048×480 at"),
-        ({"format": "Mono12"}, "camera .configure.: refused it"),
-        ({"left": 16, "width": 320, "rate": 50.0, "exposure_us": 1.0}, "exposure_us 1 is beyond its 10…"),
+        ({"format": "Mono12"}, "camera .configure.: refused the request"),
+        ({"left": 16, "width": 320, "rate": 50.0, "exposure_us": 1.0}, "exposure_us 1 is outside 10…"),
     ],
 )
-def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
+def test_unsupported_settings_raise_and_change_nothing(
     camera: Cam, changes: dict[str, Any], said: str
 ) -> None:
     before = camera.settings
@@ -153,7 +153,7 @@ def test_what_the_camera_cannot_do_is_said_and_changes_nothing(
     assert camera.reconnections == 1
 
 
-def test_what_is_left_to_the_camera_is_as_it_was_found(simulated: GigeCamera) -> None:
+def test_default_settings_restore_the_original_values(simulated: GigeCamera) -> None:
     def asked(camera: Cam) -> tuple[Any, ...]:
         source = camera._source
         assert isinstance(source, cameras.Aravis)
@@ -177,9 +177,7 @@ def test_what_is_left_to_the_camera_is_as_it_was_found(simulated: GigeCamera) ->
         assert asked(camera) == found
 
 
-def test_any_feature_is_set_by_its_name_also_after_the_plug_was_pulled(
-    simulated: GigeCamera, camera: Cam
-) -> None:
+def test_features_are_set_by_name_also_after_unplugging(simulated: GigeCamera, camera: Cam) -> None:
     source = camera._source
     assert isinstance(source, cameras.Aravis)
     camera.configure(features="BinningHorizontal=2 GainAuto=Continuous TestBoolean=True")
@@ -205,7 +203,7 @@ def test_any_feature_is_set_by_its_name_also_after_the_plug_was_pulled(
         ('DeviceVendorName="me', SettingError, "is not whole"),
     ],
 )
-def test_a_feature_that_is_none_or_takes_no_such_value_is_said(
+def test_unknown_features_and_invalid_values_raise(
     camera: Cam, features: str, error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
@@ -214,7 +212,7 @@ def test_a_feature_that_is_none_or_takes_no_such_value_is_said(
     assert camera.expose().fresh
 
 
-def test_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Cam) -> None:
+def test_frame_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Cam) -> None:
     # The library's camera begins at 65400, and counts 0 too.
     camera.configure(rate=500.0)
     shots = list(camera.frames(200))
@@ -226,7 +224,7 @@ def test_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Ca
 
 
 @pytest.mark.parametrize("kind", ["dropped", "truncated", "corrupted"])
-def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
+def test_lost_and_damaged_frames_are_counted_and_not_returned(
     simulated: GigeCamera, camera: Cam, kind: Any
 ) -> None:
     camera.configure(rate=50.0)
@@ -241,7 +239,7 @@ def test_lost_and_damaged_frames_are_counted_and_never_handed_out(
     assert shots[-1].sequence - before.sequence == 8 + lost
 
 
-def test_a_repeated_frame_is_not_handed_out_twice(simulated: GigeCamera, camera: Cam) -> None:
+def test_a_repeated_frame_is_not_returned_twice(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     script = simulated.body.script
     script.fault_at(script.count + 2, Fault("repeated"))
@@ -250,9 +248,7 @@ def test_a_repeated_frame_is_not_handed_out_twice(simulated: GigeCamera, camera:
     assert len(set(numbers)) == 8
 
 
-def test_control_that_was_lost_is_said_and_taken_back_with_the_settings(
-    simulated: GigeCamera, camera: Cam
-) -> None:
+def test_lost_control_raises_and_is_regained_with_the_settings(simulated: GigeCamera, camera: Cam) -> None:
     camera.configure(exposure_us=4000.0)
     camera.expose()
     simulated.power_cycle()
@@ -262,7 +258,7 @@ def test_control_that_was_lost_is_said_and_taken_back_with_the_settings(
     assert camera.reconnections == 2
 
 
-def test_the_plug_pulled_and_put_back(simulated: GigeCamera, camera: Cam) -> None:
+def test_unplugging_and_plugging_in(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     simulated.pull_plug()
     began = time.monotonic()
@@ -276,7 +272,7 @@ def test_the_plug_pulled_and_put_back(simulated: GigeCamera, camera: Cam) -> Non
     assert (camera.expose(5.0).pixels == seen(0)).all()
 
 
-def test_a_camera_that_another_controls_is_refused(simulated: GigeCamera, camera: Cam) -> None:
+def test_a_camera_controlled_by_another_program_is_refused(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     began = time.monotonic()
     with pytest.raises(RefusedError, match=r"other .connect.: 127.0.0.1 is controlled by another program"):
@@ -287,7 +283,7 @@ def test_a_camera_that_another_controls_is_refused(simulated: GigeCamera, camera
     assert camera.reconnections == 1
 
 
-def test_a_camera_named_otherwise_that_another_controls_is_refused_before_it_is_set(
+def test_a_camera_controlled_by_another_program_is_refused_before_it_is_set(
     simulated: GigeCamera, camera: Cam, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Only IP addresses are asked before; of other names the library finds out itself.
@@ -298,7 +294,7 @@ def test_a_camera_named_otherwise_that_another_controls_is_refused_before_it_is_
     assert camera.expose().fresh
 
 
-def test_control_that_is_still_ours_is_waited_for(simulated: GigeCamera, camera: Cam) -> None:
+def test_the_driver_waits_for_its_own_old_control_to_end(simulated: GigeCamera, camera: Cam) -> None:
     camera.expose()
     source = camera._source
     assert isinstance(source, cameras.Aravis)
@@ -311,7 +307,7 @@ def test_control_that_is_still_ours_is_waited_for(simulated: GigeCamera, camera:
     assert camera.reconnections == 2
 
 
-def test_one_that_refuses_its_settings_is_not_kept_from_others(simulated: GigeCamera) -> None:
+def test_a_camera_that_refuses_its_settings_is_released(simulated: GigeCamera) -> None:
     refused = aravis("refused", simulated.address, settings=SIZE | {"format": "Mono12"})
     with pytest.raises(RefusedError):
         refused.connect()
@@ -319,7 +315,7 @@ def test_one_that_refuses_its_settings_is_not_kept_from_others(simulated: GigeCa
         assert camera.expose().fresh
 
 
-def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> None:
+def test_the_self_test_reports_rate_losses_clock_and_dark_noise(camera: Cam) -> None:
     camera.configure(rate=50.0)
     before = camera.settings
     found = camera.check(10.0)
@@ -337,7 +333,7 @@ def test_the_self_test_tells_rate_losses_clock_and_dark_noise(camera: Cam) -> No
     assert camera.settings == before
 
 
-def test_a_bench_checks_it_and_gives_it_back(simulated: GigeCamera) -> None:
+def test_a_bench_check_releases_the_camera(simulated: GigeCamera) -> None:
     text = f'''schema = "reseau-bench/1"
 name = "cameras"
 [instruments.eye]
@@ -354,12 +350,12 @@ settings = {{width = 320, height = 240, rate = 50.0, exposure_us = 2000.0}}
         assert camera.expose().fresh
 
 
-def test_there_is_one_port_and_one_camera_on_it(simulated: GigeCamera) -> None:
+def test_only_one_simulated_camera_runs_at_a_time(simulated: GigeCamera) -> None:
     with pytest.raises(UsageError, match="another simulated GigE camera"):
         GigeCamera(SimulatedCamera())
 
 
-def test_where_nobody_answers_it_is_said() -> None:
+def test_no_answer_raises() -> None:
     with ExitStack() as stack:
         gige_camera(stack, SimulatedCamera()).pull_plug()
         with pytest.raises(InstrumentError, match="camera"):
@@ -386,7 +382,7 @@ class Numbered:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_thousands_of_large_frames_leave_memory_flat_and_none_is_damaged() -> None:
+def test_thousands_of_large_frames_use_constant_memory_without_damage() -> None:
     """`benchmarks/gige.py` compares rates; here is what must hold, one frame in fifty being lost or torn."""
     count = int(os.environ.get("RESEAU_FRAMES", "5000"))
     sight, script = Numbered(), FaultScript(rate=0.02, seed=3, kinds=("dropped", "truncated", "repeated"))

@@ -112,7 +112,7 @@ def wired(features: str = "", **settings: Any) -> Iterator[Wired]:
         yield Wired(source, Sender(stack))
 
 
-def test_chunks_tell_exposure_and_gain_of_their_frame(tmp_path: Path) -> None:
+def test_chunks_contain_exposure_and_gain_of_their_frame(tmp_path: Path) -> None:
     (tmp_path / "features").write_text(FEATURES)
     with wired(str(tmp_path / "features"), chunks="on") as pair:
         for block, exposure, gain in ((1, 1234.5, 6.25), (2, 777.0, 0.5)):
@@ -125,7 +125,7 @@ def test_chunks_tell_exposure_and_gain_of_their_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2, 3])
-def test_a_frame_with_any_packet_missing_is_counted_and_not_handed_out(lost: int) -> None:
+def test_a_frame_with_a_missing_packet_is_counted_and_not_returned(lost: int) -> None:
     with wired() as pair:
         pair.sender.send(1, IMAGE)
         assert pair.taken() is not None
@@ -137,7 +137,7 @@ def test_a_frame_with_any_packet_missing_is_counted_and_not_handed_out(lost: int
         assert (taken.sequence, pair.source.dropped) == (3, 1)
 
 
-def test_blocks_that_wrap_come_twice_or_never_are_told_apart() -> None:
+def test_wrapped_repeated_and_missing_blocks_are_distinguished() -> None:
     with wired() as pair:
         numbers = []
         for block in (65534, 65535, 1, 1, 4):
@@ -174,7 +174,7 @@ class _Numbered:
         (range(65530, 65542, 3), 6),
     ],
 )
-def test_numbers_are_counted_on_however_many_bits_they_have(numbers: Any, lost: int) -> None:
+def test_frame_numbers_continue_with_any_number_of_bits(numbers: Any, lost: int) -> None:
     source = Aravis("127.0.0.1")
     counted = [source._counted(_Numbered(number)) for number in numbers]
     assert counted[-1] is not None
@@ -183,19 +183,19 @@ def test_numbers_are_counted_on_however_many_bits_they_have(numbers: Any, lost: 
     assert source.dropped == lost
 
 
-def test_a_frame_of_another_size_is_none() -> None:
+def test_a_frame_of_another_size_is_rejected() -> None:
     with wired() as pair:
         pair.sender.send(1, IMAGE, width=WIDTH // 2)
         with pytest.raises(ProtocolError, match="32×32"):
             pair.taken()
 
 
-def test_a_camera_without_chunk_data_is_not_asked_for_any() -> None:
+def test_a_camera_without_chunk_data_refuses_chunks() -> None:
     with pytest.raises(RefusedError, match="no chunk data"), wired(chunks="on"):
         pass
 
 
-def test_a_frame_triggered_by_a_line_is_fresh_and_one_of_before_is_not(
+def test_a_frame_after_a_hardware_trigger_is_fresh_and_an_earlier_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with ExitStack() as stack:

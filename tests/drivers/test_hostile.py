@@ -98,7 +98,9 @@ class Talker:
     [(driver, PtyServer) for driver in DRIVERS if driver not in ("bk", "oscilloscope")]
     + [("ping360", UdpServer)],
 )
-def test_a_talker_on_a_serial_line_or_in_datagrams(driver: str, door: type[Server], noise: str) -> None:
+def test_unsolicited_bytes_on_a_serial_line_or_in_datagrams(
+    driver: str, door: type[Server], noise: str
+) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with door(lambda: Talker(NOISE[noise])) as server:
         device = DRIVERS[driver]("victim", server.address, seconds=0.2)
@@ -112,7 +114,7 @@ def test_a_talker_on_a_serial_line_or_in_datagrams(driver: str, door: type[Serve
 
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_an_endless_talker_costs_bounded_time_and_memory(driver: str, noise: str) -> None:
+def test_endless_unsolicited_bytes_use_bounded_time_and_memory(driver: str, noise: str) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with flood(NOISE[noise]) as address:
         device = DRIVERS[driver]("victim", address, seconds=0.2)
@@ -135,7 +137,7 @@ MACHINES: dict[str, Callable[[], Machine]] = {
 
 
 @pytest.mark.parametrize("machine", MACHINES)
-def test_a_simulator_survives_any_noise_and_says_that_it_was_none_of_its_protocol(machine: str) -> None:
+def test_simulators_report_noise_as_violations(machine: str) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     made = MACHINES[machine]()
     link, deadline = InProcess(lambda: FaultyConnection(made)), Deadline(60.0)
@@ -187,7 +189,7 @@ def test_every_call_of_a_silent_instrument_ends_at_its_deadline(driver: str) -> 
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_close_never_raises_whatever_the_connection_is_in(driver: str) -> None:
+def test_close_never_raises_in_any_state(driver: str) -> None:
     device = DRIVERS[driver]("victim", "tcp://127.0.0.1:1", seconds=0.2)
     device.close()
     device.close()

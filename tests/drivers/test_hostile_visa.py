@@ -41,7 +41,7 @@ def address(transport: str, port: int) -> str:
 
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("transport", ["vxi-11", "hislip"])
-def test_a_flood_in_the_place_of_the_protocol(transport: str, noise: str) -> None:
+def test_a_flood_of_noise_instead_of_the_protocol(transport: str, noise: str) -> None:
     with flood(NOISE[noise]) as server:
         device = oscilloscope("victim", address(transport, int(server.rpartition(":")[2])), seconds=0.3)
         with bounded(), pytest.raises(InstrumentError, match="victim"):
@@ -93,9 +93,7 @@ def impossible_message(data: bytes) -> list[Output]:
         ("hislip", impossible_message),
     ],
 )
-def test_lengths_of_the_protocol_are_not_believed(
-    transport: str, answer: Callable[[bytes], list[Output]]
-) -> None:
+def test_announced_lengths_are_not_trusted(transport: str, answer: Callable[[bytes], list[Output]]) -> None:
     with TcpServer(lambda: Harmful(answer)) as server:
         device = oscilloscope("victim", address(transport, server.port), seconds=0.5)
         with bounded(seconds=3.0, kib=150_000), pytest.raises(InstrumentError, match="victim"):
@@ -105,7 +103,7 @@ def test_lengths_of_the_protocol_are_not_believed(
 
 @pytest.mark.parametrize("kind", HOSTILE)
 @pytest.mark.parametrize("transport", ["vxi-11", "hislip", "usbtmc"])
-def test_answers_that_never_end_within_the_protocol(transport: str, kind: str) -> None:
+def test_answers_without_end_within_the_protocol(transport: str, kind: str) -> None:
     machine, script = serving.Oscilloscope("keysight"), FaultScript()
 
     def execute(message: bytes) -> bytes | None:
@@ -125,7 +123,7 @@ def test_answers_that_never_end_within_the_protocol(transport: str, kind: str) -
         device.close()
 
 
-def test_the_sessions_of_simulators_take_no_more_than_their_limit_either() -> None:
+def test_simulator_sessions_limit_their_input() -> None:
     machine = serving.Oscilloscope("keysight")
     sessions = {
         "vxi-11": Vxi11Session(machine, machine.execute, FaultScript()),

@@ -88,7 +88,7 @@ def test_families_over_their_real_protocols(family: str, transport: str) -> None
     assert machine.violations == []
 
 
-def test_a_wave_descriptor_of_siglent_is_read_where_its_guide_puts_the_numbers() -> None:
+def test_siglent_wave_descriptor_offsets_are_those_of_the_guide() -> None:
     # As public drivers of SDS1000X HD and 2000X Plus unpack it (EN11): offsets in bytes, little endian.
     head = bytearray(346)
     head[116:120] = bytes.fromhex("88 13 00 00")  # 5000 points
@@ -131,7 +131,7 @@ def test_dialects_are_chosen_by_identity() -> None:
         "AGILENT TECHNOLOGIES,DSO-X 2024A,M,1": "Keysight InfiniiVision X",
     }.items():
         assert dialect_of(idn).name == name
-    with pytest.raises(ProtocolError, match="name a dialect"):
+    with pytest.raises(ProtocolError, match="set the option dialect"):
         dialect_of("ACME,X1,1,1")
     assert len({dialect.name for dialect in DIALECTS}) == len(DIALECTS)
     with pytest.raises(SettingError):
@@ -140,7 +140,7 @@ def test_dialects_are_chosen_by_identity() -> None:
         oscilloscope("scope", "TCPIP::127.0.0.1::x::SOCKET")
 
 
-def test_what_the_scanner_sweeps_is_on_the_oscilloscope() -> None:
+def test_the_oscilloscope_shows_the_echoes_of_the_scanner() -> None:
     laboratory = Laboratory(World.standard(seed=4))
     machine = serving.Oscilloscope(
         "rigol-1000z", lambda: laboratory.picture(400, 240), lambda: laboratory.echoes
@@ -166,7 +166,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_a_hostile_peer_costs_bounded_time(kind: str) -> None:
+def test_a_hostile_peer_uses_bounded_time(kind: str) -> None:
     listener = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -219,7 +219,7 @@ def _portmapper(core: int) -> TcpServer:
         ("tektronix", "tektronix-2000"),
     ],
 )
-def test_lxi_saves_the_very_screen(family: str, plugin: str, tmp_path: Path) -> None:
+def test_lxi_saves_the_same_screen(family: str, plugin: str, tmp_path: Path) -> None:
     laboratory = Laboratory(World.standard(seed=4))
     machine = serving.Oscilloscope(family, lambda: laboratory.picture(400, 240))
     with TcpServer(partial(Vxi11Session, machine, machine.execute, FaultScript())) as core:

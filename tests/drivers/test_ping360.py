@@ -138,6 +138,6 @@ def test_another_device_at_the_address_is_named() -> None:
     machine._tell = lambda id_: (
         __import__("reseau_drivers.codecs.ping").codecs.ping.Information(1, 1, (1, 0, 0)).frame()
     )  # type: ignore[method-assign]
-    with pytest.raises(ProtocolError, match="no Ping360"):
+    with pytest.raises(ProtocolError, match="not a Ping360"):
         device.connect()
     device.close()

@@ -132,14 +132,14 @@ def test_echoes_of_the_pulser_come_from_its_oscilloscope() -> None:
     assert machine.violations == shown.violations == []
 
 
-def test_where_the_gain_alone_is_told_it_vouches_for_the_rest() -> None:
+def test_a_readable_gain_checks_the_other_settings() -> None:
     machine = serving.CompactPulser(readable="G")
     device = compact_pulser("pulser", InProcess(lambda: FaultyConnection(machine)), answer_s=0.05)
     with device:
         assert machine.values == {"P": 0, "W": 220, "V": 300, "D": 0, "M": 0, "T": 0, "G": 0}
         device.configure(gain_db=84.0, width_ns=100.0)
         assert (machine.values["G"], machine.values["W"]) == (840, 100)
-        assert "tells no other" in device.check()["settings"]
+        assert "others are not readable" in device.check()["settings"]
         machine.inject_fault("power-cycled")
         with pytest.raises(StateError, match="G = 5"):
             device.verify()
@@ -218,7 +218,7 @@ def test_stop_ends_a_section_and_the_carrier_stands() -> None:
     assert machine.violations == chain.violations == shown.violations == []
 
 
-def test_what_works_together_is_named_on_the_bench() -> None:
+def test_combined_instruments_are_named_on_the_bench() -> None:
     text = """
         schema = "reseau-bench/1"
         [instruments.pulser]
@@ -237,8 +237,8 @@ def test_what_works_together_is_named_on_the_bench() -> None:
     assert bench["pulser"]._digitiser is bench["scope"]  # type: ignore[attr-defined]
     assert bench["pulser"]._carrier is bench["table"]  # type: ignore[attr-defined]
     for wrong, said in (
-        (text.replace('"scope", carrier', '"table", carrier'), "digitiser 'table' is no oscilloscope"),
-        (text.replace("axes = {z", "axes = {tilt"), "no table with an axis 'z'"),
+        (text.replace('"scope", carrier', '"table", carrier'), "digitiser 'table' is not an oscilloscope"),
+        (text.replace("axes = {z", "axes = {tilt"), "is not a table with an axis 'z'"),
         (text.replace('carrier = "table"', 'carrier = "none"'), "carrier 'none'"),
     ):
         with pytest.raises(BenchError, match=said):
@@ -267,10 +267,10 @@ def test_a_pulser_that_was_off_gets_all_its_settings_back() -> None:
         assert machine.values == before
 
 
-def test_a_knob_that_was_turned_is_found() -> None:
+def test_a_setting_changed_by_hand_is_detected() -> None:
     device, machine = pulser()
     with device:
-        assert device.check()["settings"] == "as pushed"
+        assert device.check()["settings"] == "as sent"
         machine.values["G"] = 12
         with pytest.raises(StateError, match="G = 12 and not 0"):
             device.verify()

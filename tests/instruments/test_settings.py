@@ -40,7 +40,7 @@ class Pulser(Settings):
         {"colour": 3},
     ],
 )
-def test_what_is_no_setting_is_refused_by_name(wrong: dict[str, Any]) -> None:
+def test_invalid_settings_raise_with_their_name(wrong: dict[str, Any]) -> None:
     with pytest.raises(SettingError, match=next(iter(wrong))):
         Pulser().changed(wrong)
 
@@ -54,11 +54,11 @@ def test_a_bench_narrows_limits() -> None:
 
 
 @given(st.floats(40, 300))
-def test_what_is_within_the_limits_is_taken(voltage: float) -> None:
+def test_values_within_the_limits_are_accepted(voltage: float) -> None:
     assert Pulser(voltage).to_dict() == {"voltage": voltage, "averages": 1, "mode": "echo", "note": ""}
 
 
-def test_a_deadline_runs_out_and_its_parts_never_after_it() -> None:
+def test_a_deadline_expires_and_its_parts_not_later() -> None:
     deadline = Deadline(0.02)
     part = deadline.part(10.0)
     assert part.left <= deadline.seconds
@@ -70,7 +70,7 @@ def test_a_deadline_runs_out_and_its_parts_never_after_it() -> None:
             Deadline(seconds)
 
 
-def test_a_status_tells_how_it_went_and_calls_back_once() -> None:
+def test_a_status_reports_its_outcome_and_calls_back_once() -> None:
     gate, called = threading.Event(), []
     status = Status(gate.wait, "gate")
     status.add_callback(lambda s: called.append(s.success))

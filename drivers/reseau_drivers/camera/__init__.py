@@ -1,4 +1,4 @@
-"""Cameras: Video4Linux; GigE Vision and USB3 Vision by Aravis."""
+"""Drivers of cameras: Video4Linux, and GigE Vision and USB3 Vision through Aravis."""
 
 from __future__ import annotations
 
@@ -30,18 +30,26 @@ __all__ = [
 def v4l2(
     name: str, address: str | OpenNode, *, settings: Mapping[str, Any] | None = None, **options: Any
 ) -> CameraDriver[V4l2Settings]:
-    """A camera of Video4Linux; found by its entry point.
+    """Create the driver of a Video4Linux camera; entry point ``v4l2``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or callable
-        Its node, as ``/dev/video0``, or what opens one.
+        Device node, such as ``/dev/video0``, or a function that opens one.
     settings : mapping, optional
-        Of :class:`V4l2Settings`.
+        Values for :class:`V4l2Settings`.
     **options
-        Of :class:`CameraDriver`.
+        Further arguments of :class:`CameraDriver`.
+
+    Examples
+    --------
+    The node is opened on the first call, not on construction:
+
+    >>> camera = v4l2("eye", "/dev/video0", settings={"format": "Y16", "exposure_us": 5000.0})
+    >>> camera.settings.format, camera.settings.exposure_us
+    ('Y16', 5000.0)
     """
     open_node = partial(KernelNode, address) if isinstance(address, str) else address
     return CameraDriver(name, V4l2(open_node), V4l2Settings().changed(settings or {}), **options)
@@ -50,17 +58,25 @@ def v4l2(
 def aravis(
     name: str, address: str, *, settings: Mapping[str, Any] | None = None, **options: Any
 ) -> CameraDriver[AravisSettings]:
-    """A camera of GigE Vision or USB3 Vision; found by its entry point.
+    """Create the driver of a GigE Vision or USB3 Vision camera; entry point ``aravis``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str
-        Its identifier as `reseau bench list` shows it, or its IP address.
+        Identifier as shown by ``reseau bench list``, or IP address.
     settings : mapping, optional
-        Of :class:`AravisSettings`.
+        Values for :class:`AravisSettings`.
     **options
-        Of :class:`CameraDriver`.
+        Further arguments of :class:`CameraDriver`.
+
+    Examples
+    --------
+    The camera is opened on the first call, not on construction:
+
+    >>> camera = aravis("camera", "192.0.2.30", settings={"format": "Mono12", "trigger": "software"})
+    >>> camera.settings.format, camera.settings.trigger
+    ('Mono12', 'software')
     """
     return CameraDriver(name, Aravis(address), AravisSettings().changed(settings or {}), **options)

@@ -1,7 +1,7 @@
-"""Cameras of GigE Vision and USB3 Vision, by Aravis: all that knows its library.
+"""GigE Vision and USB3 Vision cameras through Aravis; the only module that uses this library.
 
-Aravis is used through its introspection (PyGObject and the typelib ``Aravis-0.8``); where they are missing
-the driver says so when it connects. A buffer that was taken is copied and always given back.
+Aravis is called through its introspection (PyGObject and the typelib ``Aravis-0.8``); if these are not
+installed, the driver reports it when it connects. Each buffer is copied and always returned to the stream.
 """
 
 from __future__ import annotations
@@ -41,12 +41,18 @@ _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue"),
     ("GevTimestampControlLatch", "GevTimestampValue"),
 )
-"""Features that read a camera's clock, of the Standard Features Naming Convention from 2.0 on, and before."""
+"""Features that read a camera's clock: Standard Features Naming Convention 2.0 and later, and earlier."""
 
 
 @dataclass(frozen=True)
 class AravisSettings(CameraSettings):
-    """Settings of a camera of GenICam; gains in dB, where it has that unit; packet size 0: negotiated."""
+    """Settings of a GenICam camera; gains in dB if the camera uses that unit; packet size 0 is negotiated.
+
+    Examples
+    --------
+    >>> AravisSettings(format="Mono12", features="ReverseX=true").features
+    'ReverseX=true'
+    """
 
     format: str = choice("Mono8", *GENICAM)
     trigger: str = choice("off", "off", "software", "hardware")
@@ -54,7 +60,7 @@ class AravisSettings(CameraSettings):
     stamp: str = choice("end", "end", "start")
     chunks: str = choice("off", "off", "on")
     packet_size: int = quantity(0, "B", 0, 65535)
-    features: str = text("")  # by name, before all others; see :func:`wanted_features`
+    features: str = text("")  # set by name, before all other settings; see :func:`wanted_features`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,12 +68,17 @@ class AravisSettings(CameraSettings):
 
 
 def wanted_features(text: str) -> tuple[tuple[str, str], ...]:
-    """Names and values, in the order in which they are to be set.
+    """Parse GenICam features, as ``ReverseX=true BlackLevel=16 DeviceUserID="left eye"``.
+
+    Returns
+    -------
+    tuple of (str, str)
+        Names and values in the order in which they are set.
 
     Raises
     ------
     SettingError
-        When the text is something else.
+        If the text is not valid.
 
     Examples
     --------
@@ -77,19 +88,19 @@ def wanted_features(text: str) -> tuple[tuple[str, str], ...]:
     try:
         pairs = [word.partition("=") for word in shlex.split(text)]
     except ValueError as error:
-        raise SettingError(f"{text!r} is not whole ({error})", where="features") from None
+        raise SettingError(f"{text!r} is incomplete ({error})", where="features") from None
     for name, sign, value in pairs:
         if not (name.isidentifier() and sign and value):
             raise SettingError(
-                f"{name + sign + value!r} sets no feature",
+                f"{name + sign + value!r} is not a feature setting",
                 where="features",
-                do="write Name=value, with blanks between them",
+                do="write Name=value, separated by spaces",
             )
     return tuple((name, value) for name, _, value in pairs)
 
 
 def same_value(got: str, wanted: str) -> bool:
-    """Whether what a camera says it has is what was asked for.
+    """Whether the value that a camera reports equals the requested one.
 
     Examples
     --------
@@ -105,20 +116,20 @@ def same_value(got: str, wanted: str) -> bool:
 
 
 def require_within(name: str, value: float, bounds: Sequence[float]) -> None:
-    """Make sure that a camera can do what it is to be set to.
+    """Raise if a value is outside the range of the camera.
 
     Raises
     ------
     RefusedError
-        When the value is beyond its bounds.
+        If the value is outside its bounds.
     """
     low, high = bounds[0], bounds[1]
     if not low <= value <= high:
-        raise RefusedError(f"{name} {value:g} is beyond its {low:g}…{high:g}")
+        raise RefusedError(f"{name} {value:g} is outside {low:g}…{high:g}")
 
 
 def _number(text: str) -> float:
-    """The number; NaN, which is the same as no other, when it is none."""
+    """Return the number in a text; NaN if there is none."""
     for kind in (lambda: int(text, 0), lambda: float(text)):
         try:
             return kind()
@@ -129,12 +140,12 @@ def _number(text: str) -> float:
 
 @cache
 def _library() -> tuple[Any, Any]:
-    """Aravis and GLib.
+    """Return Aravis and GLib.
 
     Raises
     ------
     UsageError
-        When they are not installed.
+        If they are not installed.
     """
     try:
         import gi  # type: ignore[import-untyped, import-not-found, unused-ignore]
@@ -151,12 +162,17 @@ def _library() -> tuple[Any, Any]:
 
 
 def aravis_cameras() -> tuple[str, ...]:
-    """Identifiers of the cameras that answer; found by its entry point.
+    """List the identifiers of the cameras that answer; entry point ``aravis``.
 
     Raises
     ------
     UsageError
-        When Aravis is not installed.
+        If Aravis is not installed.
+
+    Examples
+    --------
+    >>> aravis_cameras()  # doctest: +SKIP
+    ('Aravis-Fake-GV01',)
     """
     library, _ = _library()
     library.update_device_list()
@@ -164,12 +180,17 @@ def aravis_cameras() -> tuple[str, ...]:
 
 
 class Aravis:
-    """A camera that Aravis opens.
+    """Interface to a camera that Aravis opens.
 
     Parameters
     ----------
     address : str
-        Its identifier, or its IP address.
+        Identifier or IP address.
+
+    Examples
+    --------
+    >>> Aravis("192.0.2.30").dropped
+    0
     """
 
     def __init__(self, address: str) -> None:
@@ -191,16 +212,16 @@ class Aravis:
 
     @property
     def dropped(self) -> int:
-        """Frames that were lost or damaged."""
+        """Number of frames lost or damaged."""
         return self._numbers.lost
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of its frames."""
+        """Height and width of the frames (px)."""
         return self._size[1], self._size[0]
 
     def open(self, deadline: Deadline) -> None:
-        """Open it anew, and take control of it."""
+        """Open the camera and take control of it; an open one is closed before."""
         self.close()
         library, _ = _library()
         self._lost = lost = Event()
@@ -212,25 +233,26 @@ class Aravis:
             self._camera.get_device().connect("control-lost", lambda *_: lost.set())
             if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
                 raise controlled_elsewhere(self._address)
-            # Whoever had it may have died while it sent; to whom it sends is settled when it starts.
+            # A previous application may have died during an acquisition; the receiver is set at the next
+            # start.
             self._camera.stop_acquisition()
             self._stamps.offset = self._latched()
 
     def close(self) -> None:
-        """Let go of it, if it is open; one that does not answer is not waited for."""
+        """Release the camera if it is open, without waiting for one that does not answer."""
         held = [self._camera] if self._camera is not None else []
         running, self._running = self._running, False
-        # Only when nothing refers to it any more does the library give its control back, and it tries hard.
+        # The library releases the control when the last reference is dropped, and retries for a long time.
         self._stream = self._parser = self._camera = None
         if held:
             releasing = Thread(target=_release, args=(held, running), name="Aravis", daemon=True)
             releasing.start()
             releasing.join(_RELEASE_S)
-            # One that did not hear it takes it that we are still there, until it misses our heartbeat.
+            # A camera that did not receive the release keeps our control until our heartbeat times out.
             self._ours_until = time.monotonic() + HEARTBEAT_S
 
     def identify(self, deadline: Deadline) -> Identity:
-        """What it says it is."""
+        """Return the identity that the camera reports."""
         with self._translated_errors("identify") as camera:
             version = ""
             if camera.is_feature_available("DeviceVersion"):
@@ -240,7 +262,7 @@ class Aravis:
             )
 
     def apply(self, settings: AravisSettings, deadline: Deadline) -> None:
-        """Stop, and have it set so."""
+        """Stop the acquisition and apply settings."""
         self.halt()
         self._settings = settings
         with self._translated_errors("set") as camera:
@@ -258,20 +280,20 @@ class Aravis:
                 camera.gv_set_packet_size_adjustment(_library()[0].GvPacketSizeAdjustment.NEVER)
 
     def dark(self, settings: AravisSettings) -> AravisSettings:
-        """Settings with the shortest exposure."""
+        """Return the settings with the shortest exposure."""
         with self._translated_errors("limits") as camera:
             if not camera.is_exposure_time_available():
                 return settings
             return replace(settings, exposure_us=max(1.0, float(camera.get_exposure_time_bounds()[0])))
 
     def start(self, deadline: Deadline) -> None:
-        """Have it deliver frames, if it does not yet."""
+        """Start the acquisition if it is not running."""
         if self._running:
             return
         with self._translated_errors("start") as camera:
             self._stream = camera.create_stream(None, None)
             if self._stream is None:
-                raise RefusedError("opens no stream", do="is it open elsewhere?")
+                raise RefusedError("does not open a stream", do="is it open in another program?")
             payload = camera.get_payload()
             for _ in range(self._settings.buffers):
                 self._stream.push_buffer(_library()[0].Buffer.new_allocate(payload))
@@ -281,7 +303,7 @@ class Aravis:
         self._stamps.restart(self._period_ns)
 
     def request(self, deadline: Deadline) -> None:
-        """Trigger it by software, where it is set so; what came before is let go."""
+        """Send a software trigger if configured; earlier frames are discarded."""
         if self._settings.trigger == "off":
             return
         while (buffer := self._stream.try_pop_buffer()) is not None:
@@ -293,9 +315,9 @@ class Aravis:
                 camera.software_trigger()
 
     def take(self, deadline: Deadline) -> RawFrame | None:
-        """The next whole frame that is newer than the last."""
+        """Return the next complete frame that is newer than the last."""
         if self._lost.is_set() or self._stream is None:
-            raise ConnectionLost("control of the camera was lost", do="is it on, and the cable good?")
+            raise ConnectionLost("control of the camera was lost", do="check power and cable")
         with self._translated_errors("fetch"):
             stream = _held(self._stream)
             buffer = stream.timeout_pop_buffer(max(1, int(deadline.left * 1e6)))
@@ -308,7 +330,7 @@ class Aravis:
                 stream.push_buffer(buffer)
 
     def halt(self) -> None:
-        """Have it stop, and let its stream go."""
+        """Stop the acquisition and close its stream."""
         self._stream = None
         if not self._running:
             return
@@ -317,15 +339,16 @@ class Aravis:
             camera.stop_acquisition()
 
     def clock(self, deadline: Deadline) -> str:
-        """How its clock stands to UTC."""
+        """Describe the offset of the camera's clock to UTC."""
         with self._translated_errors("clock"):
             self._stamps.offset = self._latched()
         return self._stamps.describe()
 
     def _counted(self, buffer: Any) -> int | None:
-        """The number of a whole frame counted on; None of a damaged one, or one that is not newer.
+        """Return the number of a complete frame without wrapping; None if it is damaged or not newer.
 
-        A damaged one may have lost its leader, and with it its number: it is missed when the next comes.
+        A damaged frame may have lost its leader, and with it its number; it counts as lost when the next one
+        arrives.
         """
         if buffer.get_status() != _library()[0].BufferStatus.SUCCESS:
             return None
@@ -353,7 +376,7 @@ class Aravis:
         return RawFrame(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
 
     def _latched(self) -> tuple[int, int] | None:
-        """What is added to the camera's clock to have ours, and its uncertainty; None: it cannot be read."""
+        """Return offset of the camera's clock to the computer's and its uncertainty; None if not readable."""
         camera = _held(self._camera)
         for latch, value in _LATCHES:
             if not (camera.is_feature_available(latch) and camera.is_feature_available(value)):
@@ -365,29 +388,29 @@ class Aravis:
                 after = time.monotonic_ns()
                 readings.append((after - before, (before + after) // 2, int(camera.get_integer(value))))
             if readings[0][2] == readings[-1][2]:
-                return None  # a clock that stands still is none
+                return None  # the clock does not run
             accepted, ours, theirs = min(readings)
             return ours - theirs, (accepted + 1) // 2
         return None
 
     def _set_feature(self, camera: Any, name: str, value: str) -> None:
         if not camera.is_feature_available(name):
-            raise RefusedError(f"has no feature {name}", do="arv-tool-0.8 features lists those that it has")
-        # No names for the device and its nodes: see :meth:`_translated_errors`.
+            raise RefusedError(f"has no feature {name}", do="list the features with arv-tool-0.8 features")
+        # Do not assign the device or its nodes to variables: see :meth:`_translated_errors`.
         camera.get_device().get_feature(name).set_value_from_string(value)
         got = str(camera.get_device().get_feature(name).get_value_as_string())
         if not same_value(got, value):
             raise RefusedError(f"{name} is {got}, not {value}")
 
     def _set_chunks(self, camera: Any, wanted: bool) -> None:
-        """Have each frame tell with which exposure and gain it was taken, as far as it can."""
+        """Make each frame report its exposure and gain, as far as the camera supports it."""
         self._parser, self._chunks = None, ()
         if not wanted:
             if camera.are_chunks_available():
                 camera.set_chunk_mode(False)
             return
         if not camera.are_chunks_available():
-            raise RefusedError("has no chunk data")
+            raise RefusedError("does not support chunk data")
         offered = camera.dup_available_enumerations_as_strings("ChunkSelector")
         self._chunks = tuple(name for name in ("ExposureTime", "Gain") if name in offered)
         camera.set_chunks(",".join(self._chunks))
@@ -403,9 +426,9 @@ class Aravis:
         sensor = camera.get_sensor_size()
         if left + width > sensor[0] or top + height > sensor[1]:
             raise RefusedError(
-                f"has {sensor[0]}×{sensor[1]} pixels, and none of {width}×{height} at ({left}, {top})"
+                f"has {sensor[0]}×{sensor[1]} pixels; {width}×{height} at ({left}, {top}) does not fit"
             )
-        camera.set_region(0, 0, -1, -1)  # where it lies limits how large it may be
+        camera.set_region(0, 0, -1, -1)  # the offset limits the size
         camera.set_region(*region)
         if (got := tuple(camera.get_region())) != region:
             raise RefusedError(f"reads the region {got}, not {region}")
@@ -433,21 +456,21 @@ class Aravis:
 
     @contextmanager
     def _translated_errors(self, what: str) -> Iterator[Any]:
-        """The camera; and what the library's errors mean."""
+        """Provide the camera and translate errors of the library."""
         glib = _library()[1]
         if self._camera is None and what != "open":
             raise ConnectionLost("the camera is not open")
         try:
-            # What an error's traceback refers to lives on: were it the camera, nobody could open it anew.
+            # A traceback keeps its objects alive: were the camera among them, it could not be opened again.
             yield None if self._camera is None else _held(self._camera)
         except glib.Error as error:
             raise _meaning(error, what, self._lost.is_set()) from None
         except ReferenceError:
-            raise ConnectionLost("was closed meanwhile") from None
+            raise ConnectionLost("was closed during the call") from None
 
 
 def _release(held: list[Any], running: bool) -> None:
-    """Stop the camera, and drop the only reference to it."""
+    """Stop the camera and drop the only reference to it."""
     with suppress(Exception):
         if running:
             held[0].stop_acquisition()
@@ -455,18 +478,20 @@ def _release(held: list[Any], running: bool) -> None:
 
 
 def _held(thing: Any) -> Any:
-    """A reference that keeps nothing alive."""
+    """Return a weak reference."""
     if thing is None:
-        raise ConnectionLost("was closed meanwhile")
+        raise ConnectionLost("was closed during the call")
     return weakref.proxy(thing)
 
 
 def _meaning(error: Any, what: str, lost: bool) -> InstrumentError:
-    """The project's error for one of the library."""
+    """Translate an error of the library."""
     text, codes = f"{what}: {error.message}", _library()[0].DeviceError
     if lost:
-        return ConnectionLost(f"control of the camera was lost ({text})", do="is it switched on?")
+        return ConnectionLost(f"control of the camera was lost ({text})", do="check power and cable")
     gone = (codes.TIMEOUT, codes.NOT_CONNECTED, codes.NOT_FOUND, codes.TRANSFER_ERROR, codes.UNKNOWN)
     if error.domain == "arv-device-error-quark" and error.code in (int(code) for code in gone):
-        return ConnectionLost(f"does not answer ({text})", do="is it switched on, and the address right?")
-    return RefusedError(f"refused it ({text})", do="does it have that, and no other program control it?")
+        return ConnectionLost(f"does not answer ({text})", do="check power and address")
+    return RefusedError(
+        f"refused the request ({text})", do="does it support this, and does no other program control it?"
+    )

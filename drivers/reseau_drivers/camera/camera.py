@@ -1,4 +1,4 @@
-"""What is safe with any camera: whole frames, begun after they were asked for, and the lost ones counted."""
+"""Base of all camera drivers: complete frames, exposed after the request, and a count of lost frames."""
 
 from __future__ import annotations
 
@@ -23,14 +23,22 @@ from .clocks import TimeInterval, utc
 __all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame"]
 
 _SLICE_S = 0.05
-"""How long one waits for a frame before looking whether one was told to stop."""
+"""Time to wait for a frame before checking for a stop request (s)."""
 _CHECKED = 12
-"""Frames of which :meth:`Camera.check` tells the rate."""
+"""Number of frames from which :meth:`CameraDriver.check` computes the frame rate."""
 
 
 @dataclass(frozen=True)
 class CameraSettings(Settings):
-    """What all cameras have; 0, or a gain below 0, leaves it to the camera, as it was found."""
+    """Settings of all cameras; 0, or a gain below 0, keeps the value that the camera had when it was opened.
+
+    Exposure time in µs, frame rate in 1/s, region in pixels, number of frame buffers.
+
+    Examples
+    --------
+    >>> CameraSettings(exposure_us=5000.0).units["exposure_us"]
+    'µs'
+    """
 
     exposure_us: float = quantity(0.0, "µs", 0.0, 1e8)
     gain: float = quantity(-1.0, "", -1.0, 1e6)
@@ -47,24 +55,31 @@ S = TypeVar("S", bound=CameraSettings)
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
-    """A whole frame as a camera delivered it.
+    """Complete frame as a camera delivered it.
 
     Parameters
     ----------
     pixels : ndarray (height, width)
-        Grey values, never converted; of a mosaic, all of them.
+        Grey values without conversion; of a colour mosaic, all raw pixels.
     full_scale : float
-        At which they saturate.
+        Grey value at saturation.
     pattern : str
-        Of colour, empty for grey.
+        Colour pattern; empty for grey.
     raw : bytes
-        The frame where the grey values are not all of it.
+        Original frame if the grey values do not contain all of it (YUYV, MJPEG).
     sequence : int
-        Counted on without wrapping.
+        Frame number, counted without wrapping.
     began : TimeInterval
-        When its exposure began.
+        Interval that contains the start of the exposure (ns).
     exposure_us, gain : float
-        As the camera says; NaN where it does not.
+        Exposure time (µs) and gain as reported by the camera; NaN if it does not report them.
+
+    Examples
+    --------
+    >>> from reseau_drivers.camera.clocks import TimeInterval
+    >>> frame = RawFrame(np.zeros((2, 3), np.uint8), 255.0, "", b"", 7, TimeInterval(100, 120), 5000.0, 0.0)
+    >>> frame.sequence, frame.began.latest - frame.began.earliest
+    (7, 20)
     """
 
     pixels: NDArray[Any]
@@ -78,15 +93,15 @@ class RawFrame:
 
 
 class OriginalValues:
-    """Values as they were found, by name.
+    """Values that a camera had before the driver changed them, so that they can be restored.
 
     Examples
     --------
-    >>> found, gain = OriginalValues(), 7
-    >>> found.keep("gain", True, lambda: gain)
+    >>> original, gain = OriginalValues(), 7
+    >>> original.keep("gain", True, lambda: gain)
     7
     >>> gain = 3
-    >>> found.keep("gain", True, lambda: gain), found.keep("gain", False), found.keep("gain", False)
+    >>> original.keep("gain", True, lambda: gain), original.keep("gain", False), original.keep("gain", False)
     (7, 7, None)
     """
 
@@ -94,16 +109,16 @@ class OriginalValues:
         self._values: dict[Hashable, Any] = {}
 
     def keep(self, name: Hashable, given: bool, now: Callable[[], Any] | None = None) -> Any:
-        """What there was before it was changed; None where it was not.
+        """Return the value before the first change; None if the setting was not changed.
 
         Parameters
         ----------
         name : hashable
-            Of the setting.
+            Name of the setting.
         given : bool
-            Whether it is changed now; otherwise what there was is to be brought back, and forgotten.
+            Whether the setting is changed now. If not, the original value is returned once, to be restored.
         now : callable, optional
-            Asks for what there is, when it is changed for the first time.
+            Reads the current value; called before the first change.
         """
         if not given:
             return self._values.pop(name, None)
@@ -113,50 +128,67 @@ class OriginalValues:
 
 
 class CameraInterface(Protocol[S]):
-    """What a camera does on its own interface."""
+    """Operations of a camera on its own interface (Video4Linux, GenICam).
+
+    Examples
+    --------
+    >>> from reseau_drivers.camera import Aravis
+    >>> all(hasattr(Aravis, name) for name in ("open", "apply", "start", "take", "halt"))
+    True
+    """
 
     @property
     def dropped(self) -> int:
-        """Frames that were exposed, and lost or damaged on the way, since the camera was opened."""
+        """Number of exposed frames that were lost or damaged since the camera was opened."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of its frames."""
+        """Height and width of the frames (px)."""
 
     def open(self, deadline: Deadline) -> None:
-        """Open it anew."""
+        """Open the camera; an open one is closed before."""
 
     def close(self) -> None:
-        """Close it, if it is open; may be called from another thread."""
+        """Close the camera if it is open; may be called from another thread."""
 
     def identify(self, deadline: Deadline) -> Identity:
-        """Who it is."""
+        """Return the identity."""
 
     def apply(self, settings: S, deadline: Deadline) -> None:
-        """Have it set so; it stops for that."""
+        """Stop the acquisition and apply settings."""
 
     def dark(self, settings: S) -> S:
-        """Settings with the shortest exposure that it can."""
+        """Return the settings with the shortest possible exposure."""
 
     def start(self, deadline: Deadline) -> None:
-        """Have it deliver frames, if it does not yet."""
+        """Start the acquisition if it is not running."""
 
     def request(self, deadline: Deadline) -> None:
-        """Trigger it by software, where it is set to be; frames of before are let go."""
+        """Send a software trigger if configured; frames exposed before are discarded."""
 
     def take(self, deadline: Deadline) -> RawFrame | None:
-        """The next whole frame that is newer than the last; None when there is none by then."""
+        """Return the next complete frame that is newer than the last; None if none arrives in time."""
 
     def halt(self) -> None:
-        """Have it stop."""
+        """Stop the acquisition."""
 
     def clock(self, deadline: Deadline) -> str:
-        """How its clock stands to that of this machine."""
+        """Describe the relation of the camera's clock to that of the computer."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraExposure:
-    """A frame with what is known of it; see :class:`reseau.instruments.Exposure`."""
+    """Frame with its time and settings; implements :class:`reseau.instruments.Exposure`.
+
+    Examples
+    --------
+    >>> from datetime import UTC
+    >>> pixels = np.zeros((2, 3), np.uint8)
+    >>> at = datetime(2026, 1, 1, tzinfo=UTC)
+    >>> shot = CameraExposure(at, 1e-3, True, 7, 0, 5000.0, 0.0, "", pixels, 255.0, b"", "camera-7")
+    >>> shot.frame.width, shot.frame.name
+    (3, 'camera-7')
+    """
 
     taken: datetime
     taken_within_s: float
@@ -173,30 +205,37 @@ class CameraExposure:
 
     @cached_property
     def frame(self) -> Frame:
-        """The image; its hash is that of the raw frame where there is one."""
+        """Image; its hash is that of the original frame if there is one."""
         return Frame(self.pixels, self.full_scale, self.name, sha256_of(self.raw or self.pixels.tobytes()))
 
 
 class CameraDriver(Device[S]):
-    """A camera.
+    """Driver of a camera.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     source : CameraInterface
-        Its interface.
+        Interface of the camera.
     settings : CameraSettings
-        Pushed on every connection.
+        Sent on every connection.
     seconds : float
-        Deadline of calls that name none.
+        Time limit of calls that do not specify one (s).
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
 
     Attributes
     ----------
     skipped : int
-        Frames that had begun before they were asked for, and were not handed out.
+        Number of frames not returned because their exposure started before the request.
+
+    Examples
+    --------
+    >>> from reseau_drivers.camera import v4l2
+    >>> camera = v4l2("eye", "/dev/video0")
+    >>> type(camera).__name__, camera.name, camera.skipped
+    ('CameraDriver', 'eye', 0)
     """
 
     def __init__(
@@ -222,7 +261,7 @@ class CameraDriver(Device[S]):
         try:
             self._source.apply(settings, deadline)
         except RefusedError:
-            # A part of them it may have taken: as it was before, or not at all.
+            # The camera may have accepted some of the settings: restore the previous ones.
             if self._connected:
                 with suppress(InstrumentError):
                     self._source.apply(self._settings, deadline)
@@ -250,32 +289,37 @@ class CameraDriver(Device[S]):
         }
 
     def expose(self, seconds: float | None = None) -> CameraExposure:
-        """A frame whose exposure began after this call.
+        """Return a frame whose exposure started after this call.
+
+        Parameters
+        ----------
+        seconds : float, optional
+            Time limit (s).
 
         Raises
         ------
         DeadlineError
-            When none came in time, or none but such that had begun before.
+            If no frame arrives in time, or only frames whose exposure started before the call.
         RefusedError
-            When the camera is another's.
+            If another program uses the camera.
         StateError
-            When it was stopped.
+            If the camera was stopped.
         InstrumentError
-            When it went away, or sends what is no frame.
+            If the connection is lost or the data are not a valid frame.
         """
         self._stopping.clear()
         with self._exchange("expose", seconds) as deadline:
             return self._next(deadline, stale=False)
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[CameraExposure]:
-        """Frames one after the other, as the camera delivers them; each says whether it is fresh.
+        """Yield consecutive frames as the camera delivers them; each states whether it is fresh.
 
         Parameters
         ----------
         count : int
-            How many.
+            Number of frames.
         seconds : float, optional
-            Deadline of each.
+            Time limit of each frame (s).
 
         Raises
         ------
@@ -303,7 +347,7 @@ class CameraDriver(Device[S]):
                 self.skipped += 1
                 passed += 1
             if deadline.expired:
-                seen = f"; {passed} came that may have begun before it was asked for" if passed else ""
+                seen = f"; {passed} frames may have started before the request" if passed else ""
                 raise DeadlineError(
                     f"delivered no new frame within {deadline.seconds:g} s{seen}",
                     do="is it triggered, and the exposure shorter than that?",
@@ -327,10 +371,10 @@ class CameraDriver(Device[S]):
         )
 
     def check(self, seconds: float | None = None) -> dict[str, str]:
-        """Who it is; frame rate, lost frames, clock; noise of frames at the shortest exposure.
+        """Test the camera: identity, frame rate, lost frames, clock, and noise at the shortest exposure.
 
-        The noise is that of the difference of two frames, over √2: no pattern that stays is in it. For that
-        of the dark the lens is to be covered.
+        The noise is the standard deviation of the difference of two frames, divided by √2, so that fixed
+        patterns cancel. Cover the lens to measure the dark noise.
         """
         deadline = Deadline(self._seconds if seconds is None else seconds)
         found = {"identity": str(self.connect(deadline.left or 1e-3))}

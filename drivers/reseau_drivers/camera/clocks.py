@@ -1,6 +1,6 @@
-"""Clocks of frames: from the clock that stamped them to UTC, and how well that is known.
+"""Start of exposures in UTC, from the time stamps of frames, with their uncertainty.
 
-All times are whole nanoseconds of the monotonic clock of this machine, until they are handed out.
+All times are integer nanoseconds of the computer's monotonic clock until they are returned to the caller.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True)
 class TimeInterval:
-    """When an exposure began, as far as it is known: between these (ns)."""
+    """Interval that contains the start of an exposure (ns)."""
 
     earliest: int
     latest: int
 
 
 def realtime_offset() -> tuple[int, int]:
-    """What is added to the monotonic clock to have UTC, and half the time in which both were read (ns)."""
+    """Return the offset from the monotonic clock to UTC and its uncertainty (ns).
+
+    The uncertainty is half of the time that reading both clocks took.
+    """
     best = (0, 1 << 62)
     for _ in range(_TRIES):
         before, real, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -35,7 +38,7 @@ def realtime_offset() -> tuple[int, int]:
 
 
 def utc(span: TimeInterval) -> tuple[datetime, float]:
-    """The middle of a span in UTC, and how far from it the truth may be (s)."""
+    """Return the middle of an interval in UTC, and half of its width (s)."""
     offset, doubt = realtime_offset()
     middle = (span.earliest + span.latest) // 2 + offset
     half = (span.latest - span.earliest) / 2 + doubt + 1000  # datetime counts microseconds
@@ -43,12 +46,12 @@ def utc(span: TimeInterval) -> tuple[datetime, float]:
 
 
 class FrameCounter:
-    """Frame numbers that begin anew after their highest one, and what is missing between them.
+    """Count frames whose numbers wrap around, and the numbers that are missing.
 
     Parameters
     ----------
     period : int
-        After how many the numbers begin anew; may be changed once that is known better.
+        Period of the frame numbers; it may be changed when it becomes known.
 
     Examples
     --------
@@ -63,14 +66,14 @@ class FrameCounter:
         self.period = period
         self._number, self._counted = -1, -1
         self.lost = 0
-        """Numbers that were left out."""
+        """Number of missing frames."""
 
     def restart(self) -> None:
-        """Numbers begin at any one; none is missing before it."""
+        """Accept any number next; no frame counts as missing before it."""
         self._number = -1
 
     def next(self, number: int) -> int | None:
-        """The number counted on without wrapping; None when it is not a newer one."""
+        """Return the number without wrapping; None if the frame is not newer than the last."""
         if self._number < 0:
             self._number = number
             self._counted = max(number, self._counted + 1)
@@ -85,7 +88,7 @@ class FrameCounter:
 
 
 class BlockCounter(FrameCounter):
-    """Frame numbers of GenICam: GigE Vision 1 counts 1…65535, some cameras 0…65535, all others in 64 bits.
+    """Count GenICam frames: numbers 1…65535 (GigE Vision 1), 0…65535 (some cameras), or 64 bits (all others).
 
     Examples
     --------
@@ -98,7 +101,7 @@ class BlockCounter(FrameCounter):
         super().__init__(_SHORT)
 
     def next(self, number: int) -> int | None:
-        """As of :class:`FrameCounter`; how many there are shows by itself."""
+        """As :meth:`FrameCounter.next`; the period is inferred from the numbers."""
         if number > _SHORT:
             self.period = _LONG
         elif number == 0 and self.period == _SHORT:
@@ -107,23 +110,24 @@ class BlockCounter(FrameCounter):
 
 
 class ExposureTimes:
-    """When exposures began, of frames that a camera stamps by a clock of its own.
+    """Start of exposures of frames that the camera stamps with its own clock.
 
     Attributes
     ----------
     offset : (int, int) or None
-        What is added to the camera's clock to have ours, and its uncertainty; None where it cannot be read.
+        Offset from the camera's clock to the computer's, and its uncertainty (ns); None if the camera's clock
+        cannot be read.
     triggered : int or None
-        When the frame that is waited for was triggered, all others having been let go.
+        Time of the software trigger of the expected frame; all earlier frames were discarded.
 
     Examples
     --------
-    >>> stamps = ExposureTimes()
-    >>> stamps.restart(period=10)
-    >>> stamps.began(1000, 5000, before=3, exposure=3), stamps.began(1100, 5140, before=3, exposure=3)
+    >>> times = ExposureTimes()
+    >>> times.restart(period=10)
+    >>> times.began(1000, 5000, before=3, exposure=3), times.began(1100, 5140, before=3, exposure=3)
     (TimeInterval(earliest=4987, latest=4997), TimeInterval(earliest=5087, latest=5137))
-    >>> stamps.offset = 4000, 2
-    >>> stamps.began(1200, 5240, before=3, exposure=3)
+    >>> times.offset = 4000, 2
+    >>> times.began(1200, 5240, before=3, exposure=3)
     TimeInterval(earliest=5195, latest=5199)
     """
 
@@ -134,40 +138,40 @@ class ExposureTimes:
         self._least_delay: int | None = None
 
     def restart(self, period: int) -> None:
-        """The camera was started anew; its frames follow one another after this period."""
+        """Start a new acquisition with the given frame period (ns)."""
         self._period, self._least_delay, self.triggered = period, None, None
 
     def began(self, stamped: int, arrived: int, before: int, exposure: int) -> TimeInterval:
-        """When an exposure began.
+        """Return the interval that contains the start of the exposure.
 
         Parameters
         ----------
         stamped, arrived : int
-            By the camera's clock, and when its first packet came, by ours.
+            Time stamp of the camera, and arrival of the first packet by the computer's clock (ns).
         before : int
-            How long before its stamp it began.
+            Time from the start of the exposure to the stamp (ns).
         exposure : int
-            How long it accepted.
+            Exposure time (ns).
         """
         if self.offset is not None:
-            begun, doubt = stamped + self.offset[0] - before, self.offset[1]
-            span = TimeInterval(begun - doubt, begun + doubt)
+            start, doubt = stamped + self.offset[0] - before, self.offset[1]
+            span = TimeInterval(start - doubt, start + doubt)
         else:
-            # A frame that came later after its stamp than another did has waited for as long somewhere.
+            # The longest possible wait of a frame is its delay beyond the shortest delay of all frames.
             delay = arrived - stamped
             self._least_delay = delay if self._least_delay is None else min(delay, self._least_delay)
             waited = delay - self._least_delay
             span = TimeInterval(arrived - waited - exposure - self._period, arrived - exposure)
         if self.triggered is None:
             return span
-        # Everything of before was let go, so this one was exposed at the trigger, or after it.
+        # All earlier frames were discarded: this one was exposed at the trigger or after it.
         return TimeInterval(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
 
     def describe(self) -> str:
-        """How the camera's clock stands to UTC."""
+        """Describe the offset of the camera's clock to UTC."""
         real = realtime_offset()[0]
         if self.offset is not None:
             return f"offset {(self.offset[0] + real) / 1e9:.6f} ± {self.offset[1] / 1e9:.6f} s"
         if self._least_delay is None:
-            return "offset unknown: no way to read its clock, and no frame yet"
-        return f"offset at most {(self._least_delay + real) / 1e9:+.6f} s, by the arrival of frames"
+            return "offset unknown: the clock cannot be read, and no frame has arrived yet"
+        return f"offset at most {(self._least_delay + real) / 1e9:+.6f} s, from the arrival of frames"

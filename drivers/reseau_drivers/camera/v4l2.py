@@ -1,7 +1,7 @@
-"""Cameras of Video4Linux: webcams, frame grabbers, sensors of boards.
+"""Video4Linux cameras: webcams, frame grabbers, board cameras.
 
-Buffers are shared with the kernel and copied out at once. The kernel counts frames, also those for which
-there was no buffer, and stamps them by the monotonic clock, at the start of the exposure or at the end of the
+Frame buffers are shared with the kernel and copied at once. The kernel counts frames, including those without
+a free buffer, and stamps them with the monotonic clock at the start of the exposure or at the end of the
 frame.
 """
 
@@ -32,56 +32,57 @@ from .clocks import FrameCounter, TimeInterval
 __all__ = ["KernelNode", "Mapping", "Node", "OpenNode", "V4l2", "V4l2Settings", "video_devices"]
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
-"""From frame to frame, where the driver does not tell: none is slower."""
+"""Frame period if the driver does not report one: an upper bound."""
 _TICK_NS = 100_000
-"""By which a stamp may lie ahead of the moment in which it is read: clocks of processors differ by less."""
+"""Tolerance for stamps ahead of the time of reading: clocks of processors differ by less."""
 _MOST_CONTROLS = 500
 _WEBCAMS = "uvcvideo"
-"""The kernel's driver of USB webcams. It says that it stamps starts of exposures, but stamps a frame when its
-first packet comes, unless it is told to believe the camera's own clock (its parameter ``hwtimestamps``)."""
+"""Kernel driver of USB webcams. It declares its stamps as starts of exposures, but stamps a frame when its
+first packet arrives, unless it is set to use the camera's own clock (parameter ``hwtimestamps``).
+"""
 
 
 class Mapping(Protocol):
     """Memory shared with the device."""
 
     def __getitem__(self, part: slice, /) -> bytes:
-        """A copy of a part."""
+        """Return a copy of a part."""
 
     def close(self) -> None:
-        """Give it back."""
+        """Unmap the memory."""
 
 
 class Node(Protocol):
-    """A device that has been opened; raises OSError as the kernel does."""
+    """Open device node; raises OSError as the kernel does."""
 
     def ioctl(self, request: int, data: bytearray) -> None:
-        """Ask or tell it something; the answer replaces the data."""
+        """Execute a request; the answer replaces the data."""
 
     def map(self, length: int, offset: int) -> Mapping:
-        """Map memory of it."""
+        """Map memory of the device."""
 
     def wait(self, seconds: float) -> bool:
-        """Wait until a frame can be fetched; whether it can."""
+        """Wait until a frame is available; return whether one is."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the node."""
 
 
 OpenNode = Callable[[], Node]
 
 
 class KernelNode:
-    """A device node.
+    """Device node of the kernel.
 
     Parameters
     ----------
     path : str
-        As ``/dev/video0``, or one of the links in ``/dev/v4l/by-id`` that stay.
+        Such as ``/dev/video0``, or one of the persistent links in ``/dev/v4l/by-id``.
 
     Raises
     ------
     ConnectionLost
-        When it cannot be opened.
+        If the node cannot be opened.
     """
 
     def __init__(self, path: str) -> None:
@@ -89,31 +90,31 @@ class KernelNode:
             self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
             raise ConnectionLost(
-                f"{path} cannot be opened ({error.strerror})", do="is it plugged in, and may you use it?"
+                f"{path} cannot be opened ({error.strerror})", do="check the cable and the permissions"
             ) from None
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
 
     def ioctl(self, request: int, data: bytearray) -> None:
-        """Ask or tell it something; the answer replaces the data."""
+        """Execute a request; the answer replaces the data."""
         fcntl.ioctl(self._fd, request, data, True)
 
     def map(self, length: int, offset: int) -> Mapping:
-        """Map memory of it."""
+        """Map memory of the device."""
         return mmap.mmap(self._fd, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
 
     def wait(self, seconds: float) -> bool:
-        """Wait until a frame can be fetched; whether it can."""
+        """Wait until a frame is available; return whether one is."""
         for _, events in self._poll.poll(max(0, int(seconds * 1000))):
             if events & select.POLLIN:
                 return True
-            # Unplugged it hangs up; an error alone is one of its queue of buffers.
+            # An unplugged device reports a hang-up; an error alone concerns its queue of buffers.
             number = errno.EIO if events == select.POLLERR else errno.ENODEV
             raise OSError(number, os.strerror(number))
         return False
 
     def close(self) -> None:
-        """Close it."""
+        """Close the node."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             with suppress(OSError):
@@ -121,26 +122,43 @@ class KernelNode:
 
 
 def video_devices() -> tuple[str, ...]:
-    """Nodes of video devices, by the links that stay where there are any; found by its entry point."""
+    """List the nodes of video devices, by persistent links if there are any; entry point ``video``.
+
+    Examples
+    --------
+    >>> all(path.startswith("/dev/") for path in video_devices())
+    True
+    """
     stable = sorted(str(path) for path in Path("/dev/v4l/by-id").glob("*"))
     return tuple(stable or sorted(str(path) for path in Path("/dev").glob("video*")))
 
 
 @dataclass(frozen=True)
 class V4l2Settings(CameraSettings):
-    """Settings of a camera of V4L2; a gain or brightness below 0 leaves it as it is. Gains have no unit."""
+    """Settings of a Video4Linux camera; a gain or brightness below 0 keeps its value. Gains have no unit.
+
+    Examples
+    --------
+    >>> V4l2Settings(format="Y16", gain=10.0).format
+    'Y16'
+    """
 
     format: str = choice("GREY", *VIDEO)
     brightness: int = quantity(-1, "", -1, 65535)
 
 
 class V4l2:
-    """A camera of V4L2.
+    """Interface to a Video4Linux camera.
 
     Parameters
     ----------
     open_node : callable
-        Opens its node.
+        Opens the device node.
+
+    Examples
+    --------
+    >>> V4l2(lambda: KernelNode("/dev/video0")).dropped
+    0
     """
 
     def __init__(self, open_node: OpenNode) -> None:
@@ -161,30 +179,32 @@ class V4l2:
 
     @property
     def dropped(self) -> int:
-        """Frames that were lost or damaged."""
+        """Number of frames lost or damaged."""
         return self._numbers.lost + self._damaged
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of its frames."""
+        """Height and width of the frames (px)."""
         return self._format.height, self._format.width
 
     def open(self, deadline: Deadline) -> None:
-        """Open the node anew; nothing of an earlier one is used again."""
+        """Open the node; an open one is closed before and all state is reset."""
         self.close()
         self._numbers, self._damaged, self._original = FrameCounter(1 << 32), 0, OriginalValues()
         self._node = self._open_node()
         with self._translated_errors("query"):
             found = uapi.Capability.parse(self._ask(uapi.QUERYCAP, bytearray(uapi.Capability.SIZE)))
         if not found.capabilities & uapi.Capability.VIDEO_CAPTURE:
-            raise RefusedError("is no camera", do="name the node that captures; see v4l2-ctl --list-devices")
+            raise RefusedError(
+                "is not a capture device", do="give the node that captures; see v4l2-ctl --list-devices"
+            )
         if not found.capabilities & uapi.Capability.STREAMING:
-            raise RefusedError("cannot share its buffers")
+            raise RefusedError("does not support streaming with shared buffers")
         self._identity = Identity(found.driver, found.card, found.bus, ".".join(map(str, found.version)))
         self._controls = {control.identifier: control for control in self._listed()}
 
     def close(self) -> None:
-        """Close it, if it is open."""
+        """Close the node if it is open."""
         node, self._node = self._node, None
         maps, self._maps = self._maps, []
         self._streaming = False
@@ -195,11 +215,11 @@ class V4l2:
             node.close()
 
     def identify(self, deadline: Deadline) -> Identity:
-        """What the driver says it is."""
+        """Return the identity that the kernel driver reports."""
         return self._identity
 
     def apply(self, settings: V4l2Settings, deadline: Deadline) -> None:
-        """Stop, and have it set so."""
+        """Stop the acquisition and apply settings."""
         self.halt()
         self._buffers = settings.buffers
         with self._translated_errors("set"):
@@ -213,12 +233,12 @@ class V4l2:
             self._put_back(uapi.BRIGHTNESS)
 
     def dark(self, settings: V4l2Settings) -> V4l2Settings:
-        """Settings with the shortest exposure, where it has a control for that."""
+        """Return the settings with the shortest exposure, if there is a control for it."""
         control = self._controls.get(uapi.EXPOSURE_ABSOLUTE)
         return settings if control is None else replace(settings, exposure_us=max(1, control.low) * 100.0)
 
     def start(self, deadline: Deadline) -> None:
-        """Have it deliver frames, if it does not yet."""
+        """Start the acquisition if it is not running."""
         if self._streaming:
             return
         with self._translated_errors("start"):
@@ -234,10 +254,10 @@ class V4l2:
         self._stamp_ns = 0
 
     def request(self, deadline: Deadline) -> None:
-        """Nothing to send: it runs freely."""
+        """Do nothing: the camera runs freely."""
 
     def take(self, deadline: Deadline) -> RawFrame | None:
-        """The next whole frame that is newer than the last."""
+        """Return the next complete frame that is newer than the last."""
         with self._translated_errors("fetch"):
             if not self._opened().wait(deadline.left):
                 return None
@@ -260,7 +280,7 @@ class V4l2:
         try:
             pixels = decode(self._layout, self._format.width, self._format.height, data, self._format.stride)
         except ProtocolError:
-            # A picture that was compressed tells its damage only here.
+            # Damage of a compressed frame shows only when it is decoded.
             self._damaged += 1
             return None
         exposure_us = float("nan") if self._exposure_ns is None else self._exposure_ns / 1000
@@ -277,7 +297,7 @@ class V4l2:
         )
 
     def halt(self) -> None:
-        """Stop, and give the buffers back."""
+        """Stop the acquisition and release the buffers."""
         if self._node is None:
             return
         maps, self._maps = self._maps, []
@@ -290,7 +310,7 @@ class V4l2:
                 self._ask(uapi.REQBUFS, uapi.Request(0).build())
 
     def clock(self, deadline: Deadline) -> str:
-        """Frames are stamped by the clock of this machine."""
+        """Describe the clock: the kernel stamps frames with the computer's clock."""
         return f"offset 0 s, stamped by the kernel at the {self._stamped_at}"
 
     def _whole(self, buffer: uapi.Buffer) -> bool:
@@ -298,17 +318,17 @@ class V4l2:
         return not buffer.flags & uapi.Buffer.ERROR and buffer.used >= max(1, need)
 
     def _began(self, buffer: uapi.Buffer, now: int) -> TimeInterval:
-        """When the exposure began; see the documentation of ``v4l2_buffer``'s flags."""
+        """Return the interval of the start of the exposure; see the flags of ``v4l2_buffer``."""
         if buffer.flags & uapi.Buffer.CLOCKS != uapi.Buffer.MONOTONIC:
-            raise ProtocolError("stamps its frames by an unknown clock")
+            raise ProtocolError("stamps its frames with an unknown clock")
         stamp = buffer.stamp_ns
         if stamp > now + self._period_ns + _TICK_NS or stamp < self._stamp_ns:
             raise ProtocolError(f"stamped a frame {(stamp - now) / 1e9:+.3g} s from now, or out of order")
         self._stamp_ns = stamp
-        # Drivers that stamp where a frame is to end may be ahead of that by a part of the period.
+        # Drivers that stamp the expected end of a frame may be ahead of it by a part of the period.
         stamp = min(stamp, now)
         at_start = buffer.flags & uapi.Buffer.SOURCES == uapi.Buffer.START_OF_EXPOSURE
-        # Rows are read one after the other, which takes up to a period; an unknown exposure may fill one.
+        # Reading the rows takes up to one period; an unknown exposure may fill another one.
         exposure = self._exposure_ns
         earliest = stamp - self._period_ns - (self._period_ns if exposure is None else exposure)
         if at_start and self._identity.maker == _WEBCAMS:
@@ -349,12 +369,12 @@ class V4l2:
         self._format = accepted
 
     def _region(self) -> uapi.Selection:
-        """The region of the sensor that is read."""
+        """Return the region of the sensor that is read out."""
         return uapi.Selection.parse(self._ask(uapi.G_SELECTION, uapi.Selection(0, 0, 0, 0).build()))
 
     def _set_rate(self, rate: float) -> None:
         self._period_ns = _UNKNOWN_PERIOD_NS
-        # Not every driver knows of intervals; one that does tells the one that it accepted.
+        # Not every driver supports frame intervals; one that does reports the interval it chose.
         with suppress(OSError):
             interval = self._original.keep("interval", bool(rate), self._interval)
             if rate:
@@ -372,7 +392,7 @@ class V4l2:
     def _set_exposure(self, exposure_us: float) -> None:
         known = uapi.EXPOSURE_ABSOLUTE in self._controls
         if exposure_us and not known:
-            raise RefusedError("has no control of the exposure time")
+            raise RefusedError("has no control for the exposure time")
         if exposure_us:
             if uapi.EXPOSURE_AUTO in self._controls:
                 self._set(uapi.EXPOSURE_AUTO, uapi.EXPOSURE_MANUAL, "exposure mode")
@@ -396,9 +416,9 @@ class V4l2:
     def _set(self, identifier: int, value: int, name: str) -> None:
         control = self._controls.get(identifier)
         if control is None:
-            raise RefusedError(f"has no control of {name}")
+            raise RefusedError(f"has no control for {name}")
         if not control.low <= value <= control.high:
-            raise RefusedError(f"{name} {value} is beyond its {control.low}…{control.high}")
+            raise RefusedError(f"{name} {value} is outside {control.low}…{control.high}")
         self._original.keep(identifier, True, lambda: self._get(identifier))
         with self._translated_errors(f"set {control.name}"):
             self._ask(uapi.S_CTRL, uapi.control_value(identifier, value))
@@ -406,7 +426,7 @@ class V4l2:
             raise RefusedError(f"{name} is {got}, not {value}", do="is it driven automatically?")
 
     def _put_back(self, *identifiers: int) -> None:
-        """Controls as they were found, where they have been changed."""
+        """Restore controls that the driver has changed."""
         for identifier in identifiers:
             if (value := self._original.keep(identifier, False)) is not None:
                 with self._translated_errors(f"set {self._controls[identifier].name}"):
@@ -418,7 +438,7 @@ class V4l2:
         return int(np.frombuffer(data, "<i4")[1])
 
     def _listed(self) -> Iterator[uapi.Control]:
-        """Controls with their limits, as the driver goes through them."""
+        """Yield the controls with their limits."""
         last = 0
         for _ in range(_MOST_CONTROLS):
             try:
@@ -433,7 +453,7 @@ class V4l2:
                 yield control
 
     def _offered(self) -> Iterator[str]:
-        """Pixel formats that it has, by the names of the settings where they have one."""
+        """Yield the available pixel formats, by the names of the settings where possible."""
         names = {str(layout.code): name for name, layout in VIDEO.items()}
         for index in range(64):
             try:
@@ -453,18 +473,20 @@ class V4l2:
 
     @contextmanager
     def _translated_errors(self, what: str) -> Iterator[None]:
-        """Name what the kernel's numbers mean."""
+        """Translate errors of the kernel."""
         try:
             yield
         except OSError as error:
             number = error.errno or 0
             if number == errno.EBUSY:
-                raise RefusedError(f"is used by another process ({what})", do="end that, or wait") from None
+                raise RefusedError(
+                    f"is used by another process ({what})", do="end that process, or wait"
+                ) from None
             if number in (errno.EINVAL, errno.ENOTTY, errno.ERANGE, errno.EACCES):
-                raise RefusedError(f"does not do that ({what}: {os.strerror(number)})") from None
+                raise RefusedError(f"does not support this ({what}: {os.strerror(number)})") from None
             if number == errno.EIO:
-                raise ProtocolError(f"reports a fault of its own ({what})", do="is the cable good?") from None
-            raise ConnectionLost(f"went away ({what}: {error.strerror})", do="is it plugged in?") from None
+                raise ProtocolError(f"reports an internal fault ({what})", do="check the cable") from None
+            raise ConnectionLost(f"disappeared ({what}: {error.strerror})", do="check the cable") from None
         except ValueError:
-            # Memory that another thread has given back.
-            raise ConnectionLost("was closed meanwhile") from None
+            # Another thread has unmapped the memory.
+            raise ConnectionLost("was closed during the call") from None

@@ -1,10 +1,10 @@
 """BK Medical's OEM interface: messages between 0x01 and 0x04, with frames and their geometry.
 
-Source: BK's document PS12640-44, page 9 (framing), as NifTK's ``BKMedicalDataSourceWorker`` quotes it, and
-PLUS's ``vtkPlusBkProFocusOemVideoSource`` (frames, geometry). The bytes 0x01, 0x04 and 0x1B inside a message
-stand as 0x1B and their complement. A frame comes as ``DATA:GRAB_FRAME #6227332<4 bytes of a time
-stamp><592·384 pixels>;``: its length counts the time stamp. A BK5000 states another one: the end of the
-message counts.
+Source: BK's document PS12640-44, page 9 (framing), as quoted by NifTK's ``BKMedicalDataSourceWorker``, and
+PLUS's ``vtkPlusBkProFocusOemVideoSource`` (frames, geometry). Inside a message the bytes 0x01, 0x04 and 0x1B
+are sent as 0x1B and their complement. A frame is ``DATA:GRAB_FRAME #6227332<4 bytes of a time
+stamp><592·384 pixels>;``: its length includes the time stamp. A BK5000 announces another length; the end of
+the message is decisive.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _GRAB = b"DATA:GRAB_FRAME "
 
 
 def encode(content: bytes) -> bytes:
-    """A message with its frame.
+    """Encode a message with its delimiters.
 
     Examples
     --------
@@ -40,12 +40,12 @@ def encode(content: bytes) -> bytes:
 
 
 class MessageDecoder:
-    """Messages from a stream.
+    """Decode messages from a stream.
 
     Parameters
     ----------
     limit : int
-        Bytes of the longest message; of a longer one nothing is kept.
+        Largest size of a message (bytes); a longer one is discarded.
     """
 
     def __init__(self, limit: int = 8_000_000) -> None:
@@ -53,11 +53,11 @@ class MessageDecoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the message that was begun."""
+        """Discard an incomplete message."""
         self._partial: bytearray | None = None
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
-        """Messages that are complete with these bytes, without their frame and escapes."""
+        """Return the messages that these bytes complete, without delimiters and escapes."""
         found: list[bytes | Damaged] = []
         at = 0
         for mark in _MARKS.finditer(data):
@@ -69,13 +69,13 @@ class MessageDecoder:
             if mark[0] == b"\x04":
                 found.append(_unescaped(bytes(body)))
             else:
-                # A start inside a message, which escapes forbid: the end of the one before was lost.
+                # A start byte cannot occur inside a message: the end of the previous one was lost.
                 _report(found, bytes(body), "a message without end")
         self._take(data[at:], found)
         return found
 
     def _take(self, piece: bytes, found: list[bytes | Damaged]) -> None:
-        """Add a piece without marks to the message that was begun."""
+        """Append bytes without delimiters to the incomplete message."""
         if not piece:
             return
         if self._partial is None:
@@ -88,7 +88,7 @@ class MessageDecoder:
 
 
 def _report(found: list[bytes | Damaged], data: bytes, why: str) -> None:
-    """One report for what is damaged in one go: garbage can look like thousands of messages."""
+    """Report consecutive damaged data once: noise can look like thousands of messages."""
     if not found or not isinstance(found[-1], Damaged):
         found.append(Damaged(data[:60], why))
 
@@ -111,11 +111,11 @@ class GrabbedFrame:
     Parameters
     ----------
     stamp : int
-        Milliseconds of the instrument's clock.
+        Time stamp of the instrument's clock (ms).
     pixels : bytes
-        One byte each.
+        One byte per pixel.
     announced : int
-        What the message said of its length; not to be trusted.
+        Length in the message; unreliable.
     """
 
     stamp: int
@@ -124,50 +124,50 @@ class GrabbedFrame:
 
 
 def encode_frame(frame: GrabbedFrame) -> bytes:
-    """The content of a message that brings a frame."""
+    """Encode the content of a message with a frame."""
     length = str(frame.announced).encode("ascii")
     stamp = frame.stamp.to_bytes(_STAMP, "little")
     return _GRAB + b"#%d" % len(length) + length + stamp + frame.pixels + b";"
 
 
 def parse_frame(content: bytes, size: int) -> GrabbedFrame:
-    """The frame that a message brings.
+    """Decode the frame in a message.
 
     Parameters
     ----------
     content : bytes
-        Of the message.
+        Content of the message.
     size : int
-        Pixels of the window; a semicolon behind them is none of them.
+        Number of pixels of the window; a semicolon after them is not one of them.
 
     Raises
     ------
     ProtocolError
-        When it brings none, or one of another size.
+        If there is no frame, or it has another size.
     """
     head = re.match(rb"DATA:GRAB_FRAME #([1-9])", content)
     digits = int(head[1]) if head else 0
     length = content[head.end() : head.end() + digits] if head else b""
     if head is None or len(length) != digits or not length.isdigit():
-        raise ProtocolError(f"no frame: {excerpt(content)}")
+        raise ProtocolError(f"not a frame: {excerpt(content)}")
     start = head.end() + digits
     stamp, pixels = content[start : start + _STAMP], content[start + _STAMP :]
     if len(pixels) == size + 1:
         pixels = pixels.removesuffix(b";")
     if len(stamp) < _STAMP or len(pixels) != size:
         raise ProtocolError(
-            f"a frame of {len(pixels)} bytes for {size} pixels", do="colour, or an overlay? switch them off"
+            f"a frame of {len(pixels)} bytes for {size} pixels", do="switch off colour and overlays"
         )
     return GrabbedFrame(int.from_bytes(stamp, "little"), pixels, int(length))
 
 
 def numbers(content: bytes, name: str) -> tuple[float, ...]:
-    """The numbers of an answer ``DATA:<name> a,b,…;``.
+    """Decode the numbers of an answer ``DATA:<name> a,b,…;``.
 
     Raises
     ------
     ProtocolError
-        When it is another message or holds no numbers.
+        If it is another message or does not contain numbers.
 
     Examples
     --------
@@ -180,4 +180,4 @@ def numbers(content: bytes, name: str) -> tuple[float, ...]:
             raise ValueError
         return tuple(float(value) for value in content[len(prefix) :].rstrip(b"; ").split(b","))
     except ValueError:
-        raise ProtocolError(f"no answer to {name}: {excerpt(content)}") from None
+        raise ProtocolError(f"not an answer to {name}: {excerpt(content)}") from None

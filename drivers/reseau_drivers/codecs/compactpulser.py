@@ -1,6 +1,6 @@
-r"""US Ultratek's CompactPulser: one letter, a whole number, a carriage return; ``G?`` is answered ``G=…\r``.
+r"""US Ultratek's CompactPulser: one letter, an integer, a carriage return; ``G?`` is answered by ``G=…\r``.
 
-Source: ``ultratekPulser.py`` of changbatterygroup/ultrasonicTesting, which runs one: 9600 baud, ``D0``,
+Source: ``ultratekPulser.py`` of changbatterygroup/ultrasonicTesting, which controls one: 9600 baud, ``D0``,
 ``M0``, ``V300``, ``W220``, ``P500`` (5000 Hz), ``P0``, ``T0`` (internal), ``G?`` → ``G=…``, gains from −120
 to 840. The maker's manual is not public: that gains are tenths of a decibel follows from their range.
 """
@@ -17,7 +17,7 @@ from .stream import excerpt
 __all__ = ["LETTERS", "LIMIT", "Setting", "decode", "encode", "encode_answer"]
 
 LIMIT = 64
-"""Bytes of the longest line."""
+"""Largest size of a line (bytes)."""
 
 LETTERS: dict[str, str] = {
     "P": "pulse repetition frequency, in units of 10 Hz; 0 is off",
@@ -28,7 +28,7 @@ LETTERS: dict[str, str] = {
     "T": "trigger: 0 internal, 1 external",
     "G": "gain (0.1 dB)",
 }
-"""What each letter sets."""
+"""Meaning of each letter."""
 
 _COMMAND = re.compile(rb"([A-Z])(\?|-?\d{1,5})")
 _ANSWER = re.compile(rb"([A-Z])=(-?\d{1,5})")
@@ -36,43 +36,43 @@ _ANSWER = re.compile(rb"([A-Z])=(-?\d{1,5})")
 
 @dataclass(frozen=True)
 class Setting:
-    """A letter with its value; none in a question."""
+    """Letter with its value; None in a query."""
 
     letter: str
     value: int | None
 
 
 def encode(setting: Setting) -> bytes:
-    """Bytes of a command or question.
+    r"""Encode a command or query.
 
     Raises
     ------
     SettingError
-        When there is no such letter or the value cannot be written.
+        If the letter does not exist or the value cannot be encoded.
 
     Examples
     --------
     >>> encode(Setting("P", 100)), encode(Setting("G", None))
-    (b'P100\\r', b'G?\\r')
+    (b'P100\r', b'G?\r')
     """
     text = f"{setting.letter}{'?' if setting.value is None else setting.value}"
     if setting.letter not in LETTERS or _COMMAND.fullmatch(text.encode()) is None:
-        raise SettingError("is no command of a CompactPulser", where=repr(text))
+        raise SettingError("is not a command of a CompactPulser", where=repr(text))
     return text.encode("ascii") + b"\r"
 
 
 def encode_answer(setting: Setting) -> bytes:
-    """Bytes of an answer."""
+    """Encode an answer."""
     return f"{setting.letter}={setting.value}\r".encode("ascii")
 
 
 def decode(line: bytes) -> tuple[Setting, bool]:
-    """The setting in a line, and whether it is an answer.
+    """Return the setting in a line, and whether it is an answer.
 
     Raises
     ------
     ProtocolError
-        When the line is neither command nor answer.
+        If the line is neither a command nor an answer.
     """
     line = line.strip(b"\r\n")
     for pattern, answer in ((_COMMAND, False), (_ANSWER, True)):
@@ -80,4 +80,4 @@ def decode(line: bytes) -> tuple[Setting, bool]:
         if found and found[1].decode() in LETTERS:
             value = None if found[2] == b"?" else int(found[2])
             return Setting(found[1].decode(), value), answer
-    raise ProtocolError(f"no line of a CompactPulser: {excerpt(line)}")
+    raise ProtocolError(f"not a line of a CompactPulser: {excerpt(line)}")

@@ -1,4 +1,4 @@
-"""HiSLIP messages: sixteen bytes of head, and a payload.
+"""HiSLIP messages: a header of sixteen bytes and a payload.
 
 Source: IVI-6.1, *High-Speed LAN Instrument Protocol* 1.1, section 2.4 (message header format), table 4
 (message types) and section 3 (transactions).
@@ -18,13 +18,13 @@ __all__ = ["HEAD", "PORT", "Message", "MessageDecoder", "Type", "encode"]
 
 PORT = 4880
 HEAD = 16
-"""Bytes of the head."""
+"""Size of the header (bytes)."""
 
 _HEAD = struct.Struct(">2sBBIQ")
 
 
 class Type(IntEnum):
-    """Of a message."""
+    """Message types."""
 
     INITIALIZE = 0
     INITIALIZE_RESPONSE = 1
@@ -61,13 +61,13 @@ class Message:
     Parameters
     ----------
     type : int
-        A :class:`Type`, or what the peer sent for one.
+        A :class:`Type`, or the unknown value that the peer sent.
     control : int
         Control code, 8 bits.
     parameter : int
-        Message parameter, 32 bits: the message's number in data messages.
+        Message parameter, 32 bits; in data messages, the message's number.
     payload : bytes
-        What it carries.
+        Data.
     """
 
     type: int
@@ -77,12 +77,12 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of a message.
+    """Encode a message.
 
     Raises
     ------
     SettingError
-        When a number does not fit its field.
+        If a number does not fit its field.
 
     Examples
     --------
@@ -97,13 +97,13 @@ def encode(message: Message) -> bytes:
 
 
 class MessageDecoder:
-    """Messages from a stream.
+    """Decode messages from a stream.
 
     Parameters
     ----------
     limit : int
-        Bytes of the largest payload. After a larger one, or a wrong head, the stream cannot be trusted any
-        more; what follows is ignored.
+        Largest size of a payload (bytes). After a larger one, or an invalid header, the stream cannot be
+        synchronised again; further data are ignored.
     """
 
     def __init__(self, limit: int = 1 << 23) -> None:
@@ -111,11 +111,11 @@ class MessageDecoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the message that was begun."""
+        """Discard an incomplete message."""
         self._partial, self._failed = bytearray(), False
 
     def feed(self, data: bytes) -> list[Message | Damaged]:
-        """Messages that are complete with these bytes."""
+        """Return the messages that these bytes complete."""
         if self._failed:
             return []
         found: list[Message | Damaged] = []
@@ -123,7 +123,7 @@ class MessageDecoder:
         while len(self._partial) >= HEAD:
             prologue, kind, control, parameter, length = _HEAD.unpack_from(self._partial)
             if prologue != b"HS" or length > self._limit:
-                why = "no head of HiSLIP" if prologue != b"HS" else f"a payload of {length} bytes"
+                why = "not a HiSLIP header" if prologue != b"HS" else f"a payload of {length} bytes"
                 found.append(Damaged(bytes(self._partial[:60]), why))
                 self._partial.clear()
                 self._failed = True

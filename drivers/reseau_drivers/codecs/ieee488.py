@@ -1,10 +1,10 @@
-r"""IEEE 488.2 as oscilloscopes speak it: program messages, answers, and blocks of binary data.
+"""IEEE 488.2 for oscilloscopes: program messages, answers, and blocks of binary data.
 
 Source: IEEE 488.2-1992, sections 7.6 (program data) and 8.7.9 (definite length arbitrary block response
 data); SCPI 1999.0, volume 1, section 6 (short and long form of headers) and 21.8 (the error queue). A block
-is ``#``, one digit n, n digits of its length, and as many bytes. Pictures come as a block or as the bare
-file; where they end is told by the block's length, by the chunk ``IEND`` of a PNG or by the size field of a
-BMP, never by a terminator.
+is ``#``, one digit n, n digits of its length, and as many bytes. Pictures are sent as a block or as the bare
+file; their end follows from the length of the block, from the chunk ``IEND`` of a PNG, or from the size field
+of a BMP, never from a terminator.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ __all__ = [
 ]
 
 LARGEST = 64_000_000
-"""Bytes of the largest answer that is waited for."""
+"""Largest size of an accepted answer (bytes)."""
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _BLOCK = re.compile(rb"#([1-9])")
 
 
 def block(data: bytes) -> bytes:
-    """A definite length block.
+    """Encode a definite length block.
 
     Examples
     --------
@@ -48,25 +48,25 @@ def block(data: bytes) -> bytes:
 
 
 def _block_span(data: bytes) -> tuple[int, int] | None:
-    """Where the content of a block begins and ends; None while its head is not complete."""
+    """Return start and end of the content of a block; None while its header is incomplete."""
     head = _BLOCK.match(data)
     if head is None:
         if len(data) < 2 and data in (b"", b"#"):
             return None
-        raise ProtocolError(f"no block: {excerpt(data)}")
+        raise ProtocolError(f"not a block: {excerpt(data)}")
     digits = data[2 : 2 + int(head[1])]
     if digits and not digits.isdigit():
-        raise ProtocolError(f"no block: {excerpt(data)}")
+        raise ProtocolError(f"not a block: {excerpt(data)}")
     if len(digits) < int(head[1]):
         return None
     start, length = 2 + len(digits), int(digits)
     if length > LARGEST:
-        raise ProtocolError(f"announces {length} bytes; more than {LARGEST} are not waited for")
+        raise ProtocolError(f"announces {length} bytes; at most {LARGEST} are accepted")
     return start, start + length
 
 
 def _png_end(data: bytes) -> int | None:
-    """Where a PNG ends; None while it is not complete."""
+    """Return the end of a PNG file; None while it is incomplete."""
     at = len(_PNG)
     while len(data) >= at + 8:
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -79,22 +79,22 @@ def _png_end(data: bytes) -> int | None:
 
 
 def missing_bytes(data: bytes) -> int | None:
-    r"""How many bytes a binary answer lacks that begins with these: 0 when it is whole.
+    r"""Return the number of bytes missing from a binary answer; 0 if it is complete.
 
     Parameters
     ----------
     data : bytes
-        A block, a PNG or a BMP, as far as it has come.
+        Start of a block, a PNG or a BMP.
 
     Returns
     -------
     int or None
-        None while that cannot be told.
+        None while the number is unknown.
 
     Raises
     ------
     ProtocolError
-        When it is none of them, or announces more than is waited for.
+        If the data are none of these, or announce more than the limit.
 
     Examples
     --------
@@ -121,45 +121,45 @@ def missing_bytes(data: bytes) -> int | None:
 
 
 def parse_block(data: bytes) -> bytes:
-    """The content of a block.
+    """Return the content of a block.
 
     Raises
     ------
     ProtocolError
-        When it is none, or not complete.
+        If it is not a block, or is incomplete.
     """
     span = _block_span(data)
     if span is None or len(data) < span[1]:
-        raise ProtocolError(f"a block that is not complete: {excerpt(data)}")
+        raise ProtocolError(f"an incomplete block: {excerpt(data)}")
     return data[span[0] : span[1]]
 
 
 def picture(data: bytes) -> bytes:
-    """The file of a picture that came as a block or bare.
+    """Return the file of a picture that was sent as a block or as the bare file.
 
     Raises
     ------
     ProtocolError
-        When it is no picture, or not complete.
+        If it is not a picture, or is incomplete.
     """
     inner = parse_block(data) if data[:1] == b"#" else data
     if inner[:8] != _PNG and inner[:2] != b"BM":
-        raise ProtocolError(f"no picture: {excerpt(data)}")
+        raise ProtocolError(f"not a picture: {excerpt(data)}")
     lacking = missing_bytes(inner)
     if lacking != 0:
-        raise ProtocolError(f"a picture that is not complete ({len(inner)} bytes)")
+        raise ProtocolError(f"an incomplete picture ({len(inner)} bytes)")
     end = _png_end(inner) if inner[:8] == _PNG else int.from_bytes(inner[2:6], "little")
     return inner[:end]
 
 
 @dataclass(frozen=True)
 class Header:
-    """A header as the manual writes it, ``:DISPlay:DATA?``: capitals may not be left out.
+    """Header as in a manual, ``:DISPlay:DATA?``: the capitals are mandatory.
 
     Parameters
     ----------
     written : str
-        With the capitals of the short form. ``<n>`` stands for a number.
+        Header with the capitals of the short form; ``<n>`` stands for a number.
 
     Examples
     --------
@@ -170,7 +170,7 @@ class Header:
     written: str
 
     def matches(self, header: str) -> bool:
-        """Whether a header that a client sent is this one, in its short or its long form."""
+        """Whether a received header is this one, in its short or long form."""
         return re.fullmatch(self._pattern(), header.lstrip(":"), re.IGNORECASE) is not None
 
     def _pattern(self) -> str:
@@ -185,7 +185,7 @@ class Header:
 
 
 def split_message(text: str) -> list[tuple[str, str]]:
-    r"""Units of a program message as (header, arguments); quotes keep semicolons together.
+    """Split a program message into (header, arguments); semicolons in quotes do not separate.
 
     Examples
     --------
@@ -202,12 +202,12 @@ def split_message(text: str) -> list[tuple[str, str]]:
 
 
 def error_entry(answer: str) -> tuple[int, str]:
-    r"""Number and text of an entry of the error queue; 0 is none.
+    """Return number and text of an entry of the error queue; 0 means no error.
 
     Raises
     ------
     ProtocolError
-        When it is none.
+        If it is not an entry.
 
     Examples
     --------
@@ -216,5 +216,5 @@ def error_entry(answer: str) -> tuple[int, str]:
     """
     found = re.fullmatch(r"\s*([+-]?\d{1,6})\s*(?:,\s*\"?(.*?)\"?)?\s*", answer)
     if found is None:
-        raise ProtocolError(f"no entry of an error queue: {excerpt(answer.encode())}")
+        raise ProtocolError(f"not an entry of an error queue: {excerpt(answer.encode())}")
     return int(found[1]), found[2] or ""

@@ -1,8 +1,8 @@
 """Blue Robotics' Ping protocol, and the messages of the scanning sonar Ping360.
 
-Source: *Ping Protocol*, "Message Format", "Common Messages" and "Ping360 Messages". A frame is ``BR``, the
-payload's length, the message's number, sender and receiver, the payload and the sum of all bytes before,
-little-endian. Angles are gradians of 400 a turn, sample periods are units of 25 ns.
+Source: *Ping Protocol*, "Message Format", "Common Messages" and "Ping360 Messages". A frame consists of
+``BR``, length of the payload, number of the message, sender and receiver, payload, and the sum of all these
+bytes, little-endian. Angles are in gradians (400 per turn), sample periods in units of 25 ns.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ ACK, NACK, ASCII_TEXT, DEVICE_INFORMATION, PROTOCOL_VERSION, GENERAL_REQUEST = 1
 DEVICE_ID, DEVICE_DATA, AUTO_DEVICE_DATA = 2000, 2300, 2301
 RESET, TRANSDUCER, AUTO_TRANSMIT, MOTOR_OFF = 2600, 2601, 2602, 2903
 GRADIANS = 400
-"""Of a turn of the head."""
+"""Gradians per turn of the head."""
 PERIOD_NS = 25.0
-"""Unit of the sample period."""
+"""Unit of the sample period (ns)."""
 MAX_PAYLOAD = 2048
-"""Longer than any message of these devices; a length beyond is noise."""
+"""Longer than any message of these devices; a greater length is noise."""
 
 _HEAD = struct.Struct("<2sHHBB")
 _TRANSDUCER = struct.Struct("<BBHHHHHBB")
@@ -63,9 +63,9 @@ class Frame:
     Parameters
     ----------
     id : int
-        What it is.
+        Number of the message type.
     payload : bytes
-        What it says.
+        Content.
     source, target : int
         Numbers of the devices.
     """
@@ -77,16 +77,16 @@ class Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """Bytes of a frame.
+    r"""Encode a frame.
 
     Raises
     ------
     SettingError
-        When its payload is too long.
+        If the payload is too long.
 
     Examples
     --------
-    >>> encode(Frame(GENERAL_REQUEST, b"\\x05\\x00")).hex(" ")
+    >>> encode(Frame(GENERAL_REQUEST, b"\x05\x00")).hex(" ")
     '42 52 02 00 06 00 00 00 05 00 a1 00'
     """
     if len(frame.payload) > MAX_PAYLOAD:
@@ -96,17 +96,17 @@ def encode(frame: Frame) -> bytes:
 
 
 class FrameDecoder:
-    """Frames from a stream; garbage between them is skipped and reported."""
+    """Decode frames from a stream; data between them are skipped and reported."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frame that was begun."""
+        """Discard an incomplete frame."""
         self._partial = bytearray()
 
     def feed(self, data: bytes) -> list[Frame | Damaged]:
-        """Frames that are complete with these bytes."""
+        """Return the frames that these bytes complete."""
         found: list[Frame | Damaged] = []
         begun = self._partial
         begun += data
@@ -122,7 +122,7 @@ class FrameDecoder:
             if len(begun) < end + 2:
                 return found
             if _VECTOR.unpack_from(begun, end)[0] != sum(begun[:end]) & 0xFFFF:
-                # Its length may be what is wrong: the next frame may begin within this one.
+                # The length may be wrong: the next frame may start within this one.
                 self._give_up(found, "a frame with a wrong checksum")
                 continue
             found.append(Frame(id_, bytes(begun[_HEAD.size : end]), source, target))
@@ -138,7 +138,7 @@ class FrameDecoder:
             del self._partial[:start]
 
     def _give_up(self, found: list[Frame | Damaged], why: str) -> None:
-        # One report for what is damaged in one go: garbage can look like thousands of frames.
+        # Report consecutive damaged data once: noise can look like thousands of frames.
         if not found or not isinstance(found[-1], Damaged):
             found.append(Damaged(bytes(self._partial[:60]), why))
         del self._partial[:2]
@@ -152,20 +152,20 @@ def _unpacked(layout: struct.Struct, payload: bytes, what: str) -> tuple[int, ..
 
 @dataclass(frozen=True)
 class Transducer:
-    """What TRANSDUCER asks for, and DEVICE_DATA repeats.
+    """Parameters that TRANSDUCER requests and DEVICE_DATA repeats.
 
     Parameters
     ----------
     gain : int
         0 low, 1 normal, 2 high.
     angle : int
-        Of the head (gradians).
+        Angle of the head (gradians).
     duration_us : int
-        Of the transmitted pulse.
+        Duration of the transmitted pulse (µs).
     period : int
-        Between samples, in units of 25 ns.
+        Sample period, in units of 25 ns.
     frequency_khz : int
-        Of the pulse.
+        Frequency of the pulse (kHz).
     samples : int
         Number of samples.
     transmit : bool
@@ -184,12 +184,12 @@ class Transducer:
     mode: int = 1
 
     def frame(self, target: int = 0) -> Frame:
-        """The message that asks for it.
+        """Return the request message.
 
         Raises
         ------
         SettingError
-            When a value does not fit its field.
+            If a value does not fit its field.
         """
         try:
             payload = _TRANSDUCER.pack(*self._common, int(self.transmit), 0)
@@ -199,12 +199,12 @@ class Transducer:
 
     @classmethod
     def parse(cls, payload: bytes) -> Self:
-        """What a TRANSDUCER message asks for.
+        """Decode a TRANSDUCER message.
 
         Raises
         ------
         ProtocolError
-            When it is too short.
+            If it is too short.
         """
         mode, *rest, transmit, _ = _unpacked(_TRANSDUCER, payload, "a TRANSDUCER message")
         gain, angle, duration, period, frequency, samples = rest
@@ -225,30 +225,30 @@ class Transducer:
 
 @dataclass(frozen=True)
 class DeviceData:
-    """One line of echoes: with what it was taken, and its samples."""
+    """One line of echoes: acquisition parameters and samples."""
 
     settings: Transducer
     samples: bytes
 
     def frame(self, source: int = 1) -> Frame:
-        """The message that reports it."""
+        """Return the message that reports it."""
         head = _DATA.pack(*self.settings._common)
         return Frame(DEVICE_DATA, head + _VECTOR.pack(len(self.samples)) + self.samples, source, 0)
 
     @classmethod
     def parse(cls, payload: bytes) -> Self:
-        """What a DEVICE_DATA message reports.
+        """Decode a DEVICE_DATA message.
 
         Raises
         ------
         ProtocolError
-            When it is too short, or announces another number of samples than it brings.
+            If it is too short, or its number of samples is wrong.
         """
         mode, *rest = _unpacked(_DATA, payload, "a DEVICE_DATA message")
         (count,) = _unpacked(_VECTOR, payload[_DATA.size :], "the vector of a DEVICE_DATA message")
         samples = payload[_DATA.size + _VECTOR.size :]
         if len(samples) != count:
-            raise ProtocolError(f"DEVICE_DATA announces {count} samples and brings {len(samples)}")
+            raise ProtocolError(f"DEVICE_DATA announces {count} samples and contains {len(samples)}")
         gain, angle, duration, period, frequency, number = rest
         asked = Transducer(gain, angle, duration, period, frequency, number, False, mode)
         return cls(asked, samples)
@@ -256,26 +256,26 @@ class DeviceData:
 
 @dataclass(frozen=True)
 class Information:
-    """DEVICE_INFORMATION: type 2 is a Ping360."""
+    """DEVICE_INFORMATION; type 2 is a Ping360."""
 
     type: int
     revision: int
     firmware: tuple[int, int, int]
 
     def frame(self, source: int = 1) -> Frame:
-        """The message that reports it."""
+        """Return the message that reports it."""
         return Frame(
             DEVICE_INFORMATION, _INFORMATION.pack(self.type, self.revision, *self.firmware, 0), source
         )
 
     @classmethod
     def parse(cls, payload: bytes) -> Self:
-        """What a DEVICE_INFORMATION message reports.
+        """Decode a DEVICE_INFORMATION message.
 
         Raises
         ------
         ProtocolError
-            When it is too short.
+            If it is too short.
         """
         kind, revision, major, minor, patch, _ = _unpacked(
             _INFORMATION, payload, "a DEVICE_INFORMATION message"

@@ -1,4 +1,4 @@
-"""Pixel formats: what cameras call them, and grey values out of the bytes of a frame, none of them converted.
+"""Pixel formats of cameras, and conversion between the bytes of a frame and unmodified grey values.
 
 Sources: the kernel's *Linux Media Infrastructure userspace API*, "Image Formats"; EMVA, *Pixel Format Naming
 Convention* 2.1.
@@ -20,18 +20,18 @@ __all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How grey values lie in memory.
+    """Memory layout of grey values.
 
     Parameters
     ----------
     code : str or int
         Four characters of V4L2, or the number of the Pixel Format Naming Convention.
     bits : int
-        Of a grey value, in the low bits of its bytes.
+        Significant bits of a grey value, in the low bits of its bytes.
     stored : int
-        Bytes of a pixel; 0 when the frame is compressed.
+        Bytes per pixel; 0 for compressed frames.
     pattern : str
-        Of colour that is kept raw: the filters of the first two rows (RGGB …), YUYV or MJPEG; empty for grey.
+        Colour pattern of raw data: filters of the first two rows (RGGB …), YUYV or MJPEG; empty for grey.
     """
 
     code: str | int
@@ -41,12 +41,12 @@ class PixelFormat:
 
     @property
     def full_scale(self) -> float:
-        """Grey value at which it saturates."""
+        """Grey value at saturation."""
         return float(2**self.bits - 1)
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the grey values."""
+        """Data type of the grey values."""
         return np.dtype(np.uint8 if self.bits <= 8 else "<u2")
 
 
@@ -62,7 +62,7 @@ VIDEO: dict[str, PixelFormat] = {
     "SGBRG8": PixelFormat("GBRG", 8, 1, "GBRG"),
     "SBGGR8": PixelFormat("BA81", 8, 1, "BGGR"),
 }
-"""Of V4L2, by the names of its documentation."""
+"""Formats of V4L2, by the names of its documentation."""
 
 GENICAM: dict[str, PixelFormat] = {
     "Mono8": PixelFormat(0x01080001, 8, 1),
@@ -79,11 +79,11 @@ GENICAM: dict[str, PixelFormat] = {
     "BayerGB12": PixelFormat(0x01100012, 12, 2, "GBRG"),
     "BayerBG12": PixelFormat(0x01100013, 12, 2, "BGGR"),
 }
-"""Of GenICam, by the names of the convention."""
+"""Formats of GenICam, by the names of the convention."""
 
 
 def size_of(layout: PixelFormat, width: int, height: int, stride: int = 0) -> int:
-    """Bytes of a frame whose rows begin `stride` bytes apart, or follow one another; 0 when compressed."""
+    """Return the size of a frame with rows `stride` bytes apart (bytes); 0 if compressed."""
     if not layout.stored:
         return 0
     row = width * layout.stored
@@ -91,28 +91,28 @@ def size_of(layout: PixelFormat, width: int, height: int, stride: int = 0) -> in
 
 
 def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: int = 0) -> NDArray[Any]:
-    """Grey values of a frame: of YUYV and MJPEG their luminance, of a mosaic all of its pixels as they are.
+    """Decode the grey values of a frame: luminance of YUYV and MJPEG, all raw pixels of a mosaic.
 
     Parameters
     ----------
     layout : PixelFormat
-        Of the data.
+        Format of the data.
     width, height : int
-        Of the frame.
+        Size of the frame (px).
     data : bytes
-        The frame; what follows it is passed over.
+        The frame; further bytes are ignored.
     stride : int, optional
         Bytes from one row to the next.
 
     Returns
     -------
     ndarray (height, width)
-        A view of `data` where they need no decoding.
+        A view of `data` if no conversion is needed.
 
     Raises
     ------
     ProtocolError
-        When there are fewer bytes than the frame needs, or grey values beyond its bits.
+        If there are too few bytes, or grey values exceed the number of bits.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
         return _jpeg(width, height, data)
     need = size_of(layout, width, height, stride)
     if len(data) < need or min(width, height) < 1:
-        raise ProtocolError(f"a frame of {width}×{height} pixels came with {len(data)} of its {need} bytes")
+        raise ProtocolError(f"a frame of {width}×{height} pixels has {len(data)} of {need} bytes")
     row = max(stride, width * layout.stored)
     raw = np.frombuffer(data, np.uint8, need)
     rows = np.lib.stride_tricks.as_strided(raw, (height, width * layout.stored), (row, 1), writeable=False)
@@ -133,7 +133,7 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
         return rows[:, ::2]
     pixels = rows if layout.stored == 1 else _words(rows)
     if layout.stored == 2 and layout.bits < 16 and int(pixels.max()) >> layout.bits:
-        raise ProtocolError(f"a frame of {layout.bits} bits holds the grey value {int(pixels.max())}")
+        raise ProtocolError(f"a frame of {layout.bits} bits contains the grey value {int(pixels.max())}")
     return pixels
 
 
@@ -144,26 +144,26 @@ def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _jpeg(width: int, height: int, data: bytes) -> NDArray[Any]:
-    # Decoders fill what a torn picture lacks with grey and say nothing: ask for the end mark.
+    # Decoders silently fill the missing part of a truncated picture with grey: check the end mark.
     if not (data.startswith(b"\xff\xd8") and data.rstrip(b"\0").endswith(b"\xff\xd9")):
-        raise ProtocolError(f"a frame of {len(data)} bytes is no whole JPEG")
+        raise ProtocolError(f"a frame of {len(data)} bytes is not a complete JPEG")
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         pixels = None
     if pixels is None or pixels.shape != (height, width):
         found = "nothing" if pixels is None else f"{pixels.shape[1]}×{pixels.shape[0]} pixels"
-        raise ProtocolError(f"a JPEG of {width}×{height} pixels holds {found}")
+        raise ProtocolError(f"a JPEG of {width}×{height} pixels contains {found}")
     return np.asarray(pixels)
 
 
 def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
-    """Bytes of grey values, as a camera of this format sends them; colour of YUYV is none.
+    r"""Encode grey values as a camera with this format sends them; YUYV is encoded without colour.
 
     Examples
     --------
     >>> encode(VIDEO["Y16"], np.array([[1, 256]], np.uint16))
-    b'\\x01\\x00\\x00\\x01'
+    b'\x01\x00\x00\x01'
     """
     if layout.pattern == "YUYV":
         coloured = np.full((*pixels.shape, 2), 128, np.uint8)

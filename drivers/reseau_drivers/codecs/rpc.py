@@ -1,8 +1,8 @@
 """ONC remote procedure calls: XDR, records on a stream, calls, replies, and the portmapper.
 
 Source: RFC 4506 (XDR), RFC 5531 (RPC: sections 9 and 11), RFC 1833 (portmapper, section 3). Numbers are
-big-endian and fill four bytes; opaque data is padded to four. On a stream a record is cut into fragments
-whose four-byte head says their length, with the highest bit set in the last.
+big-endian with four bytes; opaque data are padded to multiples of four. On a stream, a record consists of
+fragments with a header of four bytes: their length, and the highest bit in the last fragment.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LAST = 0x80000000
 
 
 def pack(*values: int | bytes) -> bytes:
-    """XDR of numbers and of opaque data of variable length.
+    """Encode numbers and opaque data of variable length as XDR.
 
     Examples
     --------
@@ -58,23 +58,23 @@ def pack(*values: int | bytes) -> bytes:
 
 
 class Unpacker:
-    """Takes XDR apart.
+    """Decode XDR.
 
     Raises
     ------
     ProtocolError
-        From its methods, when the data ends before the value.
+        From its methods, if the data end before the value.
     """
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
 
     def number(self) -> int:
-        """An unsigned number."""
+        """Return an unsigned number."""
         return int.from_bytes(self._take(4), "big")
 
     def opaque(self, largest: int = 1 << 26) -> bytes:
-        """Data of variable length, no longer than allowed."""
+        """Return data of variable length, up to a limit."""
         length = self.number()
         if length > largest:
             raise ProtocolError(f"XDR announces {length} bytes")
@@ -83,7 +83,7 @@ class Unpacker:
         return data
 
     def rest(self) -> bytes:
-        """What has not been taken."""
+        """Return the remaining data."""
         rest, self._at = self._data[self._at :], len(self._data)
         return rest
 
@@ -95,17 +95,18 @@ class Unpacker:
 
 
 def record(content: bytes) -> bytes:
-    """A record of one fragment."""
+    """Encode a record with one fragment."""
     return struct.pack(">I", _LAST | len(content)) + content
 
 
 class RecordDecoder:
-    """Records from a stream.
+    """Decode records from a stream.
 
     Parameters
     ----------
     limit : int
-        Bytes of the largest record. After a larger one the stream cannot be trusted; the rest is damaged.
+        Largest size of a record (bytes). After a larger one the stream cannot be synchronised again; further
+        data are ignored.
     """
 
     def __init__(self, limit: int = 1 << 23) -> None:
@@ -113,11 +114,11 @@ class RecordDecoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the record that was begun."""
+        """Discard an incomplete record."""
         self._partial, self._record, self._failed = bytearray(), bytearray(), False
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
-        """Records that are complete with these bytes."""
+        """Return the records that these bytes complete."""
         if self._failed:
             return []
         found: list[bytes | Damaged] = []
@@ -142,7 +143,7 @@ class RecordDecoder:
 
 @dataclass(frozen=True)
 class Call:
-    """A call of a remote procedure."""
+    """Call of a remote procedure."""
 
     xid: int
     program: int
@@ -152,23 +153,23 @@ class Call:
 
 
 def encode_call(call: Call) -> bytes:
-    """The content of a record that calls, without credentials."""
+    """Encode the content of a record with a call, without credentials."""
     head = (call.xid, 0, 2, call.program, call.version, call.procedure, 0, 0, 0, 0)
     return pack(*head) + call.arguments
 
 
 def decode_call(data: bytes) -> Call:
-    """The call in a record.
+    """Decode the call in a record.
 
     Raises
     ------
     ProtocolError
-        When it is none, or of another version of RPC.
+        If it is not a call, or of another version of RPC.
     """
     found = Unpacker(data)
     xid, kind, version = found.number(), found.number(), found.number()
     if kind != 0 or version != 2:
-        raise ProtocolError(f"no RPC call: {excerpt(data)}")
+        raise ProtocolError(f"not an RPC call: {excerpt(data)}")
     program, its_version, procedure = found.number(), found.number(), found.number()
     for _ in ("credentials", "verifier"):
         found.number()
@@ -177,22 +178,22 @@ def decode_call(data: bytes) -> Call:
 
 
 def encode_reply(xid: int, results: bytes, status: int = SUCCESS) -> bytes:
-    """The content of a record that replies to an accepted call."""
+    """Encode the content of a record with the reply to an accepted call."""
     return pack(xid, 1, ACCEPTED, 0, 0, status) + (results if status == SUCCESS else b"")
 
 
 def decode_reply(data: bytes) -> tuple[int, int, bytes]:
-    """Number of the call, status and results of a reply in a record.
+    """Return number of the call, status and results of a reply.
 
     Raises
     ------
     ProtocolError
-        When it is none, or denies the call.
+        If it is not a reply, or denies the call.
     """
     found = Unpacker(data)
     xid, kind, state = found.number(), found.number(), found.number()
     if kind != 1 or state != ACCEPTED:
-        raise ProtocolError(f"no RPC reply to an accepted call: {excerpt(data)}")
+        raise ProtocolError(f"not an RPC reply to an accepted call: {excerpt(data)}")
     found.number()
     found.opaque(400)
     return xid, found.number(), found.rest()

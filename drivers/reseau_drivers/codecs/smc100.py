@@ -1,9 +1,8 @@
-r"""Newport's SMC100 and CONEX controllers: ``nnAAxx\r\n``, one axis for each address.
+r"""Newport's SMC100 and CONEX controllers: ``nnAAxx\r\n``, one axis per address.
 
-Source: *SMC100CC & SMC100PP User's Manual*, commands TE (page 61) and TS (page 65), as the drivers of
-PyMeasure, bliss and hvl_ccb have them, which agree; *CONEX-CC Controller Documentation* for what that one has
-besides. Commands that set or move are not acknowledged: whether one was understood is asked with TE, what the
-axis does with TS.
+Source: *SMC100CC & SMC100PP User's Manual*, commands TE (page 61) and TS (page 65), as implemented in the
+drivers of PyMeasure, bliss and hvl_ccb, which agree; *CONEX-CC Controller Documentation* for the additions of
+the CONEX. Commands that set or move are not acknowledged: TE returns their error, TS the state of the axis.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from .stream import excerpt
 __all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
 
 LIMIT = 128
-"""Bytes of the longest line that is waited for."""
+"""Largest size of an accepted line (bytes)."""
 
 _LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
 
@@ -60,11 +59,11 @@ BITS: dict[int, str] = {
     0x0100: "DC voltage too low",
     0x0200: "80 W output power exceeded",
 }
-"""Bits of the first four digits of TS."""
+"""Error bits in the first four digits of TS."""
 
 
 class Phase(Enum):
-    """What an axis is doing, of the last two digits of TS."""
+    """State of an axis, from the last two digits of TS."""
 
     NOT_REFERENCED = "not referenced"
     CONFIGURATION = "configuration"
@@ -76,12 +75,12 @@ class Phase(Enum):
 
 
 def phase(code: int) -> Phase:
-    """The phase of a state's code.
+    """Return the phase of a state code.
 
     Raises
     ------
     ProtocolError
-        When the controller has no such state.
+        If the code is unknown.
 
     Examples
     --------
@@ -102,21 +101,21 @@ def phase(code: int) -> Phase:
     ):
         if code in codes:
             return found
-    raise ProtocolError(f"state {code:02X} is none of an SMC100")
+    raise ProtocolError(f"{code:02X} is not a state of an SMC100")
 
 
 @dataclass(frozen=True)
 class Line:
-    """A command or an answer.
+    """Command or answer.
 
     Parameters
     ----------
     address : int
-        Of the controller, 1 to 31.
+        Address of the controller, 1 to 31.
     name : str
         Two letters.
     value : str
-        Its argument, ``?`` in a question about a parameter.
+        Argument; ``?`` queries a parameter.
     """
 
     address: int
@@ -126,62 +125,62 @@ class Line:
 
 @dataclass(frozen=True)
 class Status:
-    """An answer to TS: what is wrong, and what the axis does."""
+    """Answer to TS: error bits and state."""
 
     errors: int
     state: int
 
     @property
     def phase(self) -> Phase:
-        """What the axis is doing."""
+        """State of the axis."""
         return phase(self.state)
 
     @property
     def error_texts(self) -> tuple[str, ...]:
-        """What is wrong, in words."""
+        """Texts of the error bits."""
         return tuple(text for bit, text in BITS.items() if self.errors & bit)
 
 
 def encode(line: Line) -> bytes:
-    """Bytes of a command or an answer.
+    r"""Encode a command or an answer.
 
     Raises
     ------
     SettingError
-        When it cannot be sent.
+        If it cannot be sent.
 
     Examples
     --------
     >>> encode(Line(1, "PA", "12.5"))
-    b'1PA12.5\\r\\n'
+    b'1PA12.5\r\n'
     """
     content = f"{line.address}{line.name}{line.value}"
     if not 1 <= line.address <= 31 or not content.isascii() or _LINE.fullmatch(content.encode()) is None:
-        raise SettingError("is no command of an SMC100", where=repr(content))
+        raise SettingError("is not a command of an SMC100", where=repr(content))
     return content.encode("ascii") + b"\r\n"
 
 
 def decode(line: bytes) -> Line:
-    """The command or answer that stands in a line.
+    """Decode a command or an answer.
 
     Raises
     ------
     ProtocolError
-        When it is none.
+        If the line is neither.
     """
     found = _LINE.fullmatch(line.strip(b"\r\n"))
     if found is None or not 1 <= int(found[1]) <= 31:
-        raise ProtocolError(f"no line of an SMC100: {excerpt(line)}")
+        raise ProtocolError(f"not a line of an SMC100: {excerpt(line)}")
     return Line(int(found[1]), found[2].decode(), found[3].decode())
 
 
 def decode_status(value: str) -> Status:
-    """What an answer to TS says.
+    """Decode an answer to TS.
 
     Raises
     ------
     ProtocolError
-        When it is none, or of a state the controller does not have.
+        If it is not a valid answer, or the state is unknown.
 
     Examples
     --------
@@ -189,7 +188,7 @@ def decode_status(value: str) -> Status:
     ('following error',)
     """
     if re.fullmatch(r"[0-9A-Fa-f]{6}", value) is None:
-        raise ProtocolError(f"no status: {value!r}")
+        raise ProtocolError(f"not a status: {value!r}")
     status = Status(int(value[:4], 16), int(value[4:], 16))
     phase(status.state)
     return status

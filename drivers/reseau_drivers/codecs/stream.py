@@ -1,4 +1,4 @@
-"""What all decoders of streams have in common, and the one for lines."""
+"""Common parts of stream decoders, and the decoder of lines."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ __all__ = ["Damaged", "Decoder", "LineDecoder", "excerpt"]
 T = TypeVar("T")
 
 _SHOWN = 60
-"""Bytes of a damaged message that are kept to be shown."""
+"""Number of bytes of a damaged message that are kept for error messages."""
 
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes that arrived and are no message.
+    """Received bytes that are not a valid message.
 
     Parameters
     ----------
     data : bytes
-        The first of them.
+        The first of these bytes.
     why : str
-        What is wrong with them.
+        Reason.
     """
 
     data: bytes
@@ -33,17 +33,17 @@ class Damaged:
 
 
 class Decoder(Protocol, Generic[T]):
-    """Takes the bytes of a stream as they come and yields what they mean."""
+    """Decodes the bytes of a stream into messages."""
 
     def feed(self, data: bytes) -> list[T | Damaged]:
-        """Messages that are complete with these bytes, in their order."""
+        """Return the messages that these bytes complete, in order."""
 
     def reset(self) -> None:
-        """Forget what was begun: the connection is a new one."""
+        """Discard incomplete data: a new connection starts."""
 
 
 def excerpt(data: bytes) -> str:
-    r"""Bytes as one can read them, not too many.
+    r"""Return the start of some bytes in readable form.
 
     Examples
     --------
@@ -54,14 +54,14 @@ def excerpt(data: bytes) -> str:
 
 
 class LineDecoder:
-    r"""Lines of a stream.
+    r"""Decode lines from a stream.
 
     Parameters
     ----------
     end : bytes
-        The one byte that ends a line; carriage returns and line feeds around a line are taken off.
+        Byte that ends a line; carriage returns and line feeds around a line are removed.
     limit : int
-        Bytes of the longest line. A longer one is damaged, and is skipped up to its end.
+        Largest size of a line (bytes). A longer one is damaged, and is skipped up to its end.
 
     Examples
     --------
@@ -77,12 +77,12 @@ class LineDecoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the line that was begun."""
+        """Discard an incomplete line."""
         self._partial = bytearray()
         self._skipping = False
 
     def feed(self, data: bytes) -> list[bytes | Damaged]:
-        """Lines that are complete with these bytes; empty ones are left out."""
+        """Return the lines that these bytes complete; empty ones are omitted."""
         found: list[bytes | Damaged] = []
         *ended, rest = data.split(self._end)
         for piece in ended:

@@ -1,4 +1,4 @@
-"""USB Test and Measurement Class: the twelve bytes before each transfer.
+"""USB Test and Measurement Class: the header of twelve bytes of each transfer.
 
 Source: *USBTMC* 1.0, tables 1 to 9: MsgID, bTag and its complement, a reserved byte, the size of the
 transfer, its attributes.
@@ -18,14 +18,14 @@ __all__ = ["END", "HEAD", "OUT", "REQUEST_IN", "Transfer", "decode", "encode_in"
 OUT, REQUEST_IN = 1, 2
 HEAD = 12
 END = 1
-"""Bit of the attributes: the last byte of a message is in this transfer."""
+"""Attribute bit: this transfer contains the last byte of a message."""
 
 _HEAD = struct.Struct("<BBBBIB3x")
 
 
 @dataclass(frozen=True)
 class Transfer:
-    """What a host sends to the bulk-out endpoint.
+    """Transfer from the host to the bulk-out endpoint.
 
     Parameters
     ----------
@@ -34,11 +34,11 @@ class Transfer:
     tag : int
         1 to 255; an answer repeats it.
     size : int
-        Bytes of the data, or the most that are asked for.
+        Number of bytes sent, or the largest number requested.
     end : bool
-        Whether the message ends with it.
+        Whether the message ends with this transfer.
     data : bytes
-        Of an OUT transfer, without padding.
+        Data of an OUT transfer, without padding.
     """
 
     kind: int
@@ -49,32 +49,32 @@ class Transfer:
 
 
 def decode(packet: bytes) -> Transfer:
-    """The transfer that begins with these bytes.
+    r"""Decode the transfer that starts with these bytes.
 
     Raises
     ------
     ProtocolError
-        When it is none: the complement of its tag is wrong, or its data are not of the size that it states.
+        If the complement of the tag is wrong, or the size of the data differs from the stated one.
 
     Examples
     --------
     >>> decode(bytes.fromhex("01 01 fe 00 06 00 00 00 01 00 00 00 2a 49 44 4e 3f 0a 00 00")).data
-    b'*IDN?\\n'
+    b'*IDN?\n'
     """
     if len(packet) < HEAD:
-        raise ProtocolError(f"no USBTMC transfer: {excerpt(packet)}")
+        raise ProtocolError(f"not a USBTMC transfer: {excerpt(packet)}")
     kind, tag, complement, _, size, attributes = _HEAD.unpack_from(packet)
     if tag == 0 or tag ^ complement != 0xFF or kind not in (OUT, REQUEST_IN):
-        raise ProtocolError(f"no USBTMC transfer: {excerpt(packet)}")
+        raise ProtocolError(f"not a USBTMC transfer: {excerpt(packet)}")
     if kind == REQUEST_IN:
         return Transfer(kind, tag, size, False)
-    # The padding to four bytes may be missing, as some hosts leave it out; data may not.
+    # Some hosts omit the padding to four bytes; data must not be missing.
     if size == 0 or not size <= len(packet) - HEAD <= size + 3:
         raise ProtocolError(f"a transfer of {len(packet) - HEAD} bytes states {size}")
     return Transfer(kind, tag, size, bool(attributes & END), packet[HEAD : HEAD + size])
 
 
 def encode_in(tag: int, data: bytes, end: bool) -> bytes:
-    """A transfer of an instrument's answer."""
+    """Encode a transfer of an instrument's answer."""
     head = _HEAD.pack(REQUEST_IN, tag, tag ^ 0xFF, 0, len(data), END if end else 0)
     return head + data + bytes(-len(data) % 4)

@@ -1,6 +1,6 @@
-"""Structures of Video4Linux as they are handed to `ioctl`: bytes and values, no devices.
+"""Structures of Video4Linux for `ioctl`: bytes and values, no devices.
 
-Source: the kernel's ``include/uapi/linux/videodev2.h`` (Linux 6.1), on machines of 64 bits, low byte first.
+Source: the kernel's ``include/uapi/linux/videodev2.h`` (Linux 6.1), on little-endian 64-bit machines.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MMAP = 1
 
 
 def _request(way: int, number: int, size: int) -> int:
-    """As <asm-generic/ioctl.h> composes it; way: 1 into the kernel, 2 out of it, 3 both."""
+    """Compose a request as <asm-generic/ioctl.h>; way: 1 into the kernel, 2 out of it, 3 both."""
     return way << 30 | size << 16 | ord("V") << 8 | number
 
 
@@ -71,13 +71,13 @@ G_SELECTION, S_SELECTION = _request(3, 94, 64), _request(3, 95, 64)
 BRIGHTNESS, AUTOGAIN, GAIN = 0x980900, 0x980912, 0x980913
 EXPOSURE_AUTO, EXPOSURE_ABSOLUTE = 0x9A0901, 0x9A0902
 EXPOSURE_MANUAL = 1
-"""Of EXPOSURE_AUTO: the exposure time is that of EXPOSURE_ABSOLUTE, in units of 100 µs."""
+"""Value of EXPOSURE_AUTO: EXPOSURE_ABSOLUTE sets the exposure time, in units of 100 µs."""
 
 _NEXT = 0x80000000
 
 
 def fourcc_of(text: str) -> int:
-    """The number of four characters.
+    """Return the number of a four-character code.
 
     Examples
     --------
@@ -88,7 +88,7 @@ def fourcc_of(text: str) -> int:
 
 
 def fourcc_text(code: int) -> str:
-    """The four characters of a number."""
+    """Return the four characters of a code."""
     return code.to_bytes(4, "little").decode("ascii", "replace")
 
 
@@ -97,7 +97,7 @@ def _text(data: bytes) -> str:
 
 
 def stream_type() -> bytearray:
-    """What STREAMON and STREAMOFF take."""
+    """Argument of STREAMON and STREAMOFF."""
     return bytearray(struct.pack("<i", CAPTURE))
 
 
@@ -108,7 +108,7 @@ def control_value(identifier: int, value: int = 0) -> bytearray:
 
 @dataclass(frozen=True)
 class Capability:
-    """``struct v4l2_capability``: what a node is."""
+    """``struct v4l2_capability``: properties of a node."""
 
     driver: str
     card: str
@@ -121,13 +121,13 @@ class Capability:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes; the capabilities are those of this node, where the driver tells them."""
+        """Decode the structure; the capabilities are those of this node if the driver reports them."""
         driver, card, bus, version, whole, own = struct.unpack_from("<16s32s32sIII", data)
         parts = (version >> 16 & 0xFF, version >> 8 & 0xFF, version & 0xFF)
         return cls(_text(driver), _text(card), _text(bus), parts, own if whole & cls.OWN else whole)
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         major, minor, patch = self.version
         return bytearray(
             struct.pack(
@@ -149,15 +149,15 @@ class Format:
     Parameters
     ----------
     width, height : int
-        Pixels.
+        Size (px).
     fourcc : str
-        Four characters.
+        Four-character code.
     stride : int
         Bytes from one row to the next.
     size : int
-        Bytes of the largest frame.
+        Largest size of a frame (bytes).
     field : int
-        0 as the driver likes, 1 progressive.
+        0 any, 1 progressive.
     """
 
     width: int
@@ -169,12 +169,12 @@ class Format:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         width, height, code, field, stride, size = struct.unpack_from("<IIIIII", data, 8)
         return cls(width, height, fourcc_text(code), stride, size, field)
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         head = struct.pack("<I4x", CAPTURE)
         body = struct.pack(
             "<IIIIII", self.width, self.height, fourcc_of(self.fourcc), self.field, self.stride, self.size
@@ -183,12 +183,12 @@ class Format:
 
     @staticmethod
     def ask(index: int) -> bytearray:
-        """``struct v4l2_fmtdesc``: the question for the format of this number."""
+        """``struct v4l2_fmtdesc``: query for the format with this index."""
         return bytearray(struct.pack("<II", index, CAPTURE)).ljust(64, b"\0")
 
     @staticmethod
     def listed(data: bytes) -> str:
-        """The four characters that answered it."""
+        """Return the four-character code of the answer."""
         return fourcc_text(struct.unpack_from("<I", data, 44)[0])
 
 
@@ -209,29 +209,29 @@ class Control:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         identifier, kind, name, low, high, step, default, flags = struct.unpack_from("<II32siiiiI", data)
         return cls(identifier, _text(name), kind, low, high, step, default, flags)
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         fields = self.identifier, self.kind, self.name.encode(), self.low, self.high, self.step
         return bytearray(struct.pack("<II32siiiiI8x", *fields, self.default, self.flags))
 
     @staticmethod
     def after(identifier: int) -> bytearray:
-        """The question for the first control behind this one."""
+        """Query for the first control after this one."""
         return bytearray(struct.pack("<I", identifier | _NEXT)).ljust(68, b"\0")
 
     @staticmethod
     def asked(data: bytes) -> int:
-        """The identifier behind which a question looks."""
+        """Return the identifier in a query."""
         return int(struct.unpack_from("<I", data)[0]) & ~_NEXT
 
 
 @dataclass(frozen=True)
 class Interval:
-    """``struct v4l2_streamparm``: the time from one frame to the next, as a fraction of seconds."""
+    """``struct v4l2_streamparm``: the time between frames as a fraction of seconds."""
 
     numerator: int
     denominator: int
@@ -239,24 +239,24 @@ class Interval:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         capability, _, numerator, denominator = struct.unpack_from("<IIII", data, 4)
         return cls(numerator, denominator, capability)
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         head = struct.pack("<IIIII", CAPTURE, self.capability, 0, self.numerator, self.denominator)
         return bytearray(head).ljust(204, b"\0")
 
     @property
     def ns(self) -> int:
-        """Nanoseconds; 0 when it is not known."""
+        """Interval in nanoseconds; 0 if unknown."""
         return self.numerator * 1_000_000_000 // self.denominator if self.denominator else 0
 
 
 @dataclass(frozen=True)
 class Selection:
-    """``struct v4l2_selection``: the region of the sensor that is read."""
+    """``struct v4l2_selection``: the region of the sensor that is read out."""
 
     left: int
     top: int
@@ -265,11 +265,11 @@ class Selection:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         return cls(*struct.unpack_from("<iiII", data, 12))
 
     def build(self) -> bytearray:
-        """The bytes, with the crop rectangle as target."""
+        """Encode the structure with the crop rectangle as target."""
         head = struct.pack("<IIIiiII", CAPTURE, 0, 0, self.left, self.top, self.width, self.height)
         return bytearray(head).ljust(64, b"\0")
 
@@ -282,32 +282,32 @@ class Request:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         return cls(struct.unpack_from("<I", data)[0])
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         return bytearray(struct.pack("<IIIII", self.count, CAPTURE, MMAP, 0, 0))
 
 
 @dataclass(frozen=True)
 class Buffer:
-    """``struct v4l2_buffer`` of memory that is mapped.
+    """``struct v4l2_buffer`` of mapped memory.
 
     Parameters
     ----------
     index : int
-        Which one.
+        Index of the buffer.
     used : int
-        Bytes of the frame in it.
+        Size of the frame in it (bytes).
     flags : int
         See the constants.
     stamp_ns : int
-        Time of the frame.
+        Time of the frame (ns).
     sequence : int
-        Its number, of 32 bits.
+        Frame number, 32 bits.
     offset, length : int
-        Of the memory.
+        Position and size of the memory (bytes).
     """
 
     index: int = 0
@@ -323,14 +323,14 @@ class Buffer:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Out of the bytes."""
+        """Decode the structure."""
         index, _, used, flags, _, seconds, micros = struct.unpack_from("<IIIII4xqq", data)
         (sequence,) = struct.unpack_from("<I", data, 56)
         offset, length = struct.unpack_from("<I4xI", data, 64)
         return cls(index, used, flags, (seconds * 1_000_000 + micros) * 1000, sequence, offset, length)
 
     def build(self) -> bytearray:
-        """The bytes."""
+        """Encode the structure."""
         seconds, micros = divmod(self.stamp_ns // 1000, 1_000_000)
         head = struct.pack("<IIIII4xqq", self.index, CAPTURE, self.used, self.flags, 1, seconds, micros)
         tail = struct.pack("<IIQI", self.sequence, MMAP, self.offset, self.length)

@@ -1,4 +1,4 @@
-"""VXI-11: the numbers of its core channel, and the arguments of its procedures.
+"""VXI-11: numbers of the core channel, and arguments of its procedures.
 
 Source: *TCP/IP Instrument Protocol Specification VXI-11*, revision 1.0, sections B.4 (error codes), B.5
 (flags) and B.6 (procedures).
@@ -29,7 +29,7 @@ CORE, VERSION = 0x0607AF, 1
 
 
 class Procedure(IntEnum):
-    """Of the core channel."""
+    """Procedures of the core channel."""
 
     NULL = 0
     CREATE_LINK = 10
@@ -48,7 +48,7 @@ class Procedure(IntEnum):
 
 
 class Error(IntEnum):
-    """Codes in responses."""
+    """Error codes in responses."""
 
     NONE = 0
     SYNTAX = 1
@@ -72,7 +72,7 @@ class Flag(IntEnum):
 
 
 class Reason(IntEnum):
-    """Bits that say why a read ended."""
+    """Bits for the reason why a read ended."""
 
     REQUEST_COUNT = 1
     TERM_CHAR = 2
@@ -89,7 +89,7 @@ class WriteParameters:
 
     @classmethod
     def parse(cls, arguments: bytes) -> Self:
-        """Take them apart; raises ProtocolError when they are too short."""
+        """Decode the arguments; raises ProtocolError if they are too short."""
         found = Unpacker(arguments)
         link, _io, _lock, flags = (found.number() for _ in range(4))
         return cls(link, flags, found.opaque())
@@ -97,7 +97,7 @@ class WriteParameters:
 
 @dataclass(frozen=True)
 class ReadParameters:
-    """Arguments of device_read; `timeout_ms` is that of the instrument's answer."""
+    """Arguments of device_read; `timeout_ms` is the time limit of the instrument's answer."""
 
     link: int
     size: int
@@ -107,17 +107,17 @@ class ReadParameters:
 
     @classmethod
     def parse(cls, arguments: bytes) -> Self:
-        """Take them apart; raises ProtocolError when they are too short."""
+        """Decode the arguments; raises ProtocolError if they are too short."""
         found = Unpacker(arguments)
         link, size, io, _lock, flags, char = (found.number() for _ in range(6))
         return cls(link, size, io, flags, char & 0xFF)
 
 
 def generic_link(arguments: bytes) -> int:
-    """The link that the arguments of any other procedure begin with; raises ProtocolError without one."""
+    """Return the link at the start of any other procedure's arguments; raises ProtocolError without one."""
     return Unpacker(arguments).number()
 
 
 def read_response(error: Error, reason: int, data: bytes) -> bytes:
-    """Results of device_read."""
+    """Encode the results of device_read."""
     return pack(error, reason, data)

@@ -1,9 +1,9 @@
-r"""Zaber's ASCII protocol: chained motion controllers, each with axes.
+r"""Zaber's ASCII protocol: chained motion controllers with one or more axes.
 
 Source: *Zaber ASCII Protocol Manual*, sections "Message Format" and "Checksumming". A command is
-``/device axis id words:LRC\n``; a reply ``@device axis id OK|RJ IDLE|BUSY flag data:LRC\r\n``, an info ``#``,
-an alert ``!``. The checksum of a message is the two's complement of the sum of its bytes between the first
-one and the colon.
+``/device axis id words:LRC\n``; a reply is ``@device axis id OK|RJ IDLE|BUSY flag data:LRC\r\n``, an info
+starts with ``#``, an alert with ``!``. The checksum is the two's complement of the sum of the bytes between
+the first one and the colon.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 LIMIT = 512
-"""Bytes of the longest message that is waited for; devices send at most 80 by default."""
+"""Largest size of an accepted message (bytes); devices send at most 80 by default."""
 
 FAULTS: dict[str, str] = {
     "FF": "a critical error switched the driver off",
@@ -41,10 +41,10 @@ FAULTS: dict[str, str] = {
     "FD": "the driver is off: it was overloaded",
     "FS": "the axis stalled",
     "FT": "the driver is too hot",
-    "FB": "the motion stopped: something was in its way",
-    "FE": "a limit switch was met",
+    "FB": "the motion was stopped by an obstacle",
+    "FE": "a limit switch was reached",
 }
-"""Warning flags that mean that a movement did not end where it should, and what they say."""
+"""Warning flags of movements that did not reach their target, with their meaning."""
 
 _REPLY = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? (OK|RJ) (IDLE|BUSY) ([A-Z]{2}|--) ([ -~]+)")
 _INFO = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? ([ -~]*)")
@@ -52,7 +52,7 @@ _ALERT = re.compile(rb"(\d{1,2}) (\d) (IDLE|BUSY) ([A-Z]{2}|--)(?: ([ -~]*))?")
 
 
 def lrc(content: bytes) -> bytes:
-    """The checksum of a message as two hexadecimal digits; `content` is what stands between lead and colon.
+    """Return the checksum of a message as two hexadecimal digits; `content` is the part before the colon.
 
     Examples
     --------
@@ -64,14 +64,14 @@ def lrc(content: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class Command:
-    """What a device is told.
+    """Command to a device.
 
     Parameters
     ----------
     device, axis : int
-        0 for all of them.
+        0 addresses all.
     words : str
-        The command with its arguments; nothing asks for the status.
+        Command with its arguments; empty queries the status.
     id : int or None
         0 to 99; the reply repeats it.
     """
@@ -84,7 +84,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a device answers to a command."""
+    """Answer of a device to a command."""
 
     lead: ClassVar[bytes] = b"@"
     device: int
@@ -98,7 +98,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class Info:
-    """A further line of an answer."""
+    """Further line of an answer."""
 
     lead: ClassVar[bytes] = b"#"
     device: int
@@ -109,7 +109,7 @@ class Info:
 
 @dataclass(frozen=True)
 class Alert:
-    """What a device says of itself, unasked."""
+    """Unsolicited message of a device."""
 
     lead: ClassVar[bytes] = b"!"
     device: int
@@ -123,19 +123,26 @@ Message = Reply | Info | Alert
 
 
 def encode(message: Command | Message) -> bytes:
-    """Bytes of a message, with its checksum.
+    r"""Encode a message with its checksum.
 
     Raises
     ------
     SettingError
-        When the words of a command cannot be sent.
+        If the words of a command cannot be sent.
+
+    Examples
+    --------
+    >>> encode(Command(1, 2, "move abs 1000", 7))
+    b'/01 2 07 move abs 1000:B8\n'
     """
     number = "" if getattr(message, "id", None) is None else f" {message.id:02d}"  # type: ignore[union-attr]
     if isinstance(message, Command):
         if not message.words.isascii() or any(c in message.words for c in "/:\n\r\\"):
-            raise SettingError("holds what the protocol does not allow", where=repr(message.words))
+            raise SettingError(
+                "contains characters that the protocol does not allow", where=repr(message.words)
+            )
         if not (0 <= message.device <= 99 and 0 <= message.axis <= 9 and (message.id or 0) in range(100)):
-            raise SettingError("device 0…99, axis 0…9, id 0…99", where=repr(message))
+            raise SettingError("device must be 0…99, axis 0…9, id 0…99", where=repr(message))
         content = f"{message.device:02d} {message.axis}{number} {message.words}".rstrip().encode("ascii")
         return b"/" + content + b":" + lrc(content) + b"\n"
     text = f"{message.device:02d} {message.axis}{number} "
@@ -148,7 +155,7 @@ def encode(message: Command | Message) -> bytes:
 
 
 def _content(line: bytes) -> bytes:
-    """What stands between the lead and the checksum, when that is right; a message may have none."""
+    """Return the part between the first byte and the checksum; verify the checksum if there is one."""
     content, colon, check = line[1:].partition(b":")
     if colon and check.upper() != lrc(content):
         raise ProtocolError(f"a message with a wrong checksum: {excerpt(line)}")
@@ -160,14 +167,14 @@ def _number(text: bytes | None) -> int | None:
 
 
 def decode(line: bytes) -> Message:
-    """The message of a device that stands in a line.
+    """Decode a message of a device.
 
     Raises
     ------
     ProtocolError
-        When it is none.
+        If the line is not a message.
     """
-    # After noise on the wire the message begins at the last of the bytes that can begin one.
+    # After noise, the message starts at the last byte that can start one.
     start = max(line.rfind(b"@"), line.rfind(b"#"), line.rfind(b"!")) if line[:1] not in b"@#!" else 0
     line = line[max(start, 0) :]
     content, lead = _content(line), line[:1]
@@ -182,44 +189,44 @@ def decode(line: bytes) -> Message:
     if lead == b"!" and (found := _ALERT.fullmatch(content)):
         device, axis, busy, flag, data = found.groups()
         return Alert(int(device), int(axis), busy == b"BUSY", flag.decode(), (data or b"").decode())
-    raise ProtocolError(f"no message of a Zaber device: {excerpt(line)}")
+    raise ProtocolError(f"not a message of a Zaber device: {excerpt(line)}")
 
 
 def decode_command(line: bytes) -> Command:
-    """The command that stands in a line; numbers that are left out are 0.
+    """Decode a command; omitted numbers are 0.
 
     Raises
     ------
     ProtocolError
-        When it is none.
+        If the line is not a command.
     """
     start = line.rfind(b"/")
     if start < 0:
-        raise ProtocolError(f"no command: {excerpt(line)}")
+        raise ProtocolError(f"not a command: {excerpt(line)}")
     content = _content(line[start:])
     if not content.isascii():
-        raise ProtocolError(f"no command: {excerpt(line)}")
+        raise ProtocolError(f"not a command: {excerpt(line)}")
     words, numbers = content.decode("ascii").split(), list[int]()
     while words and len(numbers) < 3 and words[0].isdigit():
         numbers.append(int(words.pop(0)))
     device, axis, id_ = (numbers[k] if k < len(numbers) else None for k in range(3))
     if max(device or 0, id_ or 0) > 99 or (axis or 0) > 9:
-        raise ProtocolError(f"no command: {excerpt(line)}")
+        raise ProtocolError(f"not a command: {excerpt(line)}")
     return Command(device or 0, axis or 0, " ".join(words), id_)
 
 
 class MessageDecoder:
-    """Messages of devices from a stream."""
+    """Decode messages of devices from a stream."""
 
     def __init__(self) -> None:
         self._lines = LineDecoder(limit=LIMIT)
 
     def reset(self) -> None:
-        """Forget the message that was begun."""
+        """Discard an incomplete message."""
         self._lines.reset()
 
     def feed(self, data: bytes) -> list[Message | Damaged]:
-        """Messages that are complete with these bytes."""
+        """Return the messages that these bytes complete."""
         found: list[Message | Damaged] = []
         for line in self._lines.feed(data):
             if isinstance(line, Damaged):

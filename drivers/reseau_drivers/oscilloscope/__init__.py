@@ -1,4 +1,4 @@
-"""Oscilloscopes, over raw sockets, VXI-11, HiSLIP and USBTMC."""
+"""Drivers of oscilloscopes over raw sockets, VXI-11, HiSLIP and USBTMC."""
 
 from __future__ import annotations
 
@@ -30,29 +30,37 @@ def oscilloscope(
     dialect: str | None = None,
     **options: Any,
 ) -> Oscilloscope:
-    """An oscilloscope; found by its entry point.
+    """Create the driver of an oscilloscope; entry point ``oscilloscope``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or Link
-        A VISA resource, or ``tcp://host:port``.
+        VISA resource, or ``tcp://host:port``.
     settings : dict, optional
-        Of :class:`OscilloscopeSettings`.
+        Values for :class:`OscilloscopeSettings`.
     dialect : str, optional
-        Name of one of :data:`DIALECTS`, instead of the one that its identity tells.
+        Name of one of :data:`DIALECTS`; by default it is chosen by the answer to ``*IDN?``.
     **options
-        Of :class:`Oscilloscope`.
+        Further arguments of :class:`Oscilloscope`.
 
     Raises
     ------
     SettingError
-        When there is no such dialect.
+        If the dialect does not exist.
+
+    Examples
+    --------
+    The connection is opened on the first call, not on construction:
+
+    >>> scope = oscilloscope("scope", "TCPIP::192.0.2.20::INSTR", settings={"channel": 2})
+    >>> scope.settings.channel
+    2
     """
     by_name = {each.name: each for each in DIALECTS}
     if dialect is not None and dialect not in by_name:
-        raise SettingError("is no dialect", where=dialect, do=f"there are {', '.join(by_name)}")
+        raise SettingError("is not a known dialect", where=dialect, do=f"choose from {', '.join(by_name)}")
     chosen = by_name[dialect] if dialect is not None else None
     checked = OscilloscopeSettings().changed(settings or {})
     return Oscilloscope(name, scpi_link(address), checked, dialect=chosen, **options)

@@ -1,8 +1,8 @@
-"""A limit to what pyvisa-py takes for one call of ours, and a hand on the sockets that it opens.
+"""Limit the bytes that pyvisa-py accepts in one call, and close the sockets that it opens.
 
-Its VXI-11 and HiSLIP believe the lengths that a peer announces, up to 2 GB and 2⁶⁴: they reserve it, gather
-bytes as long as some come, and lose their sockets when they fail while they open. So for a thread that has an
-account, its sockets and buffers are counted; for every other thread they are as they always were.
+Its VXI-11 and HiSLIP modules trust the lengths that a peer announces, up to 2 GB and 2⁶⁴ bytes: they allocate
+that size, read as long as bytes arrive, and lose their sockets when opening fails. Therefore sockets and
+buffers of threads with an account are counted; all other threads use the ordinary ones.
 """
 
 from __future__ import annotations
@@ -26,12 +26,21 @@ _thread = threading.local()
 
 
 class Account:
-    """What the calls of one link may take and have opened.
+    """Limits and open sockets of the calls of one link.
 
     Parameters
     ----------
     size : int
-        Bytes that a call may take.
+        Largest number of bytes that a call may receive.
+
+    Examples
+    --------
+    >>> account = Account(100)
+    >>> with account.open():
+    ...     account.spend(60)
+    ...     account.spend(60)
+    Traceback (most recent call last):
+    reseau.core.errors.ProtocolError: sent, or announced, more than 100 bytes in one answer
     """
 
     def __init__(self, size: int) -> None:
@@ -40,7 +49,7 @@ class Account:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """For one call, on this thread."""
+        """Apply the limits to one call on this thread."""
         self._left, _thread.account = self.size, self
         try:
             yield
@@ -48,22 +57,28 @@ class Account:
             _thread.account = None
 
     def opened(self, made: socket.socket) -> None:
-        """Remember a socket."""
+        """Register a socket."""
         self._sockets.append(made)
 
     def spend(self, count: int) -> None:
-        """Count bytes that came, or are to be reserved; raises ProtocolError when they are too many."""
+        """Count bytes received or to be allocated.
+
+        Raises
+        ------
+        ProtocolError
+            If the limit is exceeded.
+        """
         self._left -= count
         if self._left < 0:
             raise ProtocolError(f"sent, or announced, more than {self.size} bytes in one answer")
 
     def cut(self) -> None:
-        """Close all sockets, whoever waits for them."""
+        """Close all sockets, also those that a thread waits for."""
         sockets, self._sockets = self._sockets, []
         for each in sockets:
             with suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
-            # pyvisa-py takes the end of a VXI-11 stream for silence, and asks again; not of a closed one.
+            # pyvisa-py reads on at the end of a VXI-11 stream, but not from a closed socket.
             each.close()
 
 
@@ -72,7 +87,7 @@ def _account() -> Account | None:
 
 
 class _Counted(socket.socket):
-    """A socket that counts, and asks for no more at once than it may be worth."""
+    """Socket that counts bytes and limits the size of a single read."""
 
     def __init__(self, *kind: Any, **more: Any) -> None:
         super().__init__(*kind, **more)
@@ -93,14 +108,14 @@ class _Counted(socket.socket):
 
 
 def _counted_bytearray(source: Any = b"") -> bytearray:
-    """A bytearray; one of a size is of zeros, which takes its memory at once."""
+    """Replacement for bytearray that counts the memory of large buffers before it is allocated."""
     if isinstance(source, int) and (account := _account()) and source > account.size:
         account.spend(source)
     return builtins.bytearray(source)
 
 
 class _SocketModule(types.ModuleType):
-    """The module socket, but for its class."""
+    """The module ``socket`` with another socket class."""
 
     socket = _Counted
 

@@ -1,7 +1,7 @@
-"""How each maker's oscilloscopes hand over their screen and their waveforms: data, chosen by ``*IDN?``.
+"""Commands for screen pictures and waveforms of each manufacturer's oscilloscopes, selected by ``*IDN?``.
 
-Source: the makers' programming manuals. A family's model is found by the first pattern that its identity
-matches.
+Source: programming manuals of the manufacturers. The first pattern that matches the identity selects the
+family.
 """
 
 from __future__ import annotations
@@ -23,36 +23,37 @@ __all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of", "fiel
 
 Numbers = dict[str, float]
 Step = tuple[Literal["send", "query", "fetch"], str]
-"""``tell`` sends a command; ``ask`` waits for a line, and lets it be; ``fetch`` takes a picture or block."""
+"""``send`` a command; ``query``: wait for a line and ignore it; ``fetch`` a picture or block."""
 
 
 @dataclass(frozen=True)
 class WaveformDialect:
-    """How a waveform is handed over; ``{n}`` stands for the channel.
+    """Commands that transfer a waveform; ``{n}`` stands for the channel.
 
     Parameters
     ----------
     setup : tuple of str
-        Commands.
+        Commands sent first.
     scale : mapping
-        Questions by the name of their number; or of several, separated by spaces, answered with commas. A
-        name ``-`` is passed over.
+        Queries by the name of the number in their answer; several names, separated by spaces, stand for an
+        answer with commas. The name ``-`` skips a number.
     data : str
-        Question for the block.
+        Query for the block of samples.
     dtype : str
-        Of its samples.
+        Data type of the samples.
     volts : callable
-        From samples and the numbers to volts.
+        Converts samples to volts, given the numbers.
     start, step : callable
-        From the numbers to the seconds of the first sample, and of a step.
+        Time of the first sample and time step (s), given the numbers.
     preamble : str
-        Question for a block that holds more numbers.
+        Query for a block with further numbers.
     fields : mapping
-        Where in it they stand, and how (of :mod:`struct`), by name.
+        Offset and format (of :mod:`struct`) of these numbers, by name.
     wide : tuple (str, str), optional
-        What is said for samples of more than eight bits (the number ``bits``), and their type.
+        Command and data type for samples of more than eight bits (number ``bits``).
     piece : str
-        Said before each block, where all samples need not come in one; ``{at}`` is the first of it.
+        Command before each block, if the samples come in several blocks; ``{at}`` is the index of the first
+        sample.
     """
 
     setup: tuple[str, ...]
@@ -68,30 +69,35 @@ class WaveformDialect:
     piece: str = ""
 
     def sampled(self, numbers: Numbers) -> tuple[str, str]:
-        """What has to be said for these samples, and their type."""
+        """Return the command for the sample width, and the data type."""
         return self.wide if self.wide and numbers.get("bits", 8) > 8 else ("", self.dtype)
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """One way to speak.
+    """Commands of one family of oscilloscopes.
 
     Parameters
     ----------
     name : str
-        Of the family.
+        Name of the family.
     identity : str
-        Pattern of maker and model, as ``MAKER,MODEL``.
+        Regular expression for maker and model, as ``MAKER,MODEL``.
     screen : tuple of Step
-        What is said for the picture of the screen; one step fetches it.
+        Steps to obtain the screen picture; one of them fetches it.
     waveform : WaveformDialect, optional
-        None where waveforms are not known.
+        None if waveforms are not supported.
     setup : tuple of str
-        Said after connecting.
+        Commands sent after connecting.
     halt : str
-        Stops the acquisition.
+        Command that stops the acquisition.
     errors : str
-        Asks for the oldest error; nothing where there is no queue.
+        Query for the oldest error; empty if there is no error queue.
+
+    Examples
+    --------
+    >>> [step for step, _ in DIALECTS[0].screen]
+    ['send', 'fetch']
     """
 
     name: str
@@ -104,7 +110,7 @@ class Dialect:
 
 
 _TEN = "- - points - dx x0 - dy y0 yref"
-"""The ten numbers of a preamble of Keysight and Rigol: format, type, points, count, x, y."""
+"""The ten numbers of a Keysight or Rigol preamble: format, type, points, count, x, y."""
 
 _KEYSIGHT = WaveformDialect(
     (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", ":WAVeform:UNSigned ON"),
@@ -126,7 +132,7 @@ _SIGLENT = WaveformDialect(
     "C{n}:WF? DAT2",
     "i1",
     lambda codes, f: codes * f["vdiv"] / 25 - f["ofst"],
-    # Fourteen divisions, the trigger in the middle.
+    # Fourteen divisions with the trigger in the middle.
     start=lambda f: -7 * f["tdiv"],
     step=lambda f: 1 / f["rate"],
 )
@@ -136,7 +142,7 @@ _SIGLENT_BLOCK = WaveformDialect(
     ":WAVeform:DATA?",
     "i1",
     lambda codes, f: f["probe"] * (codes / f["codes"] * f["vdiv"] - f["ofst"]),
-    # Ten divisions; the delay is that of their middle.
+    # Ten divisions; the delay refers to their middle.
     start=lambda f: f["delay"] - 5 * f["tdiv"],
     step=lambda f: f["dx"],
     preamble=":WAVeform:PREamble?",
@@ -267,12 +273,12 @@ DIALECTS: tuple[Dialect, ...] = (
 
 
 def dialect_of(identity: str) -> Dialect:
-    """The dialect of an instrument by its answer to ``*IDN?``.
+    """Return the dialect of an instrument by its answer to ``*IDN?``.
 
     Raises
     ------
     ProtocolError
-        When none is known for it.
+        If no dialect matches.
 
     Examples
     --------
@@ -282,16 +288,16 @@ def dialect_of(identity: str) -> Dialect:
     for dialect in DIALECTS:
         if re.match(dialect.identity, identity.strip(), re.IGNORECASE):
             return dialect
-    raise ProtocolError(f"how to speak to {identity!r} is not known", do="name a dialect")
+    raise ProtocolError(f"no dialect is known for {identity!r}", do="set the option dialect")
 
 
 def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:
-    """The numbers that a preamble holds.
+    """Decode the numbers of a preamble.
 
     Raises
     ------
     ProtocolError
-        When it is too short for them, or holds what cannot be meant.
+        If the preamble is too short or contains invalid numbers.
     """
     try:
         found = {
@@ -301,22 +307,22 @@ def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:
         raise ProtocolError(f"a preamble of {len(block)} bytes is too short") from None
     divisors = (found.get("codes", 1.0), found.get("dx", 1.0))
     if not all(math.isfinite(value) for value in found.values()) or min(divisors) <= 0:
-        raise ProtocolError(f"a preamble that holds {found}")
+        raise ProtocolError(f"the preamble contains invalid numbers: {found}")
     return found
 
 
 def samples_of(data: bytes, dialect: WaveformDialect, numbers: Numbers) -> Array:
-    """Volts of the samples of all blocks.
+    """Convert the samples of all blocks to volts.
 
     Raises
     ------
     ProtocolError
-        When their number is not the one that was announced.
+        If the number of samples differs from the announced one.
     """
     dtype = np.dtype(dialect.sampled(numbers)[1])
     if len(data) % dtype.itemsize:
-        raise ProtocolError(f"{len(data)} bytes are no whole number of samples")
+        raise ProtocolError(f"{len(data)} bytes are not a whole number of samples")
     codes = np.frombuffer(data, dtype).astype(np.float64)
     if "points" in numbers and len(codes) != int(numbers["points"]):
-        raise ProtocolError(f"{len(codes)} samples came; {numbers['points']:g} were announced")
+        raise ProtocolError(f"received {len(codes)} samples; {numbers['points']:g} were announced")
     return dialect.volts(codes, numbers)

@@ -1,4 +1,4 @@
-"""An oscilloscope over SCPI: its screen and its waveforms, whoever made it."""
+"""Driver of SCPI oscilloscopes: screen picture and waveforms, independent of the manufacturer."""
 
 from __future__ import annotations
 
@@ -24,28 +24,41 @@ _LONGEST_LINE = 65536
 
 @dataclass(frozen=True)
 class OscilloscopeSettings(Settings):
-    """What is read with every reading."""
+    """Settings of an oscilloscope: the channel of each reading.
+
+    Examples
+    --------
+    >>> OscilloscopeSettings(channel=2).channel
+    2
+    """
 
     channel: int = quantity(1, "", 1, 8)
 
 
 class Oscilloscope(Device[OscilloscopeSettings]):
-    """The instrument.
+    """Driver of an oscilloscope.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     link : Link
-        To it.
+        Link to the instrument.
     settings : OscilloscopeSettings
-        What is read.
+        Channel of readings.
     dialect : Dialect, optional
-        Instead of the one of its identity.
+        By default, chosen by the answer to ``*IDN?``.
     seconds : float
-        Deadline of calls that name none; some take ten seconds for a picture.
+        Time limit of calls that do not specify one (s); some instruments take ten seconds for a picture.
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> scope = Oscilloscope("scope", link_to("tcp://192.0.2.20:5025"))
+    >>> scope.name, scope.dialect
+    ('scope', None)
     """
 
     def __init__(
@@ -64,7 +77,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
 
     @property
     def dialect(self) -> Dialect | None:
-        """How it is spoken to; None before it was asked who it is."""
+        """Dialect in use; None before the first connection."""
         return self._dialect
 
     def _open(self, deadline: Deadline) -> None:
@@ -73,7 +86,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         self._send("*CLS", deadline)
         self._idn = self._query("*IDN?", deadline)
         if self._idn.count(",") < 2:
-            raise ProtocolError(f"{self._idn!r} is no answer to *IDN?")
+            raise ProtocolError(f"{self._idn!r} is not a valid answer to *IDN?")
         self._dialect = self._forced_dialect or dialect_of(self._idn)
 
     def _disconnect(self) -> None:
@@ -100,7 +113,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         return {f"{self.name}_screen": {"dtype": "array", "shape": shape}}
 
     def stage(self) -> list[Any]:
-        """Connect, and take a picture: its size is told before the run begins."""
+        """Connect and take a picture, so that its size is known before the run."""
         staged = super().stage()
         self._take()
         return staged
@@ -114,12 +127,12 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         return found
 
     def screen(self, seconds: float | None = None) -> ScreenPicture:
-        """The picture of its screen.
+        """Return the picture of the screen.
 
         Raises
         ------
         InstrumentError
-            When none came that is whole.
+            If no complete picture arrives.
         """
         with self._exchange("screen", seconds) as deadline:
             asked, data = now(), b""
@@ -134,20 +147,27 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             return ScreenPicture(data, asked)
 
     def waveform(self, channel: int = 1, seconds: float | None = None) -> Waveform:
-        """The samples of a channel.
+        """Return the samples of a channel.
+
+        Parameters
+        ----------
+        channel : int
+            Number of the channel.
+        seconds : float, optional
+            Time limit (s).
 
         Raises
         ------
         RefusedError
-            When waveforms of this family are not known.
+            If waveforms are not supported for this family.
         InstrumentError
-            When none came that is whole.
+            If no complete waveform arrives.
         """
         self._settings.changed({"channel": channel}, self._limits)
         with self._exchange(f"waveform of channel {channel}", seconds) as deadline:
             dialect = self._required_dialect.waveform
             if dialect is None:
-                raise RefusedError(f"waveforms of {self._required_dialect.name} are not known")
+                raise RefusedError(f"waveforms of {self._required_dialect.name} are not supported")
             asked = now()
             for command in dialect.setup:
                 self._send(command.format(n=channel), deadline)
@@ -161,16 +181,16 @@ class Oscilloscope(Device[OscilloscopeSettings]):
                 volts = samples_of(data, dialect, numbers)
                 start, step = dialect.start(numbers), dialect.step(numbers)
             except ZeroDivisionError:
-                raise ProtocolError("its waveform has no extent in time") from None
+                raise ProtocolError("the waveform has no extent in time") from None
             return Waveform(volts, start, step, channel, asked)
 
     def _samples(
         self, dialect: WaveformDialect, numbers: dict[str, float], channel: int, deadline: Deadline
     ) -> bytes:
-        """The samples of a waveform, in as many blocks as they come in."""
-        said, dtype = dialect.sampled(numbers)
-        if said:
-            self._send(said, deadline)
+        """Return the samples of a waveform, from as many blocks as needed."""
+        command, dtype = dialect.sampled(numbers)
+        if command:
+            self._send(command, deadline)
         question = dialect.data.format(n=channel)
         if not dialect.piece:
             return parse_block(self._fetch(question, deadline))
@@ -187,7 +207,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         return data
 
     def errors(self, seconds: float | None = None) -> list[str]:
-        """What its error queue holds; taken out of it."""
+        """Return and clear the entries of the error queue."""
         found: list[str] = []
         with self._exchange("errors", seconds) as deadline:
             while self._required_dialect.errors and len(found) < 100:
@@ -200,11 +220,11 @@ class Oscilloscope(Device[OscilloscopeSettings]):
     @property
     def _required_dialect(self) -> Dialect:
         if self._dialect is None:
-            raise ProtocolError("has not said who it is")
+            raise ProtocolError("has not been identified yet")
         return self._dialect
 
     def _send(self, text: str, deadline: Deadline) -> None:
-        # What is still there of the last answer is none to what follows, and would be an interrupted one.
+        # Discard the rest of the last answer; the instrument would report it as interrupted.
         while self._answer_pending and self._link.pending() and not deadline.expired:
             self._link.read(deadline)
         self._answer_pending = False
@@ -222,14 +242,14 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             if newline:
                 return line.strip().decode("latin-1")
             if len(self._received) > _LONGEST_LINE:
-                raise ProtocolError(f"{text} is answered without end: {excerpt(bytes(self._received))}")
+                raise ProtocolError(f"the answer to {text} does not end: {excerpt(bytes(self._received))}")
             self._receive(deadline, text)
 
     def _fetch(self, text: str, deadline: Deadline) -> bytes:
         self._start_query(text, deadline)
         lacking: int | None = None
         while True:
-            # Asked again only when as much has come as was missing: a picture is large.
+            # Parse again only when the missing bytes have arrived: a picture is large.
             if self._received and not lacking:
                 start = _start_of_binary(self._received)
                 lacking = missing_bytes(bytes(self._received[start:]))
@@ -240,7 +260,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             if lacking:
                 lacking = max(0, lacking - (len(self._received) - before))
             if len(self._received) > LARGEST:
-                raise ProtocolError(f"{text} is answered without end")
+                raise ProtocolError(f"the answer to {text} does not end")
 
     def _receive(self, deadline: Deadline, text: str) -> None:
         if deadline.expired:
@@ -248,13 +268,13 @@ class Oscilloscope(Device[OscilloscopeSettings]):
                 raise ProtocolError(f"the answer to {text} broke off after {len(self._received)} bytes")
             raise DeadlineError(
                 f"{text} was not answered within {deadline.seconds:g} s",
-                do="is it busy, or its screen locked?",
+                do="check whether it is busy or its screen is locked",
             )
         self._received += self._link.read(deadline)
 
 
 def _start_of_binary(data: bytearray) -> int:
-    """Where the block begins: behind newlines, or a word such as ``DAT2,``."""
+    """Return the start of the block: after newlines, or after a word such as ``DAT2,``."""
     start = len(data) - len(data.lstrip(b"\r\n"))
     sign = data.find(b"#", start, start + 40)
     word = bytes(data[start:sign]) if sign > start else b""
@@ -262,22 +282,22 @@ def _start_of_binary(data: bytearray) -> int:
 
 
 def _numbers(names: str, answer: str) -> dict[str, float]:
-    """Numbers by name from an answer with commas."""
+    """Parse an answer with commas into numbers by name."""
     wanted, found = names.split(), answer.split(",")
     if len(found) < len(wanted):
-        raise ProtocolError(f"{answer!r} holds fewer than {len(wanted)} numbers")
+        raise ProtocolError(f"{answer!r} has fewer than {len(wanted)} numbers")
     try:
         return {name: float(text) for name, text in zip(wanted, found, strict=False) if name != "-"}
     except ValueError:
-        raise ProtocolError(f"{answer!r} holds no numbers") from None
+        raise ProtocolError(f"{answer!r} does not consist of numbers") from None
 
 
 def _verify_png(data: bytes) -> None:
-    """Raise ProtocolError when the sum of a chunk of a PNG is wrong (ISO 15948, 5.3)."""
+    """Raise ProtocolError if the checksum of a PNG chunk is wrong (ISO 15948, 5.3)."""
     at = 8
     while data[:2] != b"BM" and at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")
         end = at + 8 + length
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            raise ProtocolError("its picture was damaged on the way")
+            raise ProtocolError("the picture was damaged in transmission")
         at = end + 4

@@ -1,4 +1,4 @@
-"""Ultrasonic scanners."""
+"""Drivers of ultrasonic scanners."""
 
 from __future__ import annotations
 
@@ -29,18 +29,23 @@ __all__ = [
 def ping360(
     name: str, address: str | Link, *, settings: dict[str, Any] | None = None, **options: Any
 ) -> Ping360:
-    """A Ping360; found by its entry point.
+    """Create the driver of a Ping360; entry point ``ping360``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or Link
         Serial device, ``tcp://host:port``, or ``udp://host:9092`` of a vehicle's computer.
     settings : dict, optional
-        Of :class:`Ping360Settings`.
+        Values for :class:`Ping360Settings`.
     **options
-        Of :class:`Ping360`.
+        Further arguments of :class:`Ping360`.
+
+    Examples
+    --------
+    >>> ping360("sonar", "udp://192.0.2.2:9092", settings={"range_mm": 2000.0}).settings.range_mm
+    2000.0
     """
     return Ping360(name, link_to(address), Ping360Settings().changed(settings or {}), **options)
 
@@ -48,18 +53,23 @@ def ping360(
 def bk_oem(
     name: str, address: str | Link, *, settings: dict[str, Any] | None = None, **options: Any
 ) -> BkScanner:
-    """A BK scanner; found by its entry point ``bk``.
+    """Create the driver of a BK scanner; entry point ``bk``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or Link
         ``tcp://host:7915``.
     settings : dict, optional
-        Of :class:`BkSettings`.
+        Values for :class:`BkSettings`.
     **options
-        Of :class:`BkScanner`.
+        Further arguments of :class:`BkScanner`.
+
+    Examples
+    --------
+    >>> bk_oem("bmode", "tcp://192.0.2.3:7915", settings={"frequency_khz": 8000.0}).settings.units
+    {'speed_m_s': 'm/s', 'frequency_khz': 'kHz'}
     """
     return BkScanner(name, link_to(address), BkSettings().changed(settings or {}), **options)
 
@@ -67,18 +77,24 @@ def bk_oem(
 def compact_pulser(
     name: str, address: str | Link, *, settings: dict[str, Any] | None = None, **options: Any
 ) -> CompactPulser:
-    """A CompactPulser; found by its entry point ``compactpulser``.
+    """Create the driver of a CompactPulser; entry point ``compactpulser``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or Link
         Serial device, 9600 baud.
     settings : dict, optional
-        Of :class:`CompactPulserSettings`.
+        Values for :class:`CompactPulserSettings`.
     **options
-        Of :class:`CompactPulser`.
+        Further arguments of :class:`CompactPulser`.
+
+    Examples
+    --------
+    >>> pulser = compact_pulser("pulser", "/dev/ttyUSB1", settings={"voltage": 120.0}, digitiser="scope")
+    >>> pulser.settings.voltage
+    120.0
     """
     checked = CompactPulserSettings().changed(settings or {})
     return CompactPulser(name, link_to(address, baud=9600), checked, **options)
@@ -87,17 +103,22 @@ def compact_pulser(
 def dicom_files(
     name: str, address: str, *, settings: dict[str, Any] | None = None, **options: Any
 ) -> DicomFiles:
-    """Files of a scanner, in its stead; found by its entry point ``dicom``.
+    """Create a scanner that returns the frames of DICOM files; entry point ``dicom``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str
-        A DICOM file, or a folder of them.
+        DICOM file, or folder of DICOM files.
     settings : dict, optional
-        Of :class:`DicomSettings`.
+        Values for :class:`DicomSettings`.
     **options
-        Of :class:`DicomFiles`.
+        Further arguments of :class:`DicomFiles`.
+
+    Examples
+    --------
+    >>> dicom_files("loops", "recordings/")  # doctest: +SKIP
+    <reseau_drivers.scanner.dicom.DicomFiles object at 0x...>
     """
     return DicomFiles(name, address, DicomSettings().changed(settings or {}), **options)

@@ -1,9 +1,9 @@
-"""BK scanners through their OEM interface: B-mode frames with the millimetres that the scanner states.
+"""BK scanners through their OEM interface: B-mode frames with the pixel size that the scanner reports.
 
-Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``, which was tried on the instruments, and BK's document
-PS12640-44. The section is told twice, as a box of pixels of the grabbed frame (its last ones included) and in
-metres of tissue; their quotient is the size of a pixel. A box beyond the frame gives no millimetres rather
-than wrong ones.
+Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``, which was tested on the instruments, and BK's document
+PS12640-44. The scanner reports the section twice: as a box in pixels of the grabbed frame (last pixels
+included) and in metres of tissue. The pixel size is their quotient. If the box exceeds the frame, no pixel
+size is returned rather than a wrong one.
 """
 
 from __future__ import annotations
@@ -30,30 +30,47 @@ _BOXES = ("B_GEOMETRY_US_FRAME_GRAB", "B_GEOMETRY_PIXEL")
 
 @dataclass(frozen=True)
 class BkSettings(Settings):
-    """What the interface does not tell and the calibration needs; set on the scanner by hand."""
+    """Values that the interface does not report and the calibration needs; set on the scanner by hand.
+
+    Examples
+    --------
+    >>> BkSettings(frequency_khz=8000.0).speed_m_s
+    1540.0
+    """
 
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 2500.0)
     frequency_khz: float = quantity(6000.0, "kHz", 500.0, 30_000.0)
 
 
 class BkScanner(Device[BkSettings]):
-    """The scanner.
+    """Driver of a BK scanner.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     link : Link
-        To its port 7915.
+        Link to port 7915 of the scanner.
     settings : BkSettings
-        What it is set to.
+        Speed of sound and frequency set on the scanner.
     box : str
-        What tells the box of the section: ``B_GEOMETRY_US_FRAME_GRAB``, or ``B_GEOMETRY_PIXEL`` for firmware
-        that knows no other; PLUS found the latter to mean more than the section on some instruments.
+        Parameter that reports the box of the section: ``B_GEOMETRY_US_FRAME_GRAB``, or ``B_GEOMETRY_PIXEL``
+        for firmware without it. On some instruments PLUS found the latter to cover more than the section.
     seconds : float
-        Deadline of calls that name none.
+        Time limit of calls that do not specify one (s).
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
+
+    Raises
+    ------
+    SettingError
+        If `box` is not one of these names.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> BkScanner("bmode", link_to("tcp://192.0.2.3:7915")).name
+    'bmode'
     """
 
     def __init__(
@@ -67,7 +84,7 @@ class BkScanner(Device[BkSettings]):
         limits: Limits | None = None,
     ) -> None:
         if box not in _BOXES:
-            raise SettingError(f"box is one of {', '.join(_BOXES)}", where=name)
+            raise SettingError(f"box must be one of {', '.join(_BOXES)}", where=name)
         super().__init__(name, settings or BkSettings(), seconds=seconds, limits=limits)
         self._box = box
         self._link: MessageLink[bytes] = MessageLink(link, bk.MessageDecoder())
@@ -80,7 +97,7 @@ class BkScanner(Device[BkSettings]):
         self._link.close()
 
     def _push(self, settings: BkSettings, deadline: Deadline) -> None:
-        """Nothing to send: the interface reads."""
+        """Do nothing: the interface is read-only."""
 
     def _identify(self, deadline: Deadline) -> Identity:
         width, height = self._window(deadline)
@@ -109,12 +126,12 @@ class BkScanner(Device[BkSettings]):
         return {"frame": f"{width}×{height} px {mm}"}
 
     def scan(self, seconds: float | None = None) -> BScan:
-        """One frame, with the millimetres of the moment.
+        """Return one frame with its current pixel size.
 
         Raises
         ------
         InstrumentError
-            When no whole frame came.
+            If no complete frame arrives.
         """
         with self._exchange("scan", seconds) as deadline:
             asked = now()
@@ -123,27 +140,29 @@ class BkScanner(Device[BkSettings]):
             gain = self._numbers("B_GAIN:A", 1, deadline)[0]
             grabbed = bk.parse_frame(self._query(_ON, b"DATA:GRAB_FRAME ", deadline), width * height)
             if self._quiet(deadline) != (width, height):
-                raise ProtocolError("changed its window while a frame was taken", do="take it again")
+                raise ProtocolError(
+                    "changed its window during the acquisition of a frame", do="repeat the scan"
+                )
             pixels = np.frombuffer(grabbed.pixels, np.uint8).reshape(height, width)
             s = self.settings
             return BScan(pixels, mm, origin, s.speed_m_s, s.frequency_khz, gain, asked)
 
     def _quiet(self, deadline: Deadline) -> tuple[int, int]:
-        """Let no more frames come; the window, whose answer comes behind the last of them."""
-        # Some instruments acknowledge this, others do not: nothing may depend on it.
+        """Stop the frames and return the window, whose answer follows the last frame."""
+        # Some instruments acknowledge this command, others do not: nothing depends on it.
         self._link.send(bk.encode(_OFF), deadline)
         return self._window(deadline)
 
     def _window(self, deadline: Deadline) -> tuple[int, int]:
         size = self._numbers("US_WIN_SIZE", 2, deadline)
         if not all(2 <= side <= _LARGEST_SIDE and side == int(side) for side in size):
-            raise ProtocolError(f"states a window of {size}")
+            raise ProtocolError(f"reports a window of {size}")
         return int(size[0]), int(size[1])
 
     def _geometry(
         self, width: int, height: int, deadline: Deadline
     ) -> tuple[tuple[float, float] | None, tuple[float, float]]:
-        """Millimetres of a pixel, and where the middle of the transducer's face is."""
+        """Return the pixel size (mm), and the position of the middle of the transducer's face (px)."""
         left, top, right, bottom = self._numbers(f"{self._box}:A", 4, deadline)
         x0, y0, x1, y1 = self._numbers("B_GEOMETRY_TISSUE:A", 4, deadline)
         origin = ((left + right) / 2, top)
@@ -152,11 +171,11 @@ class BkScanner(Device[BkSettings]):
         return (1000 * abs(x1 - x0) / (right - left + 1), 1000 * abs(y1 - y0) / (bottom - top + 1)), origin
 
     def _numbers(self, name: str, count: int, deadline: Deadline) -> tuple[float, ...]:
-        """Numbers that the scanner tells under a name."""
+        """Query the numbers of a parameter."""
         answer = self._query(f"QUERY:{name};".encode(), f"DATA:{name} ".encode(), deadline)
         found = bk.numbers(answer, name)
         if len(found) != count or not np.isfinite(found).all():
-            raise ProtocolError(f"states {found} for {name}")
+            raise ProtocolError(f"reports {found} for {name}")
         return found
 
     def _query(self, question: bytes, head: bytes, deadline: Deadline) -> bytes:

@@ -1,9 +1,10 @@
-"""US Ultratek's CompactPulser: sends pulses and amplifies their echoes; an oscilloscope digitises them.
+"""US Ultratek CompactPulser: sends pulses and amplifies their echoes, which an oscilloscope digitises.
 
-Source: see :mod:`reseau_drivers.codecs.compactpulser`. Commands are not acknowledged; so values are asked for
-after they were set. That ``G?`` is answered is known of all; where the other letters are silent the gain
-vouches for them: it is set one step off before them, and right behind them. A sample at the time t after the
-pulse lies at c·t/2. A table that carries the transducer along makes sections of the lines.
+Source: see :mod:`reseau_drivers.codecs.compactpulser`. Commands are not acknowledged; values are therefore
+read back. All known instruments answer ``G?``. If an instrument does not answer queries of other letters, the
+gain serves as a check: it is set to a neighbouring value before the other settings and to its final value
+after them. A sample at the time t after the pulse is at the depth c·t/2. Sections consist of lines that are
+taken while a table moves the transducer.
 """
 
 from __future__ import annotations
@@ -43,7 +44,16 @@ _MOST_GAIN = 840
 
 @dataclass(frozen=True)
 class CompactPulserSettings(Settings):
-    """How pulses are sent and echoes amplified; nothing is sent at 0 Hz."""
+    """Pulses and amplification; a repetition rate of 0 Hz sends no pulses.
+
+    Sections have `lines` lines, `step_mm` apart, from `first_mm` on; an amplitude of `full_scale_v` is shown
+    as 255.
+
+    Examples
+    --------
+    >>> CompactPulserSettings(voltage=120.0, gain_db=12.5).units["gain_db"]
+    'dB'
+    """
 
     repetition_hz: float = quantity(0.0, "Hz", 0.0, 5000.0)
     width_ns: float = quantity(220.0, "ns", 10.0, 1000.0)
@@ -61,28 +71,35 @@ class CompactPulserSettings(Settings):
 
 
 class CompactPulser(Device[CompactPulserSettings]):
-    """The pulser.
+    """Driver of the pulser.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     link : Link
-        To it.
+        Link to the pulser.
     settings : CompactPulserSettings
-        Pushed on every connection.
+        Sent on every connection.
     digitiser : Oscilloscope or str, optional
-        Sees its echoes; a name is that of one on the same bench.
+        Oscilloscope that digitises the echoes; a name refers to an instrument on the same bench.
     carrier : Turntable or str, optional
-        Carries the transducer along for sections; likewise.
+        Table that moves the transducer for sections; likewise.
     axis : str
-        Of the carrier, in millimetres.
+        Axis of the carrier, in millimetres.
     seconds : float
-        Deadline of calls that name none.
+        Time limit of calls that do not specify one (s).
     answer_s : float
-        Within which a value is told.
+        Time limit of an answer (s).
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> line = Waveform(np.zeros(3), start_s=0.0, step_s=1e-6)
+    >>> CompactPulser("pulser", link_to("/dev/ttyUSB1@9600")).depths_mm(line)
+    array([0.  , 0.77, 1.54])
     """
 
     def __init__(
@@ -105,29 +122,32 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._readable, self._scanning = "G", False
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
-        """Find what was named among the instruments of the bench.
+        """Look up the digitiser and the carrier by name among the instruments of the bench.
 
         Raises
         ------
         SettingError
-            When there is none of this name and kind.
+            If there is no such instrument, or it is of another kind.
         """
         if isinstance(self._digitiser, str):
             found = instruments.get(self._digitiser)
             if not isinstance(found, Oscilloscope):
-                raise SettingError(f"digitiser {self._digitiser!r} is no oscilloscope here", where=self.name)
+                raise SettingError(
+                    f"digitiser {self._digitiser!r} is not an oscilloscope on this bench", where=self.name
+                )
             self._digitiser = found
         if isinstance(self._carrier, str):
             table = instruments.get(self._carrier)
             if not isinstance(table, Turntable) or self._axis not in table.axes:
                 raise SettingError(
-                    f"carrier {self._carrier!r} is no table with an axis {self._axis!r} here", where=self.name
+                    f"carrier {self._carrier!r} is not a table with an axis {self._axis!r} on this bench",
+                    where=self.name,
                 )
             self._carrier = table
 
     def _open(self, deadline: Deadline) -> None:
         self._link.open(deadline)
-        # Ends what may have been begun on the line. The first answer only shows that somebody is there.
+        # End an incomplete line. The first answer only shows that the instrument is present.
         self._link.send(b"\r", deadline)
         self._value("G", deadline)
         self._readable = "".join(_letters(self.settings)) if self._answers("W", deadline) else "G"
@@ -138,34 +158,34 @@ class CompactPulser(Device[CompactPulserSettings]):
     def _push(self, settings: CompactPulserSettings, deadline: Deadline) -> None:
         wanted = _letters(settings)
         off = wanted["G"] + (1 if wanted["G"] < _MOST_GAIN else -1)
-        # Pulses last: they begin when all else is set.
+        # The repetition rate is last: pulses start when everything else is set.
         for letter, value in ({"G": off} | {k: v for k, v in wanted.items() if k != "G"}).items():
             self._set(letter, value, deadline)
         self._verify({"G": off}, deadline)
         self._set("G", wanted["G"], deadline)
-        # It may have lost its power in between, and all that was set before.
+        # The instrument may have lost its power in between, and with it the settings sent before.
         self._verify(wanted, deadline)
 
     def stop(self, *, success: bool = False) -> None:
-        """Stop the pulses, and the carrier in the midst of a section."""
+        """Stop the pulses, and the carrier during a section."""
         scanning = self._scanning
         super().stop(success=success)
         if scanning and isinstance(self._carrier, Turntable):
             self._carrier.stop(success=success)
 
     def stage(self) -> list[Any]:
-        """Connect, and send pulses again, which the end of the run before had stopped."""
+        """Connect and send the settings again: the end of the previous run stopped the pulses."""
         staged = super().stage()
         self.configure()
         return staged
 
     def verify(self, seconds: float | None = None) -> None:
-        """Read settings back: all of them, or the gain where the instrument tells no other.
+        """Read back the settings: all of them, or only the gain if the instrument reports nothing else.
 
         Raises
         ------
         StateError
-            When one is not as it was set: someone turned a knob, or the power was off.
+            If a value differs: a knob was turned, or the power was off.
         """
         with self._exchange("verify", seconds) as deadline:
             self._verify(_letters(self.settings), deadline)
@@ -173,7 +193,7 @@ class CompactPulser(Device[CompactPulserSettings]):
     def _test(self, deadline: Deadline) -> dict[str, str]:
         self.verify(deadline.left_or_minimum)
         alone = len(self._readable) == 1
-        return {"settings": "gain as pushed; it tells no other" if alone else "as pushed"}
+        return {"settings": "gain as sent; others are not readable" if alone else "as sent"}
 
     def _identify(self, deadline: Deadline) -> Identity:
         self._value("G", deadline)
@@ -199,37 +219,37 @@ class CompactPulser(Device[CompactPulserSettings]):
         return {f"{self.name}_volts": {"dtype": "array", "shape": shape, "units": "V"}}
 
     def line(self, seconds: float | None = None) -> Waveform:
-        """Echoes of a pulse, as the oscilloscope digitised them.
+        """Return the echoes of a pulse, as the oscilloscope digitised them.
 
         Raises
         ------
         StateError
-            When no oscilloscope was given, or no pulses are sent.
+            If there is no oscilloscope, or no pulses are sent.
         InstrumentError
-            When it did not answer.
+            If the oscilloscope does not answer.
         """
         s = self.settings
         if not isinstance(self._digitiser, Oscilloscope):
             raise StateError(
-                "has no digitiser", where=self.name, command="line", do="give it an oscilloscope"
+                "has no digitiser", where=self.name, command="line", do="set the option digitiser"
             )
         if not s.repetition_hz:
             raise StateError("sends no pulses", where=self.name, command="line", do="set repetition_hz")
         return self._digitiser.waveform(s.channel, seconds)
 
     def scan(self, seconds: float | None = None) -> BScan:
-        """A section: a line at each place that the carrier brings the transducer to.
+        """Return a section: one line at each position of the carrier.
 
         Raises
         ------
         StateError
-            When there is no carrier, the carrier is not homed, or it was stopped.
+            If there is no carrier, the carrier is not homed, or it was stopped.
         InstrumentError
-            When a line did not come, or the time ran out.
+            If a line is missing, or the time limit is exceeded.
         """
         s, asked = self.settings, now()
         if not isinstance(self._carrier, Turntable):
-            raise StateError("is not carried along", where=self.name, command="scan", do="give it a carrier")
+            raise StateError("has no carrier", where=self.name, command="scan", do="set the option carrier")
         deadline = Deadline(self._seconds * s.lines if seconds is None else seconds)
         self._stopping.clear()
         self._scanning = True
@@ -243,11 +263,11 @@ class CompactPulser(Device[CompactPulserSettings]):
         return BScan(pixels, mm, ((s.lines - 1) / 2, row), s.speed_m_s, float("nan"), s.gain_db, asked)
 
     def _line_at(self, carrier: Turntable, number: int, deadline: Deadline) -> Waveform:
-        """The line of this number of a section."""
+        """Return one line of a section, given its index."""
         if self._stopping.is_set():
             raise StateError("was stopped", where=self.name, command="scan")
         if deadline.expired:
-            what = f"was not done within {deadline.seconds:g} s"
+            what = f"did not finish within {deadline.seconds:g} s"
             raise DeadlineError(what, where=self.name, command="scan")
         carrier.move(
             self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.left_or_minimum
@@ -255,7 +275,7 @@ class CompactPulser(Device[CompactPulserSettings]):
         return self.line(deadline.left_or_minimum)
 
     def depths_mm(self, line: Waveform) -> Array:
-        """Where the samples of a line lie (n,)."""
+        """Return the depths of the samples of a line (n,), in millimetres."""
         depths: Array = self.settings.speed_m_s * 1e3 * line.seconds / 2
         return depths
 
@@ -267,11 +287,11 @@ class CompactPulser(Device[CompactPulserSettings]):
         for letter, value in wanted.items():
             if letter in self._readable and (found := self._value(letter, deadline)) != value:
                 raise StateError(
-                    f"has {letter} = {found} and not {value}", do="is it in local mode, or was it off?"
+                    f"has {letter} = {found} instead of {value}", do="check local mode and power"
                 )
 
     def _answers(self, letter: str, deadline: Deadline) -> bool:
-        """Whether a letter is told; asked twice, as an answer may get lost."""
+        """Whether a letter can be queried; asked twice, because an answer may be lost."""
         for _ in range(2):
             try:
                 self._value(letter, deadline)
@@ -289,7 +309,7 @@ class CompactPulser(Device[CompactPulserSettings]):
 
 
 def _letters(s: CompactPulserSettings) -> dict[str, int]:
-    """Values by letter."""
+    """Return the values by letter."""
     return {
         "W": round(s.width_ns),
         "V": round(s.voltage),
@@ -302,7 +322,7 @@ def _letters(s: CompactPulserSettings) -> dict[str, int]:
 
 
 def envelope(volts: Array) -> Array:
-    """Amplitude (n,) of an oscillation: the modulus of its analytic signal, its mean taken off."""
+    """Return the amplitude (n,) of an oscillation: the modulus of the analytic signal without its mean."""
     count = len(volts)
     weights = np.zeros(count)
     weights[0] = 1.0
@@ -314,39 +334,39 @@ def envelope(volts: Array) -> Array:
 
 
 def section(lines: Sequence[Waveform], full_scale_v: float) -> tuple[NDArray[np.uint8], float, float]:
-    """Lines as the columns of a picture.
+    """Arrange lines as the columns of an image.
 
     Parameters
     ----------
     lines : sequence of Waveform
-        Each taken at the next place; time 0 is the pulse.
+        Lines at consecutive positions; time 0 is the pulse.
     full_scale_v : float
-        Amplitude that is shown as 255.
+        Amplitude that is shown as 255 (V).
 
     Returns
     -------
     pixels : ndarray (samples, lines)
-        From the pulse on.
+        Amplitudes, from the pulse on.
     row : float
-        Of the pulse: between −1 and 0.
+        Row of the pulse, between −1 and 0.
     step_s : float
-        Time from row to row.
+        Time step between rows (s).
 
     Raises
     ------
     ProtocolError
-        When the lines are not alike, or end before the pulse.
+        If the lines have different time bases, or end before the pulse.
     """
     first = lines[0]
-    begin = max(0, int(np.ceil(-first.start_s / first.step_s - 1e-9)))
+    pulse = max(0, int(np.ceil(-first.start_s / first.step_s - 1e-9)))
     for line in lines:
         same = len(line.volts) == len(first.volts) and np.allclose(
             (line.start_s, line.step_s), (first.start_s, first.step_s), rtol=1e-6, atol=1e-12
         )
         if not same:
-            raise ProtocolError("its digitiser changed the time base within a section")
-    if len(first.volts) - begin < 2:
-        raise ProtocolError("its digitiser shows nothing behind the pulse", do="move the trigger")
-    amplitudes = np.column_stack([envelope(line.volts)[begin:] for line in lines])
+            raise ProtocolError("the digitiser changed the time base within a section")
+    if len(first.volts) - pulse < 2:
+        raise ProtocolError("the digitiser recorded nothing after the pulse", do="change the trigger delay")
+    amplitudes = np.column_stack([envelope(line.volts)[pulse:] for line in lines])
     pixels = np.clip(np.rint(255 * amplitudes / full_scale_v), 0, 255).astype(np.uint8)
-    return pixels, -(first.start_s / first.step_s + begin), first.step_s
+    return pixels, -(first.start_s / first.step_s + pulse), first.step_s

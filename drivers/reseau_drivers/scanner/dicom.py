@@ -1,10 +1,10 @@
-"""DICOM files in a scanner's stead: their frames one after the other, with the millimetres that they state.
+"""DICOM files in place of a scanner: their frames in order, with the pixel size that the files state.
 
-Source: DICOM PS3.3, C.8.5.5 "US Region Calibration". Millimetres come from the regions of the file alone, and
-only where they can be meant: a section in two dimensions, in centimetres, within the frame. Everything else,
-as a frame that someone made smaller and whose regions lie outside it now, gives pixels. What the transfer
-syntax asks for is decoded by pydicom with what is installed: always without compression, RLE and deflated;
-with Pillow JPEG of 8 bits and JPEG 2000; lossless JPEG, JPEG-LS, HTJ2K and video are refused by name.
+Source: DICOM PS3.3, C.8.5.5 "US Region Calibration". The pixel size comes only from the regions of a file,
+and only if they are plausible: a two-dimensional section, in centimetres, inside the frame. Otherwise (for
+example if a frame was reduced and its regions now lie outside it) a frame has no pixel size. pydicom decodes
+the transfer syntaxes that are installed: uncompressed, RLE and deflated always; JPEG (8 bits) and JPEG 2000
+with Pillow; lossless JPEG, JPEG-LS, HTJ2K and video are refused with an error that names them.
 """
 
 from __future__ import annotations
@@ -36,44 +36,58 @@ _TWO_DIMENSIONS, _CENTIMETRES = 1, 3
 
 @dataclass(frozen=True)
 class DicomSettings(Settings):
-    """What files do not tell, and which of their regions is meant."""
+    """Speed of sound, which files do not state, and the choice of the region.
+
+    Examples
+    --------
+    >>> DicomSettings(region=1).speed_m_s
+    1540.0
+    """
 
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 2500.0)
     region: int = quantity(-1, "", -1, 99)
-    """Counted from 0; −1 takes what all sections of a frame agree on."""
+    """Index of the region, from 0; −1 uses the scale on which all sections of a frame agree."""
 
 
 @dataclass(frozen=True)
 class _Scale:
-    """What is known of the millimetres of a frame, or why nothing is."""
+    """Pixel size of a frame, or the reason why there is none."""
 
     mm: tuple[float, float] | None
     origin: tuple[float, float]
     region: tuple[int, int, int, int] | None = None
     frequency_khz: float = math.nan
     why: str = ""
+    invalid: bool = False
+    """Whether the region contradicts the frame, so that no scale of the frame can be trusted."""
 
 
 class DicomFiles(Device[DicomSettings]):
-    """A file, or the files of a folder in the order of their names, frame by frame.
+    """Frames of a file, or of the files of a folder in the order of their names.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     path : str or Path
-        Of the file or the folder.
+        File or folder.
     settings : DicomSettings
-        How they are read.
+        Speed of sound and region.
     seconds : float
-        Deadline of calls that name none.
+        Time limit of calls that do not specify one (s).
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
 
     Raises
     ------
     UsageError
-        When pydicom is not installed.
+        If pydicom is not installed.
+
+    Examples
+    --------
+    >>> with DicomFiles("loops", "recordings/") as files:  # doctest: +SKIP
+    ...     files.scan().mm_per_px
+    (0.2, 0.2)
     """
 
     def __init__(
@@ -97,12 +111,14 @@ class DicomFiles(Device[DicomSettings]):
 
     @property
     def left(self) -> int:
-        """How many frames have not been read yet; 0 before it is connected."""
+        """Number of frames not read yet; 0 before the first connection."""
         return len(self._frames) - self._next
 
     def _open(self, deadline: Deadline) -> None:
         if not self._path.exists():
-            raise ConnectionLost(f"there is no {self._path}", do="name a DICOM file, or a folder of them")
+            raise ConnectionLost(
+                f"{self._path} does not exist", do="give a DICOM file or a folder of DICOM files"
+            )
         found = (
             sorted(p for p in self._path.iterdir() if p.is_file()) if self._path.is_dir() else [self._path]
         )
@@ -113,19 +129,19 @@ class DicomFiles(Device[DicomSettings]):
             try:
                 header = self._header(path)
             except ProtocolError:
-                # Of a folder, what is no image of this kind is passed over: DICOMDIR, reports, notes.
+                # In a folder, other files are skipped: DICOMDIR, reports, notes.
                 if path == self._path:
                     raise
                 continue
             self._frames += [(path, k) for k in range(_count(header))]
         if not self._frames:
-            raise ProtocolError(f"{self._path} holds no DICOM image")
+            raise ProtocolError(f"{self._path} contains no DICOM image")
 
     def _disconnect(self) -> None:
-        """Files are opened for each frame alone."""
+        """Do nothing: files are opened for each frame."""
 
     def _push(self, settings: DicomSettings, deadline: Deadline) -> None:
-        """Nothing to send."""
+        """Do nothing."""
 
     def _identify(self, deadline: Deadline) -> Identity:
         header = self._header(self._frames[0][0])
@@ -136,7 +152,7 @@ class DicomFiles(Device[DicomSettings]):
         return Identity(*said)
 
     def _halt(self, deadline: Deadline) -> None:
-        """Nothing moves."""
+        """Do nothing."""
 
     def _acquire(self) -> dict[str, Any]:
         scan = self.scan()
@@ -152,7 +168,7 @@ class DicomFiles(Device[DicomSettings]):
         }
 
     def stage(self) -> list[Any]:
-        """Connect, and begin again with the first frame."""
+        """Connect and restart with the first frame."""
         staged = super().stage()
         self._next = 0
         return staged
@@ -166,14 +182,14 @@ class DicomFiles(Device[DicomSettings]):
         return {"frames": str(len(self._frames)), "pixels": mm}
 
     def scan(self, seconds: float | None = None) -> BScan:
-        """The next frame.
+        """Return the next frame.
 
         Raises
         ------
         StateError
-            When there is none.
+            If there are no more frames.
         ProtocolError
-            When it cannot be decoded.
+            If the frame cannot be decoded.
         """
         with self._exchange("scan", seconds):
             if not self.left:
@@ -194,15 +210,15 @@ class DicomFiles(Device[DicomSettings]):
             )
 
     def _header(self, path: Path) -> Any:
-        """All of a file but its pixels."""
+        """Return the contents of a file except its pixels."""
         try:
             header = self._pydicom.dcmread(path, stop_before_pixels=True)
             rows, columns, _ = int(header.Rows), int(header.Columns), header.file_meta.TransferSyntaxUID
         except OSError as error:
             raise ConnectionLost(f"{path} cannot be read ({error.strerror or error})") from None
         except Exception as error:
-            # pydicom raises what its parts raise: there is no one class of them.
-            raise ProtocolError(f"{path.name} is no DICOM image ({error})") from None
+            # pydicom has no common class of exceptions.
+            raise ProtocolError(f"{path.name} is not a DICOM image ({error})") from None
         if not (2 <= rows <= _LARGEST_SIDE and 2 <= columns <= _LARGEST_SIDE):
             raise ProtocolError(f"{path.name} states a frame of {columns}×{rows} px")
         if not 1 <= _count(header) <= _MOST_FRAMES:
@@ -210,7 +226,7 @@ class DicomFiles(Device[DicomSettings]):
         return header
 
     def _pixels(self, path: Path, index: int) -> NDArray[np.uint8]:
-        """One frame, grey, with 8 bits."""
+        """Return one frame as grey values with 8 bits."""
         header = self._header(path)
         syntax = header.file_meta.TransferSyntaxUID
         try:
@@ -218,7 +234,7 @@ class DicomFiles(Device[DicomSettings]):
                 raise NotImplementedError
         except NotImplementedError:
             raise ProtocolError(
-                f"{path.name} is compressed as {syntax.name} ({syntax}), which is not readable here",
+                f"{path.name} is compressed as {syntax.name} ({syntax}), which cannot be decoded",
                 do="decompress it (gdcmconv --raw), or install pylibjpeg's decoders",
             ) from None
         try:
@@ -234,26 +250,28 @@ class DicomFiles(Device[DicomSettings]):
         return _grey(values, header, path.name)
 
     def _scale(self, header: Any) -> _Scale:
-        """Millimetres of a frame, as its regions have them."""
+        """Return the pixel size of a frame from its regions."""
         regions, wanted = list(header.get("SequenceOfUltrasoundRegions") or ()), self.settings.region
         nothing = ((int(header.Columns) - 1) / 2, 0.0)
         if wanted >= len(regions):
-            return _Scale(None, nothing, why=f"there is no region {wanted}, but {len(regions)}")
+            return _Scale(None, nothing, why=f"region {wanted} does not exist; the frame has {len(regions)}")
         chosen = regions if wanted < 0 else [regions[wanted]]
         read = [_region(each, int(header.Columns), int(header.Rows)) for each in chosen]
-        # A Doppler spectrum beside the section is no contradiction; a section beyond the frame is.
-        beyond = [each for each in read if each.why.startswith("beyond")]
+        # A Doppler spectrum beside the section is valid; a section outside the frame is not.
+        invalid = [each for each in read if each.invalid]
         known = [each for each in read if each.mm is not None]
-        if beyond or not known:
-            why = (beyond or read or [_Scale(None, nothing, why="no regions")])[0].why
+        if invalid or not known:
+            why = (invalid or read or [_Scale(None, nothing, why="no regions")])[0].why
             return _Scale(None, nothing, why=why)
         if any(not np.allclose(each.mm or 0, known[0].mm or 0, rtol=1e-6) for each in known):
-            return _Scale(None, nothing, why="regions of several scales: choose one by the setting region")
+            return _Scale(
+                None, nothing, why="regions with different scales: choose one with the setting region"
+            )
         return known[0] if len(known) == 1 else _united(known)
 
 
 def _count(header: Any) -> int:
-    """Number of frames of a file; 0 where what stands there is no number."""
+    """Return the number of frames of a file; 0 if it is not a valid number."""
     try:
         return int(header.get("NumberOfFrames", 1) or 1)
     except (TypeError, ValueError):
@@ -261,7 +279,7 @@ def _count(header: Any) -> int:
 
 
 def _region(region: Any, width: int, height: int) -> _Scale:
-    """The scale of one region, or why there is none."""
+    """Return the scale of one region, or the reason why there is none."""
     nothing = _Scale(None, ((width - 1) / 2, 0.0))
     try:
         box = tuple(
@@ -272,21 +290,23 @@ def _region(region: Any, width: int, height: int) -> _Scale:
         plane = int(region.get("RegionSpatialFormat", 0)) == _TWO_DIMENSIONS
         frequency = float(region.get("TransducerFrequency", math.nan))
     except (TypeError, ValueError, OverflowError):
-        return _Scale(None, nothing.origin, why="beyond reading")
+        return _Scale(None, nothing.origin, why="unreadable region", invalid=True)
     left, top, right, bottom = box
     if not plane or units != (_CENTIMETRES, _CENTIMETRES):
-        return _Scale(None, nothing.origin, why="no section in centimetres")
-    # Many makers write the first pixel behind the region as its last one: that one is let pass.
+        return _Scale(None, nothing.origin, why="not a section in centimetres")
+    # Many makers write the first pixel after the region as its last one: accept it.
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        return _Scale(None, nothing.origin, why=f"beyond the frame of {width}×{height} px lies {box}")
+        return _Scale(
+            None, nothing.origin, why=f"region {box} outside the frame of {width}×{height} px", invalid=True
+        )
     if not all(math.isfinite(each) and each > 0 for each in delta):
-        return _Scale(None, nothing.origin, why=f"beyond belief are {delta} cm for a pixel")
+        return _Scale(None, nothing.origin, why=f"implausible pixel size {delta} cm", invalid=True)
     inside = (left, top, min(right, width - 1), min(bottom, height - 1))
     return _Scale((10 * delta[0], 10 * delta[1]), _origin(region, inside), inside, frequency)
 
 
 def _origin(region: Any, box: tuple[int, int, int, int]) -> tuple[float, float]:
-    """Pixel of the physical point (0, 0), on the transducer's face; else the middle of the upper edge."""
+    """Return the pixel of the physical point (0, 0) on the transducer, or the middle of the upper edge."""
     left, top, right, _ = box
     at = []
     for axis, first in (("X", left), ("Y", top)):
@@ -299,7 +319,7 @@ def _origin(region: Any, box: tuple[int, int, int, int]) -> tuple[float, float]:
 
 
 def _united(known: list[_Scale]) -> _Scale:
-    """Several sections of one scale: it holds in all of them."""
+    """Combine several sections with the same scale, which is valid in all of them."""
     boxes = np.array([each.region for each in known])
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
     region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
@@ -307,7 +327,7 @@ def _united(known: list[_Scale]) -> _Scale:
 
 
 def _grey(values: NDArray[Any], header: Any, name: str) -> NDArray[np.uint8]:
-    """Grey values 0 to 255, bright is an echo."""
+    """Convert pixels to grey values 0 to 255; bright is an echo."""
     kind = str(header.get("PhotometricInterpretation", ""))
     bits = 8 * values.itemsize if kind == "PALETTE COLOR" else int(header.get("BitsStored", 8))
     if values.ndim == 3 and values.shape[2] == 3:

@@ -1,7 +1,6 @@
-"""Blue Robotics' Ping360: its head turns step by step; its lines of echoes are laid on a section in
-millimetres.
+"""Blue Robotics Ping360: a rotating head; its lines of echoes are resampled to a section in millimetres.
 
-Source: *Ping Protocol*, "Ping360 Messages". A sample k of period T lies at (k + ½)·c·T/2 from the head.
+Source: *Ping Protocol*, "Ping360 Messages". Sample k with the period T is at the distance (k + ½)·c·T/2.
 """
 
 from __future__ import annotations
@@ -24,14 +23,21 @@ from ..link import Link, MessageLink
 __all__ = ["Ping360", "Ping360Settings"]
 
 _SHORTEST = 80
-"""Sample period of the instrument, in units of 25 ns."""
+"""Shortest sample period of the instrument, in units of 25 ns."""
 _ROWS = 400
-"""Of a section, at most."""
+"""Largest number of rows of a section."""
 
 
 @dataclass(frozen=True)
 class Ping360Settings(Settings):
-    """How a section is taken."""
+    """Geometry and transmission of a section; angles in gradians (400 per turn).
+
+    Examples
+    --------
+    >>> settings = Ping360Settings(range_mm=1000.0, half_sector=2)
+    >>> settings.angles, round(settings.mm_per_sample, 1)
+    ((-2, -1, 0, 1, 2), 5.0)
+    """
 
     range_mm: float = quantity(150.0, "mm", 10.0, 60_000.0)
     speed_m_s: float = quantity(1540.0, "m/s", 1000.0, 2500.0)
@@ -45,38 +51,44 @@ class Ping360Settings(Settings):
 
     @property
     def period(self) -> int:
-        """Of the samples, in units of 25 ns: as short as reaches the range; the limits keep it below 1 ms."""
+        """Sample period in units of 25 ns: the shortest that covers the range, below 1 ms."""
         seconds = 2 * self.range_mm * 1e-3 / self.speed_m_s / self.samples
         return max(_SHORTEST, int(np.ceil(seconds * 1e9 / ping.PERIOD_NS)))
 
     @property
     def mm_per_sample(self) -> float:
-        """Depth from one sample to the next."""
+        """Depth per sample (mm)."""
         return self.speed_m_s * 1e3 * self.period * ping.PERIOD_NS * 1e-9 / 2
 
     @property
     def angles(self) -> tuple[int, ...]:
-        """Of the head, one after the other, from the middle: −half to +half a sector (gradians)."""
+        """Angles of the head relative to the middle, in order (gradians)."""
         return tuple(range(-self.half_sector, self.half_sector + 1, self.step))
 
 
 class Ping360(Device[Ping360Settings]):
-    """The scanner.
+    """Driver of a Ping360.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     link : Link
-        To it.
+        Link to the instrument.
     settings : Ping360Settings
-        How a section is taken.
+        Geometry and transmission.
     seconds : float
-        Deadline of calls that name none; of a scan, that of each line.
+        Time limit of calls that do not specify one (s); in a scan, the limit of each line.
     answer_s : float
-        Within which a line comes: the head may have to turn half a turn for it.
+        Time limit of a line (s): the head may have to rotate by half a turn first.
     limits : mapping, optional
-        Of settings.
+        Limits of settings.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> Ping360("sonar", link_to("/dev/ttyUSB2")).settings.frequency_khz
+    740
     """
 
     def __init__(
@@ -95,19 +107,19 @@ class Ping360(Device[Ping360Settings]):
 
     def _open(self, deadline: Deadline) -> None:
         self._link.open(deadline)
-        # Lines bear no number, but come in order: behind this answer nothing old is left.
+        # Lines have no number but arrive in order: after this answer no old one is left.
         self._request(ping.DEVICE_INFORMATION, deadline)
 
     def _disconnect(self) -> None:
         self._link.close()
 
     def _push(self, settings: Ping360Settings, deadline: Deadline) -> None:
-        """Nothing to send: every line brings its settings along."""
+        """Do nothing: every line is requested with its settings."""
 
     def _identify(self, deadline: Deadline) -> Identity:
         found = ping.Information.parse(self._request(ping.DEVICE_INFORMATION, deadline).payload)
         if found.type != 2:
-            raise ProtocolError(f"is of device type {found.type}, no Ping360", do="check the address")
+            raise ProtocolError(f"has device type {found.type} and is not a Ping360", do="check the address")
         return Identity("Blue Robotics", "Ping360", "", ".".join(map(str, found.firmware)))
 
     def _halt(self, deadline: Deadline) -> None:
@@ -129,23 +141,23 @@ class Ping360(Device[Ping360Settings]):
         return {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
 
     def line(self, angle: int, seconds: float | None = None) -> NDArray[np.uint8]:
-        """Echoes of one pulse.
+        """Return the echoes of one pulse.
 
         Parameters
         ----------
         angle : int
-            Of the head from the middle of the sector (gradians).
+            Angle of the head relative to the middle of the sector (gradians).
         seconds : float, optional
-            Deadline.
+            Time limit (s).
 
         Raises
         ------
         StateError
-            When the head stands elsewhere.
+            If the head is at another angle.
         RefusedError
-            When it refused.
+            If the instrument rejects the request.
         InstrumentError
-            When no line came.
+            If no line arrives.
         """
         s = self.settings
         head = (s.middle + angle) % ping.GRADIANS
@@ -154,12 +166,12 @@ class Ping360(Device[Ping360Settings]):
             return self._line(asked, deadline.part(self._answer_s))
 
     def scan(self, seconds: float | None = None) -> BScan:
-        """One section; see :class:`Ping360Settings` for what it covers.
+        """Return one section; :class:`Ping360Settings` defines what it covers.
 
         Raises
         ------
         InstrumentError
-            When a line did not come, the time ran out, or it was stopped.
+            If a line is missing, the time limit is exceeded, or the scan was stopped.
         """
         s = self.settings
         deadline = Deadline(self._answer_s * len(s.angles) if seconds is None else seconds)
@@ -170,7 +182,7 @@ class Ping360(Device[Ping360Settings]):
                 raise StateError("was stopped", where=self.name, command="scan")
             if deadline.expired:
                 raise DeadlineError(
-                    f"was not done within {deadline.seconds:g} s", where=self.name, command="scan"
+                    f"did not finish within {deadline.seconds:g} s", where=self.name, command="scan"
                 )
             lines.append(self.line(angle, max(0.05, deadline.at_most(self._seconds))))
         pixels, mm, origin = _section(np.array(lines), s)
@@ -197,8 +209,8 @@ class Ping360(Device[Ping360Settings]):
                 raise
             last = others[-1]
             raise StateError(
-                f"reports {len(last.samples)} samples at {last.settings.angle} grad, not what was asked for",
-                do="does its head turn freely?",
+                f"reports {len(last.samples)} samples at {last.settings.angle} grad, not as requested",
+                do="check that the head turns freely",
             ) from None
         if frame.id == ping.NACK:
             raise RefusedError(_reason(frame))
@@ -243,7 +255,7 @@ def _reason(frame: ping.Frame) -> str:
 
 
 def _raster(s: Ping360Settings) -> tuple[float, tuple[int, int]]:
-    """Millimetres of a pixel, and height and width of the section."""
+    """Return the pixel size (mm), and height and width of the section (px)."""
     depth = s.samples * s.mm_per_sample
     mm = depth / _ROWS
     half = int(np.ceil(depth * np.sin(min(np.pi / 2, _radians(s.half_sector))) / mm))
@@ -257,7 +269,7 @@ def _radians(gradians: float) -> float:
 def _section(
     lines: NDArray[np.uint8], s: Ping360Settings
 ) -> tuple[NDArray[np.uint8], float, tuple[float, float]]:
-    """Lines by angle laid on pixels of equal size; beyond the sector there is nothing."""
+    """Resample lines by angle to square pixels; pixels outside the sector are 0."""
     mm, (height, width) = _raster(s)
     x: Array = (np.arange(width, dtype=np.float64) - (width - 1) / 2) * mm
     y: Array = np.arange(height, dtype=np.float64) * mm

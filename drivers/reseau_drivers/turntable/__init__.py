@@ -1,4 +1,4 @@
-"""Turntables: axes that home, move and stop, whoever made their controller."""
+"""Drivers of turntables: axes that home, move and stop, independent of the controller."""
 
 from __future__ import annotations
 
@@ -21,20 +21,27 @@ def zaber(
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
-    """A table whose axes are moved by chained Zaber devices; found by its entry point.
+    """Create the driver of a table with chained Zaber devices; entry point ``zaber``.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     address : str or Link
         Serial device or ``tcp://host:port``.
     axes : mapping
-        Fields of :class:`AxisPlan` by the name of the axis.
+        Fields of :class:`AxisPlan` by name of the axis.
     settings : mapping, optional
-        Of :class:`TableSettings`.
+        Values for :class:`TableSettings`.
     **options
-        Of :class:`Table`.
+        Further arguments of :class:`Table`.
+
+    Examples
+    --------
+    >>> axes = {"tilt": {"per_unit": 2844.4, "low": -45.0, "high": 45.0, "backlash": 0.2}}
+    >>> table = zaber("table", "/dev/ttyUSB0", axes=axes, settings={"speed": 5.0})
+    >>> table.axes["tilt"].unit, table.axes["tilt"].limits
+    ('deg', (-44.8, 45.0))
     """
     return Table(
         name, Zaber(link_to(address)), AxisPlan.read(axes), TableSettings().changed(settings or {}), **options
@@ -49,12 +56,18 @@ def smc100(
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
-    """A table whose axes are moved by Newport SMC100 controllers; found by its entry point.
+    """Create the driver of a table with Newport SMC100 controllers; entry point ``smc100``.
 
     Parameters
     ----------
     name, address, axes, settings, **options
-        As for :func:`zaber`; a CONEX wants ``device@921600``.
+        As for :func:`zaber`; for a CONEX controller use the address ``device@921600``.
+
+    Examples
+    --------
+    >>> table = smc100("table", "/dev/ttyUSB0", axes={"roll": {"device": 2, "high": 180.0}})
+    >>> sorted(table.axes)
+    ['roll']
     """
     return Table(
         name,

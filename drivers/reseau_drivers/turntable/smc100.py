@@ -1,7 +1,7 @@
-"""Newport SMC100 controllers on one line.
+"""Newport SMC100 controllers on one serial line.
 
-Source: see :mod:`reseau_drivers.codecs.smc100`. Commands are not acknowledged; so the error is asked
-for after each (TE), and the state (TS) tells when a movement ends.
+Source: see :mod:`reseau_drivers.codecs.smc100`. Commands are not acknowledged: after each, the error is
+queried (TE); the state (TS) shows the end of a movement.
 """
 
 from __future__ import annotations
@@ -19,18 +19,23 @@ from .table import AxisPlan
 __all__ = ["Smc100"]
 
 _STATES = "DEHIJKLMP"
-"""Errors that mean: not in this state."""
+"""Errors that mean: not allowed in this state."""
 
 
 class Smc100:
-    """Controllers on one line, one axis each: its address is `AxisPlan.device`.
+    """Controllers on one line with one axis each; `AxisPlan.device` is the address of the controller.
 
     Parameters
     ----------
     link : Link
-        To them.
+        Link to the controllers.
     answer_s : float
-        Within which a controller answers.
+        Time limit of an answer (s).
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> controller = Smc100(link_to("/dev/ttyUSB0", baud=57600, xonxoff=True))
     """
 
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
@@ -38,28 +43,29 @@ class Smc100:
         self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(limit=LIMIT))
 
     def open(self, deadline: Deadline) -> None:
-        """Open the connection, and let go what may still come in answer to earlier questions."""
+        """Open the connection; pending answers are discarded at the first query."""
         self._link.open(deadline)
         self._synchronised = False
 
     def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
         self._link.close()
 
     def identify(self, plans: Mapping[str, AxisPlan], deadline: Deadline) -> Identity:
-        """What the controllers say of their version."""
+        """Return the versions that the controllers report."""
         versions = [self._query(plan, "VE", deadline).strip() for plan in plans.values()]
         return Identity("Newport", "SMC100", "", ", ".join(versions))
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
-        """Speed of an axis; one without a reference does not take it, and gets it when it is homed."""
-        # Nor while it moves; and as it moves, only the line was lost, and the speed is as it was set.
+        """Set the speed of an axis; without a reference it is set after homing."""
+        # The controller does not accept a speed during a movement. If the axis moves, only the connection was
+        # lost, and the speed is unchanged.
         phase = decode_status(self._query(plan, "TS", deadline)).phase
         if phase in (Phase.READY, Phase.DISABLED):
             self._send(plan, "VA", f"{units_per_s * plan.per_unit:.6g}", deadline)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Begin to look for the reference; one that is homed is so, as the controller homes only once."""
+        """Start the search for the reference; a homed axis stays as it is: the controller homes only once."""
         status = decode_status(self._query(plan, "TS", deadline))
         if status.phase is Phase.DISABLED:
             self._send(plan, "MM", "1", deadline)
@@ -68,22 +74,22 @@ class Smc100:
             self._send(plan, "OR", "", deadline)
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
-        """Begin to move."""
+        """Start a movement."""
         self._send(plan, "PA", f"{position * plan.per_unit:.6f}", deadline)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Stop; an axis that has no reference does not move."""
+        """Stop the axis; one without a reference does not move."""
         if decode_status(self._query(plan, "TS", deadline)).phase is not Phase.NOT_REFERENCED:
             self._send(plan, "ST", "", deadline)
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """How the axis stands."""
+        """Return the state of the axis."""
         status = decode_status(self._query(plan, "TS", deadline))
         answer = self._query(plan, "TP", deadline)
         try:
             position = float(answer) / plan.per_unit
         except ValueError:
-            raise ProtocolError(f"{answer!r} is no position") from None
+            raise ProtocolError(f"{answer!r} is not a position") from None
         phase, faults = status.phase, status.error_texts
         if phase is Phase.DISABLED:
             faults = (*faults, "the motor is disabled")
@@ -92,21 +98,21 @@ class Smc100:
         return AxisState(position, moving, homed, faults)
 
     def _send(self, plan: AxisPlan, name: str, value: str, deadline: Deadline) -> None:
-        """Send a command, and ask whether it was understood."""
-        # An error of before is asked for first, so that the answer is about this command.
+        """Send a command and query whether it was accepted."""
+        # Query and clear an earlier error first, so that the answer concerns this command.
         self._query(plan, "TE", deadline)
         self._link.send(encode(Line(plan.device, name, value)), deadline.part(self._answer_s))
         error = self._query(plan, "TE", deadline).strip()
         if error not in ERRORS:
-            raise ProtocolError(f"{error!r} is no answer to TE")
+            raise ProtocolError(f"{error!r} is not a valid answer to TE")
         if error != "@":
             kind = StateError if error in _STATES else RefusedError
-            raise kind(f"refused it: {ERRORS[error]}", command=f"{plan.device}{name}{value}")
+            raise kind(f"refused the command: {ERRORS[error]}", command=f"{plan.device}{name}{value}")
 
     def _query(self, plan: AxisPlan, name: str, deadline: Deadline) -> str:
-        """Ask, and wait for the answer, which begins like the question."""
+        """Send a query and wait for the answer, which repeats its address and name."""
         if not self._synchronised:
-            # Answers bear no number, but come in order: behind that to VE nothing old is left.
+            # Answers have no number but arrive in order: after the answer to VE no old one is left.
             self._exchange(plan, "VE", deadline)
             self._synchronised = True
         return self._exchange(plan, name, deadline)
@@ -118,5 +124,5 @@ class Smc100:
         )
         answer = decode(line)
         if (answer.address, answer.name) != (plan.device, name):
-            raise ProtocolError(f"{line!r} is no answer to {name}")
+            raise ProtocolError(f"{line!r} is not an answer to {name}")
         return answer.value

@@ -1,4 +1,4 @@
-"""What is safe with any motion controller: homed first, within limits, the last way always from below."""
+"""Base of all motion controllers: home first, stay within limits, approach each position from below."""
 
 from __future__ import annotations
 
@@ -13,27 +13,40 @@ __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
 _POLL_S, _HALT_S = 0.02, 1.0
 _ATTEMPTS = 3
-"""Bad answers in a row that are asked for again while an axis moves: it must not be left alone for one."""
+"""Number of queries during a movement when answers are invalid: one bad answer must not end the wait."""
 
 
 @dataclass(frozen=True)
 class AxisPlan:
-    """One axis, and what it may do.
+    """One axis with its limits.
 
     Parameters
     ----------
     device, axis : int
-        Its controller on the chain, and its number there.
+        Number of the controller on the chain, and of the axis on it.
     per_unit : float
-        Steps of the controller for one unit.
+        Steps of the controller per unit.
     unit : str
-        Degrees or millimetres.
+        ``deg`` or ``mm``.
     low, high : float
         Soft limits, in the unit.
     backlash : float
-        Play of its gear; every position is reached from below by as much. 0 moves straight there.
+        Backlash of the gear; every position is approached from below by this distance. 0 moves directly.
     tolerance : float
-        How far from the target it may stand in the end.
+        Largest accepted distance from the target after a move.
+
+    Raises
+    ------
+    SettingError
+        If a value is not positive where it must be, or low is not below high.
+
+    Examples
+    --------
+    >>> AxisPlan(low=-45.0, high=45.0, backlash=0.2).require_reachable("tilt", 30.0)
+    30.0
+    >>> AxisPlan(low=-45.0, high=45.0).require_reachable("tilt", 60.0)
+    Traceback (most recent call last):
+    reseau.core.errors.SettingError: axis tilt: 60 deg is outside -45…45 deg
     """
 
     device: int = 1
@@ -47,79 +60,95 @@ class AxisPlan:
 
     def __post_init__(self) -> None:
         if not (self.per_unit > 0 and self.low < self.high and self.backlash >= 0 and self.tolerance > 0):
-            raise SettingError("per_unit and tolerance are positive, low below high", where="axis")
+            raise SettingError(
+                "per_unit and tolerance must be positive, backlash not negative, low below high", where="axis"
+            )
 
     @classmethod
     def read(cls, axes: Mapping[str, Mapping[str, Any]]) -> dict[str, Self]:
-        """Plans by the name of the axis.
+        """Create plans from fields by name of the axis.
 
         Raises
         ------
         SettingError
-            When a plan has an unknown field, or there is none.
+            If a plan has an unknown field, or there is no plan.
         """
         known = {each.name for each in fields(cls)}
         for name, plan in axes.items():
             if unknown := set(plan) - known:
-                raise SettingError(f"has no {', '.join(sorted(unknown))}", where=f"axis {name}")
+                raise SettingError(f"has unknown fields: {', '.join(sorted(unknown))}", where=f"axis {name}")
         if not axes:
-            raise SettingError("has no axes", where="table", do="name at least one")
+            raise SettingError("has no axes", where="table", do="define at least one")
         return {name: cls(**plan) for name, plan in axes.items()}
 
     def require_reachable(self, name: str, position: float) -> float:
-        """The position, when it is one that may be moved to.
+        """Return the position if it is allowed.
 
         Raises
         ------
         SettingError
-            When it is beyond the limits, or too near to the lower one to be reached from below.
+            If the position is outside the limits, or too close to the lower one to be approached from below.
         """
         lowest = self.low + self.backlash
         if not lowest <= position <= self.high:
             raise SettingError(
-                f"{position:g} {self.unit} is beyond {lowest:g}…{self.high:g} {self.unit}",
+                f"{position:g} {self.unit} is outside {lowest:g}…{self.high:g} {self.unit}",
                 where=f"axis {name}",
             )
         return position
 
 
 class Controller(Protocol):
-    """What moves axes; positions are those of :class:`AxisPlan`, in its unit."""
+    """Motion controller; positions are in the unit of the :class:`AxisPlan`."""
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
 
     def identify(self, plans: Mapping[str, AxisPlan], deadline: Deadline) -> Identity:
-        """Who moves these axes; raises when one is missing."""
+        """Return the identity of the controllers; raises if one is missing."""
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
-        """How fast an axis moves."""
+        """Set the speed of an axis."""
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Begin to look for the reference."""
+        """Start the search for the reference."""
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
-        """Begin to move."""
+        """Start a movement."""
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Stop."""
+        """Stop the axis."""
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """How the axis stands."""
+        """Return the state of the axis."""
 
 
 @dataclass(frozen=True)
 class TableSettings(Settings):
-    """How a table moves."""
+    """Settings of a table: speed in units of the axis per second.
+
+    Examples
+    --------
+    >>> TableSettings(speed=5.0).units
+    {'speed': '1/s'}
+    """
 
     speed: float = quantity(10.0, "1/s", 0.001, 1000.0)
 
 
 class Axis:
-    """One axis as bluesky moves it."""
+    """One axis, as bluesky moves it.
+
+    Examples
+    --------
+    >>> from reseau_drivers.turntable import zaber
+    >>> tilt = zaber("table", "/dev/ttyUSB0", axes={"tilt": {"high": 90.0}}).axes["tilt"]
+    >>> tilt.name, tilt.limits
+    ('table_tilt', (0.0, 90.0))
+    """
 
     def __init__(self, table: Table, key: str) -> None:
         self.parent, self._table, self._key = None, table, key
@@ -127,32 +156,32 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """Of its positions: degrees or millimetres."""
+        """Unit of positions: ``deg`` or ``mm``."""
         return self._table.plans[self._key].unit
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest position that it may be moved to; the lowest leaves room for the backlash."""
+        """Lowest and highest allowed position; the lowest one leaves room for the backlash."""
         plan = self._table.plans[self._key]
         return plan.low + plan.backlash, plan.high
 
     @property
     def position(self) -> float:
-        """Where it stands."""
+        """Current position."""
         return self._table.state(self._key).position
 
     @property
     def hints(self) -> dict[str, Any]:
-        """What bluesky plots of it."""
+        """Fields that bluesky plots."""
         return {"fields": [self.name]}
 
     def set(self, value: float) -> Status:
-        """Begin to move there; the status is done when it is there.
+        """Start to move to a position; the status ends when the axis has arrived.
 
         Raises
         ------
         SettingError
-            When it cannot be moved there.
+            If the position is not allowed.
         """
         self.check_value(value)
         return Status(lambda: self._table.move(self._key, value), self.name)
@@ -162,43 +191,51 @@ class Axis:
         self._table.stop(success=success)
 
     def check_value(self, value: float) -> None:
-        """Raise SettingError when it cannot be moved there; for plans that are checked before they run."""
+        """Raise SettingError if the position is not allowed; used to check plans before they run."""
         self._table.plans[self._key].require_reachable(f"{self._key} of {self._table.name}", value)
 
     def read(self) -> dict[str, Any]:
-        """Where it stands."""
+        """Return the current position as a reading."""
         return {name: value for name, value in self._table.read_now().items() if name == self.name}
 
     def describe(self) -> dict[str, Any]:
-        """What the reading holds."""
+        """Return the contents of the reading."""
         return {name: kind for name, kind in self._table.describe().items() if name == self.name}
 
     def read_configuration(self) -> dict[str, Any]:
-        """That of the table."""
+        """Return the settings of the table as a reading."""
         return self._table.read_configuration()
 
     def describe_configuration(self) -> dict[str, Any]:
-        """What that holds."""
+        """Return the contents of the reading of the settings."""
         return self._table.describe_configuration()
 
 
 class Table(Device[TableSettings]):
-    """A table with one or more axes.
+    """Driver of a table with one or more axes.
 
     Parameters
     ----------
     name : str
-        On the bench.
+        Name on the bench.
     controller : Controller
-        What moves them.
+        Moves the axes.
     plans : mapping
-        The axes by name.
+        Axes by name.
     settings : TableSettings
-        How it moves.
+        Speed.
     seconds : float
-        Deadline of an exchange that names none; of a move, a minute.
+        Time limit of an exchange that does not specify one (s); a move has one minute.
     limits : mapping, optional
-        Of the settings.
+        Limits of settings.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> from reseau_drivers.turntable import Zaber
+    >>> table = Table("table", Zaber(link_to("/dev/ttyUSB0")), {"tilt": AxisPlan(high=90.0)})
+    >>> table.axes["tilt"].name
+    'table_tilt'
     """
 
     MOVE_S = 60.0
@@ -244,7 +281,7 @@ class Table(Device[TableSettings]):
         }
 
     def read_now(self) -> dict[str, Any]:
-        """A reading of how all axes stand now."""
+        """Take a reading of the positions of all axes."""
         self._take()
         return self.read()
 
@@ -261,28 +298,28 @@ class Table(Device[TableSettings]):
         return found
 
     def state(self, axis: str, seconds: float | None = None) -> AxisState:
-        """How an axis stands.
+        """Return the state of an axis.
 
         Raises
         ------
         SettingError
-            When there is no such axis.
+            If there is no such axis.
         InstrumentError
-            When it does not say.
+            If the controller does not answer.
         """
         plan = self._plan(axis)
         with self._exchange(f"state of {axis}", seconds) as deadline:
             return self._controller.state(plan, deadline)
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
-        """Find the reference of an axis; nothing moves anywhere before.
+        """Find the reference of an axis; required before any movement.
 
         Raises
         ------
         StateError
-            When it stalled, met a limit, or was stopped.
+            If the axis stalled, reached a limit switch, or was stopped.
         DeadlineError
-            When it was not done in time; the axis has been told to stop.
+            If the search does not finish in time; the axis is then stopped.
         """
         command, plan = f"home {axis}", self._plan(axis)
         self._stopping.clear()
@@ -293,21 +330,31 @@ class Table(Device[TableSettings]):
         if not state.homed:
             raise StateError("did not find its reference", where=self.name, command=command)
         with self._exchange(command, max(_POLL_S, deadline.at_most(self._seconds))) as time:
-            # Some controllers take a speed only then.
+            # Some controllers accept a speed only after homing.
             self._controller.set_speed(plan, self.settings.speed, time)
         return state
 
     def move(self, axis: str, position: float, seconds: float | None = None) -> AxisState:
-        """Move an axis there, from below, and wait until it stands.
+        """Move an axis to a position, from below, and wait until it has stopped.
+
+        Parameters
+        ----------
+        axis : str
+            Name of the axis.
+        position : float
+            Target, in the unit of the axis.
+        seconds : float, optional
+            Time limit of the whole movement (s).
 
         Raises
         ------
         SettingError
-            When the position is beyond the soft limits; nothing moved.
+            If the position is outside the soft limits; nothing moves then.
         StateError
-            When it is not homed, stalled, met a limit, was stopped, or stands elsewhere in the end.
+            If the axis is not homed, stalled, reached a limit switch, was stopped, or did not arrive at the
+            target.
         DeadlineError
-            When it was not done in time; the axis has been told to stop.
+            If the movement does not finish in time; the axis is then stopped.
         """
         command, plan = f"move {axis} to {position:g} {self._plan(axis).unit}", self._plan(axis)
         plan.require_reachable(f"{axis} of {self.name}", position)
@@ -326,11 +373,11 @@ class Table(Device[TableSettings]):
         if not state.homed:
             raise StateError("lost its reference", where=self.name, command=command, do=f"home {axis} again")
         if abs(state.position - position) > plan.tolerance:
-            raise StateError(f"stands at {state.position:g} {plan.unit}", where=self.name, command=command)
+            raise StateError(f"stopped at {state.position:g} {plan.unit}", where=self.name, command=command)
         return state
 
     def _wait_until_stopped(self, axis: str, plan: AxisPlan, deadline: Deadline, command: str) -> AxisState:
-        """Wait until an axis stands; one that did not make it is told to stop."""
+        """Wait until an axis stops; stop one that does not stop in time."""
         try:
             state = self._wait_until(
                 self._retrying(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds)))),
@@ -340,7 +387,7 @@ class Table(Device[TableSettings]):
                 command,
             )
         except DeadlineError:
-            # An axis that goes on is worth the time beyond.
+            # Stopping an axis that still moves is worth the additional time.
             with self._exchange(command, min(_HALT_S, self._seconds)) as time:
                 self._controller.halt(plan, time)
             raise
@@ -349,7 +396,7 @@ class Table(Device[TableSettings]):
         return state
 
     def _retrying(self, ask: Callable[[], AxisState]) -> Callable[[], AxisState]:
-        """The same question, asked again after an answer that was lost or damaged."""
+        """Repeat a query whose answer was lost or damaged."""
 
         def asked() -> AxisState:
             for _ in range(_ATTEMPTS - 1):
@@ -364,6 +411,6 @@ class Table(Device[TableSettings]):
     def _plan(self, axis: str) -> AxisPlan:
         if axis not in self.plans:
             raise SettingError(
-                f"has no axis {axis!r}", where=self.name, do=f"there are {', '.join(self.plans)}"
+                f"has no axis {axis!r}", where=self.name, do=f"choose from {', '.join(self.plans)}"
             )
         return self.plans[axis]

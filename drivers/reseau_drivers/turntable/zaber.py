@@ -1,4 +1,4 @@
-"""Zaber devices on one chain, in their ASCII protocol.
+"""Zaber devices on one chain, with their ASCII protocol.
 
 Source: *Zaber ASCII Protocol Manual*, "Commands" (home, move, stop, warnings, get, set) and "Warning Flags".
 """
@@ -17,19 +17,24 @@ from .table import AxisPlan
 __all__ = ["Zaber"]
 
 _SPEED = 1.6384
-"""The setting maxspeed is in steps per second times this."""
+"""Factor from steps per second to the setting ``maxspeed``."""
 _UNREFERENCED = ("WR", "WH")
 
 
 class Zaber:
-    """A chain of devices.
+    """Chain of Zaber devices.
 
     Parameters
     ----------
     link : Link
-        To the first of them.
+        Link to the first device.
     answer_s : float
-        Within which a device answers.
+        Time limit of an answer (s).
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import link_to
+    >>> controller = Zaber(link_to("tcp://192.0.2.8:55550"))
     """
 
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
@@ -42,11 +47,11 @@ class Zaber:
         self._link.open(deadline)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
         self._link.close()
 
     def identify(self, plans: Mapping[str, AxisPlan], deadline: Deadline) -> Identity:
-        """Device numbers, serial numbers and firmware of all that are needed."""
+        """Return device numbers, serial numbers and firmware of all devices in use."""
         found = []
         for device in sorted({plan.device for plan in plans.values()}):
             said = [self._query(device, 0, f"get {what}", deadline).data for what in _IDENTITY]
@@ -55,43 +60,43 @@ class Zaber:
         return Identity("Zaber", models, serials, versions)
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
-        """Speed of an axis."""
+        """Set the speed of an axis."""
         speed = max(1, round(units_per_s * plan.per_unit * _SPEED))
         self._query(plan.device, plan.axis, f"set maxspeed {speed}", deadline)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Begin to look for the reference."""
+        """Start the search for the reference."""
         self._query(plan.device, plan.axis, "warnings clear", deadline)
         self._query(plan.device, plan.axis, "home", deadline)
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
-        """Begin to move."""
-        # Warnings stay until they are cleared: what is seen afterwards is of this movement.
+        """Start a movement."""
+        # Clear old warnings, so that later ones concern this movement.
         self._query(plan.device, plan.axis, "warnings clear", deadline)
         self._query(plan.device, plan.axis, f"move abs {round(position * plan.per_unit)}", deadline)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
-        """Stop."""
+        """Stop the axis."""
         self._query(plan.device, plan.axis, "stop", deadline)
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """How the axis stands."""
+        """Return the state of the axis."""
         reply = self._query(plan.device, plan.axis, "warnings", deadline)
         count, *flags = reply.data.split()
         if not count.isdigit() or int(count) != len(flags):
-            raise ProtocolError(f"{reply.data!r} is no list of warnings")
-        # Whether it stands is asked first: a position read before could be one on the way.
+            raise ProtocolError(f"{reply.data!r} is not a list of warnings")
+        # Query the movement first: a position read before it could be an intermediate one.
         position = self._query(plan.device, plan.axis, "get pos", deadline).data
         try:
             steps = float(position)
         except ValueError:
-            raise ProtocolError(f"{position!r} is no position") from None
+            raise ProtocolError(f"{position!r} is not a position") from None
         faults = tuple(FAULTS[flag] for flag in flags if flag in FAULTS)
         homed = not any(flag in _UNREFERENCED for flag in flags)
         return AxisState(steps / plan.per_unit, reply.busy, homed, faults)
 
     def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
-        """Send a command and wait for its reply, which bears its number."""
+        """Send a command and wait for its reply, which repeats its number."""
         self._id = (self._id + 1) % 100
         sent = Command(device, axis, words, self._id)
 
@@ -104,12 +109,12 @@ class Zaber:
 
         reply = self._link.query(encode(sent), answers, deadline.part(self._answer_s))
         if not isinstance(reply, Reply):
-            raise ProtocolError("sent no reply")
+            raise ProtocolError("sent a message that is not a reply")
         if not reply.ok:
             command = f"device {device} axis {axis}: {words}"
             if reply.data in ("STATUSBUSY", "PARKED", "DRIVERDISABLED"):
-                raise StateError(f"rejected it: {reply.data}", command=command)
-            raise RefusedError(f"rejected it: {reply.data}", command=command)
+                raise StateError(f"rejected the command: {reply.data}", command=command)
+            raise RefusedError(f"rejected the command: {reply.data}", command=command)
         return reply
 
 

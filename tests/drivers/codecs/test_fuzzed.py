@@ -62,7 +62,7 @@ def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
 
 @pytest.mark.parametrize("name", SPOKEN)
 @given(data=st.data())
-def test_what_is_spoken_is_heard_however_it_is_cut(name: str, data: st.DataObject) -> None:
+def test_messages_are_decoded_from_pieces_of_any_size(name: str, data: st.DataObject) -> None:
     messages, encode = SPOKEN[name]
     spoken = data.draw(st.lists(messages, min_size=1, max_size=5))
     decoder, heard = STREAMS[name](), []
@@ -75,7 +75,7 @@ def test_what_is_spoken_is_heard_however_it_is_cut(name: str, data: st.DataObjec
 
 @pytest.mark.parametrize("name", STREAMS)
 @given(garbage=st.lists(st.binary(max_size=200), max_size=10))
-def test_garbage_is_survived(name: str, garbage: list[bytes]) -> None:
+def test_noise_does_not_raise(name: str, garbage: list[bytes]) -> None:
     decoder = STREAMS[name]()
     for piece in garbage:
         for found in decoder.feed(piece):
@@ -84,7 +84,7 @@ def test_garbage_is_survived(name: str, garbage: list[bytes]) -> None:
 
 @pytest.mark.parametrize("name", ["zaber", "ping", "bk"])
 @given(garbage=st.binary(max_size=100), data=st.data())
-def test_the_way_back_is_found_after_garbage(name: str, garbage: bytes, data: st.DataObject) -> None:
+def test_decoders_recover_after_noise(name: str, garbage: bytes, data: st.DataObject) -> None:
     messages, encode = SPOKEN[name]
     message = data.draw(messages)
     decoder = STREAMS[name]()
@@ -101,7 +101,7 @@ def test_the_way_back_is_found_after_garbage(name: str, garbage: bytes, data: st
 @pytest.mark.parametrize(
     "piece", [b"x", b"\x01\x01", b"BR\xff\x0f\x00\x00", b"\x7f\xff\xff\xff", b"HS\x07\x00", b"@"]
 )
-def test_an_endless_message_costs_bounded_memory(name: str, piece: bytes) -> None:
+def test_an_endless_message_uses_bounded_memory(name: str, piece: bytes) -> None:
     decoder, chunk = STREAMS[name](), (piece * 65536)[:65536]
     kept = 0
     # Marks of frames are met by the million; twenty chunks of them are enough.
@@ -111,7 +111,7 @@ def test_an_endless_message_costs_bounded_memory(name: str, piece: bytes) -> Non
     assert kept < 8.6e6
 
 
-def test_a_length_from_the_wire_reserves_nothing() -> None:
+def test_an_announced_length_allocates_nothing() -> None:
     tracemalloc.start()
     try:
         hislip.MessageDecoder().feed(b"HS\x07\x00" + bytes(4) + b"\xff" * 8)
@@ -127,7 +127,7 @@ def test_a_length_from_the_wire_reserves_nothing() -> None:
 
 
 @given(data=st.binary(max_size=200))
-def test_decoding_one_message_gives_a_value_or_says_what_is_wrong(data: bytes) -> None:
+def test_decoding_one_message_returns_a_value_or_raises_protocol_error(data: bytes) -> None:
     for decode in (
         zaber.decode,
         zaber.decode_command,
@@ -154,7 +154,7 @@ def test_decoding_one_message_gives_a_value_or_says_what_is_wrong(data: bytes) -
 
 
 @given(message=zaber_messages)
-def test_a_flipped_bit_never_passes_as_another_zaber_message(message: zaber.Message) -> None:
+def test_a_flipped_bit_never_decodes_as_another_zaber_message(message: zaber.Message) -> None:
     sent = zaber.encode(message)
     for at in range(1, len(sent) - 2):
         flipped = sent[:at] + bytes([sent[at] ^ 1]) + sent[at + 1 :]
@@ -163,7 +163,7 @@ def test_a_flipped_bit_never_passes_as_another_zaber_message(message: zaber.Mess
 
 
 @given(frame=ping_frames, samples=st.binary(max_size=1200))
-def test_ping_messages_come_back(frame: ping.Frame, samples: bytes) -> None:
+def test_ping_messages_round_trip(frame: ping.Frame, samples: bytes) -> None:
     asked = ping.Transducer(1, 399, 1000, 40000, 740, len(samples), transmit=False)
     assert ping.DeviceData.parse(ping.DeviceData(asked, samples).frame().payload) == ping.DeviceData(
         asked, samples

@@ -25,16 +25,16 @@ def test_zaber_replies_of_the_manual_with_and_without_id_and_checksum() -> None:
 @pytest.mark.parametrize(
     "line", [b"", b"@", b"@01 0 OK IDLE -- 0:00", b"@01 OK", b"hello", b"@01 0 OK IDLE --"]
 )
-def test_zaber_refuses_what_is_no_message(line: bytes) -> None:
+def test_zaber_rejects_invalid_messages(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         zaber.decode(line)
 
 
-def test_zaber_finds_the_message_behind_noise() -> None:
+def test_zaber_finds_the_message_after_noise() -> None:
     assert zaber.decode(b"\xff\x00@01 0 OK IDLE -- 0") == zaber.Reply(1, 0, None, True, False, "--", "0")
 
 
-def test_zaber_sends_nothing_that_ends_a_message() -> None:
+def test_zaber_rejects_words_that_would_end_a_message() -> None:
     for words in ("home\n/1 estop", "get pos:00", "move abs é", "a\\"):
         with pytest.raises(SettingError):
             zaber.encode(zaber.Command(1, 1, words))
@@ -103,7 +103,7 @@ def test_ping_transducer_payload_has_the_documented_fields() -> None:
     assert ping.Transducer.parse(payload) == asked
 
 
-def test_compactpulser_commands_as_public_code_sends_them() -> None:
+def test_compactpulser_commands_as_in_public_code() -> None:
     # changbatterygroup/ultrasonicTesting, ultratekPulser.py: all of them drive a real one.
     for typed, setting in {
         b"P500\r": compactpulser.Setting("P", 500),
@@ -139,7 +139,7 @@ def test_bk_messages_and_a_frame_with_every_escape() -> None:
     assert bk.encode(bk.encode_frame(frame)) == typed
 
 
-def test_bk_queries_and_answers_as_public_clients_have_them() -> None:
+def test_bk_queries_and_answers_as_in_public_clients() -> None:
     # PLUS, NifTK and scikit-surgerybk send these; a 592×384 frame is announced as 227332, its stamp included.
     assert bk.encode(b"QUERY:US_WIN_SIZE;") == b"\x01QUERY:US_WIN_SIZE;\x04"
     assert bk.numbers(b"DATA:US_WIN_SIZE 640,480;", "US_WIN_SIZE") == (640, 480)
@@ -156,7 +156,7 @@ def test_bk_queries_and_answers_as_public_clients_have_them() -> None:
             bk.parse_frame(wrong, 3)
 
 
-def test_blocks_and_pictures_end_where_they_say() -> None:
+def test_blocks_and_pictures_end_at_their_announced_length() -> None:
     assert ieee488.parse_block(b"#800000005hello\n") == b"hello"
     assert ieee488.missing_bytes(b"#800000005hel") == 2
     png = bytes.fromhex(
@@ -174,7 +174,7 @@ def test_blocks_and_pictures_end_where_they_say() -> None:
             ieee488.picture(wrong)
 
 
-def test_vxi11_create_link_as_on_the_wire() -> None:
+def test_vxi11_create_link_bytes() -> None:
     # RFC 5531: xid, CALL, RPC 2, program 0x0607AF, version 1, procedure 10, no credentials; arguments.
     typed = bytes.fromhex(
         "00000007 00000000 00000002 000607af 00000001 0000000a 00000000 00000000 00000000 00000000"
@@ -189,11 +189,11 @@ def test_vxi11_create_link_as_on_the_wire() -> None:
     assert rpc.record(b"abcd") == bytes.fromhex("80000004 61626364".replace(" ", ""))
 
 
-def test_a_record_in_fragments_is_one() -> None:
+def test_fragments_are_joined_to_one_record() -> None:
     assert rpc.RecordDecoder().feed(bytes.fromhex("00000002 6162 80000001 63".replace(" ", ""))) == [b"abc"]
 
 
-def test_hislip_initialize_as_on_the_wire() -> None:
+def test_hislip_initialize_bytes() -> None:
     # Table 4: prologue, Initialize, control 0, version 1.0 and vendor "xx", length 7, "hislip0".
     typed = b"HS\x00\x00\x01\x00xx" + bytes(7) + b"\x07hislip0"
     (message,) = hislip.MessageDecoder().feed(typed)
@@ -202,7 +202,7 @@ def test_hislip_initialize_as_on_the_wire() -> None:
     assert hislip.encode(message) == typed
 
 
-def test_usbtmc_transfers_as_on_the_bus() -> None:
+def test_usbtmc_transfer_bytes() -> None:
     # USBTMC 1.0, table 1 to 4: a request for 1000 bytes with tag 3, and an answer of five bytes, padded.
     assert usbtmc.decode(bytes.fromhex("02 03 fc 00 e8 03 00 00 00 0a 00 00")) == usbtmc.Transfer(
         2, 3, 1000, False

@@ -11,7 +11,7 @@ from reseau_drivers.codecs import v4l2 as uapi
 from reseau_drivers.codecs.pixels import GENICAM, VIDEO, decode, encode, size_of
 
 
-def test_requests_are_those_of_the_header() -> None:
+def test_requests_equal_those_of_the_kernel_header() -> None:
     assert {
         "QUERYCAP": uapi.QUERYCAP,
         "ENUM_FMT": uapi.ENUM_FMT,
@@ -63,12 +63,12 @@ def test_requests_are_those_of_the_header() -> None:
         ("SRGGB8", 0x42474752),
     ],
 )
-def test_pixel_formats_have_the_header_s_numbers(name: str, code: int) -> None:
+def test_pixel_formats_have_the_numbers_of_the_header(name: str, code: int) -> None:
     assert uapi.fourcc_of(str(VIDEO[name].code)) == code
     assert uapi.fourcc_text(code) == VIDEO[name].code
 
 
-def test_capabilities_of_the_node_not_of_the_whole_device() -> None:
+def test_capabilities_are_those_of_the_node_not_of_the_device() -> None:
     data = bytearray(104)
     data[0:5], data[16:22], data[48:64] = b"vivid", b"vivid!", b"platform:vivid-0"
     data[80:84] = bytes([56, 1, 6, 0])  # 6.1.56
@@ -78,7 +78,7 @@ def test_capabilities_of_the_node_not_of_the_whole_device() -> None:
     assert found == uapi.Capability("vivid", "vivid!", "platform:vivid-0", (6, 1, 56), 0x05200001)
 
 
-def test_a_format_lies_where_the_header_says() -> None:
+def test_format_fields_are_at_the_offsets_of_the_header() -> None:
     data = bytearray(208)
     data[0:4] = b"\x01\0\0\0"
     data[8:12], data[12:16], data[16:20] = b"\x40\x06\0\0", b"\xb0\x04\0\0", b"Y16 "
@@ -88,7 +88,7 @@ def test_a_format_lies_where_the_header_says() -> None:
     assert wanted.build() == data
 
 
-def test_a_buffer_lies_where_the_header_says() -> None:
+def test_buffer_fields_are_at_the_offsets_of_the_header() -> None:
     data = bytearray(88)
     data[0:4], data[4:8], data[8:12] = b"\x02\0\0\0", b"\x01\0\0\0", b"\0\x10\0\0"
     data[12:16], data[16:20] = b"\x40\x20\x01\0", b"\x01\0\0\0"
@@ -133,13 +133,13 @@ def test_intervals_and_regions() -> None:
 
 
 @pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "SRGGB8"])
-def test_grey_values_come_back_as_they_went_in(name: str) -> None:
+def test_grey_values_round_trip(name: str) -> None:
     layout, rng = VIDEO[name], np.random.default_rng(3)
     pixels = rng.integers(0, int(layout.full_scale) + 1, (5, 6)).astype(layout.dtype)
     assert (decode(layout, 6, 5, encode(layout, pixels)) == pixels).all()
 
 
-def test_rows_may_lie_apart() -> None:
+def test_rows_with_padding() -> None:
     data = bytes([1, 2, 99, 3, 4])
     assert decode(VIDEO["GREY"], 2, 2, data, 3).tolist() == [[1, 2], [3, 4]]
     words = bytes([1, 0, 9, 2, 0])
@@ -158,12 +158,12 @@ def test_rows_may_lie_apart() -> None:
         ("MJPEG", b"\xff\xd8" + bytes(50) + b"\xff\xd9"),
     ],
 )
-def test_what_is_no_whole_frame_is_refused(name: str, data: bytes) -> None:
+def test_incomplete_frames_are_rejected(name: str, data: bytes) -> None:
     with pytest.raises(ProtocolError):
         decode(VIDEO[name], 2, 2, data)
 
 
-def test_a_jpeg_gives_the_luminance_that_its_decoder_gives() -> None:
+def test_a_jpeg_gives_the_luminance_of_its_decoder() -> None:
     pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
     data = cv2.imencode(".jpg", pixels)[1].tobytes()
     wanted = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -172,7 +172,7 @@ def test_a_jpeg_gives_the_luminance_that_its_decoder_gives() -> None:
         decode(VIDEO["MJPEG"], 24, 17, data)
 
 
-def test_genicam_s_numbers_tell_the_bits_of_a_pixel() -> None:
+def test_genicam_numbers_contain_the_bits_per_pixel() -> None:
     for name, layout in GENICAM.items():
         assert isinstance(layout.code, int)
         assert (layout.code >> 16 & 0xFF) == 8 * layout.stored, name

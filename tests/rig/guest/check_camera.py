@@ -161,7 +161,7 @@ def test_what_the_camera_cannot_do_is_refused(grey: str) -> None:
     with v4l2("camera", grey) as camera:
         with pytest.raises(RefusedError, match="no control of the exposure time"):
             camera.configure(exposure_us=1000.0)
-        with pytest.raises(RefusedError, match="brightness 999 is beyond its 0…255"):
+        with pytest.raises(RefusedError, match="brightness 999 is outside 0…255"):
             camera.configure(brightness=999)
         assert camera.expose().fresh
 
