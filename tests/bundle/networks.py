@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from reseau.bundle.solver.approximate import approximate
 
-from reseau.bundle import Additional, BundleProblem, Camera, Network
+from reseau.bundle import Additional, BundleProblem, Camera, Network, approximate
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Values
 from reseau.core.data import Array
