@@ -19,6 +19,7 @@ from reseau.bundle.solver.problem import _Run
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
+from reseau.core.failure import Code, Failure
 from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
 
 from . import networks
@@ -203,7 +204,7 @@ def test_parameters_of_each_image_are_those_of_the_image() -> None:
     world = networks.world(images=6, points=60, cameras=(cam,), control=30)
     problem = world.problem()
     true = np.random.default_rng(4).normal(0, 2e-3, (6, 12))
-    system = _Run(problem).system
+    system = _Run(problem, AdjustOptions()).system
     start = replace(problem.start, extra=true)
     seen = residuals(world.network, system.unknowns, np.arange(len(world.network.xy)), start)
     bent = replace(world, network=replace(world.network, xy=world.network.xy + seen))
@@ -408,3 +409,74 @@ def test_held_coordinates_are_no_weakness_of_their_points() -> None:
     assert fit.datum.all()
     assert fit.counts[2] == 3 + 1
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
+
+
+def test_options_of_the_engine_are_honoured() -> None:
+    world = networks.world()
+    network = world.noisy(3)
+    fit = required(world.problem(network))
+    none = networks.by_itself(network).adjusted(AdjustOptions(max_iterations=0))
+    assert isinstance(none, Failure)
+    assert none.code is Code.NOT_CONVERGED
+    first = world.problem(network).adjusted(AdjustOptions(scale="a-priori", tolerance=1e-8))
+    assert isinstance(first, BundleFit)
+    assert (first.scale, first.variance) == ("a-priori", 1.0)
+    assert fit.scale == "a-posteriori"
+    assert fit.variance == pytest.approx(first.sigma0**2, rel=1e-6)
+    damped = world.problem(network).adjusted(AdjustOptions(damping=10.0))
+    assert isinstance(damped, BundleFit)
+    assert damped.iterations > fit.iterations
+    np.testing.assert_allclose(damped.values.xyz, fit.values.xyz, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("method", "gauss-newton"), ("curvature", 0.5), ("rank_tolerance", 1e-9), ("check_jacobian", 1e-3)],
+)
+def test_an_option_that_the_sparse_solver_does_not_have_is_refused(name: str, value: Any) -> None:
+    options: dict[str, Any] = {name: value}
+    with pytest.raises(UsageError, match=rf"Options\.{name}"):
+        networks.world().problem().adjusted(AdjustOptions(**options))
+
+
+def test_a_joint_prior_of_a_camera_adds_its_inverse_to_the_normal_equations() -> None:
+    world, cam = networks.world(images=8), networks.camera()
+    root = np.random.default_rng(1).normal(size=(len(cam.names), len(cam.names))) * 1e-3
+    covariance, rows = root @ root.T, [cam.names.index(name) for name in cam.free]
+    network = world.network
+    plain = required(world.problem(network, **TOLERANCE))
+    observed = replace(network, cameras=(replace(cam, covariance=covariance),))
+    prior = required(world.problem(observed, **TOLERANCE))
+    at = plain.unknowns.camera[0] + np.arange(len(cam.free))
+    q, p = plain.cofactors.reduced[np.ix_(at, at)], prior.cofactors.reduced[np.ix_(at, at)]
+    both = np.linalg.inv(np.linalg.inv(q) + np.linalg.inv(covariance[np.ix_(rows, rows)]))
+    size = np.sqrt(np.diag(both))
+    np.testing.assert_allclose(p / np.outer(size, size), both / np.outer(size, size), rtol=0, atol=1e-4)
+    assert prior.redundancy == plain.redundancy + len(cam.free)
+    assert np.nansum(prior.redundancy_numbers) == pytest.approx(prior.redundancy, abs=1e-6)
+
+
+@pytest.mark.parametrize("banded", [False, True])
+def test_a_diagonal_prior_is_that_of_single_sigmas(banded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if banded:
+        monkeypatch.setattr("reseau.bundle.solver.unknowns._DENSE", 0)
+    cams = tuple(replace(networks.camera(), id=f"cam{k}") for k in range(20))
+    world = networks.world(images=20, points=100, cameras=cams, control=100)
+    network = world.noisy(2)
+    # Each image sees the points of its neighbours alone: parameters of its camera stand in the band.
+    near = np.abs(network.image_of - network.point_of / 5) < 2.5
+    network = network.select(near) if banded else network
+    sigma = {name: 1e-3 * (k + 1) for k, name in enumerate(cams[0].free)}
+    diagonal = np.diag([sigma.get(name, 0.0) ** 2 for name in cams[0].names])
+    priors: list[dict[str, Any]] = [{"sigma": sigma}, {"covariance": diagonal}]
+    single, joint = (
+        required(
+            world.problem(replace(network, cameras=tuple(replace(c, **prior) for c in cams)), **TOLERANCE)
+        )
+        for prior in priors
+    )
+    assert (single.unknowns.bands > 0) == banded
+    np.testing.assert_allclose(single.values.cameras, joint.values.cameras, rtol=1e-8, atol=1e-10)
+    assert single.sigma0 == pytest.approx(joint.sigma0, rel=1e-9)
+    assert single.redundancy == joint.redundancy
+    np.testing.assert_allclose(single.redundancy_numbers, joint.redundancy_numbers, rtol=0, atol=1e-7)

@@ -77,6 +77,9 @@ class Camera:
         Further parameters.
     mapping : PlaneMapping, optional
         From ideal directions to pixels, for a camera that is neither of the models.
+    covariance : ndarray (u, u), optional
+        Joint covariance of all parameters, where the values are those of an earlier calibration: free
+        parameters with a variance above zero are observed. In place of `sigma`.
     """
 
     id: str
@@ -91,6 +94,7 @@ class Camera:
     sigma: dict[str, float] = field(default_factory=dict)
     additional: Additional | None = None
     mapping: PlaneMapping | None = None
+    covariance: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.model == "mapping") != (self.mapping is not None):
@@ -99,6 +103,11 @@ class Camera:
             raise UsageError(
                 f"has {len(self.values)} values, not {len(self.names)}", where=f"camera {self.id}"
             )
+        if self.covariance is not None:
+            if self.covariance.shape != (len(self.names), len(self.names)):
+                raise UsageError("needs a covariance of all parameters", where=f"camera {self.id}")
+            if self.sigma:
+                raise UsageError("has both `sigma` and `covariance`", where=f"camera {self.id}")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,13 +1,16 @@
-"""Observations that are no image coordinates: distances, coordinates, interior orientation, readings."""
+"""Observations other than image coordinates: distances, coordinates, interior orientation, stage."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from ...core.data import Array, Mask, Rows
-from ..network import Network, perpendicular
+from ...core.errors import UsageError
+from ..network import Camera, Network, perpendicular
 from .values import Values
 
 __all__ = ["OtherObservations"]
@@ -15,7 +18,7 @@ __all__ = ["OtherObservations"]
 
 @dataclass(frozen=True, eq=False)
 class OtherObservations:
-    """Observations that are no image coordinates: distances, coordinates, interior orientation, readings.
+    """Observations other than image coordinates: distances, coordinates, interior orientation, stage.
 
     Parameters
     ----------
@@ -25,18 +28,24 @@ class OtherObservations:
         Point and axis of the observed coordinates.
     interior : ndarray of int (i, 2)
         Camera and row of the observed parameter.
+    joint : ndarray of int (k,)
+        Cameras whose parameters were observed with a joint covariance C = L Lᵀ, once for each parameter.
+    combination : ndarray (k, w)
+        Rows of L⁻¹: what is observed are the uncorrelated combinations L⁻¹ p of the parameters p.
     reading : ndarray of int (r,)
         Images of a stage's readings.
     across : ndarray (3, t)
-        Two directions at right angles to the axis that a stage should have: along them it is observed to be
-        zero; none without a stage.
-    value, sigma : ndarray (d + q + i + r + t,)
-        What was observed, and how well, in this order.
+        Two directions at right angles to the nominal axis of a stage, along which the components of the axis
+        are observed to be zero; none without a stage.
+    value, sigma : ndarray (d + q + i + k + r + t,)
+        Observed values and their standard deviations, in this order.
     """
 
     ends: Rows
     coordinate: Rows
     interior: Rows
+    joint: Rows
+    combination: Array
     reading: Rows
     across: Array
     value: Array
@@ -44,7 +53,7 @@ class OtherObservations:
 
     @classmethod
     def of(cls, network: Network, active: Mask, xyz: Array) -> OtherObservations:
-        """Those of a network; coordinates `xyz` (p, 3) are reduced ones, of points that take part."""
+        """Collect those of a network; `xyz` (p, 3) are reduced coordinates, `active` the adjusted points."""
         interior = [
             (c, camera.names.index(name), camera.sigma[name])
             for c, camera in enumerate(network.cameras)
@@ -53,6 +62,7 @@ class OtherObservations:
         ]
         coordinate = np.argwhere(network.observed & active[:, None]).astype(np.intp)
         at = np.array([(c, row) for c, row, _ in interior], dtype=np.intp).reshape(-1, 2)
+        joint, combination, observed = _combinations(network.cameras)
         j, axis = coordinate.T
         stage = network.stage
         read = np.zeros(0) if stage is None else stage.reading
@@ -62,6 +72,8 @@ class OtherObservations:
             network.distance_of,
             coordinate,
             at,
+            joint,
+            combination,
             np.arange(len(read), dtype=np.intp),
             across_axis,
             np.concatenate(
@@ -69,6 +81,7 @@ class OtherObservations:
                     network.distance[:, 0],
                     xyz[j, axis],
                     [network.cameras[c].values[row] for c, row in at],
+                    observed,
                     read,
                     np.zeros(tilts),
                 ]
@@ -78,6 +91,7 @@ class OtherObservations:
                     network.distance[:, 1],
                     network.sigma[j, axis],
                     [s for *_, s in interior],
+                    np.ones(len(joint)),
                     np.full(len(read), 0.0 if stage is None else stage.sigma),
                     np.full(tilts, 0.0 if stage is None else stage.axis_sigma),
                 ]
@@ -86,30 +100,65 @@ class OtherObservations:
 
     @property
     def slices(self) -> tuple[slice, slice, slice]:
-        """Where distances, coordinates and interior orientation stand in `value`; a stage's come last."""
+        """Positions of distances, coordinates and single interior parameters in `value`."""
         d, q = len(self.ends), len(self.coordinate)
         return slice(0, d), slice(d, d + q), slice(d + q, d + q + len(self.interior))
 
     @property
+    def combinations(self) -> slice:
+        """Positions of the combinations of interior parameters in `value`."""
+        start = self.slices[2].stop
+        return slice(start, start + len(self.joint))
+
+    @property
     def readings(self) -> slice:
-        """Where the readings of a stage stand in `value`."""
-        start = len(self.ends) + len(self.coordinate) + len(self.interior)
+        """Positions of the readings of a stage in `value`."""
+        start = self.combinations.stop
         return slice(start, start + len(self.reading))
 
     @property
     def tilts(self) -> slice:
-        """Where the two angles of its axis do."""
+        """Positions of the two components of its axis."""
         return slice(self.readings.stop, len(self.value))
 
     def computed(self, values: Values) -> Array:
-        """What the values give for them."""
+        """Compute the observations from the unknowns."""
         a, b = values.xyz[self.ends[:, 0]], values.xyz[self.ends[:, 1]]
+        width = self.combination.shape[1]
         return np.concatenate(
             [
                 np.linalg.norm(b - a, axis=1),
                 values.xyz[self.coordinate[:, 0], self.coordinate[:, 1]],
                 values.cameras[self.interior[:, 0], self.interior[:, 1]],
+                (self.combination * values.cameras[self.joint, :width]).sum(axis=1),
                 [] if values.stage is None else values.stage.reading[self.reading],
                 [] if values.stage is None else values.stage.axis @ self.across,
             ]
         )
+
+
+def _combinations(cameras: Sequence[Camera]) -> tuple[Rows, Array, Array]:
+    """Cameras, coefficients and values of uncorrelated combinations of jointly observed parameters."""
+    width = max(len(camera.names) for camera in cameras)
+    joint, rows, observed = list[int](), [np.zeros((0, width))], [np.zeros(0)]
+    for c, camera in enumerate(cameras):
+        if camera.covariance is None:
+            continue
+        sigma = np.sqrt(np.diag(camera.covariance))
+        at = [k for k in (camera.names.index(name) for name in camera.free) if sigma[k] > 0]
+        if not at:
+            continue
+        scale = sigma[at]
+        try:
+            root = np.linalg.cholesky(camera.covariance[np.ix_(at, at)] / np.outer(scale, scale))
+        except np.linalg.LinAlgError:
+            raise UsageError(
+                "has a covariance of its parameters that is not positive definite",
+                where=f"camera {camera.id}",
+            ) from None
+        coefficients = np.zeros((len(at), width))
+        coefficients[:, at] = scipy.linalg.solve_triangular(root, np.diag(1.0 / scale), lower=True)
+        joint += [c] * len(at)
+        rows.append(coefficients)
+        observed.append(coefficients[:, : len(camera.values)] @ camera.values)
+    return np.array(joint, dtype=np.intp), np.concatenate(rows), np.concatenate(observed)

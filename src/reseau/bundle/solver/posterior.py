@@ -300,7 +300,7 @@ def _others(linear: Linear, z: Array, points: Array) -> Array:
     _, _, rows, columns = system.prior_column
     hats[rows] = z[columns, columns]
     hats *= system.sigma_root**2
-    for k, column, slope in linear.distance_slopes():
+    for k, column, slope in linear.slopes():
         hats[k] = slope @ z[np.ix_(column, column)] @ slope
     return hats
 
@@ -408,7 +408,7 @@ def _reduced_rows(normal: Normal) -> Array:
     rows_kept, columns_kept, rows_interior, columns_interior = system.prior_column
     own[rows_kept, columns_kept] = root[rows_kept]
     own[rows_interior, columns_interior] = root[rows_interior]
-    for k, column, slope in linear.distance_slopes():
+    for k, column, slope in linear.slopes():
         own[k, column] = slope
     own[coordinates] += observed
     return np.concatenate([image, own])

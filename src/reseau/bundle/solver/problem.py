@@ -15,6 +15,7 @@ from ...adjust import Options as AdjustOptions
 from ...adjust.fitted import Fitted
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
+from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
 from ..network import Network, Usable, finite, usable
@@ -30,7 +31,11 @@ from .values import Values
 
 __all__ = ["BundleFit", "BundleProblem"]
 
-# Points that run off to infinity are left out so many times.
+# Options of the dense engine that this solver does not have, and their defaults.
+_NOT_HERE, _USUAL = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()
+# Initial damping, relative to the diagonal of the normal equations.
+_DAMPING = 1e-5
+# Points that run off to infinity are left out at most this many times.
 _ROUNDS = 12
 # Corrections tried after which an adjustment that has not converged is asked for points that creep.
 _ENOUGH = 50
@@ -41,8 +46,9 @@ class BundleProblem:
     """All observations of a network in one column, with approximate values.
 
     Image coordinates come first, x and y in turn, then distances, observed coordinates, observed interior
-    orientation, readings and axis of a stage. It is an :class:`~reseau.adjust.fitted.Adjustable`: robust
-    estimation, data snooping and variance components of :mod:`reseau.adjust` take it as any other problem.
+    orientation, one by one or jointly, readings and axis of a stage. It is an
+    :class:`~reseau.adjust.fitted.Adjustable`: robust estimation, data snooping and variance components of
+    :mod:`reseau.adjust` take it as any other problem.
 
     Parameters
     ----------
@@ -136,9 +142,36 @@ class BundleProblem:
         return v
 
     def adjusted(self, options: AdjustOptions | None = None) -> BundleFit | Failure:
-        """Adjust it, with everything that belongs to the result."""
+        """Adjust the network.
+
+        Parameters
+        ----------
+        options : reseau.adjust.Options, optional
+            All its fields count, in place of `max_iterations` and `tolerance` of the problem. By default
+            these, an initial damping of 1e-5, and covariances a posteriori.
+
+        Raises
+        ------
+        UsageError
+            For an option that this solver does not have: another method than Levenberg–Marquardt, a bound of
+            the curvature, a rank tolerance, a check of derivatives.
+        """
+        if options is None:
+            return self._adjusted(
+                AdjustOptions(max_iterations=self.max_iterations, tolerance=self.tolerance, damping=_DAMPING)
+            )
+        for name in _NOT_HERE:
+            if getattr(options, name) != getattr(_USUAL, name):
+                raise UsageError(
+                    f"is no option of a bundle adjustment: {getattr(options, name)!r}",
+                    where=f"Options.{name}",
+                    do="leave it at its default",
+                )
+        return self._adjusted(options)
+
+    def _adjusted(self, options: AdjustOptions) -> BundleFit | Failure:
         with one_thread():
-            return _Run(self).adjust()
+            return _Run(self, options).adjust()
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,15 +228,15 @@ class BundleFit(Fitted):
 
     @property
     def variance(self) -> float:
-        """Factor of the cofactors a posteriori; one without redundancy."""
-        return self.sigma0**2 if self.redundancy > 0 else 1.0
+        """Factor of the cofactors in covariances: sigma0² a posteriori, one a priori."""
+        return self.sigma0**2 if self.scale == "a-posteriori" else 1.0
 
 
 class _Run:
     """One adjustment of a network on its way."""
 
-    def __init__(self, problem: BundleProblem) -> None:
-        self.problem, whole = problem, problem.network
+    def __init__(self, problem: BundleProblem, options: AdjustOptions) -> None:
+        self.problem, self.options, whole = problem, options, problem.network
         n, size = len(whole.xy), len(problem.observations)
         weights = np.ones(size) if problem.weights is None else problem.weights
         pairs = weights[: 2 * n].reshape(n, 2)
@@ -218,9 +251,10 @@ class _Run:
         more = problem.others
         used = np.bincount(whole.camera_of[self.usable.images], minlength=len(whole.cameras)) > 0
         coordinate, interior = part[more.coordinate[:, 0]], used[more.interior[:, 0]]
+        joint = used[more.joint]
         read = self.usable.images[more.reading]
         axis = np.ones(more.across.shape[1], dtype=bool)
-        self.in_others = np.concatenate([bars, coordinate, interior, read, axis])
+        self.in_others = np.concatenate([bars, coordinate, interior, joint, read, axis])
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
@@ -233,6 +267,8 @@ class _Run:
             self.network.distance_of,
             more.coordinate[coordinate],
             more.interior[interior],
+            more.joint[joint],
+            more.combination[joint],
             more.reading[read],
             more.across,
             more.value[self.in_others],
@@ -269,15 +305,15 @@ class _Run:
                 Code.NO_REDUNDANCY,
             )
         found = iterate(
-            self.system, start, redundancy=redundancy, max_iterations=problem.max_iterations,
-            tolerance=problem.tolerance, damping=1e-5, watch=problem.watch,
+            self.system, start, redundancy=redundancy, max_iterations=self.options.max_iterations,
+            tolerance=self.options.tolerance, damping=self.options.damping, watch=problem.watch,
         )  # fmt: skip
         if isinstance(found, Failure):
             return found
         # What hardly any angle determines creeps on for ever, and what it creeps on is noise.
         away = found.away if found.converged else self._creeping(found)
         if len(away) and problem.rounds < _ROUNDS:
-            again = self._without(away, found.values).adjusted()
+            again = self._without(away, found.values)._adjusted(self.options)
             if found.converged or again:
                 return again
         if not found.converged:
@@ -302,7 +338,7 @@ class _Run:
         except Singular:
             weak = weak_points(linear)
             if len(weak) and problem.rounds < _ROUNDS:
-                return self._without(weak, values).adjusted()
+                return self._without(weak, values)._adjusted(self.options)
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
 
@@ -394,7 +430,7 @@ class _Run:
             iterations=found.iterations,
             costs=found.costs,
             solution=solution,
-            scale="a-posteriori" if redundancy > 0 else "a-priori",
+            scale=self.options.scale if redundancy > 0 else "a-priori",
             offset=found.offset,
             counts=counts,
             datum=datum,

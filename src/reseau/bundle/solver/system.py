@@ -193,18 +193,26 @@ class Linear:
         rows, columns, rows_interior, columns_interior = system.prior_column
         for row, column in zip([*rows, *rows_interior], [*columns, *columns_interior], strict=True):
             _add(sums, int(column), system.sigma_root[row], float(self.other_misfits[row]), bands)
-        for k, column, slope in self.distance_slopes():
+        for k, column, slope in self.slopes():
             gradient = slope * self.other_misfits[k]
             sums.gradient[column] += gradient
             sums.diagonal[column] += slope**2
-            sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
+            if column[0] >= bands:
+                sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
+            else:
+                # A camera of a single image: all its columns are in the band.
+                for i, c in enumerate(column):
+                    sums.band[c, column[i:] - c] += slope[i] * slope[i:]
         held = np.flatnonzero(kept >= 0)
         for j in held:
             for axis in np.flatnonzero(system.movable[j] == 0):
                 _hold(sums, int(kept[j] + axis))
 
-    def distance_slopes(self) -> list[tuple[int, Rows, Array]]:
-        """For each distance its number, the six columns it touches, and its weighted derivatives (6,)."""
+    def slopes(self) -> list[tuple[int, Rows, Array]]:
+        """Return number, columns and weighted derivatives of observations of several reduced unknowns.
+
+        These are distances, of six columns each, and combinations of the parameters of a camera.
+        """
         system, slopes = self.system, []
         for k, (a, b) in enumerate(system.others.ends):
             along = self.values.xyz[b] - self.values.xyz[a]
@@ -212,6 +220,13 @@ class Linear:
             slope = np.concatenate([-along * system.movable[a], along * system.movable[b]])
             column = np.concatenate([system.unknowns.kept[e] + np.arange(3) for e in (a, b)])
             slopes.append((k, column, slope))
+        unknowns, others = system.unknowns, system.others
+        for k, (c, row) in enumerate(zip(others.joint, others.combination, strict=True)):
+            if unknowns.camera[c] < 0:
+                continue
+            at, count = others.combinations.start + k, unknowns.count[c]
+            slope = row[unknowns.free[c, :count]] * system.sigma_root[at]
+            slopes.append((at, unknowns.camera[c] + np.arange(count), slope))
         return slopes
 
     def normal(self, damping: float) -> Normal:
