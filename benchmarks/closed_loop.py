@@ -18,7 +18,7 @@ from reseau.core.data import Frame
 from reseau.core.threads import one_thread
 from reseau.designs import coded_testfield
 from reseau.measure import TestfieldOptions
-from reseau.procedures.calibration import CameraModel
+from reseau.procedures.calibration import CameraOptions
 from reseau.procedures.live import LiveTestfield
 from reseau.procedures.measuring import measurer_of
 from reseau_sims import FieldBench, Station
@@ -43,7 +43,7 @@ class Session:
 
     def __init__(self, seed: int) -> None:
         self.bench = FieldBench(seed=seed, bend_mm=0.0)
-        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
+        model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(DESIGN, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
         self.procedure = LiveTestfield(DESIGN, measure, model, name="closed loop")
         self.poses = 0

@@ -40,9 +40,7 @@ PAPER = {
     "circle": (0.041, 0.033),
 }
 PAPER_PAIRS = 0.018
-CAMERA = Camera(
-    "C1000", PIXELS, PIXELS, (PITCH_MM, PITCH_MM), "brown", np.array([C_MM] + 9 * [0.0]), side="object"
-)
+CAMERA = Camera("C1000", PIXELS, PIXELS, (PITCH_MM, PITCH_MM), "brown", np.array([C_MM] + 9 * [0.0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,9 +76,17 @@ def camera(model: str = "brown-object", free: tuple[str, ...] | None = None, **m
             "cam", 640, 480, (0.01, 0.01), "opencv", values, names if free is None else free, **more
         )
     names = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "B1", "B2")
-    side: Any = model.removeprefix("brown-")
+    options = {"side": model.removeprefix("brown-"), **more.pop("options", {})}
     return Camera(
-        "cam", 640, 480, (0.01, 0.01), "brown", np.array(BROWN), names if free is None else free, side, **more
+        "cam",
+        640,
+        480,
+        (0.01, 0.01),
+        "brown",
+        np.array(BROWN),
+        names if free is None else free,
+        options,
+        **more,
     )
 
 
@@ -150,7 +158,8 @@ def mapping_of(cam: Camera) -> Any:
         return cam.mapping.with_values(cam.values)
     if cam.model == "opencv":
         return OpenCV(cam.values)
-    return Brown(cam.values, cam.side, cam.balance_radius_mm, PixelGrid(cam.width, cam.height, cam.pitch_mm))
+    grid, options = PixelGrid(cam.width, cam.height, cam.pitch_mm), cam.options
+    return Brown(cam.values, options["side"], options["balance_radius_mm"], grid)  # type: ignore[arg-type]
 
 
 def wong() -> Camera:

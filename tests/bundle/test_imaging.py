@@ -98,12 +98,12 @@ def test_image_side_reckons_with_the_corrected_image_point() -> None:
 
 CASES = {
     "brown on the object side": (networks.camera("brown-object"),),
-    "brown on the image side": (networks.camera("brown-image", balance_radius_mm=2.0),),
+    "brown on the image side": (networks.camera("brown-image", options={"balance_radius_mm": 2.0}),),
     "opencv": (networks.camera("opencv"),),
     "opencv rational": (networks.camera("opencv-8", ("fx", "fy", "cx", "k1", "k3", "k4", "k5", "k6")),),
     "ebner for all": (networks.with_ebner("camera"),),
     "ebner per group": (networks.with_ebner("group"),),
-    "ebner per image, image side": (replace(networks.with_ebner("image"), side="image"),),
+    "ebner per image, image side": (replace(networks.with_ebner("image"), options={"side": "image"}),),
     "any mapping": (networks.mapped(networks.camera("opencv")),),
     "a mapping, image side": (networks.mapped(networks.camera("brown-image")),),
     "wong's display behind a lens": (networks.wong(),),

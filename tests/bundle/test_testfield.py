@@ -47,7 +47,7 @@ def paper(
     body = xyz if shape is None else np.column_stack([xyz[:, :2], shape])
     extra = Additional(BASE, True, "group")
     values = np.array([C] + 9 * [0.0])
-    camera = Camera("ccd", 512, 512, (PITCH, PITCH), "brown", values, (), "object", additional=extra)
+    camera = Camera("ccd", 512, 512, (PITCH, PITCH), "brown", values, (), additional=extra)
     settings = [(phi, t, c) for phi in (30, 45) for t in range(4) for c in range(4)]
     settings += [(0, 0, c) for c in range(4)] if all_images else []
     x0, rotation, seen = [], [], []

@@ -19,7 +19,7 @@ from reseau.designs import coded_testfield
 from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Settings, Status, quantity
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions
-from reseau.procedures.calibration import CameraModel
+from reseau.procedures.calibration import CameraOptions
 from reseau.procedures.live import LiveTestfield
 from reseau.procedures.measuring import measurer_of
 from reseau_sims import FieldBench, Station
@@ -171,7 +171,7 @@ class FieldRig:
         self, design: TestfieldDesign = DESIGN, sigmas: tuple[float, float, float] | None = None
     ) -> LiveTestfield:
         """The testfield procedure with Brown's model, as the paper's camera wants it."""
-        model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
+        model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(design, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
         return LiveTestfield(design, measure, model, name="field", sigmas=sigmas)
 

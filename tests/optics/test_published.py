@@ -24,7 +24,9 @@ def camera_of(report: str, given: dict[str, Any]) -> Brown:
     # The report reckons the principal point from the upper left corner of the upper left pixel.
     from_corner = np.array([values.pop("px"), values.pop("py")])
     x0, y0 = grid.to_photo([from_corner / grid.pitch_mm - 0.5])[0]
-    return Brown(grid=grid).with_values({"c": values.pop("Camera Constant"), "x0": x0, "y0": y0} | values)
+    return Brown(side="image", grid=grid).with_values(
+        {"c": values.pop("Camera Constant"), "x0": x0, "y0": y0} | values
+    )
 
 
 def poses_of(report: str) -> dict[str, Pose]:

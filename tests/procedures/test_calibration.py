@@ -9,7 +9,7 @@ from reseau.core.data import Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure.points import Measured
-from reseau.procedures.calibration import Calibrated, CameraModel, calibrate_camera
+from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
 from reseau_sims import FieldBench, Station
 
 BENCH = FieldBench(seed=8, bend_mm=0.0)
@@ -38,7 +38,7 @@ def measure(frame: Frame) -> Measured | Failure:
 
 def test_any_function_that_measures_a_frame_will_do() -> None:
     frames = [blank(name) for name in (*STATIONS, "empty")]
-    model = CameraModel("brown", ("c",), (0.027, 0.027))
+    model = CameraOptions("brown", ("c",), (0.027, 0.027))
     found = calibrate_camera(frames, BENCH.design, measure, model=model)
     assert isinstance(found, Calibrated)
     assert found.declined == {"empty": "no target"}

@@ -12,14 +12,14 @@ from reseau.core.failure import Code, Failure
 from reseau.designs import coded_testfield
 from reseau.optics import Brown, PixelGrid, Pose, project
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraModel, calibrate_camera
+from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
 from reseau.procedures.heights import Heights
 
 DESIGN = coded_testfield()
 READINGS = (0.0, 250.0, 500.0)
 SIGMA_PX, SIGMA_MM, SIGMA_AXIS, SIGMA_FIELD = 0.02, 0.05, 5e-3, 0.05
 TRUE = {"c": 57.5, "x0": 0.05, "y0": -0.03}
-MODEL = CameraModel("brown", tuple(TRUE), (0.027, 0.027))
+MODEL = CameraOptions("brown", tuple(TRUE), (0.027, 0.027))
 CAMERA = Brown(side="object", grid=PixelGrid(240, 240, (0.027, 0.027))).with_values(TRUE)
 Seen = list[tuple[str, ImagePoints]]
 

@@ -10,7 +10,7 @@ from reseau.core.data import Array, ImagePoints
 from reseau.core.failure import Code, Failure
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import project
-from reseau.procedures.calibration import CameraModel, calibrate_camera
+from reseau.procedures.calibration import CameraOptions, calibrate_camera
 from reseau.procedures.mount import Mount
 
 SIGMA = 0.006
@@ -45,7 +45,7 @@ def recordings(seed: int) -> list[tuple[str, ImagePoints]]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_points_without_depth_do_not_keep_it_from_its_end(seed: int) -> None:
-    model = CameraModel("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
+    model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
     found = calibrate_camera(
         recordings(seed), board(), lambda frame: Failure("", Code.NOT_FOUND), (240, 240), model
     )

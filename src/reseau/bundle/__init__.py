@@ -18,14 +18,13 @@ from .diagnostics import (
 )
 from .document import searched_document, to_document
 from .modelling.adjustment import Options, adjust_network, problem_of
-from .modelling.calibration import UNITS, calibration_of
+from .modelling.calibration import calibration_of
 from .modelling.components import Kind, estimate_components, reweighted
 from .modelling.model_search import Searched, search_model
 from .network import Additional, Camera, ControlPoints, Network, Stage
 from .solver import Approximate, BundleFit, BundleProblem, approximate
 
 __all__ = [
-    "UNITS",
     "Additional",
     "Approximate",
     "BundleFit",

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import click
 import typer
 
 from .bundle_compare import read_lens
@@ -41,9 +42,26 @@ if TYPE_CHECKING:
     from ..calibration.document import Calibration
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
-    from ..procedures.calibration import Calibrated, CalibrationOptions, CameraModel
+    from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
 
 __all__ = ["calibrate"]
+
+
+class ModelName(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
+    """Name of a registered camera model; the registry is read when it is needed, not with this module."""
+
+    name = "name"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        from ..optics import camera_models
+
+        return f"[{'|'.join(model.name for model in camera_models())}]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        from ..optics import camera_model
+
+        return camera_model(value).name if value else ""
+
 
 Sigma = Annotated[
     float | None,
@@ -65,10 +83,24 @@ def calibrate(
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
     out: Out = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            click_type=ModelName(),
+            help="Camera model; by default brown with --pitch, opencv without.",
+            show_default=False,
+        ),
+    ] = "",
     pitch: Annotated[
-        float | None, typer.Option(min=1e-6, help="Size of a pixel, mm; with it Brown's model, in mm.")
+        float | None, typer.Option(min=1e-6, help="Size of a pixel, mm; brown needs it.")
     ] = None,
-    side: Annotated[str, typer.Option(help="Side of Brown's distortion: object or image.")] = "object",
+    side: Annotated[
+        str | None, typer.Option(help="Side of Brown's distortion: object (default) or image.")
+    ] = None,
+    model_option: Annotated[
+        list[str] | None,
+        typer.Option(help="Option of the camera model, as balance_radius_mm=8; repeatable."),
+    ] = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
     channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
@@ -100,13 +132,14 @@ def calibrate(
     others = {path.name: read_lens(path) for path in against or []}
     level = level_of(eliminate, "--eliminate")
     options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
+    camera = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     with progress("measuring", len(images)) as step:
-        frames, model = _frames(images, channel, sensor, step), _model(pitch, side, free)
-        done = required(calibrate_camera(frames, target, measure, _size(size), model, options), design)
+        frames = _frames(images, channel, sensor, step)
+        done = required(calibrate_camera(frames, target, measure, _size(size), camera, options), design)
     provenance = _provenance(
         [design, *images, *(path for path in (control, sensor) if path)],
-        pitch=pitch, side=side, free=free, sigma=sigma,
+        model=camera.model, pitch=pitch, options=dict(camera.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
         leave_out=list(leave_out or []), components=kind,
     )  # fmt: skip
@@ -205,16 +238,19 @@ def _frames(
             yield corrected(read_image(path, channel.value), sensor)
 
 
-def _model(pitch: float | None, side: str, free: str) -> CameraModel:
+def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:
+    """Model and parameters of the camera, from the options of the command."""
     from ..core.errors import UsageError
-    from ..procedures.calibration import CameraModel
+    from ..procedures.calibration import CameraOptions
 
+    options: dict[str, str | float] = {} if side is None else {"side": side}
+    for text in more:
+        name, equals, value = text.partition("=")
+        if not equals or name in options:
+            raise UsageError(f"is {text!r}", where="--model-option", do="write name=value, each name once")
+        options[name] = value
     names = tuple(name.strip() for name in free.split(",") if name.strip())
-    if side not in ("object", "image"):
-        raise UsageError(f"is {side!r}", where="--side", do="write `object` or `image`")
-    if pitch is None:
-        return CameraModel("opencv", names)
-    return CameraModel("brown", names, (pitch, pitch), "image" if side == "image" else "object")
+    return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options)
 
 
 def _size(text: str) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from .sessions import model_of, steps_of
 
 if TYPE_CHECKING:
     from ..capture import Acquisition, Bench, Goal, Plan, Step
-    from ..procedures.calibration import CameraModel
+    from ..procedures.calibration import CameraOptions
 
 __all__ = ["app"]
 
@@ -218,15 +218,15 @@ def _lifted(steps: Sequence[Step]) -> bool:
     return len({step.position.get(HEIGHT, 0.0) for step in steps}) > 1
 
 
-def _of_model(goal: Goal | None, model: CameraModel) -> None:
+def _of_model(goal: Goal | None, model: CameraOptions) -> None:
     """Refuse a goal for what is not estimated, or in a unit that it does not have."""
-    from ..bundle import UNITS
+    from ..optics.cameras import unit_of
 
     if goal is None:
         return
     if goal.parameter not in model.chosen:
         raise UsageError(f"is none of {', '.join(model.chosen)}", where=f"sigma_{goal.parameter}")
-    unit = UNITS.get(goal.parameter, "")
+    unit = unit_of(goal.parameter, model.model)
     if goal.unit and goal.unit != unit:
         raise UsageError(f"is in {unit or 'no unit'}, not {goal.unit}", where=f"sigma_{goal.parameter}")
 

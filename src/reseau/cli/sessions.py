@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..archive import Archive, Session, Verdict
     from ..capture import Procedure, Step
     from ..core.data import Frame
-    from ..procedures.calibration import CameraModel
+    from ..procedures.calibration import CameraOptions
     from ..procedures.live import LiveOscilloscope, LiveTestfield
     from ..procedures.live_sensor import LiveSensor
 
@@ -110,12 +110,12 @@ def _sensor_of(kept: Session) -> _Sensor:
     return _Sensor(LiveSensor(name=kept.name, region=chosen, options=kept.parameters), kept)
 
 
-def model_of(parameters: Mapping[str, Any]) -> CameraModel:
+def model_of(parameters: Mapping[str, Any]) -> CameraOptions:
     """What a testfield's session estimates of its camera."""
-    from ..procedures.calibration import CameraModel
+    from ..procedures.calibration import CameraOptions
 
     pitch, free = parameters["pitch"], tuple(parameters["free"])
-    return CameraModel("opencv", free) if pitch is None else CameraModel("brown", free, (pitch, pitch))
+    return CameraOptions(free=free, pitch_mm=None if pitch is None else (pitch, pitch))
 
 
 def _inputs(kept: Session) -> dict[str, str]:

@@ -67,4 +67,4 @@ def read_bal(path: Path | str) -> Network:
 
 def _camera(name: str, size: int, f: float, k1: float, k2: float) -> Camera:
     values = np.array([f, 0.0, 0.0, k1 / f**2, k2 / f**4, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return Camera(name, size, size, (1.0, 1.0), "brown", values, ("c", "K1", "K2"), "object")
+    return Camera(name, size, size, (1.0, 1.0), "brown", values, ("c", "K1", "K2"))

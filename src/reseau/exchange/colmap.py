@@ -15,6 +15,7 @@ from ..bundle import Camera, Network
 from ..core.data import Array
 from ..core.errors import FormatError
 from ..io import read_text
+from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
 from .lines import network_of, numbers
 
@@ -140,10 +141,10 @@ def _camera(words: list[str], path: Path, number: int) -> Camera:
         radial = [given.get("k1", 0.0) / f**2, given.get("k2", 0.0) / f**4]
         free = ("c", *(f"K{k}" for k in (1, 2) if f"k{k}" in given))
         all_values = np.array([*brown, *radial, *5 * [0.0]])
-        return Camera(name, *size, (1.0, 1.0), "brown", all_values, free, "object")
-    order = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    opencv = np.array([given.get(key, 0.0) for key in order])
-    free = tuple(key for key in order if key in given and key not in ("cx", "cy"))
+        return Camera(name, *size, (1.0, 1.0), "brown", all_values, free)
+    full = camera_model("opencv")
+    opencv = np.array([given.get(key, 0.0) for key in full.names])
+    free = tuple(key for key in full.of_role("scale", "distortion") if key in given)
     return Camera(name, *size, (1.0, 1.0), "opencv", opencv, free)
 
 

@@ -135,4 +135,4 @@ def _camera(name: str, values: list[float], width: int, height: int) -> Camera:
     c, px, py, format_x, format_y, *distortion = values
     pitch = format_x / width, format_y / height
     brown = [c, px - format_x / 2, format_y / 2 - py, *distortion, 0.0, 0.0]
-    return Camera(name, width, height, pitch, "brown", np.array(brown), _FREE, "image")
+    return Camera(name, width, height, pitch, "brown", np.array(brown), _FREE, {"side": "image"})

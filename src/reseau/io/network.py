@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from ..core.errors import UsageError
+from ..optics.cameras import additional_models, camera_model, camera_models
 from .document import Document, Strict
 
 __all__ = [
-    "CAMERA_PARAMETERS",
     "AdditionalParameters",
     "CameraEntry",
     "DistanceColumns",
@@ -20,33 +21,37 @@ __all__ = [
     "PointColumns",
 ]
 
-CAMERA_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"),
-    "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
-_REQUIRED = {"brown": ("c",), "opencv": ("fx", "fy", "cx", "cy")}
-
 T = TypeVar("T")
 Triple = tuple[float, float, float]
 
 
 class AdditionalParameters(Strict):
-    """Further parameters of the image, in sets of their own."""
+    """Additional parameters of the image, in one set or in several."""
 
-    model: Literal["ebner12"]
+    model: str
     base_mm: float = Field(gt=0)
     free: bool
     per: Literal["camera", "group", "image"] = "camera"
 
+    @field_validator("model")
+    @classmethod
+    def _registered(cls, name: str) -> str:
+        return _known(name, [model.name for model in additional_models()])
+
 
 class CameraEntry(Strict):
-    """One camera: its pixels, its model, and what is known of its interior orientation."""
+    """One camera: its pixels, its model, and what is known of its interior orientation.
+
+    The models are those of :func:`reseau.optics.camera_models`; the options of a model are keys of the entry.
+    """
+
+    model_config = ConfigDict(extra="allow")
 
     id: str = Field(min_length=1)
     width: int = Field(gt=0)
     height: int = Field(gt=0)
     pitch_mm: tuple[float, float] | None = None
-    model: Literal["brown", "opencv"]
+    model: str
     side: Literal["image", "object"] | None = None
     balance_radius_mm: float = Field(default=0.0, ge=0)
     parameters: dict[str, float]
@@ -54,25 +59,44 @@ class CameraEntry(Strict):
     sigma: dict[str, float] | None = None
     additional: AdditionalParameters | None = None
 
+    @field_validator("model")
+    @classmethod
+    def _registered(cls, name: str) -> str:
+        return _known(name, [model.name for model in camera_models()])
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the model that the entry gives."""
+        given = {option.name: getattr(self, option.name, None) for option in camera_model(self.model).options}
+        return {name: value for name, value in given.items() if value is not None}
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        known = CAMERA_PARAMETERS[self.model]
-        who = f"camera {self.id!r}"
+        model, who = camera_model(self.model), f"camera {self.id!r}"
         if self.pitch_mm is not None and min(self.pitch_mm) <= 0:
             raise ValueError(f"{who}: `pitch_mm` must be above zero")
-        for key in ("pitch_mm", "side") if self.model == "brown" else ():
-            if getattr(self, key) is None:
+        needed = ["pitch_mm"] if model.needs_pitch else []
+        for key in [*needed, *(option.name for option in model.options if option.required)]:
+            if getattr(self, key, None) is None:
                 raise ValueError(f"{who}: missing key `{key}`")
+        for key in self.model_extra or {}:
+            if key not in [option.name for option in model.options]:
+                raise ValueError(f"{who}: unknown key `{key}`")
+        try:
+            model.checked_options(self.options)
+        except UsageError as error:
+            raise ValueError(f"{who}: {error}") from None
         for key, names in (("parameters", self.parameters), ("free", self.free), ("sigma", self.sigma or {})):
             for name in names:
-                if name not in known:
+                if name not in model.names:
                     raise ValueError(
                         f"{who}: `{key}` names {name!r}, which is no parameter of {self.model!r}"
                     )
-        for name in _REQUIRED[self.model]:
+        for name in model.required:
             if name not in self.parameters:
                 raise ValueError(f"{who}: parameter {name!r} is missing")
-            if name in ("c", "fx", "fy") and self.parameters[name] <= 0:
+        for name in model.of_role("scale"):
+            if name in self.parameters and self.parameters[name] <= 0:
                 raise ValueError(f"{who}: parameter {name!r} is not above zero")
         twice = _twice(self.free)
         if twice is not None:
@@ -82,8 +106,8 @@ class CameraEntry(Strict):
                 raise ValueError(f"{who}: the sigma of {name!r} is not above zero")
             if name not in self.free:
                 raise ValueError(f"{who}: {name!r} has a sigma and is not free")
-        if self.additional is not None and self.model != "brown":
-            raise ValueError(f"{who}: `additional` parameters go with the model 'brown' alone")
+        if self.additional is not None and model.combine is None:
+            raise ValueError(f"{who}: the model {self.model!r} takes no `additional` parameters")
         return self
 
 
@@ -232,6 +256,12 @@ class Network1(Document):
     def to_dict(self) -> dict[str, Any]:
         """The content as it stands in the file; keys that may be missing and say nothing are left out."""
         return {"schema": self.SCHEMA} | self.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def _known(name: str, names: Sequence[str]) -> str:
+    if name not in names:
+        raise ValueError(f"{name!r} is none of the models {', '.join(names)}")
+    return name
 
 
 def _twice(names: Iterable[T]) -> T | None:

@@ -1,11 +1,21 @@
 """Image formation: cameras, distortions, displays, sensors and target images."""
 
-from .additional import EbnerCorrection
 from .arcs import Arcs
-from .cameras import Brown, OpenCV, PixelGrid
+from .cameras import (
+    Brown,
+    BrownDistortion,
+    CameraModel,
+    EbnerCorrection,
+    OpenCV,
+    PixelGrid,
+    additional_model,
+    additional_models,
+    camera_model,
+    camera_models,
+    convert,
+)
 from .composition import Chain, Identity, Inverted, Similarity
 from .displays import DecenteredDisplay, wong_display
-from .distortions import BrownDistortion
 from .mapping import Derivatives, Mapping, PlaneMapping
 from .polynomials import RationalPolynomial
 from .poses import (
@@ -24,6 +34,7 @@ __all__ = [
     "Arcs",
     "Brown",
     "BrownDistortion",
+    "CameraModel",
     "Chain",
     "DecenteredDisplay",
     "Derivatives",
@@ -39,7 +50,12 @@ __all__ = [
     "RationalPolynomial",
     "Sensor",
     "Similarity",
+    "additional_model",
+    "additional_models",
     "angles_to_matrix",
+    "camera_model",
+    "camera_models",
+    "convert",
     "illumination",
     "jpeg",
     "matrix_to_angles",

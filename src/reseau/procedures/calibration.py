@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,14 +19,15 @@ from ..bundle import Camera, ControlPoints, Kind, Network, Options, Result, Sear
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
-from ..io.network import CAMERA_PARAMETERS
+from ..optics import CameraModel, PixelGrid, camera_model
+from ..optics.cameras import default_camera_model
 from .heights import Heights
 from .measuring import Measurer, measured_in_order, measurer_of
 
 __all__ = [
     "Calibrated",
     "CalibrationOptions",
-    "CameraModel",
+    "CameraOptions",
     "Measurer",
     "calibrate_camera",
     "first_camera",
@@ -55,43 +56,57 @@ class PlaneDesign(Protocol):
 
 
 @dataclass(frozen=True)
-class CameraModel:
-    """What is to be estimated of a camera.
+class CameraOptions:
+    """Model of a camera that is to be calibrated, and what is estimated of it.
 
     Parameters
     ----------
-    model : {"brown", "opencv"}
-        See :class:`reseau.bundle.Camera`.
+    model : str, optional
+        Name of a registered model, see :func:`reseau.optics.camera_models`. By default ``brown`` where the
+        size of a pixel is given, and ``opencv`` where it is not.
     free : tuple of str
-        Parameters; by default principal distance and point, two or three radial terms, tangential ones, and
-        for OpenCV both focal lengths.
+        Parameters to estimate; by default the usual ones of the model.
     pitch_mm : (float, float), optional
-        Size of a pixel; needed for `brown`.
-    side : {"image", "object"}
-        Whose coordinates Brown's distortion is a function of.
+        Size of a pixel; needed for models whose parameters are in millimetres.
+    options : mapping of str to str or float
+        Options of the model, as the side of Brown's distortion.
+
+    Raises
+    ------
+    UsageError
+        When the model, a parameter or an option is unknown, or the size of a pixel is missing.
+
+    Examples
+    --------
+    >>> CameraOptions().model, CameraOptions(pitch_mm=(0.005, 0.005)).chosen
+    ('opencv', ('c', 'x0', 'y0', 'K1', 'K2', 'P1', 'P2'))
     """
 
-    model: Literal["brown", "opencv"] = "opencv"
+    model: str = ""
     free: tuple[str, ...] = ()
     pitch_mm: tuple[float, float] | None = None
-    side: Literal["image", "object"] = "object"
+    options: Mapping[str, str | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.model == "brown" and self.pitch_mm is None:
-            raise UsageError("needs the size of a pixel", where="brown")
-        unknown = [name for name in self.free if name not in CAMERA_PARAMETERS[self.model]]
+        if not self.model:
+            object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
+        model = self.registered
+        if model.needs_pitch and self.pitch_mm is None:
+            raise UsageError("needs the size of a pixel", where=model.name)
+        unknown = [name for name in self.free if name not in model.names]
         if unknown:
-            names = ", ".join(CAMERA_PARAMETERS[self.model])
-            raise UsageError(f"is none of {names}", where=unknown[0])
+            raise UsageError(f"is none of {', '.join(model.names)}", where=unknown[0])
+        object.__setattr__(self, "options", model.checked_options(self.options))
+
+    @property
+    def registered(self) -> CameraModel:
+        """The registered model."""
+        return camera_model(self.model)
 
     @property
     def chosen(self) -> tuple[str, ...]:
         """Parameters to be estimated."""
-        usual = {
-            "brown": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
-            "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        }
-        return self.free or usual[self.model]
+        return self.free or self.registered.usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +180,7 @@ def calibrate_camera(
     design: PlaneDesign,
     measure: Measurer,
     size: tuple[int, int] | None = None,
-    model: CameraModel | None = None,
+    model: CameraOptions | None = None,
     options: CalibrationOptions | None = None,
 ) -> Calibrated | Failure:
     """Calibrate a camera from photographs of a target.
@@ -180,7 +195,7 @@ def calibrate_camera(
         What measures it in a frame; see :func:`~reseau.procedures.measuring.measurer_of`.
     size : (int, int), optional
         Width and height in pixels, where no frame tells.
-    model : CameraModel, optional
+    model : CameraOptions, optional
         What is to be estimated.
     options : CalibrationOptions, optional
         How.
@@ -206,7 +221,7 @@ def calibrate_camera(
         )
     if size is None:
         raise UsageError("is not known without an image", where="size of the images")
-    camera = first_camera(measured, design, size, model or CameraModel())
+    camera = first_camera(measured, design, size, model or CameraOptions())
     network = network_of(measured, design, camera)
     if options.heights is not None:
         network = options.heights.lifted(network)
@@ -332,7 +347,7 @@ def network_of(
 
 
 def first_camera(
-    measured: Mapping[str, ImagePoints], design: PlaneDesign, size: tuple[int, int], model: CameraModel
+    measured: Mapping[str, ImagePoints], design: PlaneDesign, size: tuple[int, int], model: CameraOptions
 ) -> Camera:
     """A camera to begin with: the principal distance from the projectivities of the images (Zhang 2000)."""
     known = dict(zip(design.ids, design.xy, strict=True))
@@ -346,11 +361,6 @@ def first_camera(
     f = float(matrix[0, 0])
     if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
         f = 1.2 * max(size)
-    values = np.zeros(len(CAMERA_PARAMETERS[model.model]))
-    if model.model == "opencv":
-        values[:4] = f, f, (size[0] - 1) / 2, (size[1] - 1) / 2
-    else:
-        assert model.pitch_mm is not None
-        values[0] = f * model.pitch_mm[0]
-    camera = Camera("camera", *size, model.pitch_mm or (1.0, 1.0), model.model, values, model.chosen)
-    return replace(camera, side=model.side)
+    pitch = model.pitch_mm or (1.0, 1.0)
+    values = model.registered.start_values(f, PixelGrid(*size, pitch))
+    return Camera("camera", *size, pitch, model.model, values, model.chosen, model.options)

@@ -76,11 +76,7 @@ class Heights:
         frames = np.array([*_frames(network, stage)]).reshape(-1, 3, 3)
         f = _focal_length(frames)
         if f is not None and 0.2 < f / max(camera.width, camera.height) < 100:
-            values = camera.values.copy()
-            values[: 2 if camera.model == "opencv" else 1] = f * (
-                1.0 if camera.model == "opencv" else camera.pitch_mm[0]
-            )
-            network = replace(network, cameras=(replace(camera, values=values),))
+            network = replace(network, cameras=(camera.rescaled(f),))
         # Towards the camera or away from it: with the right one the three directions are right-handed.
         sign = -1.0 if len(frames) and float(np.sign(np.linalg.det(frames)).sum()) < 0 else 1.0
         return replace(network, stage=replace(stage, axis=np.array([0.0, 0.0, sign])))

@@ -21,7 +21,7 @@ from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from ..optics import Pose, project
 from ..optics.poses import matrix_to_vector, rotation_matrix
-from .calibration import Calibrated, CalibrationOptions, CameraModel, PlaneDesign, calibrate_camera
+from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
 from .heights import Heights
 from .measuring import Measurer
 from .mount import HEIGHT, Mount
@@ -58,7 +58,7 @@ class LiveTestfield:
         The target.
     measure : callable
         What measures it in a frame.
-    model : CameraModel
+    model : CameraOptions
         What is to be estimated.
     name : str
         Of the calibration.
@@ -79,7 +79,7 @@ class LiveTestfield:
         self,
         design: PlaneDesign,
         measure: Measurer,
-        model: CameraModel,
+        model: CameraOptions,
         *,
         name: str,
         options: Mapping[str, Any] | None = None,

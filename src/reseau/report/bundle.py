@@ -19,17 +19,17 @@ from ..bundle import (
 )
 from ..core.data import Rows
 from ..core.provenance import Provenance
+from ..optics.cameras import unit_of
 from .bundle_figures import distortion_figure, network_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, uncertainty_figure
 from .patterns import patterns_of
+from .tables import unit_text
 from .template import rendered
 
 __all__ = ["bundle_report"]
 
 _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
-_UNITS = {"c": "mm", "x0": "mm", "y0": "mm", "K1": "mm⁻²", "K2": "mm⁻⁴", "K3": "mm⁻⁶", "P1": "mm⁻¹",
-          "P2": "mm⁻¹", "fx": "px", "fy": "px", "cx": "px", "cy": "px"}  # fmt: skip
 
 
 def bundle_report(
@@ -147,7 +147,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
                 "value": f"{value:.7g}",
                 "sigma": f"{s:.2g}",
                 "between": f"{other:.2g}" if np.isfinite(other) else "–",
-                "unit": _UNITS.get(name, ""),
+                "unit": unit_text(unit_of(name, camera.model)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
                 "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
                 "verdict": "" if test is None or test.significant else "not significant",
@@ -167,10 +167,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
 
 def _lens(result: Result, c: int) -> Lens | None:
     """The camera by itself; None where it has several sets of parameters, or no mapping."""
-    extra = result.network.cameras[c].additional
-    if extra is not None and (extra.per != "camera" or result.network.cameras[c].side == "image"):
-        return None
-    return Lens.of_result(result, c)
+    return Lens.of_result(result, c) if result.network.cameras[c].has_plane_mapping else None
 
 
 def _fields(

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from ..bundle import Lens, Result
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, nice, to_svg
+from ..optics.cameras import distortion_names
 
 __all__ = ["distortion_figure", "network_figure", "residual_figure"]
 
@@ -17,8 +18,6 @@ _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
 _BAND = 3.0
 """Standard deviations of the band."""
 _DIRECTIONS, _RADII = 24, 60
-_ORIENTATION = ("c", "x0", "y0", "fx", "fy", "cx", "cy")
-"""Parameters of the interior orientation that are no distortion."""
 
 
 def network_figure(result: Result) -> str:
@@ -148,7 +147,8 @@ def _radial(lens: Lens) -> tuple[Array, Array, Array] | None:
 
     The distortion is what the mapping adds to the central projection by its own slope on the axis.
     """
-    own = [k for k, name in enumerate(lens.names) if name not in _ORIENTATION]
+    bent = distortion_names(lens.names)
+    own = [k for k, name in enumerate(lens.names) if name in bent]
     if not own:
         return None
     axis = lens.mapping.derivatives(np.zeros((1, 2)))

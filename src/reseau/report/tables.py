@@ -30,6 +30,7 @@ __all__ = [
     "step_rows",
     "symbol",
     "unit_markup",
+    "unit_text",
 ]
 
 Item = tuple[str, str, str]
@@ -99,6 +100,18 @@ def unit_markup(unit: str) -> Markup:
     if not exponent:
         return Markup("{}").format(base)
     return Markup("{}<sup>{}</sup>").format(base, exponent.replace("-", "−"))
+
+
+def unit_text(unit: str) -> str:
+    """A unit with its exponent raised, as plain text.
+
+    Examples
+    --------
+    >>> unit_text("mm^-2"), unit_text("px")
+    ('mm⁻²', 'px')
+    """
+    base, _, exponent = unit.partition("^")
+    return base + exponent.translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def probability(p: float) -> str:

@@ -2,63 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...calibration.document import Calibration
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
-from ...io.network import CAMERA_PARAMETERS
-from ...optics import Brown, Derivatives, EbnerCorrection, OpenCV, PixelGrid, PlaneMapping
+from ...optics import PlaneMapping, camera_model, camera_models
 from ..network import Additional, Camera
 from .result import Result
 
 __all__ = ["Lens", "own_columns"]
-
-
-@dataclass(frozen=True, eq=False)
-class _WithAdditional(PlaneMapping):
-    """Brown's camera on the object side with Ebner's parameters: values of the one, then of the other."""
-
-    camera: Brown
-    additional: EbnerCorrection
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all parameters."""
-        return (*self.camera.names, *self.additional.names)
-
-    @property
-    def values(self) -> Array:
-        """Values of all parameters."""
-        return np.concatenate([self.camera.values, self.additional.values])
-
-    def _replaced(self, values: Array) -> Self:
-        count = len(self.camera.names)
-        return replace(
-            self,
-            camera=self.camera.with_values(values[:count]),
-            additional=replace(self.additional, values=values[count:]),
-        )
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """See :meth:`PlaneMapping.derivatives`."""
-        seen, grid, c = self.camera.derivatives(xy), self.camera.grid, self.camera.values[0]
-        assert grid is not None
-        turned, scale = np.array([1.0, -1.0]), grid.pixels_per_mm
-        ideal = c * turned * np.asarray(xy, dtype=np.float64)
-        more = self.additional.derivatives(ideal)
-        slope = scale[:, None] * (more.d_xy - np.eye(2)) * turned
-        by_camera = seen.d_parameters.copy()
-        by_camera[:, :, 0] += (slope @ np.asarray(xy, dtype=np.float64)[:, :, None])[:, :, 0]
-        return Derivatives(
-            seen.value + grid.to_pixels(more.value - ideal) - grid.to_pixels(np.zeros((1, 2))),
-            seen.d_xy + c * slope,
-            np.concatenate([by_camera, scale[:, None] * more.d_parameters], axis=2),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +34,7 @@ class Lens:
 
     Examples
     --------
+    >>> from reseau.optics import Brown, PixelGrid
     >>> camera = Brown(grid=PixelGrid(640, 480, (0.01, 0.01))).with_values({"c": 8.0})
     >>> Lens(camera, 640, 480, np.array([0]), np.array([[1e-6]])).names
     ('c',)
@@ -124,12 +81,12 @@ class Lens:
         Raises
         ------
         UsageError
-            When it is none of a camera of the models `brown` or `opencv`.
+            When it is none of a camera of a registered model.
         """
         model = calibration.model
         if calibration.kind != "camera" or not isinstance(model, dict):
             raise UsageError("is not that of a camera", where=f"calibration {calibration.name}")
-        if model.get("model") not in ("brown", "opencv"):
+        if model.get("model") not in [known.name for known in camera_models()]:
             raise UsageError("has a model without a form in files", where=f"calibration {calibration.name}")
         camera = _camera(calibration.name, model, calibration.values())
         names = calibration.covariance.names
@@ -138,7 +95,7 @@ class Lens:
 
     @classmethod
     def _of(cls, camera: Camera, found: dict[str, float], names: tuple[str, ...], covariance: Array) -> Self:
-        mapping = _mapping(camera)
+        mapping = camera.plane_mapping()
         mapping = mapping.with_values({name: found[name] for name in mapping.names if name in found})
         rows = np.array([mapping.names.index(name) for name in names], dtype=np.intp)
         return cls(mapping, camera.width, camera.height, rows, covariance)
@@ -163,27 +120,10 @@ def _camera(name: str, model: dict[str, Any], values: dict[str, float]) -> Camer
     extra = model.get("additional")
     if extra is not None and extra["per"] != "camera":
         raise UsageError("has several sets of additional parameters", where=f"calibration {name}")
+    registered = camera_model(model["model"])
     return Camera(
-        name, model["width"], model["height"], tuple(model["pitch_mm"]), model["model"],
-        np.array([values.get(key, 0.0) for key in CAMERA_PARAMETERS[model["model"]]]),
-        side=model.get("side", "object"),
-        balance_radius_mm=model.get("balance_radius_mm", 0.0),
-        additional=None if extra is None else Additional(extra["base_mm"]),
+        name, model["width"], model["height"], tuple(model["pitch_mm"]), registered.name,
+        np.array([values.get(key, 0.0) for key in registered.names]),
+        options={option.name: model[option.name] for option in registered.options if option.name in model},
+        additional=None if extra is None else Additional(extra["base_mm"], model=extra["model"]),
     )  # fmt: skip
-
-
-def _mapping(camera: Camera) -> PlaneMapping:
-    """The mapping of a camera, its additional parameters zero."""
-    if camera.mapping is not None:
-        return camera.mapping.with_values(camera.values)
-    if camera.model == "opencv":
-        return OpenCV(camera.values)
-    grid = PixelGrid(camera.width, camera.height, camera.pitch_mm)
-    brown = Brown(camera.values, camera.side, camera.balance_radius_mm, grid)
-    if camera.additional is None:
-        return brown
-    if camera.side == "image":
-        raise UsageError(
-            "additional parameters on the image side have no mapping of their own", where=camera.id
-        )
-    return _WithAdditional(brown, EbnerCorrection(base_mm=camera.additional.base_mm))

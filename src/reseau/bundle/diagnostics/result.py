@@ -12,9 +12,10 @@ from ...adjust.rejection import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
+from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
-from ..solver import EBNER, BundleFit
+from ..solver import BundleFit
 
 __all__ = ["Result"]
 
@@ -88,9 +89,10 @@ class Result:
             found += values.cameras[c, unknowns.free[c, :count]].tolist()
         for e, (owner, label) in enumerate(unknowns.extra_names):
             if owner == c and unknowns.extra[e] >= 0 and camera.additional is not None:
-                names += [camera.additional.name(i, label) for i in range(EBNER)]
-                columns += list(unknowns.extra[e] + np.arange(EBNER))
-                found += values.extra[e].tolist()
+                count = unknowns.extra_count[e]
+                names += [camera.additional.name(i, label) for i in range(count)]
+                columns += list(unknowns.extra[e] + np.arange(count))
+                found += values.extra[e, :count].tolist()
         return tuple(names), np.array(columns, dtype=np.intp), np.array(found)
 
     def camera_covariance(self, c: int) -> Array:
@@ -102,12 +104,13 @@ class Result:
     def camera_tests(self, c: int, alpha: float = 0.05) -> tuple[CoefficientTest, ...]:
         """Whether each distortion and each additional parameter of a camera differs from zero."""
         names, columns, values = self.camera_columns(c)
+        tested = distortion_names(names, self.network.cameras[c].model)
         size = np.sqrt(np.diag(self.fit.cofactors.reduced)[columns])
         sigma0 = self.sigma0 if self.redundancy > 0 else None
         return tuple(
             ratio_test(name, float(value / s), sigma0, self.redundancy, alpha)
             for name, value, s in zip(names, values, size, strict=True)
-            if s > 0 and name not in ("c", "x0", "y0", "fx", "fy", "cx", "cy")
+            if s > 0 and name in tested
         )
 
     # -- images

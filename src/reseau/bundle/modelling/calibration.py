@@ -9,16 +9,11 @@ import numpy as np
 
 from ...calibration.document import Calibration, Covariance, Quantity
 from ...core.errors import UsageError
+from ...optics.cameras import unit_of
 from ..diagnostics import Result, sigma_between_images
 from ..network import Camera
 
-__all__ = ["UNITS", "calibration_of"]
-
-UNITS = {
-    "c": "mm", "x0": "mm", "y0": "mm", "K1": "mm^-2", "K2": "mm^-4", "K3": "mm^-6", "P1": "mm^-1",
-    "P2": "mm^-1", "fx": "px", "fy": "px", "cx": "px", "cy": "px",
-}  # fmt: skip
-"""Of a camera's parameters; those that are not here have none."""
+__all__ = ["calibration_of"]
 
 
 def calibration_of(
@@ -58,10 +53,10 @@ def calibration_of(
     covariance = result.camera_covariance(c)
     sigma = np.sqrt(np.diag(covariance))
     parameters = {
-        key: Quantity(value=value, sigma=0.0, unit=UNITS.get(key, ""))
+        key: Quantity(value=value, sigma=0.0, unit=unit_of(key, entry.model))
         for key, value in entry.parameters.items()
     } | {
-        key: Quantity(value=float(value), sigma=float(s), unit=UNITS.get(key, ""))
+        key: Quantity(value=float(value), sigma=float(s), unit=unit_of(key, entry.model))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
     between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
@@ -92,9 +87,8 @@ def _model(camera: Camera) -> dict[str, Any]:
         "height": camera.height,
         "pitch_mm": list(camera.pitch_mm),
     }
-    if camera.model == "brown":
-        model |= {"side": camera.side, "balance_radius_mm": camera.balance_radius_mm}
+    model |= camera.options
     extra = camera.additional
     if extra is not None:
-        model["additional"] = {"model": "ebner12", "base_mm": extra.base_mm, "per": extra.per}
+        model["additional"] = {"model": extra.model, "base_mm": extra.base_mm, "per": extra.per}
     return model

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
-from ...io.network import CAMERA_PARAMETERS, CameraEntry, Network1
-from ...optics import PlaneMapping
+from ...io.network import CameraEntry, Network1
+from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
+from ...optics.cameras import distortion_names
 from .stage import Stage
 
 __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
@@ -25,7 +27,7 @@ _LEAST_POINTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Additional:
-    """Ebner's twelve orthogonal parameters of a camera, in one set or in several.
+    """Additional parameters of a camera, in one set or in several.
 
     Parameters
     ----------
@@ -37,21 +39,39 @@ class Additional:
         What has a set of its own.
     dropped : frozenset of str
         Those that stay zero, as a result names them: ``b3``, or ``b3 of group G`` of a set per group.
+    model : str
+        Name in the registry, :func:`reseau.optics.additional_models`.
+
+    Examples
+    --------
+    >>> Additional(9.0, per="group").name(2, "group A")
+    'b3 of group A'
     """
 
     base_mm: float
     free: bool = True
     per: Literal["camera", "group", "image"] = "camera"
     dropped: frozenset[str] = frozenset()
+    model: str = "ebner12"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters of a set."""
+        return additional_model(self.model).names
 
     def name(self, k: int, label: str) -> str:
-        """What the k-th parameter of a set is called, k from 0, of what the label says."""
-        return f"b{k + 1}" if self.per == "camera" else f"b{k + 1} of {label}"
+        """Name of the k-th parameter, from 0, of the set with this label."""
+        return self.names[k] if self.per == "camera" else f"{self.names[k]} of {label}"
+
+    def mapping(self, values: ArrayLike | None = None) -> PlaneMapping:
+        """The correction of photo-coordinates (mm) by a set; with values of zero by default."""
+        given = np.zeros(len(self.names)) if values is None else np.asarray(values, dtype=np.float64)
+        return additional_model(self.model).build(given, self.base_mm)
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One interior orientation, of one image or of many.
+    """The interior orientation of one camera of a network: its model, values, and what is estimated.
 
     Parameters
     ----------
@@ -60,37 +80,42 @@ class Camera:
     width, height : int
         Pixels of the image.
     pitch_mm : (float, float)
-        Size of a pixel; without meaning for `opencv`.
-    model : {"brown", "opencv", "mapping"}
-        See :class:`reseau.optics.Brown` and :class:`reseau.optics.OpenCV`; or any other mapping.
-    side : {"image", "object"}
-        Whose coordinates Brown's distortion is a function of.
-    balance_radius_mm : float
-        R0 of Brown's radial distortion.
-    values : ndarray (10,) or (12,)
+        Size of a pixel; without meaning for models whose parameters are in pixels.
+    model : str
+        Name in the registry, :func:`reseau.optics.camera_models`; ``mapping`` for any other mapping.
+    values : ndarray (u,)
         All parameters of the model, in its order; those of the mapping where there is one.
     free : tuple of str
         Those to be estimated.
+    options : mapping of str to str or float
+        Options of the model, as the side of Brown's distortion; others have their defaults.
     sigma : mapping of str to float
         Standard deviations of those whose values are observations.
     additional : Additional, optional
-        Further parameters.
+        Additional parameters.
     mapping : PlaneMapping, optional
-        From ideal directions to pixels, for a camera that is neither of the models.
+        From ideal directions to pixels, for a camera of no registered model.
     covariance : ndarray (u, u), optional
         Joint covariance of all parameters, where the values are those of an earlier calibration: free
         parameters with a variance above zero are observed. In place of `sigma`.
+
+    Examples
+    --------
+    >>> camera = Camera("front", 640, 480, (0.01, 0.01), "brown", np.array([8.0] + 9 * [0.0]), ("c", "K1"))
+    >>> camera.parameters["c"], camera.options["side"]
+    (8.0, 'object')
+    >>> camera.plane_mapping()([[0.1, 0.0]])
+    array([[399.5, 239.5]])
     """
 
     id: str
     width: int
     height: int
     pitch_mm: tuple[float, float]
-    model: Literal["brown", "opencv", "mapping"]
+    model: str
     values: Array
     free: tuple[str, ...] = ()
-    side: Literal["image", "object"] = "object"
-    balance_radius_mm: float = 0.0
+    options: Mapping[str, str | float] = field(default_factory=dict)
     sigma: dict[str, float] = field(default_factory=dict)
     additional: Additional | None = None
     mapping: PlaneMapping | None = None
@@ -98,7 +123,15 @@ class Camera:
 
     def __post_init__(self) -> None:
         if (self.model == "mapping") != (self.mapping is not None):
-            raise UsageError("of the model `mapping` needs one, others none", where=f"camera {self.id}")
+            raise UsageError(
+                "the model `mapping` needs a mapping, other models have none", where=f"camera {self.id}"
+            )
+        given = {} if self.registered is None else self.registered.checked_options(self.options)
+        object.__setattr__(self, "options", given)
+        if self.additional is not None and (self.registered is None or self.registered.combine is None):
+            raise UsageError(
+                f"the model `{self.model}` takes no additional parameters", where=f"camera {self.id}"
+            )
         if len(self.values) != len(self.names):
             raise UsageError(
                 f"has {len(self.values)} values, not {len(self.names)}", where=f"camera {self.id}"
@@ -110,13 +143,25 @@ class Camera:
                 raise UsageError("has both `sigma` and `covariance`", where=f"camera {self.id}")
 
     @property
+    def registered(self) -> CameraModel | None:
+        """The registered model; None for any other mapping."""
+        return None if self.model == "mapping" else camera_model(self.model)
+
+    @property
+    def grid(self) -> PixelGrid:
+        """Pixels of the image."""
+        return PixelGrid(self.width, self.height, self.pitch_mm)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
-        return CAMERA_PARAMETERS[self.model] if self.mapping is None else tuple(self.mapping.names)
+        if self.mapping is not None:
+            return tuple(self.mapping.names)
+        return camera_model(self.model).names
 
     @property
     def label(self) -> str:
-        """What it is called in a sentence."""
+        """Name in a sentence."""
         return self.id if self.id == "camera" else f"camera {self.id}"
 
     @property
@@ -124,23 +169,85 @@ class Camera:
         """Values by name."""
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
+    @property
+    def distortions(self) -> tuple[str, ...]:
+        """Names of the parameters that are not principal distance, focal length or principal point."""
+        return distortion_names(self.names, self.model)
+
+    @property
+    def compiled_kind(self) -> tuple[str, str | None] | None:
+        """Model and additional parameters of the compiled loops; None where the mapping is used."""
+        model = self.registered
+        if model is None or model.kernel is None:
+            return None
+        return model.name, None if self.additional is None else self.additional.model
+
+    @property
+    def constants(self) -> Array:
+        """What the kernel of the model needs of the options (q,)."""
+        model = self.registered
+        return np.zeros(0) if model is None else np.asarray(model.constants(self.options), dtype=np.float64)
+
+    def bare_mapping(self, values: ArrayLike | None = None, *, distorted: bool = True) -> PlaneMapping:
+        """The mapping from ideal directions to pixels, without additional parameters.
+
+        Parameters
+        ----------
+        values : array_like (u,), optional
+            Instead of those of the camera.
+        distorted : bool
+            Whether with distortion; otherwise its parameters are zero. Any other mapping stays as it is.
+        """
+        given = self.values if values is None else np.asarray(values, dtype=np.float64)
+        model = self.registered
+        if model is None:
+            return cast(PlaneMapping, self.mapping).with_values(given)
+        return model.mapping(given if distorted else model.undistorted(given), self.grid, self.options)
+
+    def plane_mapping(self) -> PlaneMapping:
+        """The mapping from ideal directions to pixels, with additional parameters of zero where it has them.
+
+        Raises
+        ------
+        UsageError
+            When it has additional parameters and the mapping with them has no closed form.
+        """
+        if self.additional is None:
+            return self.bare_mapping()
+        return camera_model(self.model).mapping(
+            self.values, self.grid, self.options, self.additional.mapping()
+        )
+
+    def rescaled(self, f: float) -> Self:
+        """The same camera with the focal length f (px); any other mapping stays as it is."""
+        model = self.registered
+        return self if model is None else replace(self, values=model.rescaled(self.values, f, self.grid))
+
+    @property
+    def has_plane_mapping(self) -> bool:
+        """Whether :meth:`plane_mapping` has one; a camera with several sets of parameters has not."""
+        extra, model = self.additional, self.registered
+        if extra is None or model is None or model.combine is None:
+            return True
+        return extra.per == "camera" and model.combine(self.bare_mapping(), extra.mapping()) is not None
+
     @classmethod
     def from_entry(cls, entry: CameraEntry) -> Self:
-        """A camera as it stands in a ``reseau-network/1`` document; what is not named there is zero."""
-        values = np.array([entry.parameters.get(name, 0.0) for name in CAMERA_PARAMETERS[entry.model]])
-        extra = entry.additional
+        """The camera of an entry in ``reseau-network/1``; parameters not named there are zero."""
+        model, extra = camera_model(entry.model), entry.additional
         return cls(
             id=entry.id,
             width=entry.width,
             height=entry.height,
             pitch_mm=entry.pitch_mm or (1.0, 1.0),
             model=entry.model,
-            values=values,
-            free=tuple(name for name in CAMERA_PARAMETERS[entry.model] if name in entry.free),
-            side=entry.side or "object",
-            balance_radius_mm=entry.balance_radius_mm,
+            values=np.array([entry.parameters.get(name, 0.0) for name in model.names]),
+            free=tuple(name for name in model.names if name in entry.free),
+            options=entry.options,
             sigma=dict(entry.sigma or {}),
-            additional=None if extra is None else Additional(extra.base_mm, extra.free, extra.per),
+            additional=None
+            if extra is None
+            else Additional(extra.base_mm, extra.free, extra.per, model=extra.model),
         )
 
 
@@ -306,16 +413,6 @@ class Network:
             xy=self.xy[observations],
             cov=self.cov[observations],
         )
-
-    def with_cameras_per(self, what: Literal["image", "group"]) -> Self:
-        """The same network with an interior orientation for each image, or for each group of images."""
-        labels = [
-            (int(c), name if what == "image" else str(group))
-            for c, name, group in zip(self.camera_of, self.images, self.groups, strict=True)
-        ]
-        sets = list(dict.fromkeys(labels))
-        cameras = tuple(replace(self.cameras[c], id=f"{self.cameras[c].id}/{label}") for c, label in sets)
-        return replace(self, cameras=cameras, camera_of=np.array([sets.index(label) for label in labels]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from .approximation import Approximate, approximate
 from .datum import similarity_onto
-from .imaging import EBNER
 from .normal import SEGMENTS
 from .posterior import cofactors_of
 from .problem import BundleFit, BundleProblem
@@ -11,7 +10,6 @@ from .unknowns import Unknowns
 from .values import Values
 
 __all__ = [
-    "EBNER",
     "SEGMENTS",
     "Approximate",
     "BundleFit",

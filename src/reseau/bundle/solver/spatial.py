@@ -1,7 +1,8 @@
 """Orientation of single images and pairs, and intersection of rays, as approximate values.
 
 The minimal solvers (three-point resection, five-point essential matrix) and the search for the largest set of
-points that agree are those of OpenCV; the directions they are given are free of the cameras' distortion.
+consistent points are those of OpenCV; they receive directions that are corrected for the distortion of the
+camera.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import cv2
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ...optics import Brown, OpenCV, PixelGrid
 from ...optics.poses import rotation_matrix
 from ..network import Camera, Network
 
@@ -47,20 +47,11 @@ def directions(network: Network) -> Array:
 
 
 def _inverse(camera: Camera, xy: Array) -> Array:
-    if camera.mapping is not None:
-        return camera.mapping.with_values(camera.values).inverse(xy)
-    mapping: Brown | OpenCV
-    if camera.model == "opencv":
-        mapping = OpenCV(camera.values)
-        plain: Brown | OpenCV = OpenCV(np.concatenate([camera.values[:4], np.zeros(5)]))
-    else:
-        grid = PixelGrid(camera.width, camera.height, camera.pitch_mm)
-        mapping = Brown(camera.values, camera.side, camera.balance_radius_mm, grid)
-        plain = Brown(np.concatenate([camera.values[:3], np.zeros(7)]), grid=grid)
-    found = mapping.inverse(xy)
-    # Beyond the fold of a distortion that is not known yet, the ray without it is near enough.
-    beyond = ~np.isfinite(found).all(axis=1)
-    found[beyond] = plain.inverse(xy[beyond])
+    found = camera.bare_mapping().inverse(xy)
+    if camera.registered is not None:
+        # Beyond the fold of a distortion that is not known yet, the ray without it is near enough.
+        beyond = ~np.isfinite(found).all(axis=1)
+        found[beyond] = camera.bare_mapping(distorted=False).inverse(xy[beyond])
     return found
 
 

@@ -12,7 +12,7 @@ from ...optics import PlaneMapping
 from ..network import Network
 from .arrow import Arrow, full
 from .compiled import chunks_of, in_parallel
-from .imaging import BROWN_IMAGE, BROWN_OBJECT, MAPPING, OPENCV, Interior, Seen, derive, mapped, misfit
+from .imaging import Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
 from .observations import OtherObservations
 from .stage_constraints import Constrained, StageConstraints
@@ -61,7 +61,7 @@ class System:
         self.pattern = unknowns.pattern
         self.constraints = None if network.stage is None else StageConstraints(unknowns, network.stage)
         self.chunks = chunks_of(unknowns.first)
-        self.interior = _interior(network, unknowns)
+        self.imaging = Imaging(network, unknowns.extra_names)
 
     @cached_property
     def floor(self) -> float:
@@ -69,30 +69,24 @@ class System:
         seen = np.einsum("nij,nj->ni", self.seen.root, self.seen.xy)
         return float(_ROUNDING**2 * (seen**2).sum())
 
-    def cameras(self, values: Values) -> Interior:
-        """What the compiled loops take."""
-        return self.interior._replace(values=values.cameras, extra=values.extra)
-
     def misfits(self, values: Values) -> tuple[Array, Array]:
         """Weighted misfits of the image coordinates (n, 2), by points, and of the other observations."""
         out = np.empty((len(self.seen.image), 2))
-        at, cameras, first = values.orientation, self.cameras(values), self.unknowns.first
-        in_parallel(
-            lambda _, a, b: misfit(int(first[a]), int(first[b]), self.seen, at, cameras, out), self.chunks
-        )
+        at, first = values.orientation, self.unknowns.first
+
+        def work(_: int, a: int, b: int) -> None:
+            begin, end = int(first[a]), int(first[b])
+            self.imaging.misfit(begin, end, self.seen, at, values.cameras, values.extra, out)
+
+        in_parallel(work, self.chunks)
         for mapping, _, rows in self.mappings(values):
             xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows])
             out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
         return out, (self.others.computed(values) - self.others.value) * self.sigma_root
 
     def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
-        """Cameras that are not compiled, their numbers, and the rows of their observations."""
-        found = []
-        for c, camera in enumerate(self.unknowns.network.cameras):
-            if camera.mapping is not None:
-                mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
-                found.append((mapping, c, np.flatnonzero(self.seen.camera == c).astype(np.intp)))
-        return found
+        """Cameras without a kernel, their numbers, and the rows of their observations."""
+        return _mappings(self.unknowns.network, self.seen.camera, values)
 
     def _weighted(self, rows: Rows, matrix: Array) -> Array:
         weighted: Array = self.seen.root[rows] @ matrix
@@ -102,13 +96,13 @@ class System:
         """Misfits and derivatives at some values."""
         unknowns, n = self.unknowns, len(self.seen.image)
         rows, out = np.zeros((n, 2, unknowns.width)), np.empty((n, 2))
-        at, cameras, first = values.orientation, self.cameras(values), unknowns.first
+        at, first = values.orientation, unknowns.first
         a_out, b_out = rows[:, :, :-3], rows[:, :, -3:]
 
         def work(_: int, a: int, b: int) -> None:
-            derive(
-                int(first[a]), int(first[b]), self.seen, at, cameras, unknowns.free, unknowns.count,
-                self.movable, out, a_out, b_out,
+            self.imaging.derive(
+                int(first[a]), int(first[b]), self.seen, at, values.cameras, values.extra, unknowns.free,
+                unknowns.count, self.movable, out, a_out, b_out,
             )  # fmt: skip
 
         in_parallel(work, self.chunks)
@@ -374,33 +368,22 @@ def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) 
         network.xy[rows],
         unit,
     )
-    cameras = _interior(network, unknowns)._replace(values=values.cameras, extra=values.extra)
-    out = np.empty((len(rows), 2))
-    misfit(0, len(rows), seen, values.orientation, cameras, out)
-    for c, camera in enumerate(network.cameras):
-        if camera.mapping is not None:
-            own = np.flatnonzero(seen.camera == c)
-            mapping = camera.mapping.with_values(values.cameras[c, : len(camera.names)])
-            xy, *_ = mapped(mapping, values.orientation, image[own], seen.point[own])
-            out[own] = xy - seen.xy[own]
+    imaging, out = Imaging(network, unknowns.extra_names), np.empty((len(rows), 2))
+    imaging.misfit(0, len(rows), seen, values.orientation, values.cameras, values.extra, out)
+    for mapping, _, own in _mappings(network, seen.camera, values):
+        xy, *_ = mapped(mapping, values.orientation, image[own], seen.point[own])
+        out[own] = xy - seen.xy[own]
     return out
 
 
-def _interior(network: Network, unknowns: Unknowns) -> Interior:
-    """Cameras in columns, their values still to come."""
-    cameras = network.cameras
-    brown = {"object": BROWN_OBJECT, "image": BROWN_IMAGE}
-    kinds = {"opencv": OPENCV, "mapping": MAPPING}
-    kind = [kinds.get(c.model, brown[c.side]) for c in cameras]
-    balance = np.array([c.balance_radius_mm for c in cameras])[:, None] ** [2.0, 4.0, 6.0]
-    grid = np.array([((c.width - 1) / 2, (c.height - 1) / 2, *c.pitch_mm) for c in cameras])
-    base = [network.cameras[c].additional.base_mm for c, _ in unknowns.extra_names]  # type: ignore[union-attr]
-    nothing = np.zeros((0, 12))
-    return Interior(
-        np.array(kind, dtype=np.intp),
-        nothing,
-        balance,
-        grid,
-        nothing,
-        np.array(base or [0.0], dtype=np.float64),
-    )
+def _mappings(network: Network, camera_of: Rows, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
+    """Cameras without a kernel, their numbers, and the rows of their observations."""
+    return [
+        (
+            camera.bare_mapping(values.cameras[c, : len(camera.names)]),
+            c,
+            np.flatnonzero(camera_of == c).astype(np.intp),
+        )
+        for c, camera in enumerate(network.cameras)
+        if camera.compiled_kind is None
+    ]

@@ -11,7 +11,6 @@ import scipy.sparse.csgraph
 
 from ...core.data import Mask, Rows
 from ..network import Network
-from .imaging import CAMERA_WIDTH, EBNER
 from .normal import SEGMENTS, Pattern, locals_of
 
 __all__ = ["Unknowns"]
@@ -37,7 +36,7 @@ class Unknowns:
     camera : ndarray of int (c,)
         First column of each camera's free parameters.
     extra : ndarray of int (e,)
-        First of the twelve columns of each set of additional parameters; −1 for a set that is held.
+        First column of each set of additional parameters; −1 for a set that is held.
     extra_of : ndarray of int (m,)
         Set of each image, −1 for none.
     extra_names : tuple of (int, str) (e,)
@@ -69,6 +68,7 @@ class Unknowns:
         counts = np.array([len(camera.free) for camera in network.cameras])
         sets = [network.cameras[c].additional for c, _ in extra_names]
         free_extra: Mask = np.array([a is not None and a.free for a in sets], dtype=np.bool_)
+        widths = [0 if a is None else len(a.names) for a in sets]
         order, reach = _ordered(network, active)
         m = len(network.images)
         pose, camera = np.full(m, -1), np.full(len(users), -1)
@@ -82,7 +82,7 @@ class Unknowns:
                 at += counts[c]
             if e >= 0 and extra_users[e] == 1 and free_extra[e]:
                 extra[e] = at
-                at += EBNER
+                at += widths[e]
             ends.append(at)
         begins = np.array([0, *ends[:-1]])
         bandwidth = int(max((ends[b] - 1 - begins[a] for a, b in enumerate(reach)), default=0))
@@ -92,7 +92,7 @@ class Unknowns:
             at += counts[c]
         for e in np.flatnonzero((extra_users > 1) & free_extra):
             extra[e] = at
-            at += EBNER
+            at += widths[e]
         kept = np.full(len(network.points), -1)
         for j in np.unique(network.distance_of):
             kept[j] = at
@@ -114,8 +114,8 @@ class Unknowns:
 
     @cached_property
     def free(self) -> Rows:
-        """Rows of the free parameters of each camera (c, 12 or more), padded with zeros."""
-        widest = max(CAMERA_WIDTH, *(len(camera.names) for camera in self.network.cameras))
+        """Rows of the free parameters of each camera (c, p), padded with zeros to the longest."""
+        widest = max(len(camera.names) for camera in self.network.cameras)
         rows = np.zeros((len(self.network.cameras), widest), dtype=np.intp)
         for row, camera in zip(rows, self.network.cameras, strict=True):
             row[: len(camera.free)] = [camera.names.index(name) for name in camera.free]
@@ -127,19 +127,31 @@ class Unknowns:
         return np.array([len(camera.free) for camera in self.network.cameras], dtype=np.intp)
 
     @cached_property
+    def extra_count(self) -> Rows:
+        """Number of parameters of each set of additional parameters (e,)."""
+        sets = (self.network.cameras[c].additional for c, _ in self.extra_names)
+        return np.array([0 if a is None else len(a.names) for a in sets], dtype=np.intp)
+
+    @property
+    def extra_width(self) -> int:
+        """Greatest number of parameters of a set of additional parameters; 0 without any."""
+        return int(self.extra_count.max(initial=0))
+
+    @cached_property
     def dropped(self) -> Mask:
         """Columns (u,) of additional parameters that stay zero."""
         held = np.zeros(self.size, dtype=bool)
         for (c, label), at in zip(self.extra_names, self.extra, strict=True):
             extra = self.network.cameras[c].additional
             if at >= 0 and extra is not None and extra.dropped:
-                held[at : at + EBNER] = [extra.name(k, label) in extra.dropped for k in range(EBNER)]
+                count = len(extra.names)
+                held[at : at + count] = [extra.name(k, label) in extra.dropped for k in range(count)]
         return held
 
     @property
     def width(self) -> int:
         """Entries in a ray's row of derivatives."""
-        return 6 + int(self.count.max()) + (EBNER if self.extra_names else 0) + 3
+        return 6 + int(self.count.max()) + self.extra_width + 3
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -153,7 +165,8 @@ class Unknowns:
         start[:, 1], width[:, 1], column[:, 1] = self.camera[camera], self.count[camera], 6
         if self.extra_names:
             start[:, 2] = np.where(extra >= 0, self.extra[extra], -1)
-            width[:, 2], column[:, 2] = np.where(start[:, 2] >= 0, EBNER, 0), self.width - 3 - EBNER
+            width[:, 2] = np.where(start[:, 2] >= 0, self.extra_count[extra], 0)
+            column[:, 2] = self.width - 3 - self.extra_width
         start[:, 3] = self.kept[point]
         width[:, 3], column[:, 3] = np.where(start[:, 3] >= 0, 3, 0), self.width - 3
         place = np.zeros_like(start)
@@ -175,9 +188,11 @@ class Unknowns:
         for camera, at in zip(self.network.cameras, self.camera, strict=True):
             if at >= 0:
                 names[at : at + len(camera.free)] = [f"{name} of camera {camera.id}" for name in camera.free]
-        for (_, label), at in zip(self.extra_names, self.extra, strict=True):
-            if at >= 0:
-                names[at : at + EBNER] = [f"b{i + 1} of {label}" for i in range(EBNER)]
+        for (c, label), at in zip(self.extra_names, self.extra, strict=True):
+            additional = self.network.cameras[c].additional
+            if at >= 0 and additional is not None:
+                own = [f"{name} of {label}" for name in additional.names]
+                names[at : at + len(own)] = own
         for j in np.flatnonzero(self.kept >= 0):
             at = self.kept[j]
             names[at : at + 3] = [f"{name} of point {self.network.points[j]}" for name in _POINT]

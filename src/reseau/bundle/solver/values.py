@@ -9,7 +9,7 @@ import numpy as np
 from ...core.data import Array, Rows
 from ...optics.poses import rotation_matrix
 from ..network import StageValues
-from .imaging import EBNER, Orientation
+from .imaging import Orientation
 from .stage_constraints import StageConstraints
 from .unknowns import Unknowns
 
@@ -50,9 +50,9 @@ class Values:
         Projection centres.
     xyz : ndarray (p, 3)
         Object points.
-    cameras : ndarray (c, 12)
-        Parameters of the cameras, padded.
-    extra : ndarray (e, 12)
+    cameras : ndarray (c, p)
+        Parameters of the cameras, padded to the longest.
+    extra : ndarray (e, a)
         Sets of additional parameters; one row at least.
     stage : StageValues, optional
         Readings of a stage, and its axis.
@@ -72,7 +72,7 @@ class Values:
         cameras = np.zeros(unknowns.free.shape)
         for row, camera in zip(cameras, network.cameras, strict=True):
             row[: len(camera.values)] = camera.values
-        return cls(rotation, x0, xyz, cameras, np.zeros((max(1, len(unknowns.extra)), EBNER)))
+        return cls(rotation, x0, xyz, cameras, np.zeros((max(1, len(unknowns.extra)), unknowns.extra_width)))
 
     @property
     def orientation(self) -> Orientation:
@@ -104,7 +104,8 @@ class Values:
             count = unknowns.count[c]
             cameras[c, unknowns.free[c, :count]] += y[unknowns.camera[c] : unknowns.camera[c] + count]
         for e in np.flatnonzero(unknowns.extra >= 0):
-            extra[e] += y[unknowns.extra[e] : unknowns.extra[e] + EBNER]
+            count = unknowns.extra_count[e]
+            extra[e, :count] += y[unknowns.extra[e] : unknowns.extra[e] + count]
         kept = np.flatnonzero(unknowns.kept >= 0)
         xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
         x0, stage = self.x0 + pose[:, 3:], self.stage

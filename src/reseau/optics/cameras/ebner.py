@@ -1,4 +1,4 @@
-"""Additional parameters of self-calibration: corrections of photo-coordinates without a physical reason."""
+"""Ebner's additional parameters of self-calibration, ``ebner12``: mapping, kernel and registration."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.data import Array
-from ..core.errors import UsageError
-from .mapping import Derivatives, PlaneMapping, as_points, as_values
+from ...core.data import Array
+from ...core.errors import UsageError
+from ..mapping import Derivatives, PlaneMapping, as_points, as_values
+from .kernels import CameraColumns, kernel
+from .registry import AdditionalModel, register_additional
 
 __all__ = ["EbnerCorrection"]
 
@@ -37,6 +39,11 @@ class EbnerCorrection(PlaneMapping):
     ------
     UsageError
         For a base that is not above zero.
+
+    Examples
+    --------
+    >>> EbnerCorrection(base_mm=9.0).with_values({"b1": 1e-3})([[2.0, 1.0]])
+    array([[2.002, 0.999]])
     """
 
     names: ClassVar[tuple[str, ...]] = tuple(f"b{k}" for k in range(1, 13))
@@ -68,3 +75,65 @@ class EbnerCorrection(PlaneMapping):
         d_xy[:, 1, 0] = b[1] + b[2] * y + 2 * b[5] * x + 2 * b[7] * x * y + b[9] * t + 2 * b[11] * x * t
         d_xy[:, 1, 1] = -b[0] + b[2] * x - 4 * b[3] * y + b[7] * s + 2 * b[9] * x * y + 2 * b[11] * s * y
         return Derivatives(points + d @ b, d_xy + np.eye(2), d)
+
+
+B1, B2, B3, B4, B5, B6, B7, B8, B9, B10, B11, B12 = range(len(EbnerCorrection.names))
+
+
+@kernel
+def _ebner(
+    e: int, x: float, y: float, cameras: CameraColumns, dx: float, dy: float, sxx: float, sxy: float,
+    syx: float, syy: float, more: Array,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    """See :func:`reseau.optics.cameras.kernels.additional`."""
+    b, base = cameras.extra, cameras.base[e]
+    k, m = 2.0 * base * base / 3.0, 4.0 * base * base / 3.0
+    xk, yk = x * x - k, y * y - k
+    more[:, :] = 0.0
+    more[0, B1], more[1, B1] = x, -y
+    more[0, B2], more[1, B2] = y, x
+    more[0, B3], more[1, B3] = m - 2.0 * x * x, x * y
+    more[0, B4], more[1, B4] = x * y, m - 2.0 * y * y
+    more[0, B5], more[1, B6] = yk, xk
+    more[0, B7], more[1, B8] = x * yk, y * xk
+    more[0, B9], more[1, B10] = y * xk, x * yk
+    more[0, B11], more[1, B12] = xk * yk, xk * yk
+    for i in range(B12 + 1):
+        dx += b[e, i] * more[0, i]
+        dy += b[e, i] * more[1, i]
+    sxx += (
+        b[e, B1]
+        - 4.0 * b[e, B3] * x
+        + b[e, B4] * y
+        + b[e, B7] * yk
+        + 2.0 * b[e, B9] * x * y
+        + 2.0 * b[e, B11] * x * yk
+    )
+    sxy += (
+        b[e, B2]
+        + b[e, B4] * x
+        + 2.0 * b[e, B5] * y
+        + 2.0 * b[e, B7] * x * y
+        + b[e, B9] * xk
+        + 2.0 * b[e, B11] * xk * y
+    )
+    syx += (
+        b[e, B2]
+        + b[e, B3] * y
+        + 2.0 * b[e, B6] * x
+        + 2.0 * b[e, B8] * x * y
+        + b[e, B10] * yk
+        + 2.0 * b[e, B12] * x * yk
+    )
+    syy += (
+        -b[e, B1]
+        + b[e, B3] * x
+        - 4.0 * b[e, B4] * y
+        + b[e, B8] * xk
+        + 2.0 * b[e, B10] * x * y
+        + 2.0 * b[e, B12] * xk * y
+    )
+    return dx, dy, sxx, sxy, syx, syy
+
+
+register_additional(AdditionalModel("ebner12", EbnerCorrection.names, EbnerCorrection, _ebner))

@@ -1,0 +1,56 @@
+"""Cameras: from the ideal direction of a ray to its image point, and back.
+
+A camera is a plane mapping whose first plane is that of the ideal directions u = xc/zc, v = yc/zc (camera
+axes: x right, y down, z along the view) and whose second is the image. :mod:`reseau.optics.poses` puts it in
+space.
+
+Each model is one module: its parameters with units, its mapping with derivatives and inverse, a kernel for
+the bundle adjustment, and its registration. Files, commands, adjustments and reports know the models by the
+registry.
+"""
+
+# The order of the imports is the order of the registry.
+from .brown import Brown, BrownDistortion, BrownWithAdditional  # isort: skip
+from .opencv import OpenCV  # isort: skip
+from .convert import Converted, convert
+from .ebner import EbnerCorrection
+from .grid import PixelGrid
+from .registry import (
+    AdditionalModel,
+    CameraModel,
+    Option,
+    Parameter,
+    additional_model,
+    additional_models,
+    camera_model,
+    camera_models,
+    default_camera_model,
+    distortion_names,
+    register_additional,
+    register_camera,
+    unit_of,
+)
+
+__all__ = [
+    "AdditionalModel",
+    "Brown",
+    "BrownDistortion",
+    "BrownWithAdditional",
+    "CameraModel",
+    "Converted",
+    "EbnerCorrection",
+    "OpenCV",
+    "Option",
+    "Parameter",
+    "PixelGrid",
+    "additional_model",
+    "additional_models",
+    "camera_model",
+    "camera_models",
+    "convert",
+    "default_camera_model",
+    "distortion_names",
+    "register_additional",
+    "register_camera",
+    "unit_of",
+]
