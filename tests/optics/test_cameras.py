@@ -18,6 +18,7 @@ from reseau.optics import (
     PlaneMapping,
     Pose,
     angles_to_matrix,
+    convert,
     matrix_to_angles,
     matrix_to_vector,
     project,
@@ -69,29 +70,49 @@ def test_opencv_camera_equals_opencv_in_values_and_derivatives(values: list[floa
     np.testing.assert_allclose(ours_camera, theirs[:, :, 6 : 6 + len(values)], rtol=0, atol=1e-8)
 
 
+PLAIN_TERMS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+
 def test_brown_on_the_object_side_equals_its_conversion_to_opencv_and_back() -> None:
     for balance in (0.0, 12.0):
         brown = Brown(BROWN, "object", balance, GRID)
         directions = np.random.default_rng(1).uniform(-0.6, 0.6, (200, 2))
-        opencv = brown.to_opencv()
-        np.testing.assert_allclose(opencv(directions), brown(directions), rtol=0, atol=1e-9)  # pixels
-        again = opencv.to_brown(GRID.width, GRID.height, c_mm=24.0)
-        np.testing.assert_allclose(again(directions), brown(directions), rtol=0, atol=1e-9)
+        opencv = convert(brown, GRID, "opencv", free=PLAIN_TERMS)
+        assert opencv.greatest_px < 1e-9
+        np.testing.assert_allclose(opencv.mapping(directions), brown(directions), rtol=0, atol=1e-9)  # pixels
+        fx, fy = opencv.mapping.values[:2]
+        grid = PixelGrid(GRID.width, GRID.height, (24.0 / fx, 24.0 / fy))
+        terms = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+        again = convert(opencv.mapping, grid, "brown", free=terms)
+        np.testing.assert_allclose(again.mapping(directions), brown(directions), rtol=0, atol=1e-9)
+        assert abs(again.mapping.value_of("c") - 24.0) < 1e-9
 
 
 @pytest.mark.parametrize(
     "camera",
     [
         Brown(BROWN, "image", 0.0, GRID),
-        Brown(BROWN, "object", 0.0),
-        Brown(BROWN, "object", 0.0, GRID).with_values({"B1": 1e-4}),
+        Brown(BROWN, "object", 0.0, GRID).with_values({"B1": 1e-4, "B2": 2e-4}),
     ],
 )
-def test_a_camera_without_equal_in_opencv_is_refused(camera: Brown) -> None:
-    with pytest.raises(UsageError, match="no equal"):
-        camera.to_opencv()
-    with pytest.raises(UsageError, match="no equal"):
-        OpenCV(RATIONAL).to_brown(640, 480, c_mm=8.0)
+def test_a_camera_without_equal_in_another_model_is_converted_with_its_residual(camera: Brown) -> None:
+    opencv = convert(camera, GRID, "opencv", free=PLAIN_TERMS)
+    assert 1e-3 < opencv.rms_px < opencv.greatest_px < 30
+    rational = OpenCV([2400.0, 2400.0, 2807.5, 1871.5, *RATIONAL[4:]])
+    brown = convert(rational, GRID, "brown")
+    assert 1e-3 < brown.rms_px < brown.greatest_px
+    off = brown.mapping(rational.inverse([[0.0, 0.0], [2807.5, 1871.5]])) - [[0.0, 0.0], [2807.5, 1871.5]]
+    assert np.hypot(*off.T).max() <= 1.5 * brown.greatest_px
+
+
+def test_a_conversion_that_cannot_be_made_is_refused() -> None:
+    with pytest.raises(UsageError, match="use one of brown, opencv"):
+        convert(Brown(BROWN, "object", 0.0, GRID), GRID, "pinhole")
+    with pytest.raises(UsageError, match="K1: is none of fx"):
+        convert(Brown(BROWN, "object", 0.0, GRID), GRID, "opencv", free=("K1",))
+    folded = Brown([24.0, 0, 0, -1e-2, 0, 0, 0, 0, 0, 0], "object", 0.0, GRID)
+    with pytest.raises(UsageError, match="no directions over most of the image"):
+        convert(folded, GRID, "opencv")
 
 
 def test_brown_is_the_formula_of_the_network_file() -> None:

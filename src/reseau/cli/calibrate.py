@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 import typer
 
 from .bundle_compare import read_lens
@@ -46,23 +45,6 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate"]
 
-
-class ModelName(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
-    """Name of a registered camera model; the registry is read when it is needed, not with this module."""
-
-    name = "name"
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        from ..optics import camera_models
-
-        return f"[{'|'.join(model.name for model in camera_models())}]"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        from ..optics import camera_model
-
-        return camera_model(value).name if value else ""
-
-
 Sigma = Annotated[
     float | None,
     typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
@@ -86,9 +68,8 @@ def calibrate(
     model: Annotated[
         str,
         typer.Option(
-            click_type=ModelName(),
-            help="Camera model; by default brown with --pitch, opencv without.",
-            show_default=False,
+            metavar="NAME",
+            help="Camera model; by default brown with --pitch, opencv without. An unknown name lists all.",
         ),
     ] = "",
     pitch: Annotated[
