@@ -180,7 +180,7 @@ class Session:
         """
         return frame_of(self.objects.get(archived.sha256, archived.suffix), archived.name)[0]
 
-    def given(self) -> dict[str, ArchivedFrame]:
+    def inputs(self) -> dict[str, ArchivedFrame]:
         """The files that the session was given, by name."""
         return {each.step: each for each in self.frames(kind=INPUT)}
 

@@ -1,14 +1,12 @@
-"""From instruments to frames: the bench, plans, and what carries them out into an archive."""
+"""Acquisitions on a bench: instruments, plans, and the engine that carries plans out into an archive."""
 
-from .acquisition import Acquisition, Plan
+from .acquisition import Acquisition, Plan, Procedure, Watch
 from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
 from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
-from .goal import Goal
+from .engine import Decision, Rerun, carry_out, rerun
 from .lock import BenchLock
-from .procedure import Procedure, Watch
-from .rerun import Rerun, rerun
-from .run import Decision, carry_out
-from .step import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
+from .plans import Goal, SensorSeriesPlan
+from .steps import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
 
 __all__ = [
     "HEIGHT",
@@ -25,6 +23,7 @@ __all__ = [
     "Procedure",
     "Readiness",
     "Rerun",
+    "SensorSeriesPlan",
     "Step",
     "Watch",
     "at_heights",

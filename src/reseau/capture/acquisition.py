@@ -1,112 +1,287 @@
-"""A plan carried out on a bench: every picture is in the archive before the next thing happens.
+"""An acquisition: a session on a bench. Every picture is in the archive before the next action starts.
 
-Plans are those of bluesky, generators of messages. Some messages are this module's own, `expose`, `series`,
-`picture` and `ask` among them. What they bring is stored under the name of the step, and a step that has its
-picture does not take it again: a message that is replayed after a pause, or a plan that begins anew after a
-crash, finds what is there.
+Plans are bluesky plans: generators of messages. Some messages are defined here, `expose`, `series`, `picture`
+and `ask` among them. Each picture is stored under the name of its step, and a step that already has its
+picture does not take it again. A message that is replayed after a pause, or a plan that starts again after a
+crash, therefore finds the pictures that exist.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import Any
+import math
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from bluesky import Msg
 from bluesky import plan_stubs as bps
 
-from ..core.errors import StateError, UsageError
-from ..instruments import Oscilloscope, Turntable
-from .step import Step
-from .work import Work
+from ..archive import ArchivedFrame, Session, Verdict
+from ..core.data import Frame
+from ..core.errors import (
+    ConnectionLost,
+    DeadlineError,
+    EstimationError,
+    ImageError,
+    InstrumentError,
+    ProtocolError,
+    ReseauError,
+    StateError,
+    UsageError,
+)
+from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
+from .bench import Bench
+from .checks import Limits, Readiness, exposure_fault, readiness
+from .steps import Step, as_taken
 
-__all__ = ["Acquisition", "Plan"]
+__all__ = ["Acquisition", "Plan", "Procedure", "Watch"]
+
+T = TypeVar("T")
+_TRIES = 4
+"""Attempts on an instrument before its failure ends the session."""
+_STILL = 0.02
+"""Largest movement of an axis during an exposure, in the unit of the axis."""
 
 Plan = Generator[Msg, Any, Any]
+"""A plan: a generator of bluesky messages. Its return value is that of :func:`reseau.capture.carry_out`."""
+Watch = Callable[[str, dict[str, Any]], None]
+"""Callback for events: the kind of the event, and its values."""
+
+
+class Procedure(Protocol):
+    """Interface of a procedure: what an acquisition does with its frames.
+
+    Examples
+    --------
+    A procedure that counts frames:
+
+    >>> class Count:
+    ...     frames = 0
+    ...     def on_frame(self, frame, step):
+    ...         self.frames += 1
+    ...         return Verdict(True)
+    ...     def progress(self):
+    ...         return {}
+    ...     def next_pose(self, candidates, wanted):
+    ...         return None
+    ...     def finish(self):
+    ...         return {"count.txt": f"{self.frames}"}
+    >>> procedure: Procedure = Count()
+    >>> procedure.on_frame(Frame(np.zeros((2, 2), np.uint8), 255.0), Step("first")).ok
+    True
+    >>> procedure.finish()
+    {'count.txt': '1'}
+    """
+
+    def on_frame(self, frame: Frame, step: Step) -> Verdict:
+        """Measure a new frame and return whether it is usable."""
+
+    def progress(self) -> Mapping[str, float]:
+        """Return the standard deviations reached so far, by parameter name."""
+
+    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        """Return the pose that lowers a standard deviation most, and its predicted value if known."""
+
+    def finish(self) -> Mapping[str, str]:
+        """Return the results: file contents by name. Same frames in same order give the same bytes."""
+
+
+class _Candidates(list[Step]):
+    """Candidate poses; iteration raises once the acquisition is stopped, because choosing may take minutes."""
+
+    def __init__(self, stopped: Callable[[], bool], steps: Sequence[Step]) -> None:
+        super().__init__(steps)
+        self._stopped = stopped
+
+    def __iter__(self) -> Iterator[Step]:
+        for each in super().__iter__():
+            if self._stopped():
+                raise StateError("was stopped", where="next pose")
+            yield each
 
 
 def message(command: str, *args: Any, **kwargs: Any) -> Msg:
-    """A message of a plan."""
+    """Return a message of a plan."""
     return Msg(command, *args, **kwargs)  # type: ignore[no-untyped-call]
 
 
-class Acquisition(Work):
-    """A session on a bench, as plans and bluesky's engine have it; parameters as of :class:`Work`."""
+class Acquisition:
+    """A session on a bench, with the messages that plans use.
+
+    Parameters
+    ----------
+    bench : Bench
+        Connected or not.
+    session : Session
+        The session of the archive that stores the pictures.
+    procedure : Procedure, optional
+        Measures the frames. Without one, frames are only checked for saturation and motion.
+    camera, table, oscilloscope, scanner : str, optional
+        Names of instruments on the bench. Default: the only instrument of that kind.
+    retakes : int
+        Number of additional attempts after a bad frame.
+    limits : Limits, optional
+        Limits for exposure, focus and vibration.
+    watch : callable, optional
+        Called with each event: its kind and its values.
+    operator : callable, optional
+        Called with a request that no instrument can carry out; returns when it is done.
+
+    Notes
+    -----
+    The first group of methods returns plans (generators of messages). The second group does the work behind
+    each message, in a thread of the engine: an operation that fails for a passing reason is repeated, and its
+    outcome is stored before it returns.
+
+    Examples
+    --------
+    A bench without instruments; a plan that asks the operator and then ends:
+
+    >>> import tempfile
+    >>> from reseau.archive import Archive
+    >>> from reseau.capture import Bench, BenchFile, Step, carry_out
+    >>> bench, asked = Bench(BenchFile(name="empty", instruments={})), []
+    >>> def plan(run):
+    ...     yield from run.ask("switch the light on", Step("first"))
+    ...     return "ready"
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     run = Acquisition(bench, archive.begin("monday", "own", {}), operator=asked.append)
+    ...     carry_out(run, plan(run)), asked
+    ('ready', ['switch the light on'])
+    """
 
     name = "acquisition"
     parent = None
 
+    def __init__(
+        self,
+        bench: Bench,
+        session: Session,
+        procedure: Procedure | None = None,
+        *,
+        camera: str | None = None,
+        table: str | None = None,
+        oscilloscope: str | None = None,
+        scanner: str | None = None,
+        retakes: int = 2,
+        limits: Limits | None = None,
+        watch: Watch = lambda kind, facts: None,
+        operator: Callable[[str], None] | None = None,
+    ) -> None:
+        self.bench, self.session, self.procedure = bench, session, procedure
+        self._chosen: dict[type, str | None] = {
+            Camera: camera,
+            Turntable: table,
+            Oscilloscope: oscilloscope,
+            UltrasonicScanner: scanner,
+        }
+        self.retakes, self.limits, self.watch, self._operator = retakes, limits or Limits(), watch, operator
+        self._busy = threading.Lock()
+        self._verdicts: dict[int, Verdict] = {}
+        self._last: ArchivedFrame | None = None
+        self._at_rest = False
+        self._original_us: float | None = None
+
+    def one(self, kind: type) -> Any:
+        """Return the instrument of a kind: the named one, or the only one. See :meth:`Bench.one`."""
+        return self.bench.one(kind, self._chosen.get(kind))
+
+    def has(self, kind: type) -> bool:
+        """Return whether the bench has an instrument of a kind."""
+        return self.bench.has(kind)
+
+    def reached(self, parameter: str) -> float | None:
+        """Return the standard deviation reached for a parameter; None while there is none."""
+        return None if self.procedure is None else self.procedure.progress().get(f"sigma_{parameter}")
+
+    def verdict(self, frame: ArchivedFrame) -> Verdict:
+        """Return the verdict on a frame that was taken or checked in this process."""
+        return self._verdicts[frame.id]
+
+    def done(self, step: Step) -> bool:
+        """Return whether a step has a good frame, or as many bad ones as are allowed."""
+        frames = self.session.frames(step.name, "frame")
+        return any(f.verdict is not None and f.verdict.ok for f in frames) or len(frames) > self.retakes
+
     # Messages for plans.
 
     def at(self, step: Step, average: int = 1) -> Plan:
-        """Go to a pose and take its frame, again if it is bad; nothing where it has been done before.
+        """Go to a pose and take its frame, again if it is bad. Do nothing if the step is done.
 
         Returns
         -------
         ArchivedFrame
-            The last one taken there.
+            The last frame taken at the pose.
         """
         yield from bps.checkpoint()
         if not self.done(step):
             yield from self.move(step.position)
-        found = yield message("expose", self, step, average=average)
-        yield from bps.create("primary")
-        yield from bps.read(self)
-        yield from bps.save()
-        return found
+        frame = yield message("expose", self, step, average=average)
+        yield from self._record()
+        return frame
 
     def series(self, steps: Sequence[Step]) -> Plan:
-        """Take frames of one scene as fast as the camera delivers them, a step for each; only those that are
-        not there.
-        """
+        """Take frames of one scene at the rate of the camera, one for each step; skip existing ones."""
         yield from bps.checkpoint()
         yield message("series", self, steps)
+        yield from self._record()
+
+    def _record(self) -> Plan:
+        """Have the engine emit an event for the last frame."""
         yield from bps.create("primary")
         yield from bps.read(self)
         yield from bps.save()
 
-    def set_back(self) -> Plan:
-        """Have the camera expose as it did before the steps that set it."""
+    def restore_exposure(self) -> Plan:
+        """Set the camera back to the exposure that it had before any step changed it."""
         yield message("set_back", self)
 
     def move(self, position: Mapping[str, float]) -> Plan:
-        """Move axes of the table, all at once."""
+        """Move axes of the table, all at the same time."""
         if position:
             axes = self.one(Turntable).axes
             unknown = [axis for axis in position if axis not in axes]
             if unknown:
-                raise UsageError(f"has no axis {unknown[0]}", where="table", do=f"it has {', '.join(axes)}")
+                raise UsageError(f"has no axis {unknown[0]}", where="table", do=f"use {', '.join(axes)}")
             yield message("move", self, dict(position))
 
     def home(self) -> Plan:
-        """Have the axes of the table that have no reference find it; where they drive to is theirs."""
+        """Find the reference of each axis of the table that has none. The controller chooses the path."""
         yield message("home", self)
 
     def pictures(self, step: Step, kind: str) -> Plan:
-        """Sweep with the scanner (`scan`), keep what the oscilloscope's own screen shows (`screen`), or a
-        frame that nothing is measured in (`probe`).
+        """Take and store a picture that is not measured.
+
+        Parameters
+        ----------
+        step : Step
+            The step that the picture belongs to.
+        kind : {"scan", "screen", "probe"}
+            A section of the scanner, the screenshot of the oscilloscope, or a frame of the camera.
 
         Returns
         -------
         ArchivedFrame or None
-            None where the bench has no oscilloscope for a screen.
+            None for a screenshot if the bench has no oscilloscope.
         """
         if kind != "screen" or self.has(Oscilloscope):
             return (yield message("picture", self, step, kind))
         return None
 
-    def ask(self, what: str, step: Step) -> Plan:
-        """Have the operator do something before a step; not where the step has been done."""
+    def ask(self, request: str, step: Step) -> Plan:
+        """Ask the operator to do something before a step, unless the step is done."""
         if not self.done(step):
-            yield message("ask", self, what)
+            yield message("ask", self, request)
 
     def check(self, count: int = 5) -> Plan:
-        """Take some frames of the unmoved scene; their exposure, focus, vibration and drift.
+        """Take frames of the static scene and check exposure, focus, vibration and drift.
 
         Returns
         -------
         Readiness
-            Falsy, with the reasons, when something is beyond its limits.
+            Falsy, with the reasons, if a limit is exceeded.
         """
         return (yield message("check", self, count))
 
@@ -116,12 +291,12 @@ class Acquisition(Work):
         Returns
         -------
         (Step, float) or None
-            The pose, and what is predicted of it.
+            The pose and its predicted standard deviation.
         """
         return (yield message("choose", self, candidates, wanted))
 
-    def outlook(self, step: Step) -> Plan:
-        """Have it told what the next pose would bring, where that can be predicted."""
+    def predict(self, step: Step) -> Plan:
+        """Report the standard deviation expected after the next pose, if it can be predicted."""
         if self.procedure is not None and not self.done(step):
             yield message("outlook", self, step)
 
@@ -131,14 +306,14 @@ class Acquisition(Work):
         work: dict[str, Callable[..., Any]] = {
             "expose": self.expose,
             "series": self.expose_series,
-            "set_back": self.restore_exposure,
-            "move": self.move_to,
+            "set_back": self.reset_exposure,
+            "move": self.move_axes,
             "home": self.home_axes,
             "picture": self.take_picture,
-            "ask": self.have_done,
-            "check": self.look_first,
+            "ask": self.ask_operator,
+            "check": self.check_scene,
             "choose": self.choose_pose,
-            "outlook": self.foretell,
+            "outlook": self.report_prediction,
         }
 
         def registered(do: Callable[..., Any]) -> Callable[[Msg], Any]:
@@ -151,14 +326,14 @@ class Acquisition(Work):
 
         return {name: registered(do) for name, do in work.items()}
 
-    # What bluesky asks of an object that is read, and paused.
+    # Interface of a bluesky object that is read and paused.
 
     def read(self) -> dict[str, Any]:
-        """The last frame: which step and take, its hash, whether it is good."""
+        """Return the last frame: step, take, SHA-256 and verdict."""
         last = self._last
         if last is None:
             raise StateError("no frame has been taken", where=self.name)
-        verdict = self._known[last.id]
+        verdict = self._verdicts[last.id]
         values = {
             "step": last.step,
             "take": last.take,
@@ -169,22 +344,351 @@ class Acquisition(Work):
         return {name: {"value": value, "timestamp": 0.0} for name, value in values.items()}
 
     def describe(self) -> dict[str, Any]:
-        """What a reading holds."""
+        """Return the data types of a reading."""
         kinds = {"step": "string", "take": "integer", "frame": "string", "ok": "boolean", "why": "string"}
         return {name: {"source": self.name, "dtype": kind, "shape": []} for name, kind in kinds.items()}
 
     def read_configuration(self) -> dict[str, Any]:
-        """Nothing; instruments have their own."""
+        """Return nothing: instruments record their own configuration."""
         return {}
 
     def describe_configuration(self) -> dict[str, Any]:
-        """Nothing."""
+        """Return nothing."""
         return {}
 
     def pause(self) -> None:
-        """Bring the bench to rest; called by the engine before it waits."""
+        """Stop the bench; the engine calls this before it pauses."""
         self.rest()
 
     def resume(self) -> None:
-        """Make the bench ready again; called by the engine before it goes on."""
+        """Make the bench ready again; the engine calls this before it resumes."""
         self.ready()
+
+    # State of the bench.
+
+    def ready(self) -> None:
+        """Connect all instruments and allow motion and transmission again.
+
+        Raises
+        ------
+        BenchError
+            If an instrument cannot be connected.
+        """
+        self._at_rest = False
+        for instrument in self.bench.instruments.values():
+            self._persist(instrument.stage)
+
+    def rest(self) -> None:
+        """Stop all motion and transmission. Never raises, never moves an axis."""
+        self._at_rest = True
+        try:
+            self.bench.stop()
+        except InstrumentError as error:
+            self.watch("rest", {"failed": str(error)})
+
+    def retreat(self, position: Mapping[str, float]) -> None:
+        """Move the table away after it has stopped; if that fails, report it and leave the table there."""
+        try:
+            self.ready()
+            self.move_axes(position)
+        except ReseauError as error:
+            self.watch("rest", {"failed": str(error)})
+        finally:
+            self.rest()
+
+    def settle(self) -> None:
+        """Wait until an interrupted message has finished; its picture is stored and checked."""
+        with self._busy:
+            pass
+
+    # The work behind each message, in a thread of the engine.
+
+    def expose(self, step: Step, average: int = 1) -> ArchivedFrame:
+        """Take the frame of a step, again while it is bad; return the existing one if there is one.
+
+        Raises
+        ------
+        InstrumentError
+            If the camera or the table fails repeatedly.
+        ArchiveError
+            If the frame cannot be stored.
+        """
+        # An engine that was paused during this call replays the message while the thread still works:
+        # it waits here and then finds the frame.
+        with self._busy:
+            return self._exposed(step, average)
+
+    def expose_series(self, steps: Sequence[Step]) -> list[ArchivedFrame]:
+        """Take frames of one scene as the camera delivers them, one for each step. See :meth:`expose`."""
+        source = _stream(self.one(Camera), len(steps))
+        with self._busy:
+            return [self._exposed(step, 1, source) for step in steps]
+
+    def _exposed(
+        self, step: Step, average: int, source: Callable[[], Exposure] | None = None
+    ) -> ArchivedFrame:
+        for take in range(self.retakes + 1):
+            frame = self.session.find(step.name, "frame", take) or self._taken(step, take, average, source)
+            verdict = self._judged(frame, step)
+            self._last = frame
+            if verdict.ok:
+                break
+        return frame
+
+    def move_axes(self, position: Mapping[str, float]) -> None:
+        """Move axes of the table, all at the same time, and wait.
+
+        Raises
+        ------
+        InstrumentError
+            If an axis does not arrive.
+        """
+        axes = self.one(Turntable).axes
+
+        def move() -> None:
+            statuses = [axes[axis].set(value) for axis, value in position.items()]
+            failures = [status.exception(None) for status in statuses]
+            for failure in failures:
+                if failure is not None:
+                    raise failure
+
+        self._persist(move)
+
+    def home_axes(self) -> None:
+        """Find the reference of each axis that has none, one axis after the other."""
+        table: Turntable = self.one(Turntable)
+        for axis in table.axes:
+            if not self._persist(lambda axis=axis: table.state(axis)).homed:  # type: ignore[misc]
+                self.watch("home", {"axis": axis})
+                self._persist(lambda axis=axis: table.home(axis))  # type: ignore[misc]
+
+    def _persist(self, work: Callable[[], T]) -> T:
+        """Return the outcome of a repeatable operation; repeat it after a passing failure and report that."""
+        for attempt in range(_TRIES):
+            try:
+                return work()
+            except (ConnectionLost, DeadlineError, ProtocolError) as error:
+                if attempt == _TRIES - 1 or self._at_rest:
+                    raise
+                self.watch("again", {"why": str(error)})
+        raise AssertionError
+
+    def _taken(
+        self, step: Step, take: int, average: int, source: Callable[[], Exposure] | None = None
+    ) -> ArchivedFrame:
+        camera = self._prepared(step)
+        before = self._position()
+        exposures = [self._persist(source or camera.expose) for _ in range(average)]
+        moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
+        frame = _mean_frame([each.frame for each in exposures], step.name)
+        first = exposures[0]
+        facts = {
+            "camera": camera.name,
+            "exposure_us": _finite(first.exposure_us),
+            "gain": _finite(first.gain),
+            "pattern": first.pattern,
+            "position": before,
+            "averaged": average,
+            "moved": max(moved.values(), default=0.0) > _STILL,
+            "fresh": source is not None or all(each.fresh for each in exposures),
+        }
+        if step.exposure_us is not None:
+            facts["set_exposure_us"] = step.exposure_us
+        return self.session.store(step.name, frame, take=take, facts=facts, clock=_clock(exposures))
+
+    def _prepared(self, step: Step) -> Camera:
+        """The camera, set to the exposure of a step if it has one."""
+        if self._at_rest:
+            raise StateError("the bench was stopped", where=step.name)
+        camera: Camera = self.one(Camera)
+        wanted, before = step.exposure_us, camera.settings.to_dict().get("exposure_us")
+        if wanted is not None and before != wanted:
+            if self._original_us is None and before is not None:
+                self._original_us = float(before)
+            self._persist(lambda: camera.configure(exposure_us=wanted))
+        return camera
+
+    def reset_exposure(self) -> None:
+        """Set the camera to the exposure that it had before any step; report a failure."""
+        with self._busy:
+            try:
+                if self._original_us is not None:
+                    self.one(Camera).configure(exposure_us=self._original_us)
+            except InstrumentError as error:
+                self.watch("rest", {"failed": str(error)})
+
+    def _position(self) -> dict[str, float]:
+        """Positions of the axes of the table."""
+        if not self.has(Turntable):
+            return {}
+        table: Turntable = self.one(Turntable)
+        return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
+
+    def _judged(self, frame: ArchivedFrame, step: Step) -> Verdict:
+        """The verdict on a frame; the procedure gets each frame once, also frames from before a resumption."""
+        if frame.id in self._verdicts:
+            return self._verdicts[frame.id]
+        verdict = self._checked(self.session.picture(frame), frame, step)
+        if frame.verdict is None:
+            self.session.judge(frame, verdict)
+        self._verdicts[frame.id] = verdict
+        facts = {"step": step.name, "take": frame.take, "ok": verdict.ok, "why": verdict.why}
+        # A frame from before a resumption took no time.
+        self.watch("frame", facts | {"there": frame.verdict is not None} | verdict.facts)
+        if self.procedure is not None and verdict.ok and frame.verdict is None:
+            reached = dict(self.procedure.progress())
+            if reached:
+                self.watch("precision", {"step": step.name} | reached)
+        return verdict
+
+    def _checked(self, picture: Frame, frame: ArchivedFrame, step: Step) -> Verdict:
+        if frame.facts.get("moved"):
+            return Verdict(False, "the table moved during the exposure")
+        if not frame.facts.get("fresh", True):
+            return Verdict(False, "the exposure may have started before the request")
+        fault = exposure_fault(picture, self.limits)
+        if fault:
+            return Verdict(False, fault)
+        if self.procedure is None:
+            return Verdict(True)
+        try:
+            return self.procedure.on_frame(picture, as_taken(step, frame.facts))
+        except ImageError as error:
+            return Verdict(False, error.what)
+
+    def take_picture(self, step: Step, kind: str) -> ArchivedFrame:
+        """Take and store a picture that is not measured. See :meth:`pictures`.
+
+        Raises
+        ------
+        UsageError
+            For another kind of picture.
+        """
+        with self._busy:
+            stored = self.session.find(step.name, kind)
+            picture = self._pictured(step, kind) if stored is None else stored
+            self.watch("picture", {"step": step.name, "kind": kind, "there": stored is not None})
+            return picture
+
+    def _pictured(self, step: Step, kind: str) -> ArchivedFrame:
+        if kind == "screen":
+            screen = self._persist(self.one(Oscilloscope).screen)
+            clock = {"taken": screen.taken.isoformat()}
+            return self.session.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
+        if kind == "scan":
+            scan = self._persist(self.one(UltrasonicScanner).scan)
+            facts: dict[str, Any] = {
+                "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
+                "origin_px": list(scan.origin_px),
+                "speed_m_s": _finite(scan.speed_m_s),
+                "frequency_khz": _finite(scan.frequency_khz),
+                "gain": _finite(scan.gain),
+            }
+            clock = {"taken": scan.taken.isoformat()}
+            return self.session.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
+        if kind == "probe":
+            camera = self._prepared(step)
+            exposure = self._persist(camera.expose)
+            frame = _mean_frame([exposure.frame], step.name)
+            facts = {"identity": str(camera.connect()), "set_exposure_us": step.exposure_us}
+            return self.session.store(step.name, frame, kind=kind, facts=facts, clock=_clock([exposure]))
+        raise UsageError("unknown kind of picture", where=kind, do="use screen, scan or probe")
+
+    def ask_operator(self, request: str) -> None:
+        """Ask the operator to do something.
+
+        Raises
+        ------
+        UsageError
+            If there is no operator.
+        """
+        if self._operator is None:
+            raise UsageError("needs an operator", where=request, do="pass `operator` to the acquisition")
+        self._operator(request)
+
+    def choose_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        """Return the pose that the procedure chooses; in a resumed session the pose that it had chosen."""
+        with self._busy:
+            key = f"choice among {len(candidates)}"
+            names = {step.name: step for step in candidates}
+            for made in (note for _, note in self.session.notes("choice") if note["key"] == key):
+                return None if made["step"] is None else (names[made["step"]], made["predicted"])
+            found = None
+            if self.procedure is not None:
+                found = self.procedure.next_pose(_Candidates(lambda: self._at_rest, candidates), wanted)
+            step, predicted = (None, None) if found is None else (found[0].name, found[1])
+            self.session.note(key, "choice", {"key": key, "step": step, "predicted": predicted})
+            self.watch("next", {"step": step, f"sigma_{wanted}": predicted})
+            return found
+
+    def report_prediction(self, step: Step) -> None:
+        """Report what a pose would bring for the first parameter, if the procedure can predict it."""
+        assert self.procedure is not None
+        with self._busy:
+            reached = next(iter(self.procedure.progress()), "")
+            parameter = reached.removeprefix("sigma_")
+            if not reached or reached == "sigma0":
+                return
+            try:
+                found = self.procedure.next_pose([step], parameter)
+            except EstimationError as error:
+                self.watch("outlook", {"step": step.name, "why": error.what})
+                return
+            if found is not None and found[1] is not None:
+                self.watch("outlook", {"step": step.name, f"sigma_{parameter}": found[1]})
+
+    def check_scene(self, count: int) -> Readiness:
+        """Take frames of the static scene, store them, and return what they show."""
+        with self._busy:
+            camera: Camera = self.one(Camera)
+            start = len(self.session.frames(kind="check"))
+            frames = []
+            for k in range(start, start + count):
+                exposure = self._persist(camera.expose)
+                frame = _mean_frame([exposure.frame], f"check {k}")
+                self.session.store(f"check {k}", frame, kind="check", clock=_clock([exposure]))
+                frames.append(frame)
+            found = readiness(frames, self.limits)
+            self.session.note(f"check {start}", "check", found.to_dict())
+            self.watch("check", found.to_dict())
+            return found
+
+
+def _stream(camera: Camera, count: int) -> Callable[[], Exposure]:
+    """A function that returns a fresh exposure, then those that follow it; it restarts after a failure."""
+    stream: Iterator[Exposure] = iter(())
+
+    def next_exposure() -> Exposure:
+        nonlocal stream
+        # An iterator that has raised is exhausted.
+        if (exposure := next(stream, None)) is None:
+            exposure, stream = camera.expose(), camera.frames(count)
+        return exposure
+
+    return next_exposure
+
+
+def _mean_frame(frames: list[Frame], name: str) -> Frame:
+    """The mean of frames of one scene, under the name of its step."""
+    first = frames[0]
+    if len(frames) == 1:
+        return Frame(first.pixels, first.full_scale, name)
+    total = np.zeros(first.pixels.shape, dtype=np.float64)
+    for frame in frames:
+        total += frame.pixels
+    return Frame((total / len(frames)).astype(np.float32), first.full_scale, name)
+
+
+def _finite(value: float) -> float | None:
+    """A value of an instrument; None if the instrument does not report it."""
+    return value if math.isfinite(value) else None
+
+
+def _clock(exposures: list[Exposure]) -> dict[str, Any]:
+    """Times and counters of a camera."""
+    return {
+        "taken": [each.taken.isoformat() for each in exposures],
+        "taken_within_s": [each.taken_within_s for each in exposures],
+        "sequence": [each.sequence for each in exposures],
+        "dropped": exposures[-1].dropped,
+    }

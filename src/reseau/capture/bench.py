@@ -1,6 +1,6 @@
-"""A bench: instruments by name, what drives them, where they are, and what they may do.
+"""A bench: the instruments of a laboratory by name, with driver, address, settings and limits.
 
-``bench.toml`` says it::
+``bench.toml``::
 
     schema = "reseau-bench/1"
     name = "cellar"
@@ -8,7 +8,7 @@
     [instruments.table]
     driver = "zaber"                    # an entry point of the group reseau.instruments
     address = "/dev/ttyUSB0"
-    settings = {speed = 10.0}           # pushed on every connection
+    settings = {speed = 10.0}           # sent on every connection
     limits = {speed = [0.1, 20.0]}      # narrower than the instrument's own
     options = {axes = {tilt = {device = 1, per_unit = 2844.4, low = -50, high = 50}}}
 """
@@ -29,6 +29,7 @@ from pydantic import Field
 from ..core.errors import BenchError, FormatError, ReseauError, SettingError, UsageError
 from ..instruments import Identity, Instrument
 from ..io import Document, Strict, read_text
+from .lock import BenchLock
 
 __all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
 
@@ -37,28 +38,35 @@ T = TypeVar("T")
 
 @runtime_checkable
 class _Combined(Protocol):
-    """An instrument that works with others of its bench."""
+    """An instrument that uses others of its bench."""
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
-        """Find them by the names that its options tell."""
+        """Find the other instruments by the names in its options."""
 
 
 INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "reseau.simulators"
-"""Groups of entry points: drivers; functions that list addresses; simulated benches behind real protocols."""
+"""Groups of entry points: drivers; functions that list addresses; simulated benches."""
+IN_PROCESS = "in this process"
+"""Address of a simulated instrument that is part of this process. No other process can use it."""
 
 
 def plugin(group: str, name: str) -> Any:
-    """What an installed package offers under a name.
+    """Load the entry point of an installed package.
 
     Raises
     ------
     UsageError
-        When nothing does, or it cannot be loaded.
+        If there is none of this name, or it cannot be loaded.
+
+    Examples
+    --------
+    >>> callable(plugin("reseau.instruments", "zaber"))
+    True
     """
     found = entry_points(group=group, name=name)
     if not found:
         known = ", ".join(sorted(each.name for each in entry_points(group=group)))
-        raise UsageError(f"is not installed for {group}", where=name, do=f"there are {known or 'none'}")
+        raise UsageError(f"no such entry point of {group}", where=name, do=f"installed: {known or 'none'}")
     try:
         return next(iter(found)).load()
     except (ImportError, AttributeError) as error:
@@ -66,12 +74,25 @@ def plugin(group: str, name: str) -> Any:
 
 
 def drivers() -> tuple[str, ...]:
-    """Names of the drivers that are installed."""
+    """Return the names of the installed drivers.
+
+    Examples
+    --------
+    >>> "zaber" in drivers()
+    True
+    """
     return tuple(sorted({each.name for each in entry_points(group=INSTRUMENTS)}))
 
 
 def found_instruments() -> dict[str, tuple[str, ...] | ReseauError]:
-    """Addresses that are found now, by the way in which they were searched; or why they could not be."""
+    """Search for instruments; return addresses, or the error of the search, by the kind of search.
+
+    Examples
+    --------
+    >>> found = found_instruments()  # doctest: +SKIP
+    >>> found["serial"]  # doctest: +SKIP
+    ('/dev/ttyUSB0',)
+    """
     found: dict[str, tuple[str, ...] | ReseauError] = {}
     for each in sorted(entry_points(group=DISCOVERY), key=lambda each: each.name):
         try:
@@ -82,7 +103,26 @@ def found_instruments() -> dict[str, tuple[str, ...] | ReseauError]:
 
 
 class InstrumentEntry(Strict):
-    """One instrument of a bench."""
+    """One instrument of a bench.
+
+    Parameters
+    ----------
+    driver : str
+        Name of the driver, an entry point of the group ``reseau.instruments``.
+    address : str
+        Address in the form that the driver expects.
+    settings : dict
+        Sent on every connection.
+    limits : dict
+        Lowest and highest value of settings, narrower than those of the instrument.
+    options : dict
+        Arguments of the driver.
+
+    Examples
+    --------
+    >>> InstrumentEntry(driver="ping360", address="tcp://127.0.0.1:9092").settings
+    {}
+    """
 
     driver: str
     address: str
@@ -92,7 +132,25 @@ class InstrumentEntry(Strict):
 
 
 class BenchFile(Document):
-    """The content of ``bench.toml``."""
+    """The content of ``bench.toml``.
+
+    Parameters
+    ----------
+    name : str
+        Name of the bench.
+    instruments : dict of str to InstrumentEntry
+        Instruments by name.
+
+    Examples
+    --------
+    >>> text = '''schema = "reseau-bench/1"
+    ... [instruments.sonar]
+    ... driver = "ping360"
+    ... address = "tcp://127.0.0.1:9092"
+    ... '''
+    >>> list(BenchFile.parse_toml(text, where="bench.toml").instruments)
+    ['sonar']
+    """
 
     SCHEMA: ClassVar[str] = "reseau-bench/1"
     name: str = "bench"
@@ -105,9 +163,9 @@ class BenchFile(Document):
         Raises
         ------
         InputError
-            When the file cannot be read.
+            If the file cannot be read.
         FormatError
-            When it is no bench.
+            If it is not a bench.
         """
         return cls.parse_toml(read_text(Path(path)), where=path)
 
@@ -123,22 +181,27 @@ class BenchFile(Document):
         try:
             content = json.dumps(tomllib.loads(text), default=str)
         except tomllib.TOMLDecodeError as error:
-            raise FormatError(f"is no TOML ({error})", where=where) from None
+            raise FormatError(f"is not TOML ({error})", where=where) from None
         return cls.parse(content, where=where)
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What came out when an instrument was checked.
+    """Result of the self-test of an instrument.
 
     Parameters
     ----------
     name, driver, address : str
-        Of the instrument.
+        The instrument.
     found : dict
-        What was tested, and what came out.
+        Outcome of each test.
     error : ReseauError, optional
-        What failed.
+        The error, if the instrument failed.
+
+    Examples
+    --------
+    >>> Checked("table", "zaber", "/dev/ttyUSB0", {"tilt": "homed"}).error is None
+    True
     """
 
     name: str
@@ -149,19 +212,26 @@ class Checked:
 
 
 class Bench:
-    """Instruments by name, as one resource.
+    """Instruments by name, connected and stopped together.
 
     Parameters
     ----------
     file : BenchFile
-        Says which.
+        The instruments.
     build : callable, optional
-        Makes the instrument of an entry: by default its driver, found by its entry point.
+        Makes the instrument of an entry. Default: by its driver.
 
     Raises
     ------
     BenchError
-        When instruments cannot be made of what the file says; all of them are named.
+        If an entry does not fit its driver; the message names all such entries.
+
+    Examples
+    --------
+    >>> bench = Bench(BenchFile(name="empty", instruments={}))
+    >>> with bench:
+    ...     bench.check()
+    []
     """
 
     def __init__(
@@ -186,45 +256,46 @@ class Bench:
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """The bench of a file; raises as :meth:`BenchFile.read` and the class do."""
+        """Read a bench from a file; raises as :meth:`BenchFile.read` and the class."""
         return cls(BenchFile.read(path))
 
     def __getitem__(self, name: str) -> Instrument:
         if name not in self.instruments:
             known = ", ".join(self.instruments)
-            raise UsageError("is not on this bench", where=name, do=f"there are {known or 'none'}")
+            raise UsageError("is not on this bench", where=name, do=f"its instruments: {known or 'none'}")
         return self.instruments[name]
 
     def one(self, kind: type, name: str | None = None) -> Any:
-        """The instrument of a kind: that of a name, or the only one.
+        """Return the instrument of a kind: the named one, or the only one.
 
         Raises
         ------
         UsageError
-            When there is none, or several and none was named.
+            If there is none, or there are several and no name is given.
         """
         found = {each: made for each, made in self.instruments.items() if isinstance(made, kind)}
         names = ", ".join(found) or "none"
         if name is not None:
             if not isinstance(self[name], kind):
-                raise UsageError(f"is no {kind.__name__}", where=name, do=f"there are {names}")
+                raise UsageError(f"is not a {kind.__name__}", where=name, do=f"on this bench: {names}")
             return self[name]
         if len(found) != 1:
-            do = "name one" if found else None
-            raise UsageError(f"has {names} for a {kind.__name__}", where="bench", do=do)
+            if not found:
+                raise UsageError(f"has no {kind.__name__}", where="bench")
+            raise UsageError(f"has several of {kind.__name__}: {names}", where="bench", do="name one")
         return next(iter(found.values()))
 
     def has(self, kind: type) -> bool:
-        """Whether there is an instrument of a kind."""
+        """Return whether there is an instrument of a kind."""
         return any(isinstance(each, kind) for each in self.instruments.values())
 
     def connect(self, seconds: float | None = None) -> dict[str, Identity]:
-        """Connect all at once.
+        """Connect all instruments at the same time.
 
         Raises
         ------
         BenchError
-            When one or more cannot be connected; all of them are named, the others are let go.
+            If an instrument cannot be connected; names all such instruments, and closes the others.
         """
         outcomes = self._all(lambda instrument: instrument.connect(seconds))
         failures = [each for each in outcomes.values() if isinstance(each, ReseauError)]
@@ -234,7 +305,7 @@ class Bench:
         return {name: each for name, each in outcomes.items() if isinstance(each, Identity)}
 
     def check(self, seconds: float | None = None) -> list[Checked]:
-        """Have all instruments test themselves, at once; failures are among the results."""
+        """Run the self-test of all instruments at the same time; failures are among the results."""
         outcomes = self._all(lambda instrument: instrument.check(seconds))
         checked = []
         for name, entry in self.file.instruments.items():
@@ -245,12 +316,12 @@ class Bench:
         return checked
 
     def stop(self) -> None:
-        """Stop everything.
+        """Stop all instruments.
 
         Raises
         ------
         BenchError
-            When one or more could not be stopped; all of them are named.
+            If an instrument could not be stopped; names all such instruments.
         """
         failures = [
             each for each in self._all(lambda instrument: instrument.stop()).values() if each is not None
@@ -259,8 +330,24 @@ class Bench:
             raise BenchError(failures)
 
     def close(self) -> None:
-        """Let go of all; never raises."""
+        """Close all connections; never raises."""
         self._all(lambda instrument: instrument.close())
+
+    def lock(self, owner: str, *also: str) -> BenchLock:
+        """Return the lock of the instruments, for a ``with`` block.
+
+        Instruments that are part of this process (address ``in this process``) are not locked: no other
+        process can use them, and another process may have its own at the same address.
+
+        Parameters
+        ----------
+        owner : str
+            Purpose of the lock, shown to whoever is refused.
+        also : str
+            Other things to lock, for instance the name of a session.
+        """
+        addresses = [entry.address for entry in self.file.instruments.values()]
+        return BenchLock([*(each for each in addresses if each != IN_PROCESS), *also], owner)
 
     def __enter__(self) -> Self:
         self.connect()
@@ -270,7 +357,7 @@ class Bench:
         self.close()
 
     def _all(self, work: Callable[[Instrument], T]) -> dict[str, T | ReseauError]:
-        """The outcome of the same work on every instrument, each in a thread of its own."""
+        """The outcome of the same work on every instrument, each in its own thread."""
 
         def outcome(instrument: Instrument) -> T | ReseauError:
             try:
@@ -285,12 +372,12 @@ class Bench:
 
 
 def built(name: str, entry: InstrumentEntry) -> Instrument:
-    """The driver of an entry, not connected yet.
+    """Return the instrument of an entry, made by its driver, not connected.
 
     Raises
     ------
     ReseauError
-        When there is no such driver, or the entry does not fit it.
+        If there is no such driver, or the entry does not fit it.
     """
     make = plugin(INSTRUMENTS, entry.driver)
     try:
@@ -298,8 +385,8 @@ def built(name: str, entry: InstrumentEntry) -> Instrument:
     except ReseauError as error:
         raise SettingError(str(error), where=name) from None
     except (TypeError, ValueError, AttributeError) as error:
-        # Options are the driver's own: what it does not take, Python says.
+        # Options are arguments of the driver: Python reports the unknown ones.
         raise SettingError(f"its options do not fit ({error})", where=name) from None
     if not isinstance(made, Instrument):
-        raise UsageError(f"{entry.driver} is no driver of an instrument", where=name)
+        raise UsageError(f"{entry.driver} does not make an instrument", where=name)
     return made

@@ -1,4 +1,4 @@
-"""Whether pictures are worth being taken: exposure, focus, vibration, drift."""
+"""Checks before an acquisition: exposure, focus, vibration, drift."""
 
 from __future__ import annotations
 
@@ -22,20 +22,25 @@ _SLOPE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
 
 @dataclass(frozen=True)
 class Limits:
-    """What is still good.
+    """Limits of the checks.
 
     Parameters
     ----------
     saturated : float
-        Share of pixels at full scale.
+        Largest share of pixels at full scale.
     darkest : float
         The brightest thousandth of the pixels must reach this share of full scale.
     edge_px : float
-        Width (one sigma) of the sharpest edges.
+        Largest width (one sigma, px) of the sharpest edges.
     vibration_px : float
-        Shift from frame to frame.
+        Largest rms shift from frame to frame (px).
     drift_px, drift_level : float
-        Shift, and relative change of brightness, from the first frame to the last.
+        Largest shift (px) and relative change of brightness from the first frame to the last.
+
+    Examples
+    --------
+    >>> Limits(edge_px=3.0).saturated
+    0.01
     """
 
     saturated: float = 0.01
@@ -48,20 +53,25 @@ class Limits:
 
 @dataclass(frozen=True)
 class Readiness:
-    """What a series of frames of an unmoved scene showed; truthy when nothing is wrong.
+    """Result of the checks on frames of a static scene; truthy if no limit is exceeded.
 
     Parameters
     ----------
     saturated, bright : float
-        Share of saturated pixels; grey value that a thousandth exceeds, of full scale.
+        Share of saturated pixels; grey value exceeded by a thousandth of the pixels, relative to full scale.
     edge_px : float
-        Width (one sigma) of the sharpest edges; of a step edge that of the point-spread function and a pixel.
+        Width (one sigma, px) of the sharpest edges: of a step edge, point-spread function and pixel.
     vibration_px, vibration_sigma_px : float
-        Rms shift from frame to frame, and the standard deviation that noise alone gives it.
+        Rms shift from frame to frame (px), and its standard deviation due to noise alone.
     drift_px, drift_level : float
-        From the first frame to the last.
+        Shift (px) and relative change of brightness from the first frame to the last.
     faults : tuple of str
-        What is beyond its limit, and what would help.
+        Exceeded limits, each with a remedy.
+
+    Examples
+    --------
+    >>> bool(Readiness(0.0, 0.8, 1.1, 0.01, 0.01, 0.0, 0.0, faults=("no edges found: focus",)))
+    False
     """
 
     saturated: float
@@ -77,20 +87,30 @@ class Readiness:
         return not self.faults
 
     def to_dict(self) -> dict[str, object]:
-        """JSON values; None for what could not be found."""
+        """Return JSON values; None for a value that could not be determined."""
         found = {key: value for key, value in asdict(self).items() if key != "faults"}
         return {k: v if math.isfinite(v) else None for k, v in found.items()} | {"faults": list(self.faults)}
 
 
 def exposure_fault(frame: Frame, limits: Limits | None = None) -> str:
-    """What is wrong with the exposure of a frame; empty when nothing is."""
+    """Return what is wrong with the exposure of a frame; empty if nothing is.
+
+    Examples
+    --------
+    >>> exposure_fault(Frame(np.full((40, 50), 255, np.uint8), 255.0))
+    '100 % of the pixels are saturated: expose less'
+    """
     limits = limits or Limits()
     saturated, bright = _exposure(frame)
     if saturated > limits.saturated:
-        return f"{100 * saturated:.2g} % of the pixels are saturated; expose less"
+        return f"{_percent(saturated)} of the pixels are saturated: expose less"
     if bright < limits.darkest:
-        return f"reaches {100 * bright:.2g} % of full scale only; expose more"
+        return f"brightest pixels reach only {_percent(bright)} of full scale: expose more"
     return ""
+
+
+def _percent(share: float) -> str:
+    return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def _exposure(frame: Frame) -> tuple[float, float]:
@@ -100,15 +120,22 @@ def _exposure(frame: Frame) -> tuple[float, float]:
 
 
 def edge_sigma(frame: Frame) -> float:
-    """Width (one sigma, px) of the sharpest edges of a frame; infinite where there is none above the noise.
+    """Return the width (one sigma, px) of the sharpest edges of a frame; infinite if there are no edges.
 
     Notes
     -----
     A step of height h, blurred by a Gaussian of σ, has the slope h / (σ √(2π)) in its middle. The central
-    difference sees the mean slope over two pixels, which widens σ² by 2²/12.
+    difference gives the mean slope over two pixels, which increases σ² by 2²/12.
+
+    Examples
+    --------
+    >>> from scipy.special import ndtr
+    >>> edge = 200 * ndtr((np.arange(60.0) - 30) / 2) * np.ones((60, 1))
+    >>> round(edge_sigma(Frame(edge, 255.0)), 1)
+    2.0
     """
     grey = frame.pixels.astype(np.float64)
-    # Along each row, then along each column: the steepest places, and the levels on both sides of them.
+    # Along rows, then along columns: the steepest places and the levels on both sides of them.
     widths = [_steepest(grey), _steepest(grey.T)]
     return min(widths)
 
@@ -134,22 +161,35 @@ def _steepest(grey: Array) -> float:
 
 
 def shift_between(first: Frame, second: Frame) -> tuple[Array, Array]:
-    """By how much the second frame shows everything further right and down, of the same scene.
+    """Return the shift of the second frame against the first, to the right and down, of the same scene.
 
     Returns
     -------
     ndarray (2,), ndarray (2,)
-        Shift and its standard deviations (px), of all pixels together; for shifts below a pixel.
+        Shift and its standard deviations (px) from all pixels together; for shifts below a pixel.
+
+    Raises
+    ------
+    UsageError
+        If the frames differ in size.
 
     Notes
     -----
-    Least-squares matching of whole frames (Förstner 1982): g₂ = a g₁ + b − ∇g·d, the gradient taken of the
-    mean of both, with which the linearisation is good to the second order. Both are smoothed first, since
-    finite differences see less than the slope of what is sharp; for that the covariance is N⁻¹ (SA)ᵀ(SA) N⁻¹
-    of the noise before, which was the residuals' times 4πs².
+    Least-squares matching of whole frames (Förstner 1982): g₂ = a g₁ + b − ∇g·d. The gradient of the mean of
+    both makes the linearisation accurate to the second order. Both frames are smoothed first, because finite
+    differences underestimate steep slopes. The covariance is therefore N⁻¹ (SA)ᵀ(SA) N⁻¹ times the variance
+    of the noise before smoothing, which is that of the residuals times 4πs².
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:40, :40] / 5.0
+    >>> scene = lambda d: Frame(100 + 50 * np.sin(x - d / 5) * np.cos(y), 255.0)
+    >>> shift, sigma = shift_between(scene(0.0), scene(0.2))
+    >>> shift.round(2).tolist()
+    [0.21, 0.0]
     """
     if first.pixels.shape != second.pixels.shape:
-        raise UsageError("frames of different sizes are of no one scene", where=second.name)
+        raise UsageError("differs in size from the first frame", where=second.name)
     one, two = (scipy.ndimage.gaussian_filter(f.pixels.astype(np.float64), _SMOOTH) for f in (first, second))
     both = 0.5 * (one + two)
     right, down = (scipy.ndimage.correlate1d(both, _SLOPE, axis) for axis in (1, 0))
@@ -168,15 +208,28 @@ def shift_between(first: Frame, second: Frame) -> tuple[Array, Array]:
 
 
 def readiness(frames: Sequence[Frame], limits: Limits | None = None) -> Readiness:
-    """What a series of at least two frames of an unmoved scene shows.
+    """Check a series of at least two frames of a static scene.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        In the order in which they were taken.
+    limits : Limits, optional
+        Limits of the checks.
 
     Raises
     ------
     UsageError
-        When there are fewer, or they differ in size.
+        If there are fewer frames, or they differ in size.
+
+    Examples
+    --------
+    >>> flat = Frame(np.full((40, 40), 90, np.uint8), 255.0)
+    >>> readiness([flat, flat]).faults
+    ('no edges found: focus, or point the camera at a target',)
     """
     if len(frames) < 2:
-        raise UsageError("vibration needs two frames", where="checks")
+        raise UsageError("at least two frames are needed", where="checks")
     limits = limits or Limits()
     saturated, bright = _exposure(frames[0])
     edge = edge_sigma(frames[0])
@@ -190,15 +243,15 @@ def readiness(frames: Sequence[Frame], limits: Limits | None = None) -> Readines
     level = means[1] / means[0] - 1 if means[0] else 0.0
     faults = [exposure_fault(frames[0], limits)]
     if math.isinf(edge):
-        faults.append("there are no edges; focus, or have it look at something")
+        faults.append("no edges found: focus, or point the camera at a target")
     elif edge > limits.edge_px:
-        faults.append(f"the sharpest edges are {edge:.1f} px wide; focus")
-    if vibration > limits.vibration_px + 3 * sigma:  # neither is a number where nothing shows a shift
-        faults.append(f"moves by {vibration:.2g} px from frame to frame; look for what shakes it")
+        faults.append(f"the sharpest edges are {edge:.1f} px wide: focus")
+    if vibration > limits.vibration_px + 3 * sigma:  # both are NaN if nothing in the scene shows a shift
+        faults.append(f"vibration of {vibration:.2g} px from frame to frame: find its source")
     if np.hypot(*drift) > limits.drift_px + 3 * float(np.hypot(*drift_sigma)):
-        faults.append(f"drifted by {np.hypot(*drift):.2g} px; let it warm up")
+        faults.append(f"drift of {np.hypot(*drift):.2g} px: let the camera warm up")
     if abs(level) > limits.drift_level:
-        faults.append(f"its brightness drifted by {100 * level:.2g} %; let it warm up")
+        faults.append(f"brightness drift of {_percent(level)}: let the camera warm up")
     return Readiness(
         saturated,
         bright,

@@ -1,4 +1,4 @@
-"""One session at a time on an instrument: a lock that shows its owner and dies with it."""
+"""One session at a time on an instrument: a lock that names its owner and ends with its process."""
 
 from __future__ import annotations
 
@@ -20,21 +20,28 @@ __all__ = ["BenchLock"]
 
 
 class BenchLock:
-    """The instruments at some addresses, for this process alone, from entering to leaving.
+    """Exclusive use of the instruments at some addresses, within a ``with`` block.
 
     Parameters
     ----------
     addresses : iterable of str
-        Of the instruments; two benches that share one lock each other out.
+        Addresses of the instruments. Two locks with a common address exclude each other.
     owner : str
-        What they are wanted for; shown to whoever comes later.
+        Purpose of the lock, shown to whoever is refused.
     folder : path, optional
-        Where locks are; by default one that all users of this machine share.
+        Folder of the lock files. Default: one that all users of this machine share.
 
     Notes
     -----
-    The system lets go of the lock (``flock``) when the process ends, however it ends: what a killed process
-    leaves behind locks nothing.
+    The operating system releases the lock (``flock``) when the process ends, for any reason: the files that a
+    killed process leaves behind lock nothing.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder, BenchLock(["sim-a"], "session monday", Path(folder)):
+    ...     with BenchLock(["sim-b"], "session tuesday", Path(folder)):
+    ...         print("different instruments")
+    different instruments
     """
 
     def __init__(self, addresses: Iterable[str], owner: str, folder: Path | None = None) -> None:
@@ -49,11 +56,11 @@ class BenchLock:
         Raises
         ------
         StateError
-            When another process has one of the instruments; says which process.
+            If another process uses one of the instruments; names the process.
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            with suppress(PermissionError):  # another user made it, for all
+            with suppress(PermissionError):  # another user has made it, for all users
                 self._folder.chmod(0o1777)
             for address in self._addresses:
                 self._take(address)
@@ -66,18 +73,18 @@ class BenchLock:
         return self
 
     def _take(self, address: str) -> None:
-        # A device is the same by all its names.
+        # A device is the same under all its names.
         real = os.path.realpath(address) if address.startswith("/") else address
-        handle = _for_all(self._folder / f"{hashlib.sha256(real.encode()).hexdigest()[:20]}.lock")
+        handle = _shared_file(self._folder / f"{hashlib.sha256(real.encode()).hexdigest()[:20]}.lock")
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             with handle, suppress(ValueError):
                 owner = json.load(handle)
                 who = f"{owner['owner']} (process {owner['pid']} of {owner['user']} since {owner['since']})"
-                what, do = f"is in use by {who}", "wait, or stop that one"
+                what, do = f"is in use by {who}", "wait, or stop that process"
                 raise StateError(what, where=address, do=do) from None
-            raise StateError("is in use by another process", where=address) from None
+            raise StateError("is in use by another process", where=address, do="wait") from None
         self._held.append(handle)
         handle.truncate(0)
         since = datetime.now(UTC).isoformat(timespec="seconds")
@@ -93,10 +100,10 @@ class BenchLock:
             handle.close()
 
 
-def _for_all(path: Path) -> IO[str]:
-    """A file that all users may write, open."""
+def _shared_file(path: Path) -> IO[str]:
+    """Open a file that all users may write."""
     try:
-        # In a folder for all the system lets nobody open another's file as one to be made.
+        # In a sticky folder, O_CREAT on a file of another user is refused.
         number = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
@@ -105,7 +112,7 @@ def _for_all(path: Path) -> IO[str]:
 
 
 def _user() -> str:
-    """Who this process belongs to; in a container the number may have no name."""
+    """Name of the user; in a container the number may have no name."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):

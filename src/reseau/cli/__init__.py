@@ -1,7 +1,6 @@
 """The command line: `reseau --help`.
 
-Modules of commands import what they compute with inside the commands, so that help and mistakes are answered
-at once.
+Modules of commands import other packages inside the commands, so that help and usage errors are fast.
 """
 
 from __future__ import annotations
@@ -66,14 +65,14 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Calibration of measuring cameras and imaging instruments."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit: 0 done, 1 failed, 2 wrong use; errors in one line on stderr."""
+    """Run the command line and exit: 0 success, 1 failure, 2 usage error; errors in one line on stderr."""
     sys.exit(run(arguments))
 
 
@@ -82,20 +81,20 @@ def run(arguments: list[str] | None = None) -> int:
     try:
         return int(app(arguments, standalone_mode=False) or 0)
     except ReseauError as error:
-        return _complain(str(error), error.exit_status)
+        return _report(str(error), error.exit_status)
     except KeyboardInterrupt:
-        return _complain("interrupted", 130)
-    except BrokenPipeError:  # whoever read the output has seen enough
+        return _report("interrupted", 130)
+    except BrokenPipeError:  # the reader of the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        # Typer's own complaints about arguments know how to say themselves; they have no public class.
-        said: Any = getattr(error, "format_message", None)
-        if said is None:
+        # Typer's own usage errors format themselves; they have no public class.
+        format_message: Any = getattr(error, "format_message", None)
+        if format_message is None:
             raise
-        return _complain(str(said()) or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
+        return _report(str(format_message()) or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
 
 
-def _complain(message: str, status: int) -> int:
+def _report(message: str, status: int) -> int:
     print(f"reseau: {' '.join(message.split())}", file=sys.stderr)
     return status

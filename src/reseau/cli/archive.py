@@ -1,4 +1,4 @@
-"""`reseau archive`: what was captured and computed."""
+"""`reseau archive`: list, show, verify, export and rerun sessions."""
 
 from __future__ import annotations
 
@@ -7,23 +7,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, progress, say, suffix_of, writable
-from .sessions import ArchivePlace, ObjectsPlace, SessionName, opened, procedure_of
+from .common import (
+    ArchivePlace,
+    AsJson,
+    ObjectsPlace,
+    SessionName,
+    open_archive,
+    progress,
+    say,
+    suffix_of,
+    writable,
+)
 
 if TYPE_CHECKING:
     from ..archive import ArchivedFrame
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="The archive: list, show, verify, export, compute again.")
+app = typer.Typer(no_args_is_help=True, help="List, show, verify, export and rerun archived sessions.")
 
 
 @app.command("list")
 def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
-    """List the sessions."""
+    """List the sessions of an archive."""
     from ..core.provenance import canonical_json
 
-    with opened(archive, objects) as found:
+    with open_archive(archive, objects) as found:
         sessions = found.sessions()
     if as_json:
         rows = [vars(each) | {"begun": each.begun.isoformat()} for each in sessions]
@@ -42,44 +51,24 @@ def show(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write the results to.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a session: its frames with verdicts, its results and what they were made of."""
-    from ..archive import described
+    """Show a session: frames with verdicts, and results with their inputs."""
+    from ..archive import describe
     from ..core.provenance import canonical_json
-    from ..io import write_whole
 
-    with opened(archive, objects) as found:
+    with open_archive(archive, objects) as found:
         kept = found.session(session)
         if out is not None:
-            contents = {result.name: kept.content(result) for result in kept.results()}
-            _folder(out)
-            for name, content in contents.items():
-                write_whole(out / name, content)
+            kept.write_results(out)
         if as_json:
-            say(canonical_json(described(kept)))
+            say(canonical_json(describe(kept)))
             return
         begun = f"{kept.begun:%Y-%m-%d %H:%M:%S}Z"
-        say(f"{kept.name}: {kept.plan}, begun {begun} by {kept.software}, {kept.status}\n")
+        say(f"{kept.name}: plan {kept.plan}, begun {begun} with {kept.software}, {kept.status}\n")
         for frame in kept.frames():
             say(f"  {frame.sha256[:12]}  {_verdict(frame):<8} {frame.name}\n")
         for made in kept.results():
-            origin = f"of {len(made.inputs)} files, by {made.software}"
+            origin = f"from {len(made.inputs)} files, by {made.software}"
             say(f"  {made.sha256[:12]}  result   {made.name}, {origin}\n")
-
-
-def _folder(path: Path) -> None:
-    """Make a folder where there is none.
-
-    Raises
-    ------
-    InputError
-        When it cannot be made.
-    """
-    from ..core.errors import InputError
-
-    try:
-        path.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=path, do="name a folder") from None
 
 
 def _verdict(frame: ArchivedFrame) -> str:
@@ -90,11 +79,11 @@ def _verdict(frame: ArchivedFrame) -> str:
 
 @app.command()
 def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
-    """Read every file again, and compare it with its hash."""
+    """Read every file again and compare it with its SHA-256."""
     from ..archive import verify as verified
     from ..core.provenance import canonical_json
 
-    with opened(archive, objects) as found, progress("verifying", len(found.files())) as step:
+    with open_archive(archive, objects) as found, progress("verifying", len(found.files())) as step:
         result = verified(found, step)
     if as_json:
         say(canonical_json({"schema": "reseau-verified/1", **vars(result), "sound": bool(result)}))
@@ -102,22 +91,22 @@ def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_j
         say(f"{result.files} files, {result.size / 1e6:.1f} MB: {'sound' if result else 'damaged'}\n")
         say("".join(f"  {line}\n" for line in result.damaged))
         if result.unknown:
-            say(f"{len(result.unknown)} further files of processes that were killed; they harm nothing\n")
+            say(f"{len(result.unknown)} unindexed files left by killed processes (harmless)\n")
     raise typer.Exit(0 if result else 1)
 
 
 @app.command()
 def export(
     session: SessionName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Zip to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Zip file to write.")],
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
 ) -> None:
-    """Write a session as one zip: frames, results, and a table of all."""
+    """Export a session to a zip file: frames, results, and a table of contents."""
     from ..archive import export as exported
 
     suffix_of(writable(out), (".zip",))
-    with opened(archive, objects) as found:
+    with open_archive(archive, objects) as found:
         count = exported(found.session(session), out)
     say(f"{out}: {count} files\n")
 
@@ -129,19 +118,12 @@ def rerun(
     objects: ObjectsPlace = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute the results of a session again, and say whether they are the same to the byte."""
-    from ..capture import rerun as computed
-    from ..core.errors import UsageError
+    """Compute the results of a session again, and compare them byte for byte."""
+    from .. import sessions
     from ..core.provenance import canonical_json
 
-    with opened(archive, objects) as found:
-        kept = found.session(session)
-        procedure = procedure_of(kept)
-        if procedure is None:
-            raise UsageError(f"{kept.plan} computes nothing", where=session)
-        if not kept.results():
-            raise UsageError(f"has no results; it is {kept.status}", where=session)
-        done = computed(kept, procedure)
+    with open_archive(archive, objects) as found:
+        done = sessions.rerun(found.session(session))
     same = all(each.same for each in done)
     if as_json:
         rows = [
@@ -151,8 +133,6 @@ def rerun(
         say(canonical_json({"schema": "reseau-rerun/1", "same": same, "results": rows}))
     else:
         for each in done:
-            outcome = (
-                "the same to the byte" if each.same else f"differs; it was made by {each.result.software}"
-            )
+            outcome = "identical" if each.same else f"differs; made with {each.result.software}"
             say(f"{each.result.name}: {outcome}\n")
     raise typer.Exit(0 if same else 1)

@@ -1,4 +1,4 @@
-"""`reseau bench`: what instruments there are, whether they work, and simulated ones."""
+"""`reseau bench`: find, check and simulate instruments."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .common import AsJson, Out, say, writable
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="The bench: find instruments, check them, simulate them.")
+app = typer.Typer(no_args_is_help=True, help="Find, check and simulate instruments.")
 
-BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="The bench, bench.toml.")]
+BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")]
 
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """Discover instruments (cameras, VISA, serial ports), and name the drivers that are installed."""
+    """Search for instruments (cameras, VISA, serial ports), and list the installed drivers."""
     from ..capture import drivers, found_instruments
     from ..core.provenance import canonical_json
 
@@ -41,10 +41,10 @@ def list_(as_json: AsJson = False) -> None:
 @app.command()
 def check(
     bench: BenchPath = Path("bench.toml"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline for each instrument.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline for each instrument (s).")] = 10.0,
     as_json: AsJson = False,
 ) -> None:
-    """Connect all instruments at once and have them test themselves; every failure is told."""
+    """Connect all instruments and run their self-tests; list all failures."""
     from ..capture import Bench
     from ..core.provenance import canonical_json
 
@@ -75,22 +75,22 @@ def check(
 @app.command()
 def sim(
     out: Out = None,
-    seed: Annotated[int, typer.Option(help="Of the simulated world.")] = 0,
-    table: Annotated[str, typer.Option(help="Whose controllers move the table: zaber, smc100.")] = "zaber",
-    family: Annotated[str, typer.Option(help="Of the oscilloscope: keysight, rigol-1000z, …")] = "keysight",
+    seed: Annotated[int, typer.Option(help="Seed of the simulated world.")] = 0,
+    table: Annotated[str, typer.Option(help="Controllers of the turntable: zaber, smc100.")] = "zaber",
+    family: Annotated[str, typer.Option(help="Family of the oscilloscope: keysight, rigol-1000z, …")] = "keysight",
     camera: Annotated[
-        str, typer.Option(help="What a camera looks at: screen, testfield; by default there is none.")
+        str, typer.Option(help="Scene of the camera: screen, testfield. Default: no camera.")
     ] = "",
     repeatable: Annotated[
-        bool, typer.Option("--repeatable", help="The same state gives the same picture; nothing drifts.")
+        bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
     ] = False,
     flat: Annotated[
         bool,
-        typer.Option("--flat", help="The testfield is a plane; else it bends in its mount, as the paper's."),
+        typer.Option("--flat", help="Plane testfield. Default: bent in its mount, as in the paper."),
     ] = False,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Serve so long; 0: until interrupted.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Serving time (s); 0: until interrupted.")] = 0.0,
 ) -> None:
-    """Start simulated instruments on their real protocols, and print the bench.toml that leads to them."""
+    """Start simulated instruments on their real protocols, and print a bench.toml for them."""
     import threading
 
     from ..capture import plugin
@@ -102,14 +102,14 @@ def sim(
     options |= {"repeatable": repeatable, "flat": flat}
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
         if camera and "[instruments.camera]" not in bench.toml:
-            typer.echo("no camera: Aravis is not installed", err=True)
+            typer.echo("no camera: Aravis or PyGObject is not installed", err=True)
         if out is not None:
             write_whole(out, bench.toml)
         else:
             say(bench.toml)
             typer.get_text_stream("stdout").flush()
-        leads = f"in another terminal: reseau bench check --bench {out}" if out else "a bench.toml is above"
-        typer.echo(f"serving until Ctrl-C; {leads}", err=True)
+        hint = f"in another terminal: reseau bench check --bench {out}" if out else "bench.toml: see above"
+        typer.echo(f"serving until Ctrl-C; {hint}", err=True)
         with suppress(KeyboardInterrupt):
             threading.Event().wait(seconds or None)
         complaints = [f"{name}: {text}" for name, texts in bench.violations.items() for text in texts]

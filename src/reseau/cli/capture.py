@@ -1,8 +1,7 @@
-"""`reseau capture`: acquisitions on a bench, into an archive, resumable."""
+"""`reseau capture`: acquisitions on a bench into an archive; they can be resumed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,111 +9,98 @@ import typer
 
 from ..core.errors import UsageError
 from .acquisition import CameraName, Where, conduct, in_session
-from .sessions import model_of, steps_of
 
 if TYPE_CHECKING:
-    from ..capture import Acquisition, Bench, Goal, Plan, Step
-    from ..procedures.calibration import CameraOptions
+    from ..capture import Bench
+    from ..sessions import TestfieldParameters
 
 __all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Acquisitions on a bench: every frame is in the archive before the next is taken.",
+    help="Acquire frames on a bench. Each frame is in the archive before the next one is taken.",
 )
 
-Average = Annotated[int, typer.Option(min=1, help="Exposures to a frame, averaged.")]
-Checks = Annotated[int, typer.Option(min=0, help="Frames to look at before anything is taken; 0: none.")]
-Retakes = Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")]
-HeightSigma = Annotated[float, typer.Option(min=1e-9, help="Of a height (mm), where there is z.")]
+Average = Annotated[int, typer.Option(min=1, help="Exposures averaged to a frame.")]
+Checks = Annotated[int, typer.Option(min=0, help="Frames for the checks before the first frame; 0: no checks.")]
+Retakes = Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")]
+HeightSigma = Annotated[float, typer.Option(min=1e-9, help="Standard deviation of a height (mm), with z.")]
 AxisSigma = Annotated[
-    float, typer.Option(min=1e-6, help="Of z against the normal of the board (mrad), both ways.")
+    float, typer.Option(min=1e-6, help="Standard deviation of z against the normal of the board (mrad).")
 ]
-FieldSigma = Annotated[float, typer.Option(min=1e-9, help="Of the design's points (mm), where there is z.")]
-Pitch = Annotated[float | None, typer.Option(min=1e-6, help="Of the pixels (mm), for Brown's model.")]
+FieldSigma = Annotated[
+    float, typer.Option(min=1e-9, help="Standard deviation of the coordinates of the design (mm), with z.")
+]
+Pitch = Annotated[float | None, typer.Option(min=1e-6, help="Pixel size (mm); selects Brown's model.")]
 Poses = Annotated[
-    Path | None, typer.Option(help="CSV of poses, a column for each axis; by default the paper's 36.")
+    Path | None,
+    typer.Option(help="CSV of poses, one column for each axis. Default: the 36 poses of the paper."),
 ]
-TableName = Annotated[str | None, typer.Option("--table", help="Where the bench has several.")]
-ScannerName = Annotated[str | None, typer.Option("--scanner", help="Where the bench has several.")]
-ScopeName = Annotated[str | None, typer.Option("--oscilloscope", help="Where the bench has several.")]
+TableName = Annotated[str | None, typer.Option("--table", help="Turntable to use, if there are several.")]
+ScannerName = Annotated[str | None, typer.Option("--scanner", help="Scanner to use, if there are several.")]
+ScopeName = Annotated[
+    str | None, typer.Option("--oscilloscope", help="Oscilloscope to use, if there are several.")
+]
 
 
 @app.command("testfield")
 @in_session()
 def coded_field(
     where: Where,
-    design: Annotated[Path | None, typer.Option("--design", "-d", help="Of the testfield or sheet.")] = None,
+    design: Annotated[
+        Path | None, typer.Option("--design", "-d", help="Design of the testfield or sheet.")
+    ] = None,
     poses: Poses = None,
-    heights: Annotated[str, typer.Option(help="Of the board (mm), as 0,50,100: each pose at each.")] = "",
+    heights: Annotated[
+        str, typer.Option(help="Heights of the board (mm), as 0,50,100; each pose at each height.")
+    ] = "",
     height_sigma: HeightSigma = 0.01,
     axis_sigma: AxisSigma = 10.0,
     field_sigma: FieldSigma = 0.05,
-    until: Annotated[str, typer.Option(help="Choose poses until this holds, as 'sigma_c < 0.5 um'.")] = "",
-    first: Annotated[int, typer.Option(min=4, help="Poses to begin with, where they are chosen.")] = 5,
+    until: Annotated[str, typer.Option(help="Choose poses until this goal, as 'sigma_c < 0.5 um'.")] = "",
+    first: Annotated[int, typer.Option(min=4, help="Poses taken before poses are chosen.")] = 5,
     pitch: Pitch = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
-    row_jitter: Annotated[float, typer.Option(min=0, help="Of the sensor, pixels.")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
+    row_jitter: Annotated[float, typer.Option(min=0, help="Row jitter of the sensor (px).")] = 0.0,
+    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of a pixel.")] = 1.0,
     average: Average = 1,
     checks: Checks = 3,
     retakes: Retakes = 2,
     home: Annotated[
-        bool, typer.Option("--home", help="Have axes without a reference find it first: they will move.")
+        bool, typer.Option("--home", help="Home axes without a reference first. The axes will move.")
     ] = False,
-    park: Annotated[str, typer.Option(help="Where the table ends, as tilt=0,roll=0; else it stays.")] = "",
-    retreat: Annotated[str, typer.Option(help="… where it goes after an abort or an error.")] = "",
+    park: Annotated[
+        str, typer.Option(help="Final position of the table, as tilt=0,roll=0. Default: the last pose.")
+    ] = "",
+    retreat: Annotated[
+        str, typer.Option(help="Position after an abort or error. Default: where the table stopped.")
+    ] = "",
     camera: CameraName = None,
     table: TableName = None,
 ) -> None:
-    """Record a testfield from many poses, and calibrate the camera while the recordings come in."""
-    from ..capture import Goal, Step, at_heights, paper_steps, read_steps
-    from ..instruments import Camera, Turntable
+    """Record a testfield from many poses, and calibrate the camera during the acquisition."""
+    final, away = _position(park, "--park"), _position(retreat, "--retreat")
+    levels = _numbers(heights, "--heights")
 
-    goal = Goal.parse(until) if until else None
-    ends, away = _position(park, "--park"), _position(retreat, "--retreat")
+    def parameters(bench: Bench) -> TestfieldParameters:
+        from ..capture import Goal, at_heights, paper_steps, read_steps
+        from ..instruments import Turntable
+        from ..sessions import TestfieldParameters
 
-    def parameters(found: Bench) -> dict[str, Any]:
-        found.one(Camera, camera)
-        axes = found.one(Turntable, table).axes
-        every = paper_steps(axes=tuple(axes)) if poses is None else read_steps(poses)
-        steps = at_heights(every, _numbers(heights, "--heights"))
-        _within(axes, [*steps, Step("--park", ends), Step("--retreat", away)])
-        given = {
-            "steps": [[step.name, dict(step.position)] for step in steps],
-            "until": until,
-            "first": first,
-            "pitch": pitch,
-            "free": [each.strip() for each in free.split(",") if each.strip()],
-            "sigmas": [height_sigma, axis_sigma / 1e3, field_sigma] if _lifted(steps) else None,
-            "row_jitter": row_jitter,
-            "fill": fill,
-            "average": average,
-            "checks": checks,
-            "retakes": retakes,
-            "home": home,
-            "park": ends,
-            "retreat": away,
-            "camera": camera,
-            "table": table,
-        }
-        _of_model(goal, model_of(given))
-        return given
+        if until:
+            Goal.parse(until)
+        axes = bench.one(Turntable, table).axes
+        steps = at_heights(paper_steps(axes=tuple(axes)) if poses is None else read_steps(poses), levels)
+        lifted = TestfieldParameters.lifted(steps)
+        return TestfieldParameters(
+            steps=tuple((step.name, dict(step.position)) for step in steps), until=until, first=first,
+            pitch=pitch, free=tuple(each.strip() for each in free.split(",") if each.strip()),
+            sigmas=(height_sigma, axis_sigma / 1e3, field_sigma) if lifted else None,
+            row_jitter=row_jitter, fill=fill, average=average, checks=checks, retakes=retakes, home=home,
+            park=final, retreat=away, camera=camera, table=table,
+        )  # fmt: skip
 
-    conduct(where, "testfield", _recordings, parameters, {"design.json": design})
-
-
-def _recordings(run: Acquisition, given: dict[str, Any]) -> Plan:
-    """The plan of a testfield's session."""
-    from ..capture import Goal, plans, spread
-
-    every, how = steps_of(given), (given["average"], given["checks"])
-    if given["until"]:
-        goal, begin = Goal.parse(given["until"]), spread(every, given["first"])
-        plan = plans.until(run, goal, begin, every, *how)
-    else:
-        plan = plans.poses(run, every, *how)
-    return plans.homed(run, plan) if given["home"] else plan
+    conduct(where, "testfield", parameters, {"design.json": design})
 
 
 @app.command()
@@ -123,7 +109,7 @@ def oscilloscope(
     where: Where,
     reseau: Annotated[Path | None, typer.Option("--reseau", "-r", help="Design of the reseau.")] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="Design of the test object.")] = None,
-    body: Annotated[bool, typer.Option("--body/--no-body", help="Whether PHOTO III is taken.")] = True,
+    body: Annotated[bool, typer.Option("--body/--no-body", help="Whether to take PHOTO III.")] = True,
     average: Average = 1,
     checks: Checks = 0,
     retakes: Retakes = 2,
@@ -131,104 +117,40 @@ def oscilloscope(
     scanner: ScannerName = None,
     scope: ScopeName = None,
 ) -> None:
-    """Take PHOTO I, II and III of an oscilloscope, and refine them while they come in."""
-    from ..capture import plans
-    from ..instruments import Camera, Oscilloscope, UltrasonicScanner
-
-    def parameters(found: Bench) -> dict[str, Any]:
-        found.one(Camera, camera)
-        for kind, name in ((UltrasonicScanner, scanner), (Oscilloscope, scope)):
-            if name is not None or found.has(kind):  # the operator does without
-                found.one(kind, name)
-        how = {"body": body, "average": average, "checks": checks, "retakes": retakes, "park": {}}
-        return how | {"camera": camera, "scanner": scanner, "oscilloscope": scope}
-
-    def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
-        return plans.oscilloscope(run, given["body"], given["average"], given["checks"])
-
-    conduct(where, "oscilloscope", planned, parameters, {"reseau.json": reseau, "object.json": object_})
+    """Take PHOTO I, II and III of an oscilloscope, and correct them during the acquisition."""
+    how: dict[str, Any] = {"body": body, "average": average, "checks": checks, "retakes": retakes, "park": {}}
+    how |= {"camera": camera, "scanner": scanner, "oscilloscope": scope}
+    inputs = {"reseau.json": reseau, "object.json": object_}
+    conduct(where, "oscilloscope", lambda bench: how, inputs)
 
 
 @app.command()
 @in_session()
 def scan(
     where: Where,
-    count: Annotated[int, typer.Option(min=1, help="Sections.")] = 1,
+    count: Annotated[int, typer.Option(min=1, help="Number of sections.")] = 1,
     scanner: ScannerName = None,
     scope: ScopeName = None,
 ) -> None:
-    """Sweep with the ultrasonic scanner, and keep the sections; beside each an oscilloscope's screen."""
-    from ..capture import plans
-    from ..instruments import Oscilloscope, UltrasonicScanner
-
-    def parameters(found: Bench) -> dict[str, Any]:
-        found.one(UltrasonicScanner, scanner)
-        if scope is not None or found.has(Oscilloscope):
-            found.one(Oscilloscope, scope)
-        return {"count": count, "retakes": 0, "park": {}, "scanner": scanner, "oscilloscope": scope}
-
-    def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
-        return plans.scan(run, given["count"])
-
-    conduct(where, "scan", planned, parameters)
+    """Take sections with the ultrasonic scanner, each with the screenshot of the oscilloscope if present."""
+    how = {"count": count, "retakes": 0, "park": {}, "scanner": scanner, "oscilloscope": scope}
+    conduct(where, "scan", lambda bench: how)
 
 
 @app.command()
 @in_session()
 def frames(
     where: Where,
-    count: Annotated[int, typer.Option(min=1, help="Frames.")] = 1,
+    count: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 1,
     average: Average = 1,
     checks: Checks = 0,
     retakes: Retakes = 0,
     camera: CameraName = None,
 ) -> None:
     """Take frames one after the other."""
-    from ..capture import plans
-    from ..instruments import Camera
-
-    def parameters(found: Bench) -> dict[str, Any]:
-        found.one(Camera, camera)
-        how = {"count": count, "average": average, "checks": checks, "retakes": retakes, "park": {}}
-        return how | {"camera": camera}
-
-    def planned(run: Acquisition, given: dict[str, Any]) -> Plan:
-        return plans.frames(run, given["count"], given["average"], given["checks"])
-
-    conduct(where, "frames", planned, parameters)
-
-
-def _within(axes: Mapping[str, Any], steps: Sequence[Step]) -> None:
-    """Refuse poses to which the table cannot go, before it goes to any."""
-    for step in steps:
-        for axis, value in step.position.items():
-            if axis not in axes:
-                have = ", ".join(axes)
-                raise UsageError(f"the table has no axis {axis}", where=step.name, do=f"it has {have}")
-            low, high = axes[axis].limits
-            if not low <= value <= high:
-                what = f"{axis} {value:g} is not between {low:g} and {high:g} {axes[axis].unit}"
-                raise UsageError(what, where=step.name)
-
-
-def _lifted(steps: Sequence[Step]) -> bool:
-    """Whether the board is recorded at several heights."""
-    from ..capture import HEIGHT
-
-    return len({step.position.get(HEIGHT, 0.0) for step in steps}) > 1
-
-
-def _of_model(goal: Goal | None, model: CameraOptions) -> None:
-    """Refuse a goal for what is not estimated, or in a unit that it does not have."""
-    from ..optics.cameras import unit_of
-
-    if goal is None:
-        return
-    if goal.parameter not in model.chosen:
-        raise UsageError(f"is none of {', '.join(model.chosen)}", where=f"sigma_{goal.parameter}")
-    unit = unit_of(goal.parameter, model.model)
-    if goal.unit and goal.unit != unit:
-        raise UsageError(f"is in {unit or 'no unit'}, not {goal.unit}", where=f"sigma_{goal.parameter}")
+    how: dict[str, Any] = {"count": count, "average": average, "checks": checks, "retakes": retakes}
+    how |= {"park": {}, "camera": camera}
+    conduct(where, "frames", lambda bench: how)
 
 
 def _numbers(text: str, option: str) -> tuple[float, ...]:

@@ -14,6 +14,7 @@ import typer
 from ..core.errors import EstimationError, InputError, UsageError
 
 if TYPE_CHECKING:
+    from ..archive import Archive
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
     from ..io import ReseauDesign, ReseauMeasurement, TestfieldDesign
@@ -23,6 +24,14 @@ T = TypeVar("T")
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+ArchivePlace = Annotated[
+    str,
+    typer.Option("--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive: a folder, or the URL of a database."),
+]
+ObjectsPlace = Annotated[
+    str | None, typer.Option("--objects", help="Folder or URL of the files, if the archive is a database.")
+]
+SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
 
 
 SensorFile = Annotated[
@@ -51,6 +60,19 @@ def _sensor_correction(path: Path) -> SensorCorrection:
     from ..sensor import SensorCorrection
 
     return SensorCorrection.from_calibration(Calibration.read(path))
+
+
+def open_archive(place: str, objects: str | None, *, create: bool = False) -> Archive:
+    """Open the archive at a place.
+
+    Raises
+    ------
+    ArchiveError
+        If there is none, or it cannot be used.
+    """
+    from ..archive import Archive
+
+    return Archive.open(place, objects, create=create)
 
 
 def is_points(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""What is seen of an acquisition: lines, below them a bar where there is a terminal; JSON for programs."""
+"""Display of an acquisition: lines, with a progress bar on a terminal; or JSON lines for programs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, Self, TypeVar
 
 __all__ = ["Display"]
@@ -16,24 +16,32 @@ T = TypeVar("T")
 
 
 class Display:
-    """Shows the events of an acquisition.
+    """Prints the events of an acquisition.
 
     Parameters
     ----------
     as_json : bool
-        Whether every event is a line of JSON on standard output.
+        Whether to print each event as a line of JSON on standard output.
     total : int, optional
-        Poses, where it is known how many there will be.
+        Number of poses, if known.
     sections : bool
-        Whether it is the scanner's sections that are counted.
+        Whether to count sections of the scanner instead of frames.
+    units : mapping of str to str, optional
+        Units of the standard deviations, by parameter.
     """
 
-    def __init__(self, as_json: bool, total: int | None, sections: bool = False) -> None:
-        self._json, self._total, self._sections = as_json, total, sections
-        self._poses, self._there, self._frames, self._reached = 0, 0, 0, ""
-        self._began = time.monotonic()
+    def __init__(
+        self,
+        as_json: bool,
+        total: int | None,
+        sections: bool = False,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        self._json, self._total, self._sections, self._units = as_json, total, sections, dict(units or {})
+        self._poses, self._stored, self._frames, self._reached = 0, 0, 0, ""
+        self._start = time.monotonic()
         self._bar: Any = None
-        self._stream = sys.stdout  # while the engine runs, what it prints itself goes elsewhere
+        self._stream = sys.stdout  # the engine redirects sys.stdout while it runs
 
     def __enter__(self) -> Self:
         if not self._json and sys.stderr.isatty():
@@ -41,13 +49,13 @@ class Display:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
 
-            # Where the terminal is narrow, what is told last is cut off.
+            # On a narrow terminal the end of the text is cut off.
             rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
             text = TextColumn("{task.description}", table_column=rest)
             columns = BarColumn(bar_width=12), MofNCompleteColumn(), TimeRemainingColumn(), text
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True, expand=True)
             self._bar.start()
-            self._task = self._bar.add_task("begins", total=self._total)
+            self._task = self._bar.add_task("starting", total=self._total)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -55,7 +63,7 @@ class Display:
             self._bar.stop()
 
     def aside(self, question: Callable[P, T]) -> Callable[P, T]:
-        """What asks somebody something, and the bar is out of the way for as long."""
+        """Return a function that hides the bar while it asks a question."""
 
         def asked(*args: P.args, **kwargs: P.kwargs) -> T:
             if self._bar is None:
@@ -69,36 +77,36 @@ class Display:
         return asked
 
     def watch(self, kind: str, facts: dict[str, Any]) -> None:
-        """Show an event."""
+        """Print an event."""
         if self._json:
-            # JSON has no word for what is no number.
+            # JSON has no NaN or infinity.
             plain = {
                 k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in facts.items()
             }
-            self._say(json.dumps({"event": kind, **plain}, default=str))
+            self._print(json.dumps({"event": kind, **plain}, default=str))
             return
         if kind == "precision":
-            self._reached = _told(facts)
+            self._reached = self._precision(facts)
         if kind == "frame" or self._counted(facts):
             self._frames += 1
             self._poses += facts.get("ok", True)
-            self._there += facts.get("ok", True) and facts.get("there", False)
-            if self._poses == self._there:
-                self._began = time.monotonic()
+            self._stored += facts.get("ok", True) and facts.get("there", False)
+            if self._poses == self._stored:
+                self._start = time.monotonic()
         line = self._line(kind, facts)
         if line:
-            self._say(line)
+            self._print(line)
         if self._bar is not None:
-            first = self._reached.split("  ")[0]  # all of them stand above
-            told = [first, f"{self._frames} frames", facts.get("step") or kind]
-            self._bar.update(self._task, completed=self._poses, description=" · ".join(filter(None, told)))
+            first = self._reached.split("  ")[0]  # all of them are printed above the bar
+            parts = [first, f"{self._frames} frames", facts.get("step") or kind]
+            self._bar.update(self._task, completed=self._poses, description=" · ".join(filter(None, parts)))
 
     def _counted(self, facts: dict[str, Any]) -> bool:
-        """Whether a picture is one of those that are counted."""
+        """Whether a picture is counted."""
         return self._sections and facts.get("kind") == "scan"
 
     def _line(self, kind: str, facts: dict[str, Any]) -> str:
-        """One line for what is worth one."""
+        """The line for an event; empty if it has none."""
         if kind == "begin":
             return f"session {facts['session']}"
         if kind == "frame":
@@ -106,46 +114,48 @@ class Display:
             good = f"{facts['points']} points" if "points" in facts else "good"
             take = f" take {facts['take']}" if facts["take"] else ""
             outcome = good if facts["ok"] else facts["why"]
-            return f"{self._poses}{of} {facts['step']}{take}: {outcome}{self._left()}"
+            return f"{self._poses}{of} {facts['step']}{take}: {outcome}{self._remaining()}"
         if kind == "picture":
             at = f"{self._poses}/{self._total} " if self._counted(facts) else ""
             return f"{at}{facts['step']}: {facts['kind']}"
         if kind == "precision":
             return f"    {self._reached}"
         if kind == "outlook":
-            known = "why" not in facts
-            return f"    {facts['step']} " + (
-                f"would bring {_told(facts)}" if known else f"cannot be foretold yet: {facts['why']}"
-            )
+            if "why" in facts:
+                return f"    next {facts['step']}: no prediction ({facts['why']})"
+            return f"    next {facts['step']}: {self._precision(facts)} predicted"
         if kind == "next":
-            predicted = _told(facts)
-            brings = f", would bring {predicted}" if predicted else ""
-            return f"next: {facts['step']}{brings}" if facts["step"] else "no pose is left"
+            predicted = self._precision(facts)
+            tail = f": {predicted} predicted" if predicted else ""
+            return f"next pose {facts['step']}{tail}" if facts["step"] else "no pose is left"
         if kind == "check":
-            return "checks: " + ("; ".join(facts["faults"]) or "good")
+            return "checks: " + ("; ".join(facts["faults"]) or "passed")
         if kind == "again":
-            return f"once more: {facts['why']}"
+            return f"retry: {facts['why']}"
         if kind == "rest" and "failed" in facts:
-            return f"at rest, but: {facts['failed']}"
+            return f"stopped, but: {facts['failed']}"
         return ""
 
-    def _say(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         if self._bar is not None and self._stream.isatty():
             self._bar.console.print(line, markup=False, highlight=False)
             return
         self._stream.write(line + "\n")
         self._stream.flush()
 
-    def _left(self) -> str:
-        """How long the rest takes, by those that have been taken now."""
-        taken = self._poses - self._there
+    def _remaining(self) -> str:
+        """Remaining time, from the frames taken by this process."""
+        taken = self._poses - self._stored
         if not self._total or not taken or self._poses >= self._total:
             return ""
-        seconds = (time.monotonic() - self._began) / taken * (self._total - self._poses)
+        seconds = (time.monotonic() - self._start) / taken * (self._total - self._poses)
         return f", {seconds:.0f} s left"
 
-
-def _told(facts: dict[str, Any]) -> str:
-    """Precision reached, as people read it."""
-    values = [(name, value) for name, value in facts.items() if isinstance(value, float)]
-    return "  ".join(f"{name} {value:.3g}" for name, value in values)
+    def _precision(self, facts: dict[str, Any]) -> str:
+        """Standard deviations to two digits, with units."""
+        parts = []
+        for name, value in facts.items():
+            if isinstance(value, float):
+                unit = self._units.get(name.removeprefix("sigma_"), "")
+                parts.append(f"{name} {value:.2g}{' ' if unit else ''}{unit}")
+        return "  ".join(parts)

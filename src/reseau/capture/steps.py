@@ -1,4 +1,4 @@
-"""Steps of an acquisition: where the table stands, and what the pictures taken there are called."""
+"""Steps of an acquisition: positions of the table and the names of the pictures taken there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..io import read_text
 __all__ = ["Step", "as_taken", "at_heights", "paper_steps", "read_steps", "spread"]
 
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
-"""Axes of the testfield's mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
+"""Axes of the testfield mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,14 @@ class Step:
     name : str
         Unique in a session; pictures are stored under it.
     position : mapping of str to float
-        Where the axes of the table stand, in their units; axes that are not named stay where they are.
+        Positions of the axes of the table, in their units. Axes that are not named do not move.
     exposure_us : float, optional
-        That the camera is set to; by default it stays as it is.
+        Exposure of the camera (µs). Default: unchanged.
+
+    Examples
+    --------
+    >>> Step("tilted", {"tilt": 30.0}).position["tilt"]
+    30.0
     """
 
     name: str
@@ -39,7 +44,7 @@ class Step:
 
 
 def as_taken(step: Step, facts: Mapping[str, Any]) -> Step:
-    """A step with the exposure that its frame had, by the camera's word where it tells."""
+    """Return a step with the exposure of its frame: as reported by the camera, else as set."""
     if facts.get("set_exposure_us") is None:
         return step
     return replace(step, exposure_us=facts.get("exposure_us") or facts["set_exposure_us"])
@@ -50,14 +55,21 @@ def _named(position: Mapping[str, float]) -> Step:
 
 
 def paper_steps(tilts: Sequence[float] = (0.0, 30.0, 45.0), axes: Sequence[str] = ()) -> tuple[Step, ...]:
-    """The 36 recordings of Vosselman and Förstner: nine positions, each with the camera turned four times.
+    """Return the 36 poses of Vosselman and Förstner: nine positions, each with four camera rotations.
 
     Parameters
     ----------
     tilts : sequence of float
-        φ (degrees). The board that is not tilted is recorded from one position, another from four.
+        φ (degrees). The board without tilt is recorded from one position, with tilt from four.
     axes : sequence of str, optional
-        Names of the axes that the table has; by default those of the paper. What it lacks is not turned.
+        Axes of the table. Default: those of the paper. Axes that the table lacks are left out.
+
+    Examples
+    --------
+    >>> len(paper_steps())
+    36
+    >>> [step.name for step in paper_steps(axes=("tilt",))]
+    ['tilt 0', 'tilt 30', 'tilt 45']
     """
     quarters = (0.0, 90.0, 180.0, 270.0)
     have = set(axes or (TILT, ROLL, CAMERA_ROLL))
@@ -72,10 +84,15 @@ def paper_steps(tilts: Sequence[float] = (0.0, 30.0, 45.0), axes: Sequence[str] 
 
 
 def at_heights(steps: Sequence[Step], heights: Sequence[float]) -> tuple[Step, ...]:
-    """Each pose at each height of the board (mm), as a z-stage lifts it; without heights, the poses alone.
+    """Return each pose at each height of the board (mm) on a z-stage; without heights, the poses.
 
-    All heights of a pose come one after the other: only the stage moves between them, and the images have one
+    The heights of a pose follow one another: only the stage moves between them, so their images have one
     exterior orientation.
+
+    Examples
+    --------
+    >>> [step.name for step in at_heights([Step("a")], (0.0, 50.0))]
+    ['a z 0', 'a z 50']
     """
     lifted = [
         Step(f"{step.name} {HEIGHT} {height:g}", {**step.position, HEIGHT: height})
@@ -86,18 +103,27 @@ def at_heights(steps: Sequence[Step], heights: Sequence[float]) -> tuple[Step, .
 
 
 def read_steps(path: Path) -> tuple[Step, ...]:
-    """Poses of a CSV: its header names axes of the table, and, where it has one, the column `name` the poses.
+    """Read poses from a CSV file. Its header names axes of the table, and optionally a column `name`.
 
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     FormatError
-        When it is no such table; says in which line.
+        If it is not such a table; the message names the line.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.NamedTemporaryFile("w", suffix=".csv") as file:
+    ...     _ = file.write("name,tilt\\nfirst,0\\n,30\\n")
+    ...     file.flush()
+    ...     [step.name for step in read_steps(Path(file.name))]
+    ['first', 'tilt 30']
     """
     rows = list(csv.reader(io.StringIO(read_text(path))))
     if len(rows) < 2 or not rows[0]:
-        raise FormatError("has no poses", where=path, do="write a header of axes, and a line for each pose")
+        raise FormatError("has no poses", where=path, do="write a header of axes and a line for each pose")
     header = [cell.strip() for cell in rows[0]]
     steps: dict[str, Step] = {}
     for number, row in enumerate(rows[1:], 2):
@@ -110,25 +136,31 @@ def read_steps(path: Path) -> tuple[Step, ...]:
         try:
             position = {axis: float(value) for axis, value in cells.items()}
         except ValueError:
-            raise FormatError(f"line {number} holds what is no number", where=path) from None
+            raise FormatError(f"line {number} has a value that is not a number", where=path) from None
         if not all(math.isfinite(value) for value in position.values()):
-            raise FormatError(f"line {number} holds what is no number", where=path)
+            raise FormatError(f"line {number} has a value that is not a number", where=path)
         step = Step(name, position) if name else _named(position)
         if step.name in steps:
-            raise FormatError(f"line {number}: {step.name!r} stands twice", where=path, do="name poses apart")
+            raise FormatError(f"line {number}: duplicate pose {step.name!r}", where=path, do="rename it")
         steps[step.name] = step
     return tuple(steps.values())
 
 
 def spread(steps: Sequence[Step], count: int) -> tuple[Step, ...]:
-    """Some of the poses, far from one another: each next one is that furthest from all before.
+    """Select poses far from one another: each next pose is the one farthest from all selected before.
 
     Parameters
     ----------
     steps : sequence of Step
-        The first is always taken. Of equally far ones the first is.
+        The first one is always selected. Among equally distant ones, the first is.
     count : int
-        How many.
+        Number of poses.
+
+    Examples
+    --------
+    >>> line = [Step(f"{x:g}", {"z": x}) for x in (0.0, 1.0, 2.0)]
+    >>> [step.name for step in spread(line, 2)]
+    ['0', '2']
     """
     chosen: list[Step] = []
     left = list(steps)
@@ -140,7 +172,7 @@ def spread(steps: Sequence[Step], count: int) -> tuple[Step, ...]:
 
 
 def _apart(one: Step, other: Step) -> float:
-    """Distance of two poses: axes turned by a degree count as much as those moved by a millimetre."""
+    """Distance of two poses; a rotation of one degree counts as much as a motion of one millimetre."""
     total = 0.0
     for axis in one.position.keys() | other.position.keys():
         gap = abs(one.position.get(axis, 0.0) - other.position.get(axis, 0.0))

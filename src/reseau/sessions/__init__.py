@@ -1,0 +1,59 @@
+"""Sessions: acquisitions that are measured live and can be computed again from the archive.
+
+Examples
+--------
+Compute the results of a session again, in a program:
+
+>>> from reseau import sessions
+>>> from reseau.archive import Archive
+>>> with Archive.open("archive") as archive:                            # doctest: +SKIP
+...     all(each.same for each in sessions.rerun(archive.session("monday")))
+True
+"""
+
+from .conducting import (
+    begin,
+    calibration_of,
+    capture,
+    check,
+    lock,
+    parameters_of,
+    procedure_of,
+    rerun,
+    resume,
+)
+from .kinds import KINDS, Reported, SessionKind, kind_of, own_plan, read_design
+from .parameters import (
+    FramesParameters,
+    OscilloscopeParameters,
+    OwnParameters,
+    ScanParameters,
+    SensorParameters,
+    SessionParameters,
+    TestfieldParameters,
+)
+
+__all__ = [
+    "KINDS",
+    "FramesParameters",
+    "OscilloscopeParameters",
+    "OwnParameters",
+    "Reported",
+    "ScanParameters",
+    "SensorParameters",
+    "SessionKind",
+    "SessionParameters",
+    "TestfieldParameters",
+    "begin",
+    "calibration_of",
+    "capture",
+    "check",
+    "kind_of",
+    "lock",
+    "own_plan",
+    "parameters_of",
+    "procedure_of",
+    "read_design",
+    "rerun",
+    "resume",
+]

@@ -1,0 +1,288 @@
+"""The kinds of sessions: for each plan its parameters, inputs, acquisition, procedure and report."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ..archive import Session, Verdict
+from ..capture import Acquisition, Limits, Plan, Procedure, Step, plans, spread
+from ..core.data import Frame
+from ..core.errors import FormatError, UsageError
+from ..io import ReseauDesign, TestfieldDesign
+from .parameters import (
+    FramesParameters,
+    OscilloscopeParameters,
+    OwnParameters,
+    ScanParameters,
+    SensorParameters,
+    SessionParameters,
+    TestfieldParameters,
+)
+
+if TYPE_CHECKING:
+    from ..procedures.live import LiveOscilloscope, LiveTestfield
+    from ..procedures.live_sensor import LiveSensor
+
+__all__ = ["KINDS", "Reported", "SessionKind", "kind_of", "own_plan", "read_design"]
+
+GENERATOR = "generator.py"
+"""Input of a session of the plan `own`: the Python file with the generator."""
+
+
+@dataclass(frozen=True)
+class SessionKind:
+    """What a session of one plan does, live and offline.
+
+    Parameters
+    ----------
+    parameters : type
+        Model of its parameters.
+    acquire : callable
+        Makes the plan of messages, of an acquisition and the parameters.
+    inputs : tuple of str
+        Names of the files that a session must be given; ``.json`` files are designs.
+    procedure : callable, optional
+        Makes the procedure, of a session and its parameters. Without one, frames are only stored.
+    results : callable, optional
+        Makes the results, with the report, of the procedure and the session. Default: those of the
+        procedure.
+    limits : Limits, optional
+        Limits of its frames.
+
+    Examples
+    --------
+    >>> KINDS["testfield"].inputs
+    ('design.json',)
+    """
+
+    parameters: type[SessionParameters]
+    acquire: Callable[[Acquisition, Any], Plan]
+    inputs: tuple[str, ...] = ()
+    procedure: Callable[[Session, Any], Procedure] | None = None
+    results: Callable[[Any, Session], dict[str, str]] | None = None
+    limits: Limits | None = None
+
+
+class Reported:
+    """A procedure whose results include a report.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        Measures the frames.
+    finish : callable
+        Returns the results with the report.
+
+    Examples
+    --------
+    >>> reported = Reported(None, lambda: {"calibration.json": "{}", "report.html": "<html>"})
+    >>> sorted(reported.finish())
+    ['calibration.json', 'report.html']
+    """
+
+    def __init__(self, procedure: Any, finish: Callable[[], dict[str, str]]) -> None:
+        self.procedure, self._finish = procedure, finish
+
+    def on_frame(self, frame: Frame, step: Step) -> Verdict:
+        """Measure a new frame."""
+        verdict: Verdict = self.procedure.on_frame(frame, step)
+        return verdict
+
+    def progress(self) -> Mapping[str, float]:
+        """Return the standard deviations reached so far."""
+        reached: Mapping[str, float] = self.procedure.progress()
+        return reached
+
+    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
+        """Return the pose that lowers a standard deviation most."""
+        found: tuple[Step, float | None] | None = self.procedure.next_pose(candidates, wanted)
+        return found
+
+    def finish(self) -> dict[str, str]:
+        """Return the results with the report."""
+        return self._finish()
+
+
+def kind_of(plan: str) -> SessionKind:
+    """Return the kind of the sessions of a plan.
+
+    Raises
+    ------
+    UsageError
+        If the plan is unknown.
+
+    Examples
+    --------
+    >>> kind_of("sensor").parameters.__name__
+    'SensorParameters'
+    """
+    if plan not in KINDS:
+        raise UsageError("unknown plan", where=plan, do=f"use {', '.join(KINDS)}")
+    return KINDS[plan]
+
+
+def read_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
+    """Read a design of either schema; `where` names it in messages.
+
+    Raises
+    ------
+    FormatError
+        If the text is not a design.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> type(read_design(standard_reseau().to_json(), "reseau.json")).__name__
+    'ReseauDesign'
+    """
+    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
+    return kind.parse(text, where=where)
+
+
+def own_plan(text: str, where: object, arguments: Mapping[str, Any] | None = None) -> Callable[..., Plan]:
+    """Return the generator `plan(run, …)` of a Python file, which this function executes.
+
+    Parameters
+    ----------
+    text : str
+        Content of the file.
+    where : object
+        Names the file in messages.
+    arguments : mapping, optional
+        Arguments that the generator must accept.
+
+    Raises
+    ------
+    FormatError
+        If it is not Python, or does not define the generator.
+    UsageError
+        If the generator does not accept the arguments.
+
+    Examples
+    --------
+    >>> own_plan("def plan(run, count):\\n    yield from ()", "own.py", {"count": 2}).__name__
+    'plan'
+    """
+    names: dict[str, Any] = {"__name__": "plan", "__file__": str(where)}
+    try:
+        exec(compile(text, str(where), "exec"), names)  # the user asked for this
+    except SyntaxError as error:
+        raise FormatError(f"line {error.lineno} is not Python ({error.msg})", where=where) from None
+    plan = names.get("plan")
+    if not inspect.isgeneratorfunction(plan):
+        raise FormatError("has no generator `plan(run, …)`", where=where, do="define one, with `yield from`")
+    if arguments is not None:
+        try:
+            inspect.signature(plan).bind(None, **arguments)
+        except TypeError as error:
+            raise UsageError(f"its plan does not accept the arguments ({error})", where=where) from None
+    return plan
+
+
+def _hashes(session: Session) -> dict[str, str]:
+    """SHA-256 of the inputs of a session, by name."""
+    return {name: each.sha256 for name, each in session.inputs().items()}
+
+
+def _frames(run: Acquisition, given: FramesParameters) -> Plan:
+    return plans.frames(run, given.count, given.average, given.checks)
+
+
+def _scan(run: Acquisition, given: ScanParameters) -> Plan:
+    return plans.scan(run, given.count)
+
+
+def _own(run: Acquisition, given: OwnParameters) -> Plan:
+    return own_plan(run.session.input(GENERATOR), GENERATOR)(run, **given.set)
+
+
+def _oscilloscope(run: Acquisition, given: OscilloscopeParameters) -> Plan:
+    return plans.oscilloscope(run, given.body, given.average, given.checks)
+
+
+def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> LiveOscilloscope:
+    from ..procedures.live import LiveOscilloscope
+
+    reseau, rods = (
+        ReseauDesign.parse(session.input(name), where=name) for name in ("reseau.json", "object.json")
+    )
+    return LiveOscilloscope(
+        reseau, rods, name=session.name, options=session.parameters, inputs=_hashes(session),
+        check=given.check,
+    )  # fmt: skip
+
+
+def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
+    poses = given.poses()
+    if given.goal is None:
+        plan = plans.poses(run, poses, given.average, given.checks)
+    else:
+        first = spread(poses, given.first)
+        plan = plans.until(run, given.goal, first, poses, given.average, given.checks)
+    return plans.homed(run, plan) if given.home else plan
+
+
+def _testfield_procedure(session: Session, given: TestfieldParameters) -> LiveTestfield:
+    from ..measure import TestfieldOptions
+    from ..procedures.live import LiveTestfield
+    from ..procedures.measuring import measurer_of
+
+    design = read_design(session.input("design.json"), "design.json")
+    # The poses and the goal have no influence on the result of given frames.
+    options = {key: value for key, value in session.parameters.items() if key not in ("steps", "until")}
+    measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
+    return LiveTestfield(
+        design, measure, given.camera_model(), name=session.name, options=options, inputs=_hashes(session),
+        sigmas=given.sigmas,
+    )  # fmt: skip
+
+
+def _testfield_results(procedure: LiveTestfield, session: Session) -> dict[str, str]:
+    from ..report.bundle import bundle_report
+
+    results = procedure.finish()
+    found = procedure.calibrated().required()
+    title = f"Calibration, session {session.name}"
+    report = bundle_report(found.searched, title=title, provenance=procedure.provenance)
+    return results | {"report.html": report}
+
+
+def _sensor(run: Acquisition, given: SensorParameters) -> Plan:
+    return plans.sensor(run, given.series)
+
+
+def _sensor_procedure(session: Session, given: SensorParameters) -> LiveSensor:
+    from ..procedures.live_sensor import LiveSensor
+
+    return LiveSensor(name=session.name, region=given.region, options=session.parameters)
+
+
+def _sensor_results(procedure: LiveSensor, session: Session) -> dict[str, str]:
+    from ..report.sensor import sensor_report
+
+    probes = session.frames(kind="probe")
+    camera = probes[0].facts["identity"] if probes else session.name
+    report = sensor_report(
+        procedure.result(), title=f"Sensor of {camera}", provenance=procedure.provenance
+    )
+    return procedure.calibrated(camera) | {"report.html": report}
+
+
+KINDS: Mapping[str, SessionKind] = {
+    "testfield": SessionKind(
+        TestfieldParameters, _testfield, ("design.json",), _testfield_procedure, _testfield_results
+    ),
+    "oscilloscope": SessionKind(
+        OscilloscopeParameters, _oscilloscope, ("reseau.json", "object.json"), _oscilloscope_procedure
+    ),
+    "sensor": SessionKind(
+        SensorParameters, _sensor, (), _sensor_procedure, _sensor_results, plans.NO_EXPOSURE_LIMITS
+    ),
+    "frames": SessionKind(FramesParameters, _frames),
+    "scan": SessionKind(ScanParameters, _scan),
+    "own": SessionKind(OwnParameters, _own, (GENERATOR,)),
+}
+"""Kinds of sessions by the name of the plan."""

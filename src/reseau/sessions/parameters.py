@@ -1,0 +1,422 @@
+"""Parameters of sessions: one model for each plan, read strictly from the archive.
+
+A model describes what the archive stores as `parameters` of a session. The archived JSON has no key `schema`:
+the plan and the software version of a session stand beside it. Defaults apply to keys that a session does not
+have, so that sessions of older versions stay readable.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from pydantic import Field, NonNegativeInt, PositiveInt
+
+from ..capture import HEIGHT, Bench, Goal, SensorSeriesPlan, Step
+from ..core.errors import FormatError, UsageError
+from ..instruments import Camera, Oscilloscope, Turntable, UltrasonicScanner
+from ..io import Document
+
+if TYPE_CHECKING:
+    from ..procedures.calibration import CameraModel
+
+__all__ = [
+    "FramesParameters",
+    "OscilloscopeParameters",
+    "OwnParameters",
+    "ScanParameters",
+    "SensorParameters",
+    "SessionParameters",
+    "TestfieldParameters",
+]
+
+_INSTRUMENTS: dict[str, type] = {
+    "camera": Camera,
+    "table": Turntable,
+    "oscilloscope": Oscilloscope,
+    "scanner": UltrasonicScanner,
+}
+
+
+class SessionParameters(Document):
+    """Parameters that all plans share.
+
+    Parameters
+    ----------
+    retakes : int
+        Number of additional attempts after a bad frame.
+    park : dict of str to float
+        Position of the table after a complete plan; empty: it stays at the last pose.
+    retreat : dict of str to float, optional
+        Position of the table after a stop or a failure.
+    camera, table, oscilloscope, scanner : str, optional
+        Names of instruments on the bench. Default: the only one of its kind.
+    seed : int, optional
+        Seed of a simulated bench.
+
+    Examples
+    --------
+    >>> FramesParameters.from_archive({"count": 3}, where="monday").expected
+    3
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-session-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ()
+    """Instruments that the bench must have."""
+    USES: ClassVar[tuple[str, ...]] = ()
+    """Instruments that the bench may have; the operator replaces them."""
+
+    retakes: NonNegativeInt = 2
+    park: dict[str, float] = Field(default_factory=dict)
+    retreat: dict[str, float] | None = None
+    camera: str | None = None
+    table: str | None = None
+    oscilloscope: str | None = None
+    scanner: str | None = None
+    seed: int | None = None
+
+    @classmethod
+    def from_archive(cls, parameters: Mapping[str, Any], *, where: object) -> Self:
+        """Read the parameters of a session; `where` names it in messages.
+
+        Raises
+        ------
+        FormatError
+            If a key is missing, unknown or has a value of a wrong type.
+        """
+        try:
+            text = json.dumps({**parameters, "schema": cls.SCHEMA})
+        except (TypeError, ValueError) as error:
+            raise FormatError(f"not JSON ({error})", where=where) from None
+        return cls.parse(text, where=where)
+
+    def to_archive(self) -> dict[str, Any]:
+        """Return the JSON values that the archive stores: those keys that were given."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    @property
+    def expected(self) -> int | None:
+        """Number of frames (or sections) that the plan takes; None if it is not known in advance."""
+        return None
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of the standard deviations that the procedure reports, by parameter."""
+        return {}
+
+    def check_bench(self, bench: Bench) -> None:
+        """Check that a bench can carry out the plan, before anything moves.
+
+        Raises
+        ------
+        UsageError
+            If an instrument is missing, or a pose is out of its range.
+        """
+        for key in self.NEEDS:
+            bench.one(_INSTRUMENTS[key], getattr(self, key))
+        for key in self.USES:
+            if getattr(self, key) is not None or bench.has(_INSTRUMENTS[key]):
+                bench.one(_INSTRUMENTS[key], getattr(self, key))
+
+
+class FramesParameters(SessionParameters):
+    """Parameters of the plan `frames`: frames one after the other.
+
+    Parameters
+    ----------
+    count : int
+        Number of frames.
+    average : int
+        Exposures averaged to a frame.
+    checks : int
+        Frames for the checks before the first frame; 0: no checks.
+
+    Examples
+    --------
+    >>> FramesParameters(count=2).to_archive()
+    {'count': 2}
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-frames-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
+
+    retakes: NonNegativeInt = 0
+    count: PositiveInt = 1
+    average: PositiveInt = 1
+    checks: NonNegativeInt = 0
+
+    @property
+    def expected(self) -> int:
+        """Number of frames."""
+        return self.count
+
+
+class ScanParameters(SessionParameters):
+    """Parameters of the plan `scan`: sections of the ultrasonic scanner.
+
+    Parameters
+    ----------
+    count : int
+        Number of sections.
+
+    Examples
+    --------
+    >>> ScanParameters().expected
+    1
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-scan-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("scanner",)
+    USES: ClassVar[tuple[str, ...]] = ("oscilloscope",)
+
+    retakes: NonNegativeInt = 0
+    count: PositiveInt = 1
+
+    @property
+    def expected(self) -> int:
+        """Number of sections."""
+        return self.count
+
+
+class OwnParameters(SessionParameters):
+    """Parameters of the plan `own`: a generator in a Python file of the user.
+
+    Parameters
+    ----------
+    set : dict
+        Arguments of the generator.
+
+    Examples
+    --------
+    >>> OwnParameters(set={"tilts": [10, 20]}).to_archive()
+    {'set': {'tilts': [10, 20]}}
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-own-parameters/1"
+
+    retakes: NonNegativeInt = 0
+    set: dict[str, Any] = Field(default_factory=dict)
+
+
+class OscilloscopeParameters(SessionParameters):
+    """Parameters of the plan `oscilloscope`: PHOTO I, II and III.
+
+    Parameters
+    ----------
+    body : bool
+        Whether PHOTO III is taken.
+    average, checks : int
+        As for :class:`FramesParameters`.
+    check : tuple of str
+        Marks of the reseau used as check points only.
+
+    Examples
+    --------
+    >>> OscilloscopeParameters(body=False).check
+    ()
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-oscilloscope-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
+    USES: ClassVar[tuple[str, ...]] = ("scanner", "oscilloscope")
+
+    body: bool = True
+    average: PositiveInt = 1
+    checks: NonNegativeInt = 0
+    check: tuple[str, ...] = ()
+
+
+class TestfieldParameters(SessionParameters):
+    """Parameters of the plan `testfield`: a camera calibrated by images of a target from many poses.
+
+    Parameters
+    ----------
+    steps : tuple of (str, dict of str to float)
+        Names and positions of the poses; with `until`, the candidates.
+    pitch : float or None
+        Size of a pixel (mm), for Brown's model; None: OpenCV's model.
+    free : tuple of str
+        Parameters to estimate; empty: the usual ones of the model.
+    row_jitter : float
+        Standard deviation of the start of a row of the sensor (px).
+    fill : float
+        Light-sensitive part of a pixel, as a share of its area.
+    until : str
+        Goal; poses are chosen until it is reached. See :class:`reseau.capture.Goal`.
+    first : int
+        Number of poses taken before poses are chosen.
+    sigmas : (float, float, float), optional
+        Standard deviations of a height of the z-stage (mm), of the direction of its axis (rad) and of the
+        coordinates of the design (mm); None: each image has its own orientation.
+    average, checks : int
+        As for :class:`FramesParameters`.
+    home : bool
+        Whether axes without a reference are homed first.
+
+    Examples
+    --------
+    >>> steps = (("frontal", {"tilt": 0.0}), ("tilted", {"tilt": 30.0}))
+    >>> given = TestfieldParameters(steps=steps, pitch=0.027, free=("c",), row_jitter=0.0, fill=0.8)
+    >>> given.expected, given.camera_model().model
+    (2, 'brown')
+    """
+
+    __test__: ClassVar[bool] = False  # not a class of tests
+    SCHEMA: ClassVar[str] = "reseau-testfield-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
+
+    steps: tuple[tuple[str, dict[str, float]], ...]
+    pitch: float | None
+    free: tuple[str, ...]
+    row_jitter: float
+    fill: float
+    until: str = ""
+    first: PositiveInt = 5
+    sigmas: tuple[float, float, float] | None = None
+    average: PositiveInt = 1
+    checks: NonNegativeInt = 0
+    home: bool = False
+
+    @property
+    def expected(self) -> int | None:
+        """Number of poses; None if poses are chosen."""
+        return None if self.until else len(self.steps)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of the parameters of the camera."""
+        from ..bundle import UNITS
+
+        return UNITS
+
+    @property
+    def goal(self) -> Goal | None:
+        """The goal, if poses are chosen."""
+        return Goal.parse(self.until) if self.until else None
+
+    def poses(self) -> tuple[Step, ...]:
+        """Return the poses as steps."""
+        return tuple(Step(name, position) for name, position in self.steps)
+
+    def camera_model(self) -> CameraModel:
+        """Return the camera model to estimate."""
+        from ..procedures.calibration import CameraModel
+
+        if self.pitch is None:
+            return CameraModel("opencv", self.free)
+        return CameraModel("brown", self.free, (self.pitch, self.pitch))
+
+    @staticmethod
+    def lifted(steps: Sequence[Step]) -> bool:
+        """Return whether the target is recorded at several heights."""
+        return len({step.position.get(HEIGHT, 0.0) for step in steps}) > 1
+
+    def check_bench(self, bench: Bench) -> None:
+        """Check instruments, the range of all poses, and that the goal is about an estimated parameter."""
+        super().check_bench(bench)
+        axes = bench.one(Turntable, self.table).axes
+        for step in (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})):
+            for axis, value in step.position.items():
+                if axis not in axes:
+                    raise UsageError(f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}")
+                low, high = axes[axis].limits
+                if not low <= value <= high:
+                    unit = axes[axis].unit
+                    what = f"{axis} = {value:g} {unit} is out of range"
+                    raise UsageError(what, where=step.name, do=f"use {low:g} to {high:g} {unit}")
+        self._check_goal()
+
+    def _check_goal(self) -> None:
+        from ..bundle import UNITS
+
+        model, goal = self.camera_model(), self.goal
+        if goal is None:
+            return
+        name = f"sigma_{goal.parameter}"
+        if goal.parameter not in model.chosen:
+            raise UsageError("is not estimated", where=name, do=f"use {', '.join(model.chosen)}")
+        unit = UNITS.get(goal.parameter, "")
+        if goal.unit and goal.unit != unit:
+            raise UsageError(f"has the unit {unit or '1'}, not {goal.unit}", where=name)
+
+
+class SensorParameters(SessionParameters):
+    """Parameters of the plan `sensor`: the sensor series of a camera.
+
+    Parameters
+    ----------
+    region : (int, int, int, int) or None
+        Left, top, width and height of the slanted edge (px); None: the whole image.
+    levels, frames, longest_us, edge_us
+        As for :class:`reseau.capture.SensorSeriesPlan`.
+    count : int, optional
+        Number of frames.
+    settings : dict
+        Settings of the camera at the start.
+
+    Examples
+    --------
+    >>> SensorParameters.from_archive({}, where="mine: parameters of plan `sensor`")
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.FormatError: mine: parameters of plan `sensor`: missing key `region`
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-sensor-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
+
+    region: tuple[int, int, int, int] | None
+    levels: PositiveInt = 14
+    frames: PositiveInt = 8
+    longest_us: float = 1e6
+    edge_us: float | None = None
+    count: PositiveInt | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+    @classmethod
+    def on_bench(
+        cls,
+        bench: Bench,
+        *,
+        camera: str | None = None,
+        levels: int = 14,
+        frames: int = 8,
+        longest_us: float = 1e6,
+        edge: bool = False,
+        region: tuple[int, int, int, int] | None = None,
+        retakes: int = 2,
+    ) -> Self:
+        """Return the parameters for a camera of a bench, with its current settings.
+
+        Parameters
+        ----------
+        bench : Bench
+            The bench.
+        camera : str, optional
+            Name of the camera. Default: the only one.
+        levels, frames, longest_us
+            As for :class:`reseau.capture.SensorSeriesPlan`.
+        edge : bool
+            Whether a slanted edge is taken, at the current exposure of the camera.
+        region, retakes
+            As for the class.
+        """
+        device = bench.one(Camera, camera)
+        settings = device.settings.to_dict()
+        edge_us = float(settings["exposure_us"]) if edge else None
+        plan = SensorSeriesPlan(levels, frames, longest_us, edge_us)
+        return cls(
+            **vars(plan), count=plan.count, camera=device.name, settings=settings, region=region,
+            retakes=retakes, park={},
+        )  # fmt: skip
+
+    @property
+    def series(self) -> SensorSeriesPlan:
+        """The frames to take."""
+        return SensorSeriesPlan(self.levels, self.frames, self.longest_us, self.edge_us)
+
+    @property
+    def expected(self) -> int:
+        """Number of frames."""
+        return self.count or self.series.count
