@@ -22,7 +22,7 @@ from reseau.archive import (
     LocalObjects,
     RemoteObjects,
     Verdict,
-    described,
+    describe,
     export,
     frame_of,
     tiff_of,
@@ -126,9 +126,9 @@ def test_a_name_is_given_once_and_an_unknown_one_is_told(opened: Callable[[], Ar
         archive.begin("s", "frames", {})
         with pytest.raises(ArchiveError, match="--resume"):
             archive.begin("s", "frames", {})
-        with pytest.raises(ArchiveError, match="no session"):
+        with pytest.raises(ArchiveError, match="is not a session"):
             archive.session("t")
-        with pytest.raises(ArchiveError, match="no name"):
+        with pytest.raises(ArchiveError, match="is not a valid name"):
             archive.begin("../s", "frames", {})
 
 
@@ -136,16 +136,16 @@ def test_a_session_has_what_it_was_given_from_the_beginning(opened: Callable[[],
     with opened() as archive:
         session = archive.begin("s", "testfield", {}, inputs={"design.json": "{}", "field.csv": "ä"})
         session.store("0", frame())
-        assert {name: each.kind for name, each in session.given().items()} == {
+        assert {name: each.kind for name, each in session.inputs().items()} == {
             "design.json": "input",
             "field.csv": "input",
         }
         assert session.input("field.csv") == "ä"
-        with pytest.raises(ArchiveError, match=r"s: was given no other\.json"):
+        with pytest.raises(ArchiveError, match=r"s: has no input other\.json"):
             session.input("other.json")
         with pytest.raises(ArchiveError, match="--resume"):
             archive.begin("s", "testfield", {}, inputs={"more.json": "[]"})
-        assert len(session.given()) == 2
+        assert len(session.inputs()) == 2
         assert [each.frames for each in archive.sessions()] == [1]  # what was given is no frame
         assert verify(archive).files == 3
 
@@ -202,7 +202,7 @@ def test_a_session_is_exported_to_the_same_bytes_each_time(tmp_path: Path) -> No
             assert made.testzip() is None
             about = json.loads(made.read("session.json"))
             data = made.read(about["frames"][0]["file"])
-        assert about == described(session)
+        assert about == describe(session)
         np.testing.assert_array_equal(frame_of(data, "zip")[0].pixels, frame().pixels)
         assert list(about["times"]["frames"][0]) == ["taken"]
         assert "taken" not in json.dumps(about["frames"])
@@ -233,7 +233,7 @@ def test_pixels_and_facts_come_back_from_a_tiff_as_they_were(
 @given(data=st.binary(max_size=300))
 @settings(deadline=None, max_examples=60)
 def test_bytes_that_are_no_frame_are_told(data: bytes) -> None:
-    with pytest.raises(ArchiveError, match="no frame"):
+    with pytest.raises(ArchiveError, match="is not a frame"):
         frame_of(data, "here")
 
 
@@ -266,17 +266,17 @@ def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> 
         check=True,
     ).stdout.splitlines()
     assert said == [
-        f"{tmp_path / 'objects'}: cannot be kept (File too large); make room, or name another archive",
+        f"{tmp_path / 'objects'}: cannot be stored (File too large); free disk space, or name another archive",
         "['0', '1']",
     ]
     assert len([p for p in (tmp_path / "objects").rglob("*") if p.is_file()]) == 2
 
 
 def test_places_that_cannot_be_used_are_told_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ArchiveError, match="is no archive; `reseau capture` makes one"):
+    with pytest.raises(ArchiveError, match="is not an archive; create one with `reseau capture`"):
         Archive.open(tmp_path / "none")
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ArchiveError, match="cannot be made"):
+    with pytest.raises(ArchiveError, match="cannot be created"):
         Archive.open(tmp_path / "file", create=True)
     (tmp_path / "index.sqlite").write_bytes(b"no database, but a text that is long enough" * 20)
     with pytest.raises(ArchiveError, match="not a database"):
@@ -331,7 +331,7 @@ def test_what_a_killed_process_left_in_the_log_is_read_on_a_read_only_disk_too(
         assert [f.step for f in archive.session("s").frames()] == ["0", "1", "2"]
         with pytest.raises(ArchiveError, match="readonly"):
             archive.session("s").end("done")
-    with pytest.raises(ArchiveError, match="may only be read; name another archive"):
+    with pytest.raises(ArchiveError, match="is read-only; name another archive"):
         Archive.open(tmp_path, create=True)
 
 

@@ -138,7 +138,7 @@ def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, kept: Sessi
     takes = kept.frames(FEW[1].name)
     assert [(f.take, f.verdict.ok) for f in takes if f.verdict] == [(0, False), (1, True)]
     assert takes[0].verdict is not None
-    assert "saturated; expose less" in takes[0].verdict.why
+    assert "saturated: expose less" in takes[0].verdict.why
     assert rig.camera.exposures == 6
 
 
@@ -322,21 +322,21 @@ def test_a_plan_of_ones_own_is_a_generator(rig: FieldRig, kept: Session) -> None
 
 def test_what_cannot_be_meant_is_told_before_anything_moves(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept)
-    with pytest.raises(UsageError, match=r"has no axis height; it has tilt, roll, camera_roll"):
+    with pytest.raises(UsageError, match=r"has no axis height; use tilt, roll, camera_roll"):
         carry_out(run, plans.poses(run, [Step("a", {"height": 1.0})]))
-    with pytest.raises(UsageError, match="has none for a UltrasonicScanner"):
+    with pytest.raises(UsageError, match="has no UltrasonicScanner"):
         carry_out(run, plans.scan(run))
     with pytest.raises(UsageError, match="needs an operator"):
         carry_out(run, plans.oscilloscope(run))
     wrong = rig.acquisition(kept, camera="table")
-    with pytest.raises(UsageError, match="is no Camera"):
+    with pytest.raises(UsageError, match="is not a Camera"):
         carry_out(wrong, plans.frames(wrong, 1))
 
 
 def test_checks_stop_what_would_be_worth_nothing(rig: FieldRig, kept: Session) -> None:
     rig.camera.spoil = lambda number, pixels: pixels // 20
     run = rig.acquisition(kept)
-    with pytest.raises(StateError, match=r"full scale only; expose more.*--checks 0"):
+    with pytest.raises(StateError, match=r"of full scale: expose more.*--checks 0"):
         carry_out(run, plans.poses(run, FEW, checks=3))
     assert len(kept.frames(kind="check")) == 3
     assert not kept.frames(kind="frame")

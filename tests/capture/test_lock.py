@@ -38,7 +38,7 @@ def test_a_bench_in_use_names_its_owner_and_is_free_when_that_is_killed(tmp_path
             StateError, match=rf"session tuesday \(process {other.pid} of .* since 20"
         ) as told:
             lock.__enter__()
-        assert "wait, or stop that one" in str(told.value)
+        assert "wait, or stop that process" in str(told.value)
         with BenchLock(["TCPIP::here"], "session monday", tmp_path):
             pass  # what had been taken before the refusal is free again
         os.kill(other.pid, signal.SIGKILL)

@@ -52,7 +52,7 @@ def test_a_scene_without_edges_is_told_in_words_that_any_index_takes() -> None:
     """JSON knows no infinity; PostgreSQL refuses it."""
     flat = [Frame(np.full((60, 60), 90, np.uint8), 255.0)] * 2
     found = readiness(flat)
-    assert found.faults == ("there are no edges; focus, or have it look at something",)
+    assert found.faults == ("no edges found: focus, or point the camera at a target",)
     assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["edge_px"] is None
 
 
@@ -65,9 +65,9 @@ def test_a_quiet_bench_is_ready() -> None:
 @pytest.mark.parametrize(
     ("frames", "fault"),
     [
-        ([scene((0.3 * (k % 2), 0), seed=k) for k in range(4)], "what shakes it"),
-        ([scene((0.06 * k, 0), seed=k) for k in range(5)], "drifted by 0.24 px; let it warm up"),
-        ([scene(level=1 - 0.01 * k, seed=k) for k in range(5)], "brightness drifted by -4 %"),
+        ([scene((0.3 * (k % 2), 0), seed=k) for k in range(4)], "find its source"),
+        ([scene((0.06 * k, 0), seed=k) for k in range(5)], "drift of 0.24 px: let the camera warm up"),
+        ([scene(level=1 - 0.01 * k, seed=k) for k in range(5)], "brightness drift of -4 %"),
         ([scene(sigma=4, seed=k) for k in range(3)], "focus"),
         ([scene(level=3, seed=k) for k in range(3)], "expose less"),
         ([scene(level=0.1, seed=k) for k in range(3)], "expose more"),
@@ -80,7 +80,7 @@ def test_what_is_wrong_before_an_acquisition_is_told(frames: list[Frame], fault:
 def test_checks_need_two_frames_of_one_scene() -> None:
     with pytest.raises(UsageError, match="two frames"):
         readiness([scene()])
-    with pytest.raises(UsageError, match="no one scene"):
+    with pytest.raises(UsageError, match="differs in size"):
         readiness([scene(), Frame(np.zeros((9, 9), np.uint8), 255.0)])
 
 
@@ -102,10 +102,10 @@ def test_poses_of_a_table_are_read(tmp_path: Path) -> None:
     [
         ("", "has no poses"),
         ("tilt\n", "has no poses"),
-        ("tilt\nx\n", "line 2 holds what is no number"),
-        ("tilt\nnan\n", "line 2 holds what is no number"),
+        ("tilt\nx\n", "line 2 has a value that is not a number"),
+        ("tilt\nnan\n", "line 2 has a value that is not a number"),
         ("tilt,roll\n1\n", "line 2 has 1 cells, not 2"),
-        ("tilt\n1\n1\n", "line 3: 'tilt 1' stands twice"),
+        ("tilt\n1\n1\n", "line 3: duplicate pose 'tilt 1'"),
     ],
 )
 def test_a_table_that_is_none_is_told_with_its_line(tmp_path: Path, text: str, says: str) -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from reseau.archive import Archive, Session
 from reseau.capture import Acquisition, Bench, BenchFile, Decision, InstrumentEntry, Step, carry_out, rerun
-from reseau.capture.sensor import ALL_LIMITS, SensorPlan, sensor
+from reseau.capture.plans import NO_EXPOSURE_LIMITS, SensorSeriesPlan, sensor
 from reseau.core.data import Frame
 from reseau.core.errors import DeadlineError, EstimationError, StateError
 from reseau.procedures.live_sensor import LiveSensor
@@ -27,7 +27,7 @@ from reseau_sims.serving import LampScene, SimulatedCamera, VideoCamera
 
 from .killing import exit_code
 
-PLAN = SensorPlan(levels=10, frames=3, longest_us=40_000.0)
+PLAN = SensorSeriesPlan(levels=10, frames=3, longest_us=40_000.0)
 
 
 class Rig:
@@ -48,9 +48,9 @@ class Rig:
     def operator(self, what: str) -> None:
         self.lamp.light = 0.0 if "cover" in what else self.light
 
-    def carry_out(self, kept: Session, plan: SensorPlan = PLAN, decision: Decision = "stop") -> None:
+    def carry_out(self, kept: Session, plan: SensorSeriesPlan = PLAN, decision: Decision = "stop") -> None:
         run = Acquisition(
-            self.bench, kept, LiveSensor(name="eye"), limits=ALL_LIMITS, operator=self.operator,
+            self.bench, kept, LiveSensor(name="eye"), limits=NO_EXPOSURE_LIMITS, operator=self.operator,
             watch=lambda kind, facts: self.events.append((kind, facts)),
         )  # fmt: skip
         carry_out(run, sensor(run, plan), paused=lambda: decision)
@@ -137,11 +137,11 @@ def test_interrupted_in_the_middle_of_a_series_it_goes_on_there(
 
 
 def test_no_light_and_too_much_of_it_are_said(tmp_path: Path) -> None:
-    for light, said in ((0.0, "sees nearly nothing at 8 ms"), (1e4, "saturated at its shortest exposure")):
+    for light, said in ((0.0, "gives almost no signal at 8 ms"), (1e4, "saturated at its shortest exposure")):
         with Archive.open(tmp_path / f"{light:g}", create=True) as archive, (rig := Rig(light)).bench:
             kept = archive.begin("s", "sensor", {})
             with pytest.raises(StateError, match=said):
-                rig.carry_out(kept, SensorPlan(5, 2, 8000.0))
+                rig.carry_out(kept, SensorSeriesPlan(5, 2, 8000.0))
             assert rig.camera.settings.to_dict()["exposure_us"] == 1000.0
             assert not kept.frames(kind="frame")
 
@@ -150,7 +150,7 @@ def test_no_light_and_too_much_of_it_are_said(tmp_path: Path) -> None:
 def test_exposures_reach_from_little_light_to_saturation(kept: Session, light: float) -> None:
     rig = Rig(light)
     with rig.bench:
-        rig.carry_out(kept, SensorPlan(10, 2, 60_000.0))
+        rig.carry_out(kept, SensorSeriesPlan(10, 2, 60_000.0))
     validity = json.loads(kept.content(kept.results()[-1]))["validity"]
     assert validity["saturated"]
 

@@ -54,7 +54,7 @@ def test_a_testfield_from_poses_to_a_calibration_that_can_be_rerun(
 ) -> None:
     assert capture("testfield", *TESTFIELD, "--name", "monday", "--park", "tilt=10") == 0
     out = capsys.readouterr().out
-    assert "checks: good" in out
+    assert "checks: passed" in out
     assert "5/5 tilt 30 roll 0 camera_roll 0" in out
     assert "sigma_c 0.0" in out
     assert "monday: done, 5 frames in archive\n  calibration.json\n  report.html\n" in out
@@ -121,10 +121,10 @@ def test_a_plan_of_ones_own_is_carried_out_and_resumed_as_it_was_begun(
 @pytest.mark.parametrize(
     ("text", "options", "says"),
     [
-        (OWN, ["--set", "tilts=[1]", "--set", "rolls=2"], "own.py: its plan does not fit (got an unexpected"),
-        (OWN, [], "own.py: its plan does not fit (missing a required argument: 'tilts')"),
+        (OWN, ["--set", "tilts=[1]", "--set", "rolls=2"], "own.py: its plan does not accept the arguments (got an unexpected"),
+        (OWN, [], "own.py: its plan does not accept the arguments (missing a required argument: 'tilts')"),
         (OWN, ["--set", "tilts"], "--set: is 'tilts'; write it like tilt=30"),
-        ("def plan(run:\n", [], "own.py: line 1 is no Python"),
+        ("def plan(run:\n", [], "own.py: line 1 is not Python"),
         ("def plan(run):\n    return 1\n", [], "own.py: has no generator `plan(run, …)`"),
     ],
 )
@@ -147,13 +147,13 @@ def test_what_an_archive_cannot_do_is_told_in_one_line(
     assert capture("testfield", *TESTFIELD, "--name", "b") == 1
     capsys.readouterr()
     for arguments, says in {
-        ("show", "c"): "c: is no session of this archive",
-        ("show", "a", "--out", "poses.csv"): "poses.csv: cannot be made (File exists); name a folder",
-        ("show", "a", "--out", "none/deep"): "none/deep: cannot be made (No such file",
-        ("rerun", "a"): "a: frames computes nothing",
-        ("rerun", "b"): "b: has no results; it is failed",
+        ("show", "c"): "c: is not a session of this archive",
+        ("show", "a", "--out", "poses.csv"): "poses.csv: cannot be created (File exists); name another",
+        ("show", "a", "--out", "none/deep"): "none/deep: cannot be created (No such file",
+        ("rerun", "a"): "a: plan `frames` computes nothing",
+        ("rerun", "b"): "b: has no results (status: failed)",
         ("export", "a", "--out", "a.tar"): "a.tar: ends in '.tar'; use .zip",
-        ("list", "--archive", "none"): "is no archive",
+        ("list", "--archive", "none"): "is not an archive",
     }.items():
         assert run(["archive", *arguments]) in (1, 2)
         out, err = capsys.readouterr()
@@ -175,7 +175,7 @@ def test_options_come_from_a_toml_file_and_the_command_line_wins(
     assert "--first" in capsys.readouterr().err
     Path("plan.toml").write_text("cuont = 3\n")
     assert capture("frames", "--plan", "plan.toml") == 2
-    assert "plan.toml: unknown key `cuont`; there are" in capsys.readouterr().err
+    assert "plan.toml: unknown key `cuont`; use " in capsys.readouterr().err
 
 
 def test_toml_names_options_as_the_command_line_does_and_may_hold_lists_and_tables(
@@ -209,7 +209,7 @@ def test_a_session_that_is_resumed_heeds_no_other_options_and_says_so(
     assert capture("frames", "--count", "2", "--name", "a") == 0
     capsys.readouterr()
     assert capture("frames", "--resume", "--name", "a", "--count", "3") == 2
-    assert capsys.readouterr().err == "reseau: --count: is as the session was begun; leave it out\n"
+    assert capsys.readouterr().err == "reseau: --count: cannot be changed with --resume; leave it out\n"
     assert rig.camera.exposures == 2
 
 
@@ -245,9 +245,9 @@ def test_a_session_that_failed_is_resumed_where_it_stood(
     assert "monday: done, 5 frames" in capsys.readouterr().out
     assert rig.camera.exposures == 5
     assert capture("testfield", "--resume") == 2
-    assert "none can be resumed; name one with --name" in capsys.readouterr().err
+    assert "testfield: no session can be resumed" in capsys.readouterr().err
     assert capture("frames", "--resume", "--name", "monday") == 2
-    assert "is a session of testfield; use `capture testfield`" in capsys.readouterr().err
+    assert "monday: its plan is `testfield`" in capsys.readouterr().err
 
 
 def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,7 +261,7 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
     Path("few.csv").write_text(POSES)
     why = capture("testfield", *TESTFIELD, "--checks", "0", "--until", "sigma_c < 1 nm", "--name", "b")
     assert why == 1
-    assert "b: no pose is left that would help to reach sigma_c < 1e-06 mm" in capsys.readouterr().err
+    assert "b: sigma_c < 1e-06 mm not reached: no pose is left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -269,22 +269,22 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
     [
         (["testfield"], "--design: is needed"),
         (["testfield", "--design", "none.json"], "none.json: cannot be read"),
-        (["testfield", "--design", "bench.toml"], "bench.toml: is no JSON"),
+        (["testfield", "--design", "bench.toml"], "bench.toml: is no"),
         (["frames", "--bench", "none.toml"], "none.toml: cannot be read"),
-        (["frames", "--name", "a/b"], "is no name of a session"),
-        (["frames", "--resume"], "is no archive"),
-        (["testfield", *TESTFIELD, "--until", "c < 1"], "is no goal"),
+        (["frames", "--name", "a/b"], "is not a valid name of a session"),
+        (["frames", "--resume"], "is not an archive"),
+        (["testfield", *TESTFIELD, "--until", "c < 1"], "is not a goal"),
         (["testfield", *TESTFIELD, "--park", "tilt"], "--park: is 'tilt'"),
-        (["testfield", *TESTFIELD, "--park", "z=0"], "--park: the table has no axis z; it has tilt, roll"),
-        (["testfield", *TESTFIELD, "--park", "roll=400"], "--park: roll 400 is not between -5 and 360 deg"),
+        (["testfield", *TESTFIELD, "--park", "z=0"], "park: the table has no axis z; use tilt, roll"),
+        (["testfield", *TESTFIELD, "--park", "roll=400"], "park: roll = 400 deg is out of range; use -5 to 360 deg"),
         (["testfield", *TESTFIELD, "--heights", "0,50"], "z 0: the table has no axis z"),
         (["testfield", *TESTFIELD[:-6], "--free", "c,q"], "q: is none of c, x0"),
-        (["testfield", *TESTFIELD, "--until", "sigma_K2 < 1"], "sigma_K2: is none of c, x0, y0, K1"),
-        (["testfield", *TESTFIELD, "--until", "sigma_c < 1 px"], "sigma_c: is in mm, not px"),
-        (["testfield", *TESTFIELD[:4], "--until", "sigma_fx < 1 um"], "sigma_fx: is in px, not mm"),
-        (["scan"], "has none for a UltrasonicScanner"),
-        (["frames", "--camera", "table"], "table: is no Camera"),
-        (["frames", "--archive", "poses.csv"], "cannot be made"),
+        (["testfield", *TESTFIELD, "--until", "sigma_K2 < 1"], "sigma_K2: is not estimated; use c, x0, y0, K1"),
+        (["testfield", *TESTFIELD, "--until", "sigma_c < 1 px"], "sigma_c: has the unit mm, not px"),
+        (["testfield", *TESTFIELD[:4], "--until", "sigma_fx < 1 um"], "sigma_fx: has the unit px, not mm"),
+        (["scan"], "bench: has no UltrasonicScanner"),
+        (["frames", "--camera", "table"], "table: is not a Camera"),
+        (["frames", "--archive", "poses.csv"], "cannot be created"),
     ],
 )
 def test_what_cannot_be_done_is_told_in_one_line(
@@ -337,7 +337,7 @@ def test_sections_are_those_of_the_scanner_that_is_named_and_the_session_keeps_t
         BENCH + "".join(f'[instruments.{n}]\ndriver = "{n}"\naddress = "sim-{n}"\n' for n in names)
     )
     assert capture("scan") == 2
-    assert "bench: has near, far for a UltrasonicScanner; name one" in capsys.readouterr().err
+    assert "bench: has several of UltrasonicScanner: near, far; name one" in capsys.readouterr().err
     assert capture("scan", "--scanner", "far", "--count", "2", "--name", "a") == 0
     out = capsys.readouterr().out
     assert out == "session a\n1/2 section 000: scan\n2/2 section 001: scan\na: done, 2 scans in archive\n"
@@ -354,7 +354,7 @@ def test_sections_are_those_of_the_scanner_that_is_named_and_the_session_keeps_t
 def test_bad_frames_are_told_and_kept(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.camera.spoil = lambda number, pixels: np.zeros_like(pixels) if number == 1 else pixels
     assert capture("frames", "--count", "2", "--retakes", "1", "--name", "a") == 0
-    assert "0/2 00000: reaches 0 % of full scale only; expose more" in capsys.readouterr().out
+    assert "0/2 00000: brightest pixels reach only 0 % of full scale: expose more" in capsys.readouterr().out
     assert run(["archive", "show", "a", "--json"]) == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert [(f["take"], f["ok"]) for f in document["frames"]] == [(0, False), (1, True), (0, True)]
@@ -369,9 +369,9 @@ def test_the_operator_is_asked_and_a_photograph_that_shows_no_reseau_ends_it(
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
     assert capture("oscilloscope", *given, "--name", "a") == 1
     err = capsys.readouterr().err.splitlines()
-    assert err[0] == "blank the screen; nothing but the reseau is photographed, then press Enter"
+    assert err[0] == "blank the screen: only the reseau is photographed, then press Enter"
     assert err[-1].startswith("reseau: PHOTO I: ")
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert capture("oscilloscope", *given, "--name", "b") == 2
-    assert "nobody answers; run it where someone can" in capsys.readouterr().err
+    assert "standard input is closed; run the command in a terminal" in capsys.readouterr().err
     assert rig.camera.exposures == 1

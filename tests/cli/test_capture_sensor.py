@@ -153,11 +153,11 @@ def test_a_session_that_was_interrupted_goes_on_where_it_stood(
     monkeypatch.setattr(Session, "store", store)
     asked.clear()
     assert run(["capture", "sensor", "--resume"]) == 0
-    assert [text.split()[0] for text in asked] == ["have", "cover"]
+    assert [text.split()[0] for text in asked] == ["provide", "cover"]
     assert frames_of()[: len(before)] == before
     assert len(frames_of()) == 4 * (14 + 12)
     assert run(["archive", "rerun", "monday"]) == 0
-    assert capsys.readouterr().out.count("the same to the byte") == 2
+    assert capsys.readouterr().out.count("identical") == 2
     assert run(["capture", "sensor", "--resume"]) == 2
 
 

@@ -115,7 +115,7 @@ def test_results_come_out_of_the_archive_again_to_the_byte(out: Path, reseau: Ru
     with threadpool_limits(2, user_api="blas"):  # whatever the machine has
         status, said, err = reseau("archive", "rerun", name, "--archive", out / "archive")
     second = {"oscilloscope": "true.csv", "testfield": "report.html"}[name]
-    assert said == f"calibration.json: the same to the byte\n{second}: the same to the byte\n"
+    assert said == f"calibration.json: identical\n{second}: identical\n"
     assert (status, err) == (0, "")
 
 
@@ -138,14 +138,14 @@ def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> No
 def test_it_says_by_which_way_frames_came(made: tuple[Path, str]) -> None:
     gige = aravis_is_installed()
     ways = ("Video4Linux, simulated in process (Aravis or PyGObject is not installed)", "GigE Vision")
-    assert f"\n{ways[gige]}; every frame is in" in made[1]
+    assert f"\n{ways[gige]}; all frames are in" in made[1]
     assert ways[not gige] not in made[1]
 
 
 def test_same_seed_same_bytes_but_for_the_clock_whichever_way_frames_come(
     out: Path, reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reseau.cli.simulated._speaks_gige", lambda: False)
+    monkeypatch.setattr("reseau.sessions.demo._gige_available", lambda: False)
     status, text, err = reseau("demo", "--out", tmp_path / "again", "--seed", 2, "--json")
     assert (status, err) == (0, "")
     assert text == (out / "comparison.json").read_text()

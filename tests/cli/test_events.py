@@ -36,15 +36,15 @@ def frame(step: str, **more: object) -> dict[str, object]:
 
 def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = at_terminal(monkeypatch)
-    with Display(False, 3) as display:
+    with Display(False, 3, units={"c": "mm"}) as display:
         for k in range(2):
             display.watch("frame", frame(f"tilt {k}", points=300))
         display.watch("precision", {"step": "tilt 1", "sigma_c": 0.0123, "sigma_x0": 0.5, "sigma_K1": 1e-5})
         display.watch("outlook", {"step": "tilt 2 roll 180 camera_roll 180", "sigma_c": 0.01})
     lines = shown(terminal)
-    assert any(re.search(r"2/3 +[0-9-]+:.* sigma_c 0\.0123 · 2 frames · tilt 2 ro", line) for line in lines)
+    assert any(re.search(r"2/3 +[0-9-]+:.* sigma_c 0\.012 mm · 2 frames · tilt 2 ro", line) for line in lines)
     # Above it stays what happened.
-    assert "    tilt 2 roll 180 camera_roll 180 would bring sigma_c 0.01" in [line.rstrip() for line in lines]
+    assert "    next tilt 2 roll 180 camera_roll 180: sigma_c 0.01 mm predicted" in [line.rstrip() for line in lines]
 
 
 def test_a_bad_frame_is_told_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,16 +83,16 @@ def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
 
 
 def test_an_outlook_is_a_line_also_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
-    display = Display(False, 3)
+    display = Display(False, 3, units={"c": "mm"})
     display.watch("outlook", {"step": "tilt 2", "sigma_c": 0.01})
     display.watch("outlook", {"step": "tilt 2", "why": "poses are 9° off"})
     display.watch("next", {"step": "tilt 2", "sigma_c": None})
     said = capsys.readouterr().out.splitlines()
     assert said[:2] == [
-        "    tilt 2 would bring sigma_c 0.01",
-        "    tilt 2 cannot be foretold yet: poses are 9° off",
+        "    next tilt 2: sigma_c 0.01 mm predicted",
+        "    next tilt 2: no prediction (poses are 9° off)",
     ]
-    assert said[2] == "next: tilt 2"
+    assert said[2] == "next pose tilt 2"
 
 
 def test_sections_are_counted_where_they_are_what_is_taken(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,7 @@
-"""What was captured and computed, and how it came about: written once, checked by hash, never changed."""
+"""The archive: frames and results with their provenance; written once, checked by hash, never changed."""
 
 from .archive import Archive
-from .export import described, export
+from .export import describe, export
 from .objects import LocalObjects, Objects, RemoteObjects, objects_at
 from .picture import frame_of, tiff_of
 from .records import ArchivedFrame, ArchivedResult, SessionSummary, Verdict
@@ -19,7 +19,7 @@ __all__ = [
     "SessionSummary",
     "Verdict",
     "Verified",
-    "described",
+    "describe",
     "export",
     "frame_of",
     "objects_at",

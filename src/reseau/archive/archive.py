@@ -1,4 +1,4 @@
-"""The archive: sessions with their frames and results; only ever added to."""
+"""The archive: an append-only store of sessions with their frames and results."""
 
 from __future__ import annotations
 
@@ -24,16 +24,24 @@ _INDEX, _OBJECTS = "index.sqlite", "objects"
 
 
 class Archive:
-    """What was captured and computed, and how it came about; only ever added to.
+    """An append-only store of sessions with their frames and results.
 
     Parameters
     ----------
     engine : Engine
-        Of the index.
+        Database engine of the index.
     objects : Objects
-        The files.
+        Store of the files.
     place : str
-        Where it is, for messages.
+        Name of the place, for messages.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     session = archive.begin("monday", "frames", {"count": 2})
+    ...     [each.name for each in archive.sessions()]
+    ['monday']
     """
 
     def __init__(self, engine: Engine, objects: Objects, place: str) -> None:
@@ -46,20 +54,20 @@ class Archive:
         Parameters
         ----------
         place : str or path
-            A folder, which holds index and files; or the URL of a database.
+            A folder with index and files, or the URL of a database.
         objects : str or path, optional
-            Where files are: a folder or a URL; needed with the URL of a database.
+            Folder or URL of the files; required with the URL of a database.
         create : bool
-            Whether it is made when it is not there.
+            Whether to create it if it does not exist.
 
         Raises
         ------
         ArchiveError
-            When there is none, or it cannot be used.
+            If there is none, or it cannot be used.
         """
         if "://" in str(place):
             if objects is None:
-                raise ArchiveError("needs a place for the files", where=place, do="name one with --objects")
+                raise ArchiveError("needs a store for the files", where=place, do="name one with --objects")
             return cls(schema.make(str(place), create=create), objects_at(objects), str(place))
         folder = Path(place).absolute()
         index = folder / _INDEX
@@ -68,18 +76,18 @@ class Archive:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / _OBJECTS).mkdir(exist_ok=True)
             except OSError as error:
-                raise ArchiveError(f"cannot be made ({error.strerror})", where=folder) from None
+                raise ArchiveError(f"cannot be created ({error.strerror})", where=folder) from None
         elif not index.is_file():
-            raise ArchiveError("is no archive", where=folder, do="`reseau capture` makes one")
+            raise ArchiveError("is not an archive", where=folder, do="create one with `reseau capture`")
         read_only = not all(os.access(path, os.W_OK) for path in (folder, index) if path.exists())
         if create and read_only:
-            raise ArchiveError("may only be read", where=folder, do="name another archive")
+            raise ArchiveError("is read-only", where=folder, do="name another archive")
         engine = schema.make(f"sqlite:///{index}", create=create, read_only=read_only)
         kept = LocalObjects(folder / _OBJECTS) if objects is None else objects_at(objects)
         return cls(engine, kept, str(folder))
 
     def close(self) -> None:
-        """Let go of the index."""
+        """Close the index."""
         self._engine.dispose()
 
     def __enter__(self) -> Self:
@@ -96,28 +104,30 @@ class Archive:
         bench: str = "",
         inputs: Mapping[str, str] | None = None,
     ) -> Session:
-        """Begin a session, with all that it is given, or not at all.
+        """Begin a session with its input files, in one transaction.
+
+        This method stores any parameters. :func:`reseau.sessions.begin` also checks them.
 
         Parameters
         ----------
         name : str
             Unique in the archive.
         plan : str
-            What is done.
+            Name of the plan.
         parameters : mapping
-            Of the plan, JSON values.
+            Parameters of the plan, JSON values.
         bench : str
-            The text of ``bench.toml``.
+            Content of ``bench.toml``.
         inputs : mapping, optional
-            The text of files that it works with, designs, by name.
+            Contents of the input files, such as designs, by name.
 
         Raises
         ------
         ArchiveError
-            When there is one of this name, or it cannot be kept.
+            If there is a session of this name, or it cannot be stored.
         """
         if not name or any(c in name for c in "/\\\0") or name.startswith("."):
-            raise ArchiveError("is no name of a session", where=repr(name), do="leave out slashes")
+            raise ArchiveError("is not a valid name of a session", where=repr(name), do="leave out slashes")
         files = {}
         for role, text in (inputs or {}).items():
             data, suffix = text.encode("utf-8"), Path(role).suffix
@@ -132,9 +142,7 @@ class Archive:
         }
         with schema.connected(self._engine) as connection:
             if connection.scalar(sa.select(schema.sessions.c.id).where(schema.sessions.c.name == name)):
-                raise ArchiveError(
-                    "is the name of a session in this archive", where=name, do="use --resume, or another name"
-                )
+                raise ArchiveError("exists in this archive", where=name, do="use --resume, or another name")
             made = connection.execute(schema.sessions.insert().values(row)).inserted_primary_key
             assert made is not None
             for role, (data, suffix, sha256) in files.items():
@@ -147,25 +155,23 @@ class Archive:
         return self.session(name)
 
     def session(self, name: str) -> Session:
-        """A session by its name.
+        """Return a session by its name.
 
         Raises
         ------
         ArchiveError
-            When there is none.
+            If there is none.
         """
         with schema.connected(self._engine) as connection:
             row = connection.execute(
                 sa.select(schema.sessions).where(schema.sessions.c.name == name)
             ).one_or_none()
         if row is None:
-            raise ArchiveError(
-                "is no session of this archive", where=name, do="`reseau archive list` shows them"
-            )
+            raise ArchiveError("is not a session of this archive", where=name, do="see `reseau archive list`")
         return Session(self._engine, self.objects, row._asdict())
 
     def sessions(self) -> list[SessionSummary]:
-        """All sessions in the order in which they were begun, with how many frames and results they have."""
+        """Return a summary of each session, in the order in which they were begun."""
         s = schema.sessions.c
 
         def count(table: sa.Table, *where: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
@@ -188,11 +194,11 @@ class Archive:
         ]
 
     def faults(self) -> list[str]:
-        """What is wrong with the index itself, as far as its database can tell."""
+        """Return the faults that the database finds in the index."""
         return schema.faults(self._engine)
 
     def files(self) -> list[tuple[str, str, int, str]]:
-        """Hash, suffix, size and name of every file that the index names."""
+        """Return SHA-256, suffix, size and name of every file in the index."""
         found = []
         with schema.connected(self._engine) as connection:
             for table, label in (

@@ -1,4 +1,4 @@
-"""A session in one zip: its frames and results as files with names one can read, and a table of all."""
+"""Export a session to a zip: frames and results as files with readable names, and a table of contents."""
 
 from __future__ import annotations
 
@@ -14,13 +14,22 @@ from ..core.provenance import canonical_json
 from .records import ArchivedFrame
 from .session import Session
 
-__all__ = ["described", "export"]
+__all__ = ["describe", "export"]
 
 _SCHEMA = "reseau-session/1"
 
 
-def described(session: Session) -> dict[str, Any]:
-    """All that the index knows of a session, JSON values; clock times in a block of their own."""
+def describe(session: Session) -> dict[str, Any]:
+    """Return the whole index entry of a session as JSON values, with all times in one block.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.archive import Archive
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     describe(archive.begin("monday", "frames", {"count": 2}))["parameters"]
+    {'count': 2}
+    """
     frames, results = session.frames(), session.results()
     return {
         "schema": _SCHEMA,
@@ -51,26 +60,34 @@ def described(session: Session) -> dict[str, Any]:
 
 
 def _file(number: int, frame: ArchivedFrame) -> str:
-    """The name of a frame's file in the zip; numbers keep the order, and names apart."""
+    """Name of a frame in the zip; the number keeps the order and makes it unique."""
     plain = re.sub(r"[^\w.+-]+", "_", f"{frame.step}_{frame.kind}")
     take = f"_take{frame.take}" if frame.take else ""
     return f"frames/{number:04d}_{plain}{take}{frame.suffix}"
 
 
 def export(session: Session, path: Path) -> int:
-    """Write a session as one zip, whole or not at all; the same session gives the same bytes.
+    """Write a session to a zip file, atomically; the same session gives the same bytes.
 
     Returns
     -------
     int
-        How many files it holds.
+        Number of files in the zip.
 
     Raises
     ------
     ArchiveError
-        When a file of the session is lost or damaged, or the zip cannot be written.
+        If a file of the session is lost or damaged, or the zip cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.archive import Archive
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     export(archive.begin("monday", "frames", {"count": 2}), Path(folder) / "monday.zip")
+    1
     """
-    about = described(session)
+    about = describe(session)
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with zipfile.ZipFile(draft, "w", zipfile.ZIP_STORED) as target:
@@ -92,5 +109,5 @@ def export(session: Session, path: Path) -> int:
 
 
 def _add(target: zipfile.ZipFile, name: str, data: bytes) -> None:
-    # A fixed time: the same session gives the same bytes.
+    # A fixed time, for reproducible bytes.
     target.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)

@@ -1,4 +1,4 @@
-"""Bytes by their SHA-256: written once, never changed."""
+"""Stores of files by their SHA-256: written once, never changed."""
 
 from __future__ import annotations
 
@@ -15,32 +15,50 @@ __all__ = ["LocalObjects", "Objects", "RemoteObjects", "objects_at"]
 
 
 class Objects(Protocol):
-    """A store of bytes by their hash."""
+    """Interface of a store of bytes by their SHA-256.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     store: Objects = objects_at(folder)
+    ...     store.get(store.put(b"pixels", ".raw"), ".raw")
+    b'pixels'
+    """
 
     @property
     def place(self) -> str:
-        """Where they are."""
+        """Name of the place, for messages."""
 
     def put(self, data: bytes, suffix: str) -> str:
-        """Keep bytes, unless they are there; returns their SHA-256 when nothing can lose them any more."""
+        """Store bytes durably, unless they exist, and return their SHA-256."""
 
     def get(self, sha256: str, suffix: str) -> bytes:
-        """The bytes of a hash."""
+        """Return the bytes of a hash."""
 
     def names(self) -> Iterator[tuple[str, str]]:
-        """Hash and suffix of all that is there."""
+        """Return SHA-256 and suffix of all files."""
 
 
 class LocalObjects:
-    """A folder, two letters of the hash deep.
+    """A store in a folder, with subfolders named by the first two letters of the hash.
 
-    A file is written beside its place, brought to the disk, renamed, and its folder brought to the disk:
-    after `put` it outlasts a power cut, and before it there is nothing of it under its name.
+    A file is written to a temporary name, flushed to disk and renamed, and its folder is flushed: after `put`
+    it survives a power failure, and a partial file never has its final name.
 
     Parameters
     ----------
     folder : path
-        Made when it is not there.
+        Created if it does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     store = LocalObjects(Path(folder))
+    ...     sha256 = store.put(b"pixels", ".raw")
+    ...     store.path(sha256, ".raw").parent.name == sha256[:2]
+    True
     """
 
     def __init__(self, folder: Path) -> None:
@@ -52,16 +70,16 @@ class LocalObjects:
         return str(self.folder)
 
     def path(self, sha256: str, suffix: str) -> Path:
-        """Where the bytes of a hash are."""
+        """Return the path of the file of a hash."""
         return self.folder / sha256[:2] / f"{sha256}{suffix}"
 
     def put(self, data: bytes, suffix: str) -> str:
-        """Keep bytes.
+        """Store bytes.
 
         Raises
         ------
         ArchiveError
-            When the disk is full or may not be written to; nothing is left of them.
+            If the disk is full or read-only; nothing is left behind.
         """
         sha256 = sha256_of(data)
         path = self.path(sha256, suffix)
@@ -81,17 +99,17 @@ class LocalObjects:
         except OSError as error:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
-            what, do = f"cannot be kept ({error.strerror})", "make room, or name another archive"
+            what, do = f"cannot be stored ({error.strerror})", "free disk space, or name another archive"
             raise ArchiveError(what, where=self.folder, do=do) from None
         return sha256
 
     def get(self, sha256: str, suffix: str) -> bytes:
-        """The bytes of a hash.
+        """Return the bytes of a hash.
 
         Raises
         ------
         ArchiveError
-            When they are not there, or are others than were put.
+            If the file is missing or changed.
         """
         path = self.path(sha256, suffix)
         try:
@@ -101,7 +119,7 @@ class LocalObjects:
         return _sound(data, sha256, path)
 
     def names(self) -> Iterator[tuple[str, str]]:
-        """Hash and suffix of all that is there; drafts of a process that was killed are none of them."""
+        """Return SHA-256 and suffix of all files, except temporary files of killed processes."""
         if not self.folder.is_dir():
             return
         for folder in sorted(self.folder.iterdir()):
@@ -111,17 +129,23 @@ class LocalObjects:
 
 
 class RemoteObjects:
-    """An object store that fsspec knows: ``s3://bucket/folder``, ``memory://folder`` and others.
+    """An object store supported by fsspec: ``s3://bucket/folder``, ``memory://folder`` and others.
 
     Parameters
     ----------
     url : str
-        With the protocol.
+        URL of a folder.
 
     Raises
     ------
     ArchiveError
-        When there is no such protocol, or the package for it is not installed.
+        If the protocol is unknown, or its package is not installed.
+
+    Examples
+    --------
+    >>> store = RemoteObjects("memory://frames")
+    >>> store.get(store.put(b"pixels", ".raw"), ".raw")
+    b'pixels'
     """
 
     def __init__(self, url: str) -> None:
@@ -142,12 +166,12 @@ class RemoteObjects:
         return f"{self._root}/{sha256[:2]}/{sha256}{suffix}"
 
     def put(self, data: bytes, suffix: str) -> str:
-        """Keep bytes; an object store shows an object whole or not at all.
+        """Store bytes; object stores write atomically.
 
         Raises
         ------
         ArchiveError
-            When it does not take them.
+            If the store refuses them.
         """
         sha256 = sha256_of(data)
         path = self._path(sha256, suffix)
@@ -161,18 +185,18 @@ class RemoteObjects:
         return sha256
 
     def get(self, sha256: str, suffix: str) -> bytes:
-        """The bytes of a hash.
+        """Return the bytes of a hash.
 
         Raises
         ------
         ArchiveError
-            When they are not there, or are others than were put.
+            If the file is missing or changed.
         """
         path = self._path(sha256, suffix)
         return _sound(bytes(self._asked(lambda: self._files.cat_file(path))), sha256, path)
 
     def names(self) -> Iterator[tuple[str, str]]:
-        """Hash and suffix of all that is there."""
+        """Return SHA-256 and suffix of all files."""
         found = self._asked(lambda: self._files.find(self._root) if self._files.exists(self._root) else [])
         for path in sorted(found):
             stem, dot, suffix = path.rpartition("/")[2].partition(".")
@@ -182,29 +206,34 @@ class RemoteObjects:
     def _asked(self, question: Any) -> Any:
         try:
             return question()
-        except Exception as error:  # every backend of fsspec raises its own
+        except Exception as error:  # each backend of fsspec has its own exceptions
             raise ArchiveError(f"the object store refused ({error})", where=self._url) from None
 
 
 def objects_at(place: str | Path) -> Objects:
-    """The store at a folder or URL.
+    """Return the store at a folder or URL.
 
     Raises
     ------
     ArchiveError
-        When it cannot be used.
+        If it cannot be used.
+
+    Examples
+    --------
+    >>> objects_at("memory://frames").place
+    'memory://frames'
     """
     return RemoteObjects(str(place)) if "://" in str(place) else LocalObjects(Path(place))
 
 
 def _sound(data: bytes, sha256: str, where: object) -> bytes:
     if sha256_of(data) != sha256:
-        raise ArchiveError("holds other bytes than were put there", where=where, do="take it from a backup")
+        raise ArchiveError("has been changed (SHA-256 differs)", where=where, do="restore it from a backup")
     return data
 
 
 def _to_disk(folder: Path) -> None:
-    """Bring the names in a folder to the disk."""
+    """Flush the entries of a folder to disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

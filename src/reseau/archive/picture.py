@@ -1,4 +1,4 @@
-"""A frame as the bytes of a TIFF, with what is known of it; the same frame and facts give the same bytes."""
+"""Frames as TIFF files with metadata; the same frame and metadata give the same bytes."""
 
 from __future__ import annotations
 
@@ -19,25 +19,31 @@ _SCHEMA = "reseau-frame/1"
 
 
 def tiff_of(frame: Frame, facts: Mapping[str, Any]) -> bytes:
-    """An uncompressed grey TIFF; the facts are JSON in its description.
+    """Return a frame as an uncompressed grey TIFF, with metadata as JSON in its description.
 
     Parameters
     ----------
     frame : Frame
-        Pixels of 8 or 16 bits, or of 32-bit floats.
+        Pixels of 8 or 16 bits, or floats; floats are stored with 32 bits.
     facts : mapping
-        JSON values; no clock times, so that the same exposure has the same hash.
+        Metadata, JSON values; no times, so that the same exposure has the same hash.
 
     Raises
     ------
     ArchiveError
-        When the pixels are of no type that a TIFF of greys holds.
+        If the pixels have another type.
+
+    Examples
+    --------
+    >>> frame = Frame(np.zeros((2, 3), np.uint8), 255.0, "dark")
+    >>> tiff_of(frame, {"gain": 0.0}) == tiff_of(frame, {"gain": 0.0})
+    True
     """
     import tifffile
 
     pixels = frame.pixels.astype(np.float32) if frame.pixels.dtype == np.float64 else frame.pixels
     if pixels.dtype not in (np.uint8, np.uint16, np.float32):
-        raise ArchiveError(f"has grey values of type {pixels.dtype}", where=frame.name)
+        raise ArchiveError(f"has pixels of the unsupported type {pixels.dtype}", where=frame.name)
     about = {"schema": _SCHEMA, "name": frame.name, "full_scale": frame.full_scale, "facts": dict(facts)}
     stream = io.BytesIO()
     tifffile.imwrite(
@@ -53,17 +59,23 @@ def tiff_of(frame: Frame, facts: Mapping[str, Any]) -> bytes:
 
 
 def frame_of(data: bytes, where: object) -> tuple[Frame, dict[str, Any]]:
-    """The frame and the facts of a TIFF that :func:`tiff_of` made.
+    """Read the frame and the metadata of a TIFF made by :func:`tiff_of`.
 
     Returns
     -------
     (Frame, dict)
-        The frame has the SHA-256 of the file.
+        The frame, with the SHA-256 of the file, and the metadata.
 
     Raises
     ------
     ArchiveError
-        When it is none.
+        If it is not such a file.
+
+    Examples
+    --------
+    >>> frame, facts = frame_of(tiff_of(Frame(np.zeros((2, 3), np.uint8), 255.0), {"gain": 0.0}), "dark.tif")
+    >>> frame.width, facts
+    (3, {'gain': 0.0})
     """
     import tifffile
 
@@ -75,5 +87,5 @@ def frame_of(data: bytes, where: object) -> tuple[Frame, dict[str, Any]]:
         if about["schema"] != _SCHEMA:
             raise ValueError(about["schema"])
         return Frame(pixels, float(about["full_scale"]), about["name"], sha256_of(data)), about["facts"]
-    except Exception as error:  # tifffile raises of every kind on what is no TIFF
-        raise ArchiveError(f"is no frame of an archive ({error})", where=where) from None
+    except Exception as error:  # tifffile raises many kinds of exceptions for invalid files
+        raise ArchiveError(f"is not a frame of an archive ({error})", where=where) from None

@@ -1,4 +1,4 @@
-"""What the archive hands out: frames with their verdicts, results with what they were made of, summaries."""
+"""Records of the archive: frames with verdicts, results with inputs, summaries of sessions."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ __all__ = ["ArchivedFrame", "ArchivedResult", "SessionSummary", "Verdict", "utc"
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found of a frame when it came.
+    """Verdict on a new frame.
 
     Parameters
     ----------
     ok : bool
-        Whether it can be used.
+        Whether the frame is usable.
     why : str
-        If not.
+        The reason if it is not.
     facts : dict
-        What was measured in it, for those who watch: JSON values.
+        Measured values for the display: JSON values.
+
+    Examples
+    --------
+    >>> Verdict(False, "5 points are too few").ok
+    False
     """
 
     ok: bool
@@ -30,22 +35,27 @@ class Verdict:
 
 @dataclass(frozen=True)
 class ArchivedFrame:
-    """One frame, or another picture, of a session.
+    """A frame, or another file, of a session.
 
     Parameters
     ----------
     id : int
-        In the index.
+        Key in the index.
     step, kind, take : str, str, int
-        Of what pose or photograph, which of its pictures, and the how-manieth attempt at it, from 0.
+        Pose or photograph, kind of picture, and attempt number, from 0.
     sha256, suffix, size
-        Of the file.
+        SHA-256, suffix and size (bytes) of the file.
     facts : dict
         Settings and pose.
     clock : dict
-        Times, and counters of the instrument.
+        Times and counters of the instrument.
     verdict : Verdict, optional
-        Where one was given.
+        The last verdict.
+
+    Examples
+    --------
+    >>> ArchivedFrame(1, "tilt 30", "frame", 1, "ab12", ".tif", 100, {}, {}).name
+    'tilt 30/frame take 1'
     """
 
     id: int
@@ -61,28 +71,33 @@ class ArchivedFrame:
 
     @property
     def name(self) -> str:
-        """Within its session."""
+        """Name of the picture, unique in its session."""
         return f"{self.step}/{self.kind}" + (f" take {self.take}" if self.take else "")
 
 
 @dataclass(frozen=True)
 class ArchivedResult:
-    """One result of a session, and how it came about.
+    """A result of a session with its provenance.
 
     Parameters
     ----------
     id : int
-        In the index.
+        Key in the index.
     name : str
-        Of its file.
+        Name of the file.
     sha256, suffix, size
-        Of the file.
+        SHA-256, suffix and size (bytes) of the file.
     parameters : dict
-        It was computed with.
+        Parameters of the computation.
     inputs : dict
-        SHA-256 of what it was computed from, by role.
+        SHA-256 of its inputs, by role.
     software : str
-        That computed it.
+        Version of the software.
+
+    Examples
+    --------
+    >>> ArchivedResult(1, "true.csv", "ab12", ".csv", 80, {}, {"PHOTO I/frame": "cd34"}, "reseau 0.1").name
+    'true.csv'
     """
 
     id: int
@@ -97,7 +112,24 @@ class ArchivedResult:
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """A line of `reseau archive list`."""
+    """Summary of a session, a line of `reseau archive list`.
+
+    Parameters
+    ----------
+    name, plan : str
+        Name and plan.
+    begun : datetime
+        Time of the start (UTC).
+    frames, results : int
+        Number of pictures, without inputs, and of results.
+    status : str
+        Last status.
+
+    Examples
+    --------
+    >>> SessionSummary("monday", "frames", datetime(2026, 1, 5, tzinfo=UTC), 5, 0, "done").status
+    'done'
+    """
 
     name: str
     plan: str
@@ -108,5 +140,5 @@ class SessionSummary:
 
 
 def utc(time: datetime) -> datetime:
-    """A time of an index; SQLite forgets its zone."""
+    """Return a time of the index with its zone; SQLite does not store it."""
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)

@@ -1,4 +1,4 @@
-"""The tables of the index, which are only ever added to, and the engine that holds them."""
+"""The append-only tables of the index, and its database engine."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ frames = sa.Table(
     sa.Column("facts", _JSON, nullable=False),
     sa.Column("clock", _JSON, nullable=False),
     sa.Column("stored", _TIME, nullable=False),
-    # What makes a frame this frame: stored again, it is the one that is there.
+    # The identity of a frame: storing it again returns the stored one.
     sa.UniqueConstraint("session_id", "step", "kind", "take"),
 )
 verdicts = sa.Table(
@@ -123,13 +123,13 @@ ends = sa.Table(
 
 
 def _run(target: sa.Table | sa.MetaData, when: str, dialect: str, statement: str) -> None:
-    """Have a statement of one database run when tables are made."""
+    """Run a statement of one database when tables are created."""
     ddl = sa.DDL(statement)  # type: ignore[no-untyped-call]
     sa.event.listen(target, when, ddl.execute_if(dialect=dialect))
 
 
 def _append_only(table: sa.Table) -> None:
-    """Have the database itself refuse to change or delete a row."""
+    """Make the database refuse to change or delete a row."""
     for verb in ("UPDATE", "DELETE"):
         name = f"{table.name}_no_{verb.lower()}"
         trigger = f"CREATE TRIGGER {name} BEFORE {verb} ON {table.name}"
@@ -148,21 +148,21 @@ for _table in metadata.sorted_tables:
 
 
 def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
-    """The engine of an index, with its tables.
+    """Return the engine of an index, with its tables.
 
     Parameters
     ----------
     url : str
-        As SQLAlchemy writes it: ``sqlite:////folder/index.sqlite``, ``postgresql+psycopg://host/name``.
+        In the form of SQLAlchemy: ``sqlite:////folder/index.sqlite``, ``postgresql+psycopg://host/name``.
     create : bool
-        Whether tables that are not there are made.
+        Whether to create missing tables.
     read_only : bool
-        Whether nothing is ever written, for SQLite on a disk that allows nothing else.
+        Whether to open SQLite read-only, for a read-only disk.
 
     Raises
     ------
     ArchiveError
-        When it cannot be opened, or is no index.
+        If it cannot be opened, or is not an index.
     """
     try:
         made = sa.make_url(url)
@@ -173,28 +173,28 @@ def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
     except (SQLAlchemyError, ImportError) as error:
         raise ArchiveError(f"cannot be used as an index ({_brief(error)})", where=_shown(url)) from None
     with connected(engine) as connection:
-        if engine.dialect.name == "postgresql":  # one process makes the tables, others wait for it
+        if engine.dialect.name == "postgresql":  # one process creates the tables, others wait
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(zlib.crc32(b"reseau archive"))))
         there = set(sa.inspect(connection).get_table_names())
         if not create and not set(metadata.tables) <= there:
-            raise ArchiveError("is no archive", where=_shown(url), do="`reseau capture` makes one")
+            raise ArchiveError("is not an archive", where=_shown(url), do="create one with `reseau capture`")
         if not set(metadata.tables) <= there:
             metadata.create_all(connection)
     return engine
 
 
 def _sqlite(path: Path, read_only: bool) -> Engine:
-    # A write-ahead log lets readers look on while frames come in; FULL has every commit outlast a power cut.
+    # The write-ahead log permits reading during an acquisition; with FULL, commits survive a power failure.
     options = "uri=true"
     if read_only:
-        # Where there is no log, none must be made; in one that is left over is what was written last.
+        # Without a log none must be created; a log that was left behind has the last changes.
         log = path.with_name(f"{path.name}-wal")
         options += "&mode=ro" if log.is_file() and log.stat().st_size else "&mode=ro&immutable=1"
     engine = sa.create_engine(f"sqlite:///file:{path}?{options}", connect_args={"timeout": 30})
 
     @sa.event.listens_for(engine, "connect")
     def _prepare(raw: sqlite3.Connection, _: object) -> None:
-        raw.isolation_level = None  # transactions begin where SQLAlchemy says, also around CREATE TABLE
+        raw.isolation_level = None  # SQLAlchemy begins transactions, also around CREATE TABLE
         if not read_only:
             raw.execute("PRAGMA journal_mode=WAL")
             raw.execute("PRAGMA synchronous=FULL")
@@ -202,7 +202,7 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 
     @sa.event.listens_for(engine, "begin")
     def _begin(connection: sa.Connection) -> None:
-        # Whoever may write waits at the beginning; found out halfway, it could not wait any more.
+        # A writer waits for the lock at the start; in the middle of a transaction it cannot wait.
         connection.exec_driver_sql("BEGIN" if read_only else "BEGIN IMMEDIATE")
 
     return engine
@@ -210,37 +210,37 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 
 @contextmanager
 def connected(engine: Engine) -> Iterator[sa.Connection]:
-    """A transaction; what the database complains of becomes an error of the archive.
+    """Run a transaction; errors of the database become errors of the archive.
 
     Raises
     ------
     ArchiveError
-        When the database cannot be reached, is damaged, full or may not be written to.
+        If the database cannot be reached, or is damaged, full or read-only.
     """
     try:
         with engine.begin() as connection:
             yield connection
     except (DBAPIError, PoolTimeout, JSONDecodeError) as error:
-        what = f"the index does not take it ({_brief(error)})"
+        what = f"error of the index ({_brief(error)})"
         raise ArchiveError(what, where=_shown(engine.url)) from None
 
 
 def faults(engine: Engine) -> list[str]:
-    """What a database finds wrong with itself; PostgreSQL watches over its pages by checksums of its own."""
+    """Return the faults that SQLite finds in its file; PostgreSQL checks its pages by checksums."""
     if engine.dialect.name != "sqlite":
         return []
     try:
         with connected(engine) as connection:
             said = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
             astray = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
-    except ArchiveError as error:  # too much is damaged for it to look at all
+    except ArchiveError as error:  # too damaged to be checked
         return [error.what]
     found = [line for text in said if text != "ok" for line in str(text).splitlines()]
-    return found + [f"a row of {table} belongs to none of {parent}" for table, _, parent, _ in astray]
+    return found + [f"a row of {table} has no row in {parent}" for table, _, parent, _ in astray]
 
 
 def _brief(error: Exception) -> str:
-    """What happened, without the statement and the links that SQLAlchemy adds."""
+    """The message without the statement and links that SQLAlchemy adds."""
     said = str(error.orig) if isinstance(error, DBAPIError) else str(error)
     return said.strip().splitlines()[0] if said.strip() else type(error).__name__
 

@@ -1,4 +1,4 @@
-"""One session of an archive: frames, verdicts, results, events, each kept before the next thing happens."""
+"""A session of an archive: frames, verdicts, results and events, each stored before the next action."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
 from ..core.data import Frame
-from ..core.errors import ArchiveError
+from ..core.errors import ArchiveError, InputError
 from ..core.version import __version__
+from ..io import write_whole
 from . import schema
 from .objects import Objects
 from .picture import frame_of, tiff_of
@@ -21,20 +22,32 @@ from .records import ArchivedFrame, ArchivedResult, Verdict, utc
 __all__ = ["INPUT", "Session"]
 
 INPUT = "input"
-"""Kind of the files that a session was given."""
+"""Kind of the input files of a session."""
 
 
 class Session:
-    """One session of an archive.
+    """A session of an archive; see :meth:`Archive.begin` and :meth:`Archive.session`.
 
     Parameters
     ----------
     engine : Engine
-        Of the index.
+        Database engine of the index.
     objects : Objects
-        The files.
+        Store of the files.
     row : mapping
-        Of the session.
+        Row of the session in the index.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from reseau.archive import Archive
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     session = archive.begin("monday", "frames", {"count": 1})
+    ...     frame = session.store("00000", Frame(np.zeros((2, 3), np.uint8), 255.0))
+    ...     session.judge(frame, Verdict(True))
+    ...     session.end("done")
+    ...     [(each.name, each.verdict.ok) for each in session.frames()], session.status
+    ([('00000/frame', True)], 'done')
     """
 
     def __init__(self, engine: Engine, objects: Objects, row: Mapping[str, Any]) -> None:
@@ -58,32 +71,32 @@ class Session:
         facts: Mapping[str, Any] | None = None,
         clock: Mapping[str, Any] | None = None,
     ) -> ArchivedFrame:
-        """Keep a frame: on the disk first, then in the index; when this returns nothing can lose it.
+        """Store a picture durably, first the file, then the index entry.
 
         Parameters
         ----------
         step : str
             Pose or photograph it belongs to.
         picture : Frame or bytes
-            The frame; or a file as an instrument sent it.
+            A frame, or a file as sent by an instrument.
         kind : str
-            Which of the pictures of the step.
+            Kind of picture.
         take : int
-            The how-manieth attempt, from 0.
+            Attempt number, from 0.
         suffix : str
-            Of the file of bytes.
+            Suffix of the file, for bytes.
         facts, clock : mapping, optional
-            What is known of it; times and counters apart.
+            Metadata; and, separately, times and counters.
 
         Returns
         -------
         ArchivedFrame
-            The one that is there, where one of this step, kind and take is.
+            The stored picture; the existing one if there is one of this step, kind and take.
 
         Raises
         ------
         ArchiveError
-            When it cannot be kept.
+            If it cannot be stored.
         """
         there = self.find(step, kind, take)
         if there is not None:
@@ -103,7 +116,7 @@ class Session:
         facts: dict[str, Any],
         clock: dict[str, Any],
     ) -> ArchivedFrame:
-        """Enter a file that is there into the index."""
+        """Enter a stored file into the index."""
         step, kind, take = key["step"], key["kind"], key["take"]
         values = {
             "session_id": self._id,
@@ -123,7 +136,7 @@ class Session:
         return ArchivedFrame(made[0], step, kind, take, sha256, suffix, size, facts, clock)
 
     def recover(self) -> list[ArchivedFrame]:
-        """Enter frames that were brought to the disk, but not into the index when the process was killed."""
+        """Enter frames into the index whose process was killed after writing the file."""
         with schema.connected(self._engine) as connection:
             known = set(connection.scalars(sa.select(schema.frames.c.sha256)))
         found = []
@@ -159,46 +172,46 @@ class Session:
         ]
 
     def find(self, step: str, kind: str = "frame", take: int = 0) -> ArchivedFrame | None:
-        """A frame by what it is of, or None."""
+        """Return the picture of a step, kind and take, or None."""
         f = schema.frames.c
         found = self._frames(f.step == step, f.kind == kind, f.take == take)
         return found[0] if found else None
 
     def frames(self, step: str | None = None, kind: str | None = None) -> list[ArchivedFrame]:
-        """Frames in the order in which they were stored, with their last verdicts."""
+        """Return pictures in the order in which they were stored, with their last verdicts."""
         f = schema.frames.c
         where = [] if step is None else [f.step == step]
         return self._frames(*where, *([] if kind is None else [f.kind == kind]))
 
     def picture(self, archived: ArchivedFrame) -> Frame:
-        """The frame of a file, checked against its hash.
+        """Read a frame, checked against its SHA-256.
 
         Raises
         ------
         ArchiveError
-            When it is lost, damaged, or no frame.
+            If it is lost, damaged, or not a frame.
         """
         return frame_of(self.objects.get(archived.sha256, archived.suffix), archived.name)[0]
 
     def inputs(self) -> dict[str, ArchivedFrame]:
-        """The files that the session was given, by name."""
+        """Return the input files of the session, by name."""
         return {each.step: each for each in self.frames(kind=INPUT)}
 
     def input(self, name: str) -> str:
-        """The text of a file that it was given.
+        """Read an input file.
 
         Raises
         ------
         ArchiveError
-            When it was given none of this name, or it is lost or damaged.
+            If there is none of this name, or it is lost or damaged.
         """
         found = self.find(name, INPUT)
         if found is None:
-            raise ArchiveError(f"was given no {name}", where=self.name)
+            raise ArchiveError(f"has no input {name}", where=self.name)
         return self.objects.get(found.sha256, found.suffix).decode("utf-8")
 
     def judge(self, archived: ArchivedFrame, verdict: Verdict) -> None:
-        """Write down what was found of a frame; the last word counts, and all are kept."""
+        """Store a verdict on a frame. The last one counts; all are stored."""
         row = {"frame_id": archived.id, "ok": verdict.ok, "why": verdict.why, "facts": verdict.facts}
         with schema.connected(self._engine) as connection:
             connection.execute(schema.verdicts.insert().values(row))
@@ -210,23 +223,23 @@ class Session:
         parameters: Mapping[str, Any] | None = None,
         inputs: Mapping[str, str] | None = None,
     ) -> ArchivedResult:
-        """Keep a result with how it came about.
+        """Store a result with its provenance.
 
         Parameters
         ----------
         name : str
-            Of its file, with suffix.
+            Name of the file, with suffix.
         content : str or bytes
-            Of the file.
+            Content of the file.
         parameters : mapping, optional
-            It was computed with.
+            Parameters of the computation.
         inputs : mapping, optional
-            SHA-256 of what it was computed from, by role.
+            SHA-256 of its inputs, by role.
 
         Raises
         ------
         ArchiveError
-            When it cannot be kept.
+            If it cannot be stored.
         """
         data = content.encode("utf-8") if isinstance(content, str) else content
         suffix, software, known = Path(name).suffix, f"reseau {__version__}", dict(parameters or {})
@@ -251,7 +264,7 @@ class Session:
         return ArchivedResult(made[0], name, sha256, suffix, len(data), known, made_of, software)
 
     def results(self) -> list[ArchivedResult]:
-        """Results in the order in which they were kept."""
+        """Return the results in the order in which they were stored."""
         r, i = schema.results.c, schema.inputs.c
         columns = (r.id, r.name, r.sha256, r.suffix, r.size, r.parameters, r.software)
         with schema.connected(self._engine) as connection:
@@ -269,11 +282,29 @@ class Session:
         ]
 
     def content(self, result: ArchivedResult) -> bytes:
-        """The file of a result, checked against its hash."""
+        """Read the file of a result, checked against its SHA-256."""
         return self.objects.get(result.sha256, result.suffix)
 
+    def write_results(self, folder: Path) -> None:
+        """Write the latest result of each name to a folder, created if it does not exist.
+
+        Raises
+        ------
+        InputError
+            If the folder cannot be created or written.
+        """
+        contents = {result.name: self.content(result) for result in self.results()}
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"cannot be created ({error.strerror})", where=folder, do="name a folder"
+            ) from None
+        for name, content in contents.items():
+            write_whole(folder / name, content)
+
     def note(self, key: str, kind: str, document: Mapping[str, Any]) -> None:
-        """Write down what happened; what has the key of something written down is that."""
+        """Store an event; do nothing if there is one with this key."""
         e = schema.events
         with schema.connected(self._engine) as connection:
             there = sa.select(e.c.id).where(e.c.session_id == self._id, e.c.key == key)
@@ -282,7 +313,7 @@ class Session:
                 connection.execute(e.insert().values(row))
 
     def notes(self, kind: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Kind and document of what was written down, in order."""
+        """Yield kind and document of the events, in order."""
         e = schema.events.c
         query = sa.select(e.kind, e.document).where(e.session_id == self._id).order_by(e.id)
         with schema.connected(self._engine) as connection:
@@ -290,14 +321,14 @@ class Session:
         yield from ((row[0], row[1]) for row in rows)
 
     def end(self, status: str, why: str = "") -> None:
-        """Say how it ended; a session that is resumed ends once more."""
+        """Store the status at the end; a session that is resumed ends again."""
         row = {"session_id": self._id, "status": status, "why": why, "at": datetime.now(UTC)}
         with schema.connected(self._engine) as connection:
             connection.execute(schema.ends.insert().values(row))
 
     @property
     def status(self) -> str:
-        """How it ended last: done, stopped, failed; or that it did not end."""
+        """Last status: done, stopped or failed; or `not ended`."""
         e = schema.ends.c
         query = sa.select(e.status).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
         with schema.connected(self._engine) as connection:

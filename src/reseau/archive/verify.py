@@ -1,4 +1,4 @@
-"""Whether an archive still holds what was put into it."""
+"""Verify the files and the index of an archive."""
 
 from __future__ import annotations
 
@@ -13,19 +13,24 @@ __all__ = ["Verified", "verify"]
 
 @dataclass(frozen=True)
 class Verified:
-    """What came out; truthy when all is sound.
+    """Result of a verification; truthy if nothing is damaged.
 
     Parameters
     ----------
     files : int
-        How many the index names.
+        Number of files in the index.
     size : int
-        Their bytes.
+        Total size (bytes).
     damaged : tuple of str
-        What is missing or changed, by the frame or result it is; and what is wrong with the index.
+        Missing or changed files, by frame or result; and faults of the index.
     unknown : tuple of str
-        Files that the index does not name: of a process that was killed between file and index. They harm
-        nothing; resuming the session enters its own.
+        Files that are not in the index: their process was killed after writing them. They are harmless;
+        resuming the session adds them.
+
+    Examples
+    --------
+    >>> bool(Verified(3, 1200, ("monday/tilt 0/frame: has been changed",), ()))
+    False
     """
 
     files: int
@@ -38,14 +43,22 @@ class Verified:
 
 
 def verify(archive: Archive, step: Callable[[str], None] = lambda name: None) -> Verified:
-    """Read every file again and compare it with its hash, and have the index look at itself.
+    """Read every file again, compare it with its SHA-256, and check the index.
 
     Parameters
     ----------
     archive : Archive
-        Which.
+        The archive.
     step : callable, optional
-        Told the name of each file that has been read.
+        Called with the name of each file that was read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     _ = archive.begin("monday", "frames", {}, inputs={"note.txt": "warm-up 1 h"})
+    ...     verify(archive).files
+    1
     """
     damaged = [f"index: {line}" for line in archive.faults()]
     known, total = set(), 0

@@ -89,7 +89,7 @@ class Procedure(Protocol):
 
 
 class _Candidates(list[Step]):
-    """Candidate poses; iteration raises once the acquisition is stopped, because choosing may take minutes."""
+    """Candidate poses; iteration raises after a stop, because choosing may take minutes."""
 
     def __init__(self, stopped: Callable[[], bool], steps: Sequence[Step]) -> None:
         super().__init__(steps)
@@ -525,7 +525,7 @@ class Acquisition:
         return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
 
     def _judged(self, frame: ArchivedFrame, step: Step) -> Verdict:
-        """The verdict on a frame; the procedure gets each frame once, also frames from before a resumption."""
+        """The verdict on a frame; the procedure gets each frame once, also those from before a resumption."""
         if frame.id in self._verdicts:
             return self._verdicts[frame.id]
         verdict = self._checked(self.session.picture(frame), frame, step)

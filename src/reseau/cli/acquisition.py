@@ -71,9 +71,9 @@ class Where:
 
     archive: ArchivePlace = "archive"
     objects: ObjectsPlace = None
-    bench: Annotated[
-        Path | None, typer.Option("--bench", "-b", help="Bench file. Default: bench.toml.")
-    ] = None
+    bench: Annotated[Path | None, typer.Option("--bench", "-b", help="Bench file. Default: bench.toml.")] = (
+        None
+    )
     name: Annotated[
         str, typer.Option("--name", "-n", help="Name of the session. Default: plan and time.")
     ] = ""

@@ -77,7 +77,9 @@ def sim(
     out: Out = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated world.")] = 0,
     table: Annotated[str, typer.Option(help="Controllers of the turntable: zaber, smc100.")] = "zaber",
-    family: Annotated[str, typer.Option(help="Family of the oscilloscope: keysight, rigol-1000z, …")] = "keysight",
+    family: Annotated[
+        str, typer.Option(help="Family of the oscilloscope: keysight, rigol-1000z, …")
+    ] = "keysight",
     camera: Annotated[
         str, typer.Option(help="Scene of the camera: screen, testfield. Default: no camera.")
     ] = "",

@@ -22,7 +22,9 @@ app = typer.Typer(
 )
 
 Average = Annotated[int, typer.Option(min=1, help="Exposures averaged to a frame.")]
-Checks = Annotated[int, typer.Option(min=0, help="Frames for the checks before the first frame; 0: no checks.")]
+Checks = Annotated[
+    int, typer.Option(min=0, help="Frames for the checks before the first frame; 0: no checks.")
+]
 Retakes = Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")]
 HeightSigma = Annotated[float, typer.Option(min=1e-9, help="Standard deviation of a height (mm), with z.")]
 AxisSigma = Annotated[

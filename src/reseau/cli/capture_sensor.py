@@ -23,12 +23,16 @@ __all__ = ["sensor"]
 @in_session("out", "yes")
 def sensor(
     where: Where,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Calibration file to write as well.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Calibration file to write as well.")
+    ] = None,
     camera: CameraName = None,
     levels: Annotated[int, typer.Option(min=5, help="Number of exposures in light.")] = 14,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each exposure.")] = 8,
     longest_ms: Annotated[float, typer.Option(min=0.2, help="Longest exposure (ms).")] = 1000.0,
-    edge: Annotated[bool, typer.Option("--edge", help="Measure the MTF as well, with a slanted edge.")] = False,
+    edge: Annotated[
+        bool, typer.Option("--edge", help="Measure the MTF as well, with a slanted edge.")
+    ] = False,
     region: Annotated[
         tuple[int, int, int, int] | None, typer.Option(help="Region of the edge: left top width height (px).")
     ] = None,

@@ -26,7 +26,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON t
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 ArchivePlace = Annotated[
     str,
-    typer.Option("--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive: a folder, or the URL of a database."),
+    typer.Option(
+        "--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive: a folder, or the URL of a database."
+    ),
 ]
 ObjectsPlace = Annotated[
     str | None, typer.Option("--objects", help="Folder or URL of the files, if the archive is a database.")

@@ -150,7 +150,7 @@ def resume(archive: Archive, plan: str, name: str = "") -> Session:
         name = names[0]
     session = archive.session(name)
     if session.plan != plan:
-        raise UsageError(f"its plan is `{session.plan}`", where=name, do=f"resume it with that plan")
+        raise UsageError(f"its plan is `{session.plan}`", where=name, do="resume it with that plan")
     return session
 
 

@@ -265,9 +265,7 @@ def _sensor_results(procedure: LiveSensor, session: Session) -> dict[str, str]:
 
     probes = session.frames(kind="probe")
     camera = probes[0].facts["identity"] if probes else session.name
-    report = sensor_report(
-        procedure.result(), title=f"Sensor of {camera}", provenance=procedure.provenance
-    )
+    report = sensor_report(procedure.result(), title=f"Sensor of {camera}", provenance=procedure.provenance)
     return procedure.calibrated(camera) | {"report.html": report}
 
 

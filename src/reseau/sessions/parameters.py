@@ -319,7 +319,9 @@ class TestfieldParameters(SessionParameters):
         for step in (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})):
             for axis, value in step.position.items():
                 if axis not in axes:
-                    raise UsageError(f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}")
+                    raise UsageError(
+                        f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}"
+                    )
                 low, high = axes[axis].limits
                 if not low <= value <= high:
                     unit = axes[axis].unit
