@@ -166,7 +166,7 @@ def test_verifying_finds_what_was_changed_lost_or_left_over(tmp_path: Path) -> N
         found = verify(archive)
         assert not found
         assert [line.split(":")[0] for line in found.damaged] == ["s/0/frame", "s/1/frame"]
-        assert "other bytes" in found.damaged[0]
+        assert "SHA-256 differs" in found.damaged[0]
         assert len(found.unknown) == 1
         with pytest.raises(ArchiveError, match="backup"):
             session.picture(kept[0])

@@ -37,13 +37,13 @@ def demo(
 
 def _camera_table(field: TestfieldSession) -> str:
     """Parameters of the camera with their errors, one line for each."""
-    from ..bundle import UNITS
     from ..core.numbers import measured
+    from ..optics.cameras import unit_of
 
     facts = field.to_dict()
     lines = [f"\ntestfield, {facts['poses']} poses: sigma0 {facts['sigma0']:.3f}"]
     for name, row in facts["parameters"].items():
-        unit, off = UNITS.get(name, ""), (row["value"] - row["true"]) / row["sigma"]
+        unit, off = unit_of(name, "brown"), (row["value"] - row["true"]) / row["sigma"]
         found = measured(row["value"], row["sigma"], unit)
         lines.append(f"  {name:<4} {found:<32} true {row['true']:.6g} {unit:<6} error {off:+.1f} sigma")
     return "\n".join(lines) + "\n"

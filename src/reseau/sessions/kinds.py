@@ -235,7 +235,7 @@ def _testfield_procedure(session: Session, given: TestfieldParameters) -> LiveTe
     options = {key: value for key, value in session.parameters.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
     return LiveTestfield(
-        design, measure, given.camera_model(), name=session.name, options=options, inputs=_hashes(session),
+        design, measure, given.camera_options(), name=session.name, options=options, inputs=_hashes(session),
         sigmas=given.sigmas,
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from ..instruments import Camera, Oscilloscope, Turntable, UltrasonicScanner
 from ..io import Document
 
 if TYPE_CHECKING:
-    from ..procedures.calibration import CameraModel
+    from ..procedures.calibration import CameraOptions
 
 __all__ = [
     "FramesParameters",
@@ -258,7 +258,7 @@ class TestfieldParameters(SessionParameters):
     --------
     >>> steps = (("frontal", {"tilt": 0.0}), ("tilted", {"tilt": 30.0}))
     >>> given = TestfieldParameters(steps=steps, pitch=0.027, free=("c",), row_jitter=0.0, fill=0.8)
-    >>> given.expected, given.camera_model().model
+    >>> given.expected, given.camera_options().model
     (2, 'brown')
     """
 
@@ -286,9 +286,10 @@ class TestfieldParameters(SessionParameters):
     @property
     def units(self) -> Mapping[str, str]:
         """Units of the parameters of the camera."""
-        from ..bundle import UNITS
+        from ..optics.cameras import unit_of
 
-        return UNITS
+        options = self.camera_options()
+        return {name: unit_of(name, options.model) for name in options.chosen}
 
     @property
     def goal(self) -> Goal | None:
@@ -299,13 +300,12 @@ class TestfieldParameters(SessionParameters):
         """Return the poses as steps."""
         return tuple(Step(name, position) for name, position in self.steps)
 
-    def camera_model(self) -> CameraModel:
-        """Return the camera model to estimate."""
-        from ..procedures.calibration import CameraModel
+    def camera_options(self) -> CameraOptions:
+        """Return the camera model and the parameters to estimate."""
+        from ..procedures.calibration import CameraOptions
 
-        if self.pitch is None:
-            return CameraModel("opencv", self.free)
-        return CameraModel("brown", self.free, (self.pitch, self.pitch))
+        pitch = None if self.pitch is None else (self.pitch, self.pitch)
+        return CameraOptions(free=self.free, pitch_mm=pitch)
 
     @staticmethod
     def lifted(steps: Sequence[Step]) -> bool:
@@ -330,15 +330,13 @@ class TestfieldParameters(SessionParameters):
         self._check_goal()
 
     def _check_goal(self) -> None:
-        from ..bundle import UNITS
-
-        model, goal = self.camera_model(), self.goal
+        model, goal = self.camera_options(), self.goal
         if goal is None:
             return
         name = f"sigma_{goal.parameter}"
         if goal.parameter not in model.chosen:
             raise UsageError("is not estimated", where=name, do=f"use {', '.join(model.chosen)}")
-        unit = UNITS.get(goal.parameter, "")
+        unit = self.units[goal.parameter]
         if goal.unit and goal.unit != unit:
             raise UsageError(f"has the unit {unit or '1'}, not {goal.unit}", where=name)
 
