@@ -44,7 +44,9 @@ def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.M
     lines = shown(terminal)
     assert any(re.search(r"2/3 +[0-9-]+:.* sigma_c 0\.012 mm · 2 frames · tilt 2 ro", line) for line in lines)
     # Above it stays what happened.
-    assert "    next tilt 2 roll 180 camera_roll 180: sigma_c 0.01 mm predicted" in [line.rstrip() for line in lines]
+    assert "    next tilt 2 roll 180 camera_roll 180: sigma_c 0.01 mm predicted" in [
+        line.rstrip() for line in lines
+    ]
 
 
 def test_a_bad_frame_is_told_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
