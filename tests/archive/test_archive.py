@@ -266,7 +266,7 @@ def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> 
         check=True,
     ).stdout.splitlines()
     assert said == [
-        f"{tmp_path / 'objects'}: cannot be stored (File too large); free disk space, or name another archive",
+        f"{tmp_path / 'objects'}: cannot be stored (File too large); free disk space or name another archive",
         "['0', '1']",
     ]
     assert len([p for p in (tmp_path / "objects").rglob("*") if p.is_file()]) == 2

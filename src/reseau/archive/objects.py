@@ -99,7 +99,7 @@ class LocalObjects:
         except OSError as error:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
-            what, do = f"cannot be stored ({error.strerror})", "free disk space, or name another archive"
+            what, do = f"cannot be stored ({error.strerror})", "free disk space or name another archive"
             raise ArchiveError(what, where=self.folder, do=do) from None
         return sha256
 

@@ -178,7 +178,7 @@ def own_plan(text: str, where: object, arguments: Mapping[str, Any] | None = Non
         try:
             inspect.signature(plan).bind(None, **arguments)
         except TypeError as error:
-            raise UsageError(f"its plan does not accept the arguments ({error})", where=where) from None
+            raise UsageError(f"does not accept the arguments ({error})", where=where) from None
     return plan
 
 
