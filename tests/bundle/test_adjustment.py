@@ -51,7 +51,7 @@ def test_gross_errors_that_are_kept_are_named() -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, bad = disturbed(world.noisy(1), 0.01, 1)
     result = required(adjust_network(network))
-    said = next(w for w in result.warnings if w.startswith("gross errors are likely in"))
+    said = next(w.text for w in result.warnings if w.text.startswith("gross errors are likely in"))
     for k in bad:
         where = f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}"
         assert where in said
@@ -163,7 +163,7 @@ def test_the_calibration_of_a_camera_is_a_document_with_its_covariance() -> None
 
 def said(result: object) -> str:
     """What the result warns of, or why there is none."""
-    return " ".join(result.warnings) if isinstance(result, Result) else result.reason  # type: ignore[attr-defined]
+    return " ".join(map(str, result.warnings)) if isinstance(result, Result) else result.reason  # type: ignore[attr-defined]
 
 
 def test_a_mirrored_control_is_found() -> None:

@@ -64,10 +64,10 @@ def test_it_covers_a_camera_that_changes_where_independent_errors_do_not() -> No
 def test_a_camera_that_changes_is_a_remark_and_one_that_does_not_is_none() -> None:
     world = networks.world(images=16, points=40, datum="free", control=0)
     words = "the camera may not be the same in all of them"
-    said = [w for w in checks(adjusted(world, changed(world.noisy(1), 6e-3, 1))) if words in w]
+    said = [w.text for w in checks(adjusted(world, changed(world.noisy(1), 6e-3, 1))) if words in w.text]
     assert len(said) == 1
     assert "c " in said[0]
-    assert not any(words in w for w in checks(adjusted(world, world.noisy(1))))
+    assert not any(words in w.text for w in checks(adjusted(world, world.noisy(1))))
 
 
 def test_few_images_say_nothing() -> None:

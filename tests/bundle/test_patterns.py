@@ -135,5 +135,5 @@ def test_a_pattern_of_the_frame_is_a_remark() -> None:
     network = paper()
     offset = 0.05 * np.sign(np.sin(network.xy / 20.0))
     result = adjusted(replace(network, xy=network.xy + offset))
-    assert any("have a pattern in common by place" in warning for warning in result.warnings)
-    assert not any("have a pattern in common" in warning for warning in adjusted(network).warnings)
+    assert any("have a pattern in common by place" in warning.text for warning in result.warnings)
+    assert not any("have a pattern in common" in warning.text for warning in adjusted(network).warnings)

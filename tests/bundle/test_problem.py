@@ -339,7 +339,7 @@ def test_weak_points_carry_no_datum_unless_they_are_chosen() -> None:
     np.testing.assert_allclose(fit.residuals, chosen.residuals, atol=1e-5)
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
     result = Result(world.network, fit, np.zeros(len(xy), dtype=bool))
-    assert any("2 weak points left out of the datum: p24, p25" in said for said in checks(result))
+    assert any("2 weak points left out of the datum: p24, p25" in said.text for said in checks(result))
 
 
 def test_large_coordinates_lose_nothing() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from reseau.bundle import Network, Result, adjust_network
 from reseau.core.errors import FormatError, InputError
+from reseau.core.failure import Code
 from reseau.exchange import read_colmap, read_foreign
 from reseau.io.network import Network1
 from reseau.optics import OpenCV
@@ -49,7 +50,7 @@ def test_a_point_with_a_single_ray_is_named(reference_data: Find) -> None:
     """Published diagnosis: deficiency 1, the depth of point 88."""
     result = adjust_network(held(read_foreign(reference_data("networks/camcal-pmexport-1ray.txt"))))
     assert isinstance(result, Result)
-    said = [w for w in result.warnings if "rank defect" in w]
+    said = [w.text for w in result.warnings if w.code is Code.RANK_DEFECT]
     assert len(said) == 1
     assert "rank defect 1" in said[0]
     assert "point 88 " in said[0]
@@ -60,7 +61,7 @@ def test_points_in_no_image_are_named(reference_data: Find) -> None:
     """Published diagnosis: deficiency 6, points 13 and 60."""
     result = adjust_network(held(read_foreign(reference_data("networks/camcal-pmexport-missing-obs.txt"))))
     assert isinstance(result, Result)
-    said = [w for w in result.warnings if "rank defect" in w]
+    said = [w.text for w in result.warnings if w.code is Code.RANK_DEFECT]
     assert len(said) == 1
     assert "rank defect 6: points 13, 60 are in no image" in said[0]
     assert result.redundancy == 4064 - (8 + 126 + 282)

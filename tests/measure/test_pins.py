@@ -306,7 +306,7 @@ def test_a_symmetric_pattern_is_taken_upright_and_said_to_be_ambiguous():
     assert result
     assert np.abs(result.xy - truth).max() < 0.25
     assert len(result.notes) == 1
-    assert "symmetric" in result.notes[0]
+    assert "symmetric" in result.notes[0].text
 
 
 def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():

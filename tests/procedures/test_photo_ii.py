@@ -72,13 +72,13 @@ def test_true_coordinates_of_a_body_lie_within_their_sigmas(world, bench):
 
 def test_a_missing_row_of_rods_is_named(bench):
     found = photo_of(at_fault(missing_row="C"), bench)
-    assert found.notes == ("the whole row of rods at y = -60 mm is missing",)
+    assert [str(note) for note in found.notes] == ["the whole row of rods at y = -60 mm is missing"]
 
 
 def test_a_test_object_that_stands_turned_is_named(bench):
     found = photo_of(at_fault(object_turned_deg=3.0), bench)
     assert len(found.notes) == 1
-    assert "turned by" in found.notes[0]
+    assert "turned by" in found.notes[0].text
     # The beam and the display turn the section as well, by a few tenths.
     assert np.rad2deg(found.instrument.plane.rotation) == pytest.approx(3.0, abs=0.5)
 
@@ -93,7 +93,7 @@ def photo_of(world: World, bench: tuple[PhotoI, PhotoII]) -> PhotoII:
 def test_a_camera_that_was_pushed_is_noticed_and_followed(pushed: float, bench):
     _, before = bench
     found = photo_of(at_fault(camera_moved_mm=pushed), bench)
-    assert any("the camera has moved since PHOTO I" in note for note in found.notes)
+    assert any("the camera has moved since PHOTO I" in note.text for note in found.notes)
     common = [name for name in found.pins.names if name in before.pins.names]
     off = found.pins.select(common).xy - before.pins.select(common).xy
     assert np.abs(off.mean(axis=0)).max() < 0.02
@@ -104,7 +104,7 @@ def test_confused_marks_of_the_common_system_are_named(world, bench):
     confused = swapped(world.design)
     first = photo_i(world.photo_i(), confused).required()
     found = photo_ii(world.photo_ii(), confused, world.test_object, first.camera).required()
-    assert any("are O and S swapped?" in note for note in found.notes)
+    assert any("are O and S swapped?" in note.text for note in found.notes)
 
 
 def test_a_gap_between_reseau_and_screen_does_no_harm_from_one_place():
@@ -127,7 +127,7 @@ def test_a_gap_between_reseau_and_screen_is_named_once_it_is_seen_from_two_place
     assert not found.test.holds
     # Two millimetres behind a plane 264 mm away, seen from 5 mm beside.
     assert np.hypot(*found.test.shift) == pytest.approx(2.0 * 5.0 / 264, abs=0.004)
-    assert any("a gap between reseau and screen (parallax)" in note for note in found.notes)
+    assert any("a gap between reseau and screen (parallax)" in note.text for note in found.notes)
 
 
 def test_stored_coefficients_still_hold_in_a_new_photograph_of_the_same_bench(world, bench):

@@ -47,7 +47,8 @@ def to_document(result: Result, *, covariances: bool = False) -> dict[str, Any]:
             "statistic": test.statistic, "redundancy": test.redundancy, "lower": test.lower,
             "upper": test.upper, "p": test.p, "passed": test.passed,
         },
-        "warnings": list(result.warnings),
+        "warnings": [remark.text for remark in result.warnings],
+        "warning_codes": [remark.code.value for remark in result.warnings],
     }  # fmt: skip
     if result.rejected.any():
         document["left_out"] = _left_out(result)

@@ -24,6 +24,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..core.data import Array
+    from ..core.failure import Remark
     from ..io import ReseauMeasurement
 
 __all__ = ["app", "measurement_csv"]
@@ -101,7 +102,7 @@ def pins(
     suffix = _suffix(out)
     target = ReseauDesign.read(design)
     rms = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     if is_points(image):
         found = read_measurement(image)
     else:
@@ -158,7 +159,7 @@ def _deliver(
     as_json: bool,
     rms: Array | None,
     marks: str,
-    notes: tuple[str, ...] = (),
+    notes: tuple[Remark, ...] = (),
     spread: str = "leave-one-out",
 ) -> None:
     """Write the measurement to its file, and say what was and was not measured."""

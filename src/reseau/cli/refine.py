@@ -248,7 +248,11 @@ def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json
         documents = [] if again is None or files.photo_ii is None else [_standard(files.photo_ii, again)]
         documents += [
             points_document(found.true, instrument.unit, "object")
-            | {"image": path.name, "notes": list(found.notes)}
+            | {
+                "image": path.name,
+                "notes": [note.text for note in found.notes],
+                "note_codes": [note.code.value for note in found.notes],
+            }
             for path, found in third
         ]
         say(canonical_json(documents[0] if len(documents) == 1 else documents))
@@ -294,7 +298,8 @@ def _standard(path: Path, again: StillStandard) -> dict[str, Any]:
         "p_shift": test.p_shift,
         "p_rest": test.p_rest,
         "rods": {"id": list(test.names), "change": test.change.tolist(), "sigma": test.sigma.tolist()},
-        "notes": list(again.notes),
+        "notes": [note.text for note in again.notes],
+        "note_codes": [note.code.value for note in again.notes],
     }
 
 

@@ -22,13 +22,14 @@ class Code(StrEnum):
 
     AMBIGUOUS = "ambiguous"  # several solutions fit equally well: add something that distinguishes them
     CAMERA_MOVED = "camera-moved"  # the camera has moved between photographs
+    CAMERA_UNSTABLE = "camera-unstable"  # the camera's parameters differ between images
     COLLINEAR = "collinear"  # all points lie on one line
-    CONTROL_NOT_TESTED = "control-not-tested"  # no redundancy checks the control points
     CORRELATED = "correlated"  # unknowns that the observations can hardly separate
+    COVERAGE = "coverage"  # parts of the images have no points
     DECLINED = "declined"  # an earlier step declined the image
+    DISPLAY_SHIFTED = "display-shifted"  # the display has shifted against the reseau
     DOUBTFUL_CONTROL = "doubtful-control"  # control points or distances contradict the images
     GROSS_ERRORS = "gross-errors"  # single observations are probably wrong: check or leave them out
-    IDENTICAL_IMAGES = "identical-images"  # images with the same coordinates or the same pattern of errors
     INCONSISTENT = "inconsistent"  # the observations contradict the model or each other
     INSTRUMENT_CHANGED = "instrument-changed"  # the instrument has changed since its calibration
     LOW_CONTRAST = "low-contrast"  # nothing stands out from the noise
@@ -40,6 +41,7 @@ class Code(StrEnum):
     NO_DATUM = "no-datum"  # nothing defines the coordinate system
     NO_REDUNDANCY = "no-redundancy"  # too few observations for the unknowns, or for a test
     OTHER_DESIGN = "other-design"  # a target of another design is in the image
+    PARALLAX = "parallax"  # a gap between reseau and screen shows after the camera moved
     PREREQUISITE_MISSING = "prerequisite-missing"  # an earlier step has no result
     RANK_DEFECT = "rank-defect"  # the observations do not determine a combination of the unknowns
     SATURATED = "saturated"  # the image is overexposed
@@ -47,12 +49,15 @@ class Code(StrEnum):
     SIGMAS_DOUBTFUL = "sigmas-doubtful"  # input sigmas do not agree with the residuals
     SINGULAR = "singular"  # the normal equations are singular to rounding
     SLANT = "slant"  # an edge is slanted too little or too much
+    TARGET_ROTATED = "target-rotated"  # the target is rotated, or named points are exchanged
     TOO_FEW_IMAGES = "too-few-images"
     TOO_FEW_LEVELS = "too-few-levels"  # exposures at too few levels of light
     TOO_FEW_POINTS = "too-few-points"
     TOO_MANY_OUTLIERS = "too-many-outliers"  # the model is probably wrong, not the observations
     TOO_SMALL = "too-small"  # the region or the target covers too few pixels
+    UNEQUAL_SCALES = "unequal-scales"  # the scales along the two axes differ
     UNKNOWN_STEP = "unknown-step"  # the procedure has no step of this name
+    UNMODELLED = "unmodelled"  # the residuals show a pattern that the model does not describe
     WEAK_GEOMETRY = "weak-geometry"  # points, images or parameters with very large uncertainty
 
 

@@ -15,7 +15,7 @@ from typing import Literal, Self
 import numpy as np
 
 from ..core.data import Frame, ImagePoints
-from ..core.failure import Code, Failure
+from ..core.failure import Code, Failure, Remark
 from ..io import ReseauDesign
 from ..measure import (
     PinDetections,
@@ -143,7 +143,7 @@ class PhotoII(_Refined):
     causes : Causes or None
         The physical causes of group B's coefficients, and the conditions they impose; None for another model
         than equations (7a, b).
-    notes : tuple of str
+    notes : tuple of Remark
         What the user should look into.
     measured : PinResult, optional
         How the pins were measured; None where they came from elsewhere.
@@ -153,7 +153,7 @@ class PhotoII(_Refined):
     instrument: InstrumentCorrection
     registration: Registration | None
     causes: Causes | None
-    notes: tuple[str, ...]
+    notes: tuple[Remark, ...]
     measured: PinResult | None
 
 
@@ -169,7 +169,7 @@ class PhotoIII(_Refined):
         Their true coordinates in the object's plane, with covariances.
     registration : Registration or None
         How the photograph was referred to PHOTO I.
-    notes : tuple of str
+    notes : tuple of Remark
         What the user should look into.
     measured : PinDetections, optional
         How the points were measured; None where they came from elsewhere.
@@ -178,7 +178,7 @@ class PhotoIII(_Refined):
     points: ImagePoints
     true: ImagePoints
     registration: Registration | None
-    notes: tuple[str, ...]
+    notes: tuple[Remark, ...]
     measured: PinDetections | None = None
 
 
@@ -303,7 +303,7 @@ class StillStandard(_Refined):
         Whether they still hold.
     registration : Registration or None
         How the photograph was referred to PHOTO I; None where its reseau was not given.
-    notes : tuple of str
+    notes : tuple of Remark
         What has changed, and what it points to.
     measured : PinResult, optional
         How the pins were measured; None where they came from elsewhere.
@@ -311,7 +311,7 @@ class StillStandard(_Refined):
 
     test: StandardTest
     registration: Registration | None
-    notes: tuple[str, ...]
+    notes: tuple[Remark, ...]
     measured: PinResult | None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.data import ImagePoints
+from ..core.failure import Code, Remark
 from ..io import ReseauDesign
 from .camera import CameraCorrection
 from .instrument import InstrumentCorrection
@@ -19,30 +20,44 @@ _ANOTHER_SHAPE_PX = 0.3
 """What may remain at the marks of a photograph referred to PHOTO I."""
 
 
-def of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[str, ...]:
+def of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[Remark, ...]:
     """What is odd about the camera's side."""
     notes = []
     angle = camera.photo_system.angle
     if abs(angle) > np.pi - _UPRIGHT:
-        notes.append("the x-axis of the common system runs to the left in the image: are O and S swapped?")
+        notes.append(
+            Remark(
+                "the x-axis of the common system runs to the left in the image: are O and S swapped?",
+                Code.TARGET_ROTATED,
+            )
+        )
     elif abs(angle) > _UPRIGHT:
         notes.append(
-            f"the common system is turned by {np.rad2deg(angle):.0f}° in the image: are O and S right?"
+            Remark(
+                f"the common system is turned by {np.rad2deg(angle):.0f}° in the image: are O and S right?",
+                Code.TARGET_ROTATED,
+            )
         )
     if registration is not None and registration.moved:
         notes.append(
-            f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
-            "the photograph was carried back"
+            Remark(
+                f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
+                "the photograph was carried back",
+                Code.CAMERA_MOVED,
+            )
         )
     if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
         notes.append(
-            f"the marks of the reseau lie by {registration.left_px:.2f} px (rms) otherwise than in PHOTO I: "
-            "take PHOTO I anew"
+            Remark(
+                f"the marks of the reseau lie by {registration.left_px:.2f} px (rms) otherwise than in "
+                "PHOTO I: take PHOTO I anew",
+                Code.INCONSISTENT,
+            )
         )
     return tuple(notes)
 
 
-def of_the_change(test: StandardTest, registration: Registration | None, unit: str) -> tuple[str, ...]:
+def of_the_change(test: StandardTest, registration: Registration | None, unit: str) -> tuple[Remark, ...]:
     """What has changed since a calibration, and what it points to."""
     if test.holds:
         return ()
@@ -51,38 +66,57 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
         said = f"the display has shifted against the reseau by {shift:.3g} {unit}"
         if registration is not None and registration.moved:
             notes.append(
-                f"{said} while the camera moved: there is a gap between reseau and screen (parallax); "
-                "keep the camera where PHOTO I was taken"
+                Remark(
+                    f"{said} while the camera moved: there is a gap between reseau and screen (parallax); "
+                    "keep the camera where PHOTO I was taken",
+                    Code.PARALLAX,
+                )
             )
         else:
-            notes.append(f"{said}: was it centred anew?")
+            notes.append(Remark(f"{said}: was it centred anew?", Code.DISPLAY_SHIFTED))
     if test.p_rest < test.alpha:
         rod, length = test.largest
         notes.append(
-            f"the instrument draws otherwise than it did, by up to {length:.3g} {unit} at rod {rod}: "
-            "make its calibration anew"
+            Remark(
+                f"the instrument draws otherwise than it did, by up to {length:.3g} {unit} at rod {rod}: "
+                "make its calibration anew",
+                Code.INSTRUMENT_CHANGED,
+            )
         )
     return tuple(notes)
 
 
 def of_the_object(
     instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     """What is odd about the test object's side."""
     notes, plane = [], instrument.plane
     if abs(plane.rotation) > np.pi - _UPRIGHT:
-        notes.append("the test object stands on its head or M and N are swapped")
+        notes.append(Remark("the test object stands on its head or M and N are swapped", Code.TARGET_ROTATED))
     elif abs(plane.rotation) > np.deg2rad(2.0):
-        notes.append(f"the test object is turned by {np.rad2deg(plane.rotation):.1f}° against the reseau")
+        notes.append(
+            Remark(
+                f"the test object is turned by {np.rad2deg(plane.rotation):.1f}° against the reseau",
+                Code.TARGET_ROTATED,
+            )
+        )
     missing = [i for i, name in enumerate(design.ids) if name not in pins.names]
     for axis, word in ((1, "row"), (0, "column")):
         for value in np.unique(np.round(design.xy[:, axis], 6)):
             line = np.flatnonzero(np.abs(design.xy[:, axis] - value) < 1e-6)
             if len(line) >= 3 and set(line) <= set(missing):
-                notes.append(f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing")
+                notes.append(
+                    Remark(
+                        f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing",
+                        Code.NOT_FOUND,
+                    )
+                )
     ratio = plane.scale[0] / plane.scale[1]
     if abs(ratio - 1) > 0.1:
         notes.append(
-            f"the scales along and across differ by {abs(ratio - 1):.0%}: check the display's aspect"
+            Remark(
+                f"the scales along and across differ by {abs(ratio - 1):.0%}: check the display's aspect",
+                Code.UNEQUAL_SCALES,
+            )
         )
     return tuple(notes)

@@ -10,6 +10,7 @@ import scipy.special
 from ...adjust import critical_w
 from ...core.data import Rows
 from ...core.errors import UsageError
+from ...core.failure import Code, Remark
 from ..network import Network
 from ..solver import BundleFit
 from .image_scatter import sigma_between_images
@@ -39,7 +40,7 @@ def listed(names: Iterable[object]) -> str:
     return ", ".join(every[:LISTED]) + more
 
 
-def gaps(network: Network, fit: BundleFit) -> list[str]:
+def gaps(network: Network, fit: BundleFit) -> list[Remark]:
     """Points, images and cameras that were left out, and why."""
     found = []
     part, rays = fit.usable.points, network.rays
@@ -47,38 +48,60 @@ def gaps(network: Network, fit: BundleFit) -> list[str]:
     nowhere = np.flatnonzero(lost & (rays == 0))
     if len(nowhere):
         defect = int((~network.held & ~network.observed)[nowhere].sum())
-        found.append(f"rank defect {defect}: {_points(network, nowhere)} in no image; left out")
+        found.append(
+            Remark(
+                f"rank defect {defect}: {_points(network, nowhere)} in no image; left out", Code.RANK_DEFECT
+            )
+        )
     single = np.flatnonzero(lost & (rays == 1))
     if len(single):
         of = {int(j): network.images[i] for i, j in zip(network.image_of, network.point_of, strict=True)}
         where = [f"{network.points[j]} (image {of[int(j)]})" for j in single]
         found.append(
-            f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
-            f"{listed(where)}; left out"
+            Remark(
+                f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
+                f"{listed(where)}; left out",
+                Code.RANK_DEFECT,
+            )
         )
     lit = np.bincount(network.point_of[fit.usable.images[network.image_of]], minlength=len(part))
     parallel = np.flatnonzero(lost & (rays > 1) & (lit > 1))
     if len(parallel):
         names = listed(network.points[j] for j in parallel)
-        found.append(f"{_plural('point', parallel)} {names} left out: rays are parallel, or blunders")
+        found.append(
+            Remark(
+                f"{_plural('point', parallel)} {names} left out: rays are parallel, or blunders",
+                Code.NOT_IDENTIFIED,
+            )
+        )
     few = np.flatnonzero(lost & (rays > 1) & (lit <= 1))
     if len(few):
-        found.append(f"{_points(network, few)} not seen by two images that are oriented; left out")
+        found.append(
+            Remark(
+                f"{_points(network, few)} not seen by two images that are oriented; left out",
+                Code.NOT_IDENTIFIED,
+            )
+        )
     images = np.flatnonzero(~fit.usable.images)
     for i in images[:LISTED]:
         name, seen = network.images[i], int(network.seen[i])
         why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
         enough = "three are needed" if seen < 3 else "no position could be computed from them"
-        found.append(f"image {name} has {why}; {enough}; left out")
+        found.append(Remark(f"image {name} has {why}; {enough}; left out", Code.TOO_FEW_POINTS))
     if len(images) > LISTED:
-        found.append(f"{len(images) - LISTED} more images are left out")
+        found.append(Remark(f"{len(images) - LISTED} more images are left out", Code.TOO_FEW_POINTS))
     used = np.bincount(network.camera_of[fit.usable.images], minlength=len(network.cameras))
     for c in np.flatnonzero(used == 0):
-        found.append(f"{network.cameras[c].label} has no image; its parameters stay as they are given")
+        found.append(
+            Remark(
+                f"{network.cameras[c].label} has no image; its parameters stay as they are given",
+                Code.TOO_FEW_IMAGES,
+            )
+        )
     return found
 
 
-def checks(result: Result) -> list[str]:
+def checks(result: Result) -> list[Remark]:
     """Correlations, weak points, uncovered corners, test values, and the global test."""
     network, fit = result.network, result.fit
     return [
@@ -106,26 +129,38 @@ def _points(network: Network, rows: Rows) -> str:
     return f"{_plural('point', rows)} {listed(network.points[int(j)] for j in rows)} {verb}"
 
 
-def _global(result: Result) -> list[str]:
+def _global(result: Result) -> list[Remark]:
     test = result.global_test()
     if test is None:
-        return ["no observation is redundant: nothing is checked, and sigmas are a priori"]
+        return [
+            Remark(
+                "no observation is redundant: nothing is checked, and sigmas are a priori", Code.NO_REDUNDANCY
+            )
+        ]
     if test.passed:
         return []
     side = "larger" if test.statistic > test.upper else "smaller"
     return [
-        f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
-        "the sigmas of the observations are not true, or the model is not"
+        Remark(
+            f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
+            "the sigmas of the observations are not true, or the model is not",
+            Code.SIGMAS_DOUBTFUL,
+        )
     ]
 
 
-def _creeping(result: Result) -> list[str]:
+def _creeping(result: Result) -> list[Remark]:
     if result.fit.offset < _NEAR:
         return []
-    return [f"the adjustment creeps: corrections of {result.fit.offset:.2g} standard deviations were to come"]
+    return [
+        Remark(
+            f"the adjustment creeps: corrections of {result.fit.offset:.2g} standard deviations were to come",
+            Code.NOT_CONVERGED,
+        )
+    ]
 
 
-def _large(result: Result) -> list[str]:
+def _large(result: Result) -> list[Remark]:
     """Image points whose test value is too large for the best of so many."""
     w = np.nan_to_num(result.test_values).max(axis=1)
     critical = critical_w(_ALPHA / max(1, 2 * len(w)))
@@ -139,11 +174,15 @@ def _large(result: Result) -> list[str]:
         for k in rows
     ]
     return [
-        f"{len(rows)} image {_plural('point', rows)} with test values above {critical:.1f}: {listed(names)}"
+        Remark(
+            f"{len(rows)} image {_plural('point', rows)} with test values above "
+            f"{critical:.1f}: {listed(names)}",
+            Code.GROSS_ERRORS,
+        )
     ]
 
 
-def _correlations(result: Result) -> list[str]:
+def _correlations(result: Result) -> list[Remark]:
     found = []
     for c, camera in enumerate(result.network.cameras):
         names, _, _ = result.camera_columns(c)
@@ -154,11 +193,17 @@ def _correlations(result: Result) -> list[str]:
         size = np.where(size > 0, size, 1.0)
         r = q / np.outer(size, size)
         for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
-            found.append(f"{camera.label}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}")
+            found.append(
+                Remark(
+                    f"{camera.label}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}", Code.CORRELATED
+                )
+            )
     if len(found) > LISTED:
         found = [
             *found[:LISTED],
-            f"{len(found) - LISTED} more camera parameters correlate above {_CORRELATED}",
+            Remark(
+                f"{len(found) - LISTED} more camera parameters correlate above {_CORRELATED}", Code.CORRELATED
+            ),
         ]
     q = result.pose_covariance[result.fit.usable.images]
     size = np.sqrt(np.maximum(np.diagonal(q, axis1=1, axis2=2), 0.0))
@@ -168,12 +213,16 @@ def _correlations(result: Result) -> list[str]:
     if len(images):
         names_of = listed(result.network.images[i] for i in images)
         found.append(
-            f"position and rotation correlate above {_CORRELATED} in {_plural('image', images)} {names_of}"
+            Remark(
+                f"position and rotation correlate above {_CORRELATED} in "
+                f"{_plural('image', images)} {names_of}",
+                Code.CORRELATED,
+            )
         )
     return found
 
 
-def _weak(result: Result) -> list[str]:
+def _weak(result: Result) -> list[Remark]:
     """Points much less certain than the others."""
     network = result.network
     free = result.fit.usable.points & ~network.held.all(axis=1)
@@ -186,10 +235,15 @@ def _weak(result: Result) -> list[str]:
         return []
     rows = rows[np.argsort(-sigma[rows], kind="stable")]
     names = [f"{network.points[j]} ({sigma[j]:.3g} {network.unit}, {network.rays[j]} rays)" for j in rows]
-    return [f"weak {_plural('point', rows)}, sigma above {_WEAK:g} times the median: {listed(names)}"]
+    return [
+        Remark(
+            f"weak {_plural('point', rows)}, sigma above {_WEAK:g} times the median: {listed(names)}",
+            Code.WEAK_GEOMETRY,
+        )
+    ]
 
 
-def _datum(result: Result) -> list[str]:
+def _datum(result: Result) -> list[Remark]:
     """Points that inner constraints over all do not hold for."""
     network, fit = result.network, result.fit
     if fit.datum is None or not network.datum_points.all():
@@ -198,10 +252,14 @@ def _datum(result: Result) -> list[str]:
     if not len(rows):
         return []
     names = listed(network.points[j] for j in rows)
-    return [f"{len(rows)} weak {_plural('point', rows)} left out of the datum: {names}"]
+    return [
+        Remark(
+            f"{len(rows)} weak {_plural('point', rows)} left out of the datum: {names}", Code.WEAK_GEOMETRY
+        )
+    ]
 
 
-def _scatter(result: Result) -> list[str]:
+def _scatter(result: Result) -> list[Remark]:
     """Images, and axes, whose coordinates scatter more than the others."""
     if not result.redundancy > 0 or not result.sigma0 > 0:
         return []
@@ -216,8 +274,12 @@ def _scatter(result: Result) -> list[str]:
     names = [f"{result.network.images[i]} ({s:.2g})" for i, s in zip(rows[order], size[order], strict=True)]
     if names:
         found.append(
-            f"image coordinates scatter more than those of the other images, by the factor in brackets, in "
-            f"{_plural('image', rows)} {listed(names)}"
+            Remark(
+                "image coordinates scatter more than those of the other images, by the factor in "
+                "brackets, in "
+                f"{_plural('image', rows)} {listed(names)}",
+                Code.SIGMAS_DOUBTFUL,
+            )
         )
     total, count = squares.sum(axis=0), number.sum(axis=0)
     if count.min() > _LEAST and total.min() > 0:
@@ -226,12 +288,16 @@ def _scatter(result: Result) -> list[str]:
         times = mean[a] / mean[1 - a]
         if scipy.special.fdtrc(count[a], count[1 - a], times) < _ALPHA:
             found.append(
-                f"{'xy'[a]} scatters {np.sqrt(times):.2f} times as much as {'xy'[1 - a]}, by the sigmas given"
+                Remark(
+                    f"{'xy'[a]} scatters {np.sqrt(times):.2f} times as much as "
+                    f"{'xy'[1 - a]}, by the sigmas given",
+                    Code.SIGMAS_DOUBTFUL,
+                )
             )
     return found
 
 
-def _patterns(result: Result) -> list[str]:
+def _patterns(result: Result) -> list[Remark]:
     """Cameras whose residuals have a pattern in common, by place in the image."""
     network, found = result.network, []
     images = np.bincount(network.camera_of[result.fit.usable.images], minlength=len(network.cameras))
@@ -242,14 +308,17 @@ def _patterns(result: Result) -> list[str]:
             continue
         if pattern.p < _ALPHA:
             found.append(
-                f"{network.cameras[c].label}: residuals of its images have a pattern in common by place "
-                f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
-                "sigmas do not cover"
+                Remark(
+                    f"{network.cameras[c].label}: residuals of its images have a pattern in common by place "
+                    f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
+                    "sigmas do not cover",
+                    Code.UNMODELLED,
+                )
             )
     return found
 
 
-def _between(result: Result) -> list[str]:
+def _between(result: Result) -> list[Remark]:
     """Parameters that differ between the images of a camera by more than their sigmas."""
     found = []
     for c, camera in enumerate(result.network.cameras):
@@ -260,13 +329,16 @@ def _between(result: Result) -> list[str]:
         if len(rows):
             said = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
             found.append(
-                f"{camera.label}: by the scatter between its images parameters are less certain than their "
-                f"sigmas say, by the factor: {said}; the camera may not be the same in all of them"
+                Remark(
+                    f"{camera.label}: by the scatter between its images parameters are less certain than "
+                    f"their sigmas say, by the factor: {said}; the camera may not be the same in all of them",
+                    Code.CAMERA_UNSTABLE,
+                )
             )
     return found[:LISTED]
 
 
-def _behind(network: Network, fit: BundleFit) -> list[str]:
+def _behind(network: Network, fit: BundleFit) -> list[Remark]:
     rows = np.flatnonzero(fit.usable.observations)
     i, j = network.image_of[rows], network.point_of[rows]
     depth = np.einsum("nk,nk->n", fit.values.rotation[i, 2], fit.values.xyz[j] - fit.values.x0[i])
@@ -276,10 +348,10 @@ def _behind(network: Network, fit: BundleFit) -> list[str]:
     names = [
         f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in wrong
     ]
-    return [f"{_plural('point', wrong)} behind the camera: {listed(names)}"]
+    return [Remark(f"{_plural('point', wrong)} behind the camera: {listed(names)}", Code.GROSS_ERRORS)]
 
 
-def _corners(network: Network, fit: BundleFit) -> list[str]:
+def _corners(network: Network, fit: BundleFit) -> list[Remark]:
     """Corners of the image in which a camera to be calibrated has no points."""
     found, used = [], fit.usable.observations
     for c, camera in enumerate(network.cameras):
@@ -295,5 +367,7 @@ def _corners(network: Network, fit: BundleFit) -> list[str]:
         }
         empty = [name for name, inside in corners.items() if not inside.any()]
         if empty:
-            found.append(f"{camera.label}: no points in the {', '.join(empty)} of its images")
+            found.append(
+                Remark(f"{camera.label}: no points in the {', '.join(empty)} of its images", Code.COVERAGE)
+            )
     return found[:LISTED]

@@ -12,6 +12,7 @@ from ...adjust.rejection import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
+from ...core.failure import Remark
 from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
@@ -41,7 +42,7 @@ class Result:
         Image points left out by data snooping.
     steps : tuple of SnoopingStep
         How that came about, by the numbers of :class:`~reseau.bundle.solver.problem.BundleProblem`.
-    warnings : tuple of str
+    warnings : tuple of Remark
         What deserves attention; each names what it is about.
     """
 
@@ -49,7 +50,7 @@ class Result:
     fit: BundleFit
     rejected: Mask
     steps: tuple[SnoopingStep, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Remark, ...] = ()
 
     def __bool__(self) -> bool:
         return True

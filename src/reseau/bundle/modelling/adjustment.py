@@ -11,7 +11,7 @@ import numpy as np
 from ...adjust import data_snooping, robust
 from ...adjust.rejection import SnoopingStep
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Failure, Remark
 from ..diagnostics import Result, checks, doubtful_control, listed
 from ..network import Network, finite
 from ..solver import BundleFit, BundleProblem, Unknowns, Values, approximate
@@ -63,7 +63,7 @@ class Options:
             raise UsageError("must be between 0 and 1", where="alpha and max_fraction")
 
 
-def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[str, ...]]:
+def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[Remark, ...]]:
     """The network with approximate values, as a problem of :mod:`reseau.adjust`; and notes about them."""
     options = options or Options()
     found = approximate(network)
@@ -118,14 +118,17 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     return Result(network, fit, rejected, steps, (*notes, *doubts, *checks(bare)))
 
 
-def _doubts(problem: BundleProblem) -> list[str]:
+def _doubts(problem: BundleProblem) -> list[Remark]:
     """What may be wrong with the observations where they fit badly."""
-    doubts = [doubtful_control(problem.network)] if problem.network.datum == "control" else []
+    doubts = []
+    control = doubtful_control(problem.network) if problem.network.datum == "control" else ""
+    if control:
+        doubts.append(Remark(control, Code.DOUBTFUL_CONTROL))
     if len(problem.observations) <= _MANY:
         names = _suspects(problem)
         if names:
-            doubts.append(f"gross errors are likely in {listed(names)}")
-    return [doubt for doubt in doubts if doubt]
+            doubts.append(Remark(f"gross errors are likely in {listed(names)}", Code.GROSS_ERRORS))
+    return doubts
 
 
 def _suspects(problem: BundleProblem) -> list[str]:

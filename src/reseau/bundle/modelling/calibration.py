@@ -73,7 +73,8 @@ def calibration_of(
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
                   "sigma_between_images": {key: s for key, s in between if np.isfinite(s)},
-                  "warnings": list(result.warnings)},
+                  "warnings": [remark.text for remark in result.warnings],
+                  "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),
         times=dict(times or {}),
     )  # fmt: skip

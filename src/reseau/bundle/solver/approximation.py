@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse
 
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Remark
 from ...optics.poses import rotation_matrix
 from ..network import Network, finite
 from .datum import similarity_onto
@@ -37,14 +38,14 @@ class Approximate:
         Projection centres, NaN likewise.
     xyz : ndarray (p, 3)
         Points, NaN likewise.
-    notes : tuple of str
+    notes : tuple of Remark
         How they were found, where that matters.
     """
 
     rotation: Array
     x0: Array
     xyz: Array
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
 
 def approximate(network: Network) -> Approximate:
@@ -87,7 +88,7 @@ class _Block:
 
     def grown(self) -> Approximate:
         """The block as far as it grows."""
-        known, notes = self.known.copy(), []
+        known, notes = self.known.copy(), list[Remark]()
         if not self.posed.any():
             self._resect_all()
         if self.posed.sum() < 2 and not self.posed.all():
@@ -96,13 +97,13 @@ class _Block:
             self.known = np.zeros(len(self.xyz), dtype=bool)
             if self._begin_with_a_pair():
                 self._grow()
-                notes.append(self._onto(control, known))
+                notes += self._onto(control, known)
             else:
                 self.known, self.xyz = known, control
         self._grow()
         given = finite(self.network.xyz)
         xyz = np.where(given[:, None], self.network.xyz, self.xyz)
-        return Approximate(self.rotation, self.x0, xyz, tuple(note for note in notes if note))
+        return Approximate(self.rotation, self.x0, xyz, tuple(notes))
 
     def _grow(self) -> None:
         """Intersect points and resect images in turn, until neither gives more."""
@@ -219,15 +220,16 @@ class _Block:
         score = float(agree.sum()) * min(float(np.median(angle[agree])), 0.5) if agree.any() else 0.0
         return score, found.rotation, found.x0
 
-    def _onto(self, control: Array, known: Mask) -> str:
+    def _onto(self, control: Array, known: Mask) -> list[Remark]:
         """Carry the block onto the known points; says so where it cannot be."""
         common = known & finite(self.xyz)
         if common.sum() < 3:
             self.known = np.zeros(len(known), dtype=bool)
-            return "" if not known.any() else "too few known points in the block to place it in their system"
+            text = "too few known points in the block to place it in their system"
+            return [Remark(text, Code.TOO_FEW_POINTS)] if known.any() else []
         nothing = np.zeros((1, 12))
         values = Values(self.rotation, self.x0, self.xyz, nothing, nothing)
         moved = similarity_onto(values, control, common, scaled=True)(values)
         self.rotation, self.x0, self.xyz = moved.rotation, moved.x0, moved.xyz
         self.xyz[known], self.known = control[known], known
-        return ""
+        return []

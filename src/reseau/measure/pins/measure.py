@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
-from ...core.failure import Failure
+from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
 from ..points import Measured
@@ -18,7 +18,10 @@ from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
 __all__ = ["PinResult", "measure_pins"]
 
-_AMBIGUOUS = "the design is symmetric and fits in more than one way: taken upright, y up, as far as that goes"
+_AMBIGUOUS = Remark(
+    "the design is symmetric and fits in more than one way: taken upright, y up, as far as that goes",
+    Code.AMBIGUOUS,
+)
 _BESIDE_PX = 3.0
 """How far from the middle line of an echo, at least, another rod's place counts as covered by it."""
 _ROUNDS = 3
@@ -48,7 +51,7 @@ class PinResult(Measured):
         As in :class:`reseau.measure.pins.PinDetections`; NaN where not measured.
     detections : PinDetections
         All spots of the frame.
-    notes : tuple of str
+    notes : tuple of Remark
         What the user should know.
     """
 
@@ -59,7 +62,7 @@ class PinResult(Measured):
     curvature: Array
     tilt: Array
     detections: PinDetections
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
 
 def measure_pins(

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..matching import Matches
@@ -44,13 +44,13 @@ class ReseauResult(Measured):
         Width of the point-spread function of each match, NaN where there was none.
     field : SmoothField
         Smooth mapping from the design to the image: a polynomial with a local model on top.
-    notes : tuple of str
+    notes : tuple of Remark
         Notes for the user.
     """
 
     psf_px: Array
     field: SmoothField
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
     def need(self, trials: int = 499, seed: int = 0) -> Array:
         """Probability, per axis (2,), that white noise alone would require an equally strong local model."""
