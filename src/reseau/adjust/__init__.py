@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from .batch import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
-from .checks import check_jacobian
 from .components import VarianceComponents, variance_components
-from .consensus import Consensus, ConsensusModel, ransac
 from .differences import JacobianCheck
 from .elimination import Elimination, EliminationStep, eliminate
-from .engine import Options, adjust
-from .fitted import AdjustmentFailure
+from .engine import AdjustmentFailure, Options
+from .fitted import compare
+from .outliers import Rejection, Robust, SnoopingStep, data_snooping, robust, weight_function
 from .parameters import Constraint, Parameters, Prior
-from .problem import GaussHelmert, GaussMarkov, Problem
-from .rejection import Rejection, SnoopingStep, data_snooping, reject_outliers
+from .problem import Adjustment, GaussHelmert, GaussMarkov, Problem, adjust, check_jacobian
 from .reliability import ExternalReliability, critical_tau, critical_w, noncentrality
-from .result import Adjustment
-from .robust import Robust, robust, weight_function
-from .significance import CoefficientTest, GlobalTest, NestedTest, compare
+from .significance import CoefficientTest, GlobalTest, NestedTest
 
 __all__ = [
     "Adjustment",
@@ -25,8 +21,6 @@ __all__ = [
     "BatchOptions",
     "BatchReason",
     "CoefficientTest",
-    "Consensus",
-    "ConsensusModel",
     "Constraint",
     "Elimination",
     "EliminationStep",
@@ -53,8 +47,6 @@ __all__ = [
     "data_snooping",
     "eliminate",
     "noncentrality",
-    "ransac",
-    "reject_outliers",
     "robust",
     "variance_components",
     "weight_function",

@@ -10,11 +10,10 @@ import numpy as np
 
 from ..core.errors import UsageError
 from ..core.failure import Failure
-from .engine import Options, adjust
-from .fitted import AdjustmentFailure
-from .problem import Problem
-from .result import Adjustment
-from .significance import CoefficientTest, coefficient_test, compare
+from .engine import AdjustmentFailure, Options
+from .fitted import compare
+from .problem import Adjustment, Problem, adjust
+from .significance import CoefficientTest
 
 __all__ = ["Elimination", "EliminationStep", "eliminate"]
 
@@ -188,7 +187,7 @@ def _test(
 ) -> CoefficientTest | Failure:
     if criterion != "F":
         scale: Literal["a-priori", "a-posteriori"] = "a-priori" if criterion == "chi2" else "a-posteriori"
-        return coefficient_test(fit, name, value, alpha, scale=scale)
+        return fit.test_of(name, value, alpha, scale)
     without = _without(fit, name, value)
     if isinstance(without, Failure):
         return without

@@ -8,23 +8,22 @@ double precision while the offset still does, so that there the offset judges th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from ..core.failure import Code
-from ..core.threads import one_thread
-from .checks import check_jacobian
-from .fitted import AdjustmentFailure, NullVector
+from ..core.failure import Code, Failure
 from .linear import Linearised, constraint_matrix, linearise
-from .models import Model, State, model_of
-from .problem import Problem
-from .result import Adjustment, Solution
+from .models import Model, State, Values
+from .reliability import Solution
 
-__all__ = ["Options", "adjust"]
+__all__ = ["AdjustmentFailure", "NullVector", "Options", "Solved", "solve"]
+
+NullVector = Mapping[str, float]
 
 _EPS = float(np.finfo(np.float64).eps)
 _MEMORY, _SHRINK, _LEAST_DAMPING, _MOST_DAMPING = 0.7, 1.0 / 3.0, 1e-18, 1e18
@@ -79,52 +78,100 @@ class Options:
             raise UsageError("max_iterations, tolerance and damping must be positive", where="Options")
 
 
-def adjust(problem: Problem, options: Options | None = None) -> Adjustment | AdjustmentFailure:
-    """Adjust a problem by least squares.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AdjustmentFailure(Failure):
+    """An adjustment that gave no estimate, with the point where it stopped; falsy.
 
     Parameters
     ----------
-    problem : GaussMarkov or GaussHelmert
-        What is to be adjusted.
-    options : Options, optional
-        How.
+    reason, code, where
+        As for :class:`~reseau.core.failure.Failure`.
+    values : mapping of str to float
+        Parameters where the iteration stopped; for diagnosis only.
+    iterations : int
+        Number of corrections tried.
+    costs : tuple of float
+        Weighted sums of squares of the accepted iterations.
+    null_space : tuple of mapping of str to float
+        For a rank defect, combinations of parameters that the observations do not determine: any multiple of
+        these corrections leaves the sum of squares unchanged.
 
-    Returns
-    -------
-    Adjustment or Failure
-        A failure is falsy and carries its reason; `.required()` of either returns the adjustment or raises.
+    Examples
+    --------
+    >>> from reseau.core.failure import Code
+    >>> failed = AdjustmentFailure("not converged in 3 iterations", Code.NOT_CONVERGED, iterations=3)
+    >>> bool(failed), failed.iterations, str(failed)
+    (False, 3, 'not converged in 3 iterations')
+    """
+
+    values: Mapping[str, float] = field(default_factory=dict)
+    iterations: int = 0
+    costs: tuple[float, ...] = ()
+    null_space: tuple[NullVector, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A model at the minimum of its weighted sum of squares.
+
+    Parameters
+    ----------
+    x : ndarray (u,)
+        Parameters, in the arithmetic of the observations.
+    cofactor : ndarray (u, u)
+        Q of the parameters; zero for fixed ones.
+    residuals : ndarray (n,)
+        v = adjusted − observed.
+    cost : float
+        vᵀPv.
+    redundancy : int
+        Degrees of freedom.
+    defect : int
+        Rank defect that inner constraints removed.
+    iterations : int
+        Number of corrections tried.
+    costs : tuple of float
+        vᵀPv at the approximate values and after each accepted correction.
+    solution : Solution
+        The linearised model, from which the reliability is computed.
+    """
+
+    x: Values
+    cofactor: Array
+    residuals: Array
+    cost: float
+    redundancy: int
+    defect: int
+    iterations: int
+    costs: tuple[float, ...]
+    solution: Solution
+
+
+def solve(model: Model, options: Options) -> Solved | AdjustmentFailure:
+    """Minimise the weighted sum of squares of a model, from its approximate values.
 
     Raises
     ------
     UsageError
-        When parts of the problem do not fit together.
-
-    Notes
-    -----
-    Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
-    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
-    *Technometrics* 23, 179–183.
+        When `options.check_jacobian` is given and the derivatives disagree with differences.
     """
-    with one_thread():
-        run = _Run(problem, options or Options())
-        if run.options.check_jacobian is not None:
-            _check(run.model, run.options.check_jacobian)
-        return run.adjust()
+    if options.check_jacobian is not None:
+        _check(model, options.check_jacobian)
+    return _Run(model, options).solve()
 
 
 class _Run:
     """One adjustment on its way."""
 
-    def __init__(self, problem: Problem, options: Options) -> None:
-        self.problem, self.options = problem, options
-        parameters = problem.parameters
-        self.model = model_of(problem)
+    def __init__(self, model: Model, options: Options) -> None:
+        self.model, self.problem, self.options = model, model.problem, options
+        problem, parameters = self.problem, self.problem.parameters
         self.free = np.flatnonzero(parameters.mask)
         self.constraints = constraint_matrix(
             problem.constraints, parameters.names, parameters.values, parameters.mask
         )
-        analytic = getattr(problem, "jacobian", None) or getattr(problem, "jacobians", None)
-        self.rank_tolerance = options.rank_tolerance or (1e-13 if analytic else 1e-9)
+        default = 1e-13 if model.analytic else 1e-9
+        self.rank_tolerance = default if options.rank_tolerance is None else options.rank_tolerance
         datum = set(problem.datum)
         self.datum = np.array([name in datum for name in parameters.free], dtype=bool)
         self.marquardt = options.method == "levenberg-marquardt"
@@ -133,7 +180,7 @@ class _Run:
         self.costs: list[float] = []
         self.iterations = 0
 
-    def adjust(self) -> Adjustment | AdjustmentFailure:
+    def solve(self) -> Solved | AdjustmentFailure:
         model, x = self.model, self.model.start
         x = self._moved(x, self.constraints.onto(x[self.free].astype(np.float64)))
         self.begin = x[self.free].astype(np.float64)
@@ -283,7 +330,7 @@ class _Run:
         inner = g[self.datum].T @ g[self.datum]
         return step - g @ (np.linalg.pinv(inner) @ (g.T @ past)) / (1.0 + damping)
 
-    def _arrived(self, state: State, linear: Linearised) -> Adjustment | AdjustmentFailure:
+    def _arrived(self, state: State, linear: Linearised) -> Solved | AdjustmentFailure:
         factor, defect = linear.factor, linear.null.shape[1]
         if defect:
             vectors = self._null_vectors(linear)
@@ -299,14 +346,13 @@ class _Run:
                 return self._failure(reason, Code.NO_DATUM, state, vectors)
             weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
             factor = factor - g @ (weight @ factor)
-        return self._adjustment(state, linear, factor, defect)
+        return self._solved(state, linear, factor, defect)
 
-    def _adjustment(self, state: State, linear: Linearised, factor: Array, defect: int) -> Adjustment:
+    def _solved(self, state: State, linear: Linearised, factor: Array, defect: int) -> Solved:
         parameters = self.problem.parameters
         cofactor = np.zeros((len(parameters), len(parameters)))
         cofactor[np.ix_(self.free, self.free)] = factor @ factor.T
         redundancy = len(linear.design) - self.model.left_out - linear.rank
-        shape = self.problem.observations.shape
         solution = Solution(
             design=linear.design,
             whitened=state.whitened,
@@ -314,20 +360,15 @@ class _Run:
             influence=tuple(self.model.influence(state)),
             cofactors=tuple(self.model.cofactors()),
         )
-        return Adjustment(
-            problem=self.problem,
-            names=parameters.names,
-            exact_values=state.x,
+        return Solved(
+            x=state.x,
             cofactor=cofactor,
-            sigma0=float(np.sqrt(state.cost / redundancy)) if redundancy > 0 else float("nan"),
-            redundancy=redundancy,
+            residuals=state.residuals,
             cost=state.cost,
-            residuals=state.residuals.reshape(shape),
-            scale=self.options.scale if redundancy > 0 else "a-priori",
+            redundancy=redundancy,
+            defect=defect,
             iterations=self.iterations,
             costs=tuple(self.costs),
-            datum_defect=defect,
-            options=self.options,
             solution=solution,
         )
 
@@ -366,7 +407,7 @@ class _Run:
 
 
 def _check(model: Model, tolerance: float) -> None:
-    found = check_jacobian(model.problem)
+    found = model.check(np.array(model.problem.parameters.values, dtype=np.float64))
     if not found.agrees(tolerance):
         raise UsageError(
             f"differs from differences by {found.error:.2g} of its column, at row {found.row}",

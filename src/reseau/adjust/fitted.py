@@ -7,59 +7,22 @@ than the cofactors of the adjusted observations, block by block.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.data import Array, Mask
+from ..core.errors import UsageError
 from ..core.failure import Failure
 from ..core.threads import one_thread
+from .engine import Options
 from .reliability import Standardised, Whitened, noncentrality
-from .significance import GlobalTest, global_test
+from .significance import GlobalTest, NestedTest, global_test, nested_test
 from .stochastic import Covariance
 
-if TYPE_CHECKING:
-    from .engine import Options
-
-__all__ = ["Adjustable", "AdjustmentFailure", "Fitted", "NullVector"]
-
-NullVector = Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AdjustmentFailure(Failure):
-    """An adjustment that gave no estimate, with the point where it stopped; falsy.
-
-    Parameters
-    ----------
-    reason, code, where
-        As for :class:`~reseau.core.failure.Failure`.
-    values : mapping of str to float
-        Parameters where the iteration stopped; for diagnosis only.
-    iterations : int
-        Number of corrections tried.
-    costs : tuple of float
-        Weighted sums of squares of the accepted iterations.
-    null_space : tuple of mapping of str to float
-        For a rank defect, combinations of parameters that the observations do not determine: any multiple of
-        these corrections leaves the sum of squares unchanged.
-
-    Examples
-    --------
-    >>> from reseau.core.failure import Code
-    >>> failed = AdjustmentFailure("not converged in 3 iterations", Code.NOT_CONVERGED, iterations=3)
-    >>> bool(failed), failed.iterations, str(failed)
-    (False, 3, 'not converged in 3 iterations')
-    """
-
-    values: Mapping[str, float] = field(default_factory=dict)
-    iterations: int = 0
-    costs: tuple[float, ...] = ()
-    null_space: tuple[NullVector, ...] = ()
+__all__ = ["Adjustable", "Fitted", "compare"]
 
 
 class Fitted:
@@ -196,6 +159,44 @@ class Fitted:
     def global_test(self, alpha: float = 0.05) -> GlobalTest:
         """Two-sided χ² test of the variance factor against one (Koch 1999, ch. 4)."""
         return global_test(self.cost, self.redundancy, alpha)
+
+
+def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
+    """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
+
+    Parameters
+    ----------
+    nested, full : Adjustment, or any other fit
+        Of the same observations with the same covariance, `nested` a special case of `full`.
+    alpha : float
+        Level.
+    scale : {"a-posteriori", "a-priori"}, optional
+        F or χ²; that of `full` by default.
+
+    Returns
+    -------
+    NestedTest
+        F test of the increase of vᵀPv, or χ² test when the sigmas are taken at their word.
+
+    Raises
+    ------
+    UsageError
+        When the redundancies or the numbers of observations show that they are not nested.
+
+    Notes
+    -----
+    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, ch. 4; for non-linear
+    models the likelihood ratio in the same form.
+    """
+    restrictions = nested.redundancy - full.redundancy
+    if restrictions < 1 or nested.observed != full.observed:
+        raise UsageError(
+            f"redundancies {nested.redundancy} and {full.redundancy} are not of a model within another",
+            where="compare",
+        )
+    increase = max(nested.cost - full.cost, 0.0)
+    cost = None if (scale or full.scale) == "a-priori" else full.cost
+    return nested_test(increase, restrictions, cost, full.redundancy, alpha)
 
 
 F = TypeVar("F", bound=Fitted)

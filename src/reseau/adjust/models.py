@@ -11,21 +11,71 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from .differences import differences
-from .problem import GaussHelmert, GaussMarkov, Problem, Values
-from .stochastic import Blocks, Weighting, blocks_of
+from .differences import JacobianCheck, compare_jacobians, differences
+from .parameters import Constraint, Parameters
+from .stochastic import Blocks, Covariance, Weighting, blocks_of
 
-__all__ = ["HelmertModel", "MarkovModel", "Model", "State", "model_of"]
+__all__ = [
+    "Conditions",
+    "Function",
+    "HelmertModel",
+    "Jacobian",
+    "Jacobians",
+    "MarkovModel",
+    "Model",
+    "Specification",
+    "State",
+    "Values",
+]
+
+Values = NDArray[Any]
+Function = Callable[[Values], Any]
+Jacobian = Callable[[Array], Any]
+Conditions = Callable[[Array, Array], Any]
+Jacobians = Callable[[Array, Array], tuple[Any, Any]]
 
 _EPS = float(np.finfo(np.float64).eps)
 _INNER = 30
+
+
+class Specification(Protocol):
+    """The parts of a problem that do not depend on its kind; see :class:`reseau.adjust.GaussMarkov`."""
+
+    @property
+    def observations(self) -> Values:
+        """Observations, in any shape."""
+
+    @property
+    def covariance(self) -> Covariance:
+        """Their covariance."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Names, approximate values, which are free, and their observations."""
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """Linear conditions between parameters."""
+
+    @property
+    def datum(self) -> tuple[str, ...]:
+        """Names of the parameters of the inner constraints."""
+
+    @property
+    def weights(self) -> Array | None:
+        """Factors on the weights, of the observations' shape."""
+
+    @property
+    def size(self) -> int:
+        """Number of observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +114,7 @@ class State:
 class Model:
     """What both kinds share: arithmetic of the parameters, and the rows of the observed ones."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Specification) -> None:
         self.problem = problem
         self.names = problem.parameters.names
         self.mask = problem.parameters.mask
@@ -157,7 +207,27 @@ class Model:
 
     @property
     def left_out(self) -> int:
-        """Observations or conditions that do not count."""
+        """Number of observations or conditions with weight zero."""
+        raise NotImplementedError
+
+    @property
+    def analytic(self) -> bool:
+        """Whether analytic derivatives were given."""
+        raise NotImplementedError
+
+    def check(self, x: Array) -> JacobianCheck:
+        """Compare the analytic derivatives at x with differences.
+
+        Raises
+        ------
+        UsageError
+            When there are no analytic derivatives.
+        """
+        if not self.analytic:
+            raise UsageError("has no analytic derivatives to check", where="problem")
+        return self._check(x)
+
+    def _check(self, x: Array) -> JacobianCheck:
         raise NotImplementedError
 
     def _evaluate(self, x: Values, near: State | None) -> State | None:
@@ -175,9 +245,9 @@ class MarkovModel(Model):
 
     constant_weights = True
 
-    def __init__(self, problem: GaussMarkov) -> None:
+    def __init__(self, problem: Specification, function: Function, jacobian: Jacobian | None) -> None:
         super().__init__(problem)
-        self.markov = problem
+        self._function, self._jacobian = function, jacobian
         self.weighting = Weighting(blocks_of(problem.covariance, problem.observations.shape), self.factors)
 
     @property
@@ -185,8 +255,17 @@ class MarkovModel(Model):
         """Observations of weight zero."""
         return 0 if self.factors is None else int((self.factors == 0).sum())
 
+    @property
+    def analytic(self) -> bool:
+        """Whether a Jacobian was given."""
+        return self._jacobian is not None
+
+    def _check(self, x: Array) -> JacobianCheck:
+        names = self.problem.parameters.free
+        return compare_jacobians(self.jacobian(x)[:, self.mask], self.numeric(x)[:, self.mask], names)
+
     def _compute(self, x: Values) -> Values:
-        computed = np.asarray(self.markov.function(x))
+        computed = np.asarray(self._function(x))
         if computed.size != self.problem.size:
             raise UsageError(
                 f"gave {computed.shape} for observations {self.problem.observations.shape}", where="function"
@@ -203,9 +282,9 @@ class MarkovModel(Model):
     def jacobian(self, x: Array) -> Array:
         """Derivatives (n, u) of the function."""
         n, u = self.problem.size, len(self.names)
-        if self.markov.jacobian is None:
+        if self._jacobian is None:
             return self.numeric(x)
-        given = np.asarray(self.markov.jacobian(x), dtype=np.float64)
+        given = np.asarray(self._jacobian(x), dtype=np.float64)
         if given.shape not in ((*self.problem.observations.shape, u), (n, u)):
             raise UsageError(f"gave {given.shape}, not {(n, u)}", where="jacobian")
         return given.reshape(n, u)
@@ -229,9 +308,9 @@ class HelmertModel(Model):
 
     constant_weights = False
 
-    def __init__(self, problem: GaussHelmert) -> None:
+    def __init__(self, problem: Specification, conditions: Conditions, jacobians: Jacobians | None) -> None:
         super().__init__(problem)
-        self.helmert = problem
+        self._given_conditions, self._jacobians = conditions, jacobians
         shape = problem.observations.shape
         blocks = blocks_of(problem.covariance, shape)
         self.grouped = len(shape) == 2
@@ -239,10 +318,10 @@ class HelmertModel(Model):
         if self.grouped and not _fits(blocks, k):
             groups, k = 1, problem.size
         self.groups, self.k = groups, k
-        self.weighting = Weighting([_regrouped(blocks, groups, k)], self._whole_groups(problem))
+        self.weighting = Weighting([_regrouped(blocks, groups, k)], self._whole_groups())
         self.covariances = self.weighting.cofactors[0].matrices
 
-    def _whole_groups(self, problem: GaussHelmert) -> Array | None:
+    def _whole_groups(self) -> Array | None:
         if self.factors is None:
             return None
         factors = self.factors.reshape(self.groups, self.k)
@@ -260,9 +339,28 @@ class HelmertModel(Model):
         """Conditions of the marks left out."""
         return 0 if self.factors is None else int(self.outside.sum()) * self._conditions_each
 
+    @property
+    def analytic(self) -> bool:
+        """Whether Jacobians were given."""
+        return self._jacobians is not None
+
+    def _check(self, x: Array) -> JacobianCheck:
+        observed = self.problem.observations.ravel()
+        self.evaluate(self.carry(x))
+        (a, b), (a_numeric, b_numeric) = self.derivatives(observed, x), self.numeric(observed, x)
+        u, k = len(x), b.shape[-1]
+        of_x = compare_jacobians(
+            a.reshape(-1, u)[:, self.mask],
+            a_numeric.reshape(-1, u)[:, self.mask],
+            self.problem.parameters.free,
+        )
+        columns = tuple(f"observation {i}" for i in range(k))
+        of_l = compare_jacobians(b.reshape(-1, k), b_numeric.reshape(-1, k), columns)
+        return of_x if of_x.error >= of_l.error else of_l
+
     def _conditions(self, observed: Array, x: Array) -> Array:
         g = np.asarray(
-            self.helmert.conditions(observed.reshape(self.problem.observations.shape), x), dtype=float
+            self._given_conditions(observed.reshape(self.problem.observations.shape), x), dtype=float
         )
         if self.grouped and g.ndim and g.shape[0] == len(self.problem.observations):
             self._conditions_each = g.size // self.groups
@@ -274,10 +372,10 @@ class HelmertModel(Model):
 
     def derivatives(self, observed: Array, x: Array) -> tuple[Array, Array]:
         """A (b, c, u) and B (b, c, k)."""
-        if self.helmert.jacobians is None:
+        if self._jacobians is None:
             return self.numeric(observed, x)
         shape, u = self.problem.observations.shape, len(self.names)
-        a, b = self.helmert.jacobians(observed.reshape(shape), x)
+        a, b = self._jacobians(observed.reshape(shape), x)
         a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
         rows = self.groups * self._conditions_each
         if (self.grouped and b.shape != (shape[0], rows // shape[0], shape[1])) or a.size != rows * u:
@@ -349,7 +447,7 @@ class HelmertModel(Model):
         """Covariances where marks left out keep theirs, so that their residuals are still found."""
         if self.factors is None or not self.outside.any():
             return self.covariances
-        whole = self.helmert.covariance
+        whole = self.problem.covariance
         given = _regrouped(blocks_of(whole, self.problem.observations.shape), self.groups, self.k)
         return np.where(self.outside[:, None, None], given, self.covariances)
 
@@ -386,8 +484,3 @@ def _regrouped(blocks: list[Array], groups: int, k: int) -> Array:
         wide[:, index, index] = part.reshape(-1, k)
         out.append(wide)
     return np.concatenate(out)
-
-
-def model_of(problem: Problem) -> Model:
-    """The problem made ready."""
-    return MarkovModel(problem) if isinstance(problem, GaussMarkov) else HelmertModel(problem)

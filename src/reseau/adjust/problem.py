@@ -1,34 +1,31 @@
-"""What is to be adjusted: the Gauss–Markov and the Gauss–Helmert problem."""
+"""The Gauss–Markov and the Gauss–Helmert problem, and their adjustment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
+from ..core.threads import one_thread
+from .differences import JacobianCheck
+from .engine import AdjustmentFailure, Options, solve
+from .fitted import Fitted
+from .models import Conditions, Function, HelmertModel, Jacobian, Jacobians, MarkovModel, Model, Values
 from .parameters import Constraint, Parameters
+from .reliability import ExternalReliability, Solution, noncentrality
+from .significance import CoefficientTest, ratio_test
 from .stochastic import Covariance, blocks_of
 
-if TYPE_CHECKING:
-    from ..core.failure import Failure
-    from .engine import Options
-    from .result import Adjustment
-
-__all__ = ["GaussHelmert", "GaussMarkov", "Problem"]
-
-Values = NDArray[Any]
-Function = Callable[[Values], Any]
-Jacobian = Callable[[Array], Any]
-Conditions = Callable[[Array, Array], Any]
-Jacobians = Callable[[Array, Array], tuple[Any, Any]]
+__all__ = ["Adjustment", "GaussHelmert", "GaussMarkov", "Problem", "adjust", "check_jacobian"]
 
 
-class _Common:
+class Problem:
     """What both kinds of problem hold, and how they are changed."""
 
     observations: Values
@@ -72,11 +69,13 @@ class _Common:
         """
         return self if self.datum else self.with_parameters(fit.parameters)
 
-    def adjusted(self, options: Options | None = None) -> Adjustment | Failure:
-        """Adjust it; see :func:`adjust`."""
-        from .engine import adjust
+    def model(self) -> Model:
+        """The problem in the form that the engine iterates on."""
+        raise NotImplementedError
 
-        return adjust(self, options)  # type: ignore[arg-type]
+    def adjusted(self, options: Options | None = None) -> Adjustment | AdjustmentFailure:
+        """Adjust it; see :func:`adjust`."""
+        return adjust(self, options)
 
     @property
     def marks(self) -> NDArray[np.intp] | None:
@@ -85,7 +84,7 @@ class _Common:
 
 
 @dataclass(frozen=True, eq=False)
-class GaussMarkov(_Common):
+class GaussMarkov(Problem):
     """Observations as functions of parameters: l + v = f(x).
 
     Parameters
@@ -141,9 +140,13 @@ class GaussMarkov(_Common):
         _tidy(self)
         self._check()
 
+    def model(self) -> Model:
+        """The problem in the form that the engine iterates on."""
+        return MarkovModel(self, self.function, self.jacobian)
+
 
 @dataclass(frozen=True, eq=False)
-class GaussHelmert(_Common):
+class GaussHelmert(Problem):
     """Conditions between observations and parameters: g(l + v, x) = 0.
 
     Parameters
@@ -185,6 +188,10 @@ class GaussHelmert(_Common):
             raise UsageError("observations must be numbers (n,) or (m, k)", where="GaussHelmert")
         self._check()
 
+    def model(self) -> Model:
+        """The problem in the form that the engine iterates on."""
+        return HelmertModel(self, self.conditions, self.jacobians)
+
     @property
     def marks(self) -> NDArray[np.intp] | None:
         """Numbers of the marks, where each has conditions and a covariance of its own."""
@@ -197,7 +204,7 @@ class GaussHelmert(_Common):
         return np.broadcast_to(np.arange(m)[:, None], (m, k))
 
 
-def _tidy(problem: _Common) -> None:
+def _tidy(problem: Problem) -> None:
     observed = np.asarray(problem.observations)
     # Only types wider than double precision are kept as they are.
     if observed.dtype != np.longdouble and observed.dtype != object:
@@ -212,4 +219,256 @@ def _tidy(problem: _Common) -> None:
     object.__setattr__(problem, "datum", tuple(problem.datum or ()))
 
 
-Problem = GaussMarkov | GaussHelmert
+@dataclass(frozen=True, eq=False)
+class Adjustment(Fitted):
+    """An adjustment that converged; truthy.
+
+    What stands in columns over the observations has their shape: residuals, redundancy numbers, test values.
+    Of observed parameters the same is in the attributes beginning with `prior_`. For observations left out
+    (weight zero), and those no other observation controls, test values are NaN.
+
+    Parameters
+    ----------
+    problem : GaussMarkov or GaussHelmert
+        What was adjusted.
+    names : tuple of str (u,)
+        Names of all parameters.
+    exact_values : ndarray (u,)
+        Estimates in the arithmetic of the observations; see `values`.
+    cofactor : ndarray (u, u)
+        Q of the parameters, their covariance at a variance factor of one; zero for fixed ones.
+    sigma0 : float
+        Standard deviation of unit weight a posteriori, √(vᵀPv / redundancy); NaN without redundancy.
+    redundancy : int
+        Observations, observed parameters and constraints less free parameters (plus the datum defect).
+    cost : float
+        vᵀPv, that of the observed parameters included.
+    residuals : ndarray
+        v = adjusted − observed.
+    scale : {"a-posteriori", "a-priori"}
+        What `covariance` and `sigma` are scaled with.
+    iterations : int
+        Corrections tried.
+    costs : tuple of float
+        vᵀPv at the approximate values and after each correction taken.
+    datum_defect : int
+        Rank defect that inner constraints made good.
+    options : Options
+        How it was adjusted.
+    solution : Solution
+        The linearised problem at the estimates, of which the reliability is made.
+    """
+
+    problem: Problem
+    names: tuple[str, ...]
+    exact_values: NDArray[Any]
+    cofactor: Array
+    sigma0: float
+    redundancy: int
+    cost: float
+    residuals: Array
+    scale: str
+    iterations: int
+    costs: tuple[float, ...]
+    datum_defect: int
+    options: Options
+    solution: Solution
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[self.index(name)])
+
+    def index(self, name: str) -> int:
+        """Where a parameter stands; raises UsageError when there is none of this name."""
+        return self.problem.parameters.index(name)
+
+    @cached_property
+    def values(self) -> Array:
+        """Estimates of all parameters, (u,)."""
+        return np.asarray(self.exact_values, dtype=np.float64)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated."""
+        return self.problem.parameters.free
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        """All parameters by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+    @property
+    def parameters(self) -> Parameters:
+        """The problem's parameters at their estimates."""
+        return self.problem.parameters.with_values(self.values)
+
+    def covariance_of(self, *names: str, scaled: bool | None = None) -> Array:
+        """Covariance of some parameters, or of all.
+
+        Parameters
+        ----------
+        *names : str
+            Which; all, fixed ones included, when none is given.
+        scaled : bool, optional
+            Whether multiplied with the variance factor a posteriori; as `scale` says by default.
+
+        Raises
+        ------
+        UsageError
+            For unknown names, and for `scaled` without redundancy.
+        """
+        scaled = self.scale == "a-posteriori" if scaled is None else scaled
+        if scaled and not self.redundancy > 0:
+            raise UsageError(
+                "no variance factor without redundancy", where="covariance", do="use scaled=False"
+            )
+        at = [self.index(name) for name in names] if names else list(range(len(self.names)))
+        cofactor = self.cofactor[np.ix_(at, at)]
+        return cofactor * self.sigma0**2 if scaled else cofactor
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of all parameters (u, u), scaled as `scale` says."""
+        return self.covariance_of()
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of all parameters (u,), scaled as `scale` says; zero for fixed ones."""
+        sigma: Array = np.sqrt(np.diag(self.covariance))
+        return sigma
+
+    def sigma_of(self, name: str) -> float:
+        """Standard deviation of one parameter, scaled as `scale` says."""
+        return float(self.sigma[self.index(name)])
+
+    @cached_property
+    def correlation(self) -> Array:
+        """Correlations of all parameters (u, u); zero with fixed ones."""
+        sigma = np.sqrt(np.diag(self.cofactor))
+        known = sigma > 0
+        scale = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)
+        correlation: Array = self.cofactor * np.outer(scale, scale)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+    def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> ExternalReliability:
+        """What an undetected error as large as the minimal detectable one does to the parameters.
+
+        Parameters
+        ----------
+        alpha, power : float
+            As of :meth:`minimal_detectable_errors`.
+
+        Returns
+        -------
+        ExternalReliability
+            Effects by observation.
+        """
+        with one_thread():
+            effects, lengths = self.solution.effects(self.standardised, noncentrality(alpha, power))
+        full = np.zeros((len(effects), len(self.names)))
+        full[:, self.problem.parameters.mask] = effects
+        return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))
+
+    def test_of(
+        self, name: str, value: float = 0.0, alpha: float = 0.05, scale: str | None = None
+    ) -> CoefficientTest:
+        """Test one parameter against a value (Koch 1999, ch. 4).
+
+        Parameters
+        ----------
+        name : str
+            Parameter.
+        value : float
+            Value of the null hypothesis.
+        alpha : float
+            Level.
+        scale : {"a-posteriori", "a-priori"}, optional
+            Student's t with the estimated variance factor, or χ² with the input sigmas; that of the
+            adjustment by default.
+
+        Raises
+        ------
+        UsageError
+            When the parameter was fixed or is unknown.
+        """
+        at = self.index(name)
+        if name not in self.free or not self.cofactor[at, at] > 0:
+            raise UsageError("was not estimated", where=name)
+        ratio = (float(self.values[at]) - value) / float(np.sqrt(self.cofactor[at, at]))
+        sigma0 = None if (scale or self.scale) == "a-priori" else self.sigma0
+        return ratio_test(name, ratio, sigma0, self.redundancy, alpha)
+
+
+def adjust(problem: Problem, options: Options | None = None) -> Adjustment | AdjustmentFailure:
+    """Adjust a problem by least squares.
+
+    Parameters
+    ----------
+    problem : GaussMarkov or GaussHelmert
+        What is to be adjusted.
+    options : Options, optional
+        How.
+
+    Returns
+    -------
+    Adjustment or Failure
+        A failure is falsy and carries its reason; `.required()` of either returns the adjustment or raises.
+
+    Raises
+    ------
+    UsageError
+        When parts of the problem do not fit together.
+
+    Notes
+    -----
+    Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
+    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
+    *Technometrics* 23, 179–183.
+    """
+    options = options or Options()
+    with one_thread():
+        found = solve(problem.model(), options)
+    if isinstance(found, AdjustmentFailure):
+        return found
+    redundancy = found.redundancy
+    return Adjustment(
+        problem=problem,
+        names=problem.parameters.names,
+        exact_values=found.x,
+        cofactor=found.cofactor,
+        sigma0=float(np.sqrt(found.cost / redundancy)) if redundancy > 0 else float("nan"),
+        redundancy=redundancy,
+        cost=found.cost,
+        residuals=found.residuals.reshape(problem.observations.shape),
+        scale=options.scale if redundancy > 0 else "a-priori",
+        iterations=found.iterations,
+        costs=found.costs,
+        datum_defect=found.defect,
+        options=options,
+        solution=found.solution,
+    )
+
+
+def check_jacobian(problem: Problem, at: Array | None = None) -> JacobianCheck:
+    """Compare analytic derivatives with differences of fourth order.
+
+    Parameters
+    ----------
+    problem : GaussMarkov or GaussHelmert
+        With `jacobian` or `jacobians`; for the latter the derivatives by the observations are compared too,
+        and are named ``observation 0``, ``observation 1`` … by their column.
+    at : ndarray (u,), optional
+        Where; at the approximate values by default.
+
+    Returns
+    -------
+    JacobianCheck
+        The greatest disagreement of all free parameters.
+
+    Raises
+    ------
+    UsageError
+        When the problem has no analytic derivatives.
+    """
+    x = np.array(problem.parameters.values if at is None else at, dtype=np.float64)
+    return problem.model().check(x)

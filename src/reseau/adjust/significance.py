@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
 
 from ..core.errors import UsageError
 
-if TYPE_CHECKING:
-    from .fitted import Fitted
-    from .result import Adjustment
-
 __all__ = [
     "CoefficientTest",
     "GlobalTest",
     "NestedTest",
-    "coefficient_test",
-    "compare",
     "global_test",
+    "nested_test",
     "ratio_test",
 ]
 
@@ -125,24 +119,6 @@ def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
     return GlobalTest(cost, redundancy, lower, upper, 2.0 * min(tail, 1.0 - tail), lower <= cost <= upper)
 
 
-def coefficient_test(
-    fit: Adjustment, name: str, value: float, alpha: float, scale: str | None = None
-) -> CoefficientTest:
-    """Test of one parameter, by t (a posteriori) or χ² (a priori) (Koch 1999, ch. 4).
-
-    Raises
-    ------
-    UsageError
-        When the parameter was fixed or is unknown.
-    """
-    at = fit.index(name)
-    if name not in fit.free or not fit.cofactor[at, at] > 0:
-        raise UsageError("was not estimated", where=name)
-    ratio = (float(fit.values[at]) - value) / float(np.sqrt(fit.cofactor[at, at]))
-    sigma0 = None if (scale or fit.scale) == "a-priori" else fit.sigma0
-    return ratio_test(name, ratio, sigma0, fit.redundancy, alpha)
-
-
 def ratio_test(
     name: str, ratio: float, sigma0: float | None, redundancy: int, alpha: float = 0.05
 ) -> CoefficientTest:
@@ -177,47 +153,31 @@ def ratio_test(
     return CoefficientTest(name, "t", statistic, critical, p, bool(statistic > critical))
 
 
-def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
-    """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
+def nested_test(
+    increase: float, restrictions: int, cost: float | None, redundancy: int, alpha: float
+) -> NestedTest:
+    """Test of the increase of vᵀPv by restrictions (Koch 1999, ch. 4).
 
     Parameters
     ----------
-    nested, full : Adjustment, or any other fit
-        Of the same observations with the same covariance, `nested` a special case of `full`.
+    increase : float
+        vᵀPv of the nested model less that of the wider one.
+    restrictions : int
+        Number of restrictions.
+    cost : float or None
+        vᵀPv of the wider model, for an F test; without it χ² with the input sigmas.
+    redundancy : int
+        Redundancy of the wider model.
     alpha : float
         Level.
-    scale : {"a-posteriori", "a-priori"}, optional
-        F or χ²; that of `full` by default.
-
-    Returns
-    -------
-    NestedTest
-        F test of the increase of vᵀPv, or χ² test when the sigmas are taken at their word.
-
-    Raises
-    ------
-    UsageError
-        When the redundancies or the numbers of observations show that they are not nested.
-
-    Notes
-    -----
-    Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, ch. 4; for non-linear
-    models the likelihood ratio in the same form.
     """
     _level(alpha)
-    restrictions = nested.redundancy - full.redundancy
-    if restrictions < 1 or nested.observed != full.observed:
-        raise UsageError(
-            f"redundancies {nested.redundancy} and {full.redundancy} are not of a model within another",
-            where="compare",
-        )
-    increase = max(nested.cost - full.cost, 0.0)
-    degrees = (restrictions, full.redundancy)
-    if (scale or full.scale) == "a-priori":
+    degrees = (restrictions, redundancy)
+    if cost is None:
         critical = float(scipy.special.chdtri(restrictions, alpha))
         p = float(scipy.special.chdtrc(restrictions, increase))
         return NestedTest("chi2", increase, critical, degrees, p, increase > critical)
-    variance = full.cost / full.redundancy
+    variance = cost / redundancy
     statistic = increase / restrictions / variance if variance > 0 else (np.inf if increase else 0.0)
     critical = float(scipy.special.fdtri(*degrees, 1.0 - alpha))
     p = float(scipy.special.fdtrc(*degrees, statistic))

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...adjust.rejection import SnoopingStep
+from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ...adjust import data_snooping, robust
-from ...adjust.rejection import SnoopingStep
+from ...adjust.outliers import SnoopingStep
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ..diagnostics import Result, checks, doubtful_control, listed
