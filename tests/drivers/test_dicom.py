@@ -117,8 +117,8 @@ def test_the_physical_origin_is_converted_to_pixels(tmp_path: Path) -> None:
         ({"RegionLocationMinX0": 70, "RegionLocationMaxX1": 90}, "outside the frame"),
         ({"RegionLocationMinX0": 50, "RegionLocationMaxX1": 20}, "outside the frame"),
         ({"RegionLocationMaxX1": None}, "outside the frame"),
-        ({"PhysicalUnitsXDirection": 4}, "no section in centimetres"),
-        ({"RegionSpatialFormat": 3}, "no section in centimetres"),
+        ({"PhysicalUnitsXDirection": 4}, "not a section in centimetres"),
+        ({"RegionSpatialFormat": 3}, "not a section in centimetres"),
         ({"PhysicalDeltaX": 0.0}, "implausible pixel size"),
         ({"PhysicalDeltaY": math.nan}, "implausible pixel size"),
         ({"PhysicalDeltaY": None}, "implausible pixel size"),
@@ -279,7 +279,7 @@ def test_invalid_files_raise_one_line(tmp_path: Path) -> None:
         with pytest.raises(ProtocolError, match=said) as caught:
             DicomFiles("files", tmp_path / name).scan()
         assert caught.value.instrument == "files"
-    with pytest.raises(ConnectionLost, match="name a DICOM file"):
+    with pytest.raises(ConnectionLost, match="give a DICOM file"):
         DicomFiles("files", tmp_path / "none").connect()
 
 

@@ -272,9 +272,9 @@ def test_a_setting_changed_by_hand_is_detected() -> None:
     with device:
         assert device.check()["settings"] == "as sent"
         machine.values["G"] = 12
-        with pytest.raises(StateError, match="G = 12 and not 0"):
+        with pytest.raises(StateError, match="G = 12 instead of 0"):
             device.verify()
-        with pytest.raises(StateError, match="give it an oscilloscope"):
+        with pytest.raises(StateError, match="set the option digitiser"):
             device.line()
         with pytest.raises(SettingError, match="300 V"):
             device.configure(voltage=500.0)
