@@ -11,7 +11,7 @@ from reseau.bundle import Additional, BundleProblem, Camera, Network, approximat
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Values
 from reseau.core.data import Array
-from reseau.optics import Brown, Chain, OpenCV, PixelGrid, RationalPolynomial, Similarity, wong_display
+from reseau.optics import Chain, OpenCV, RationalPolynomial, Similarity, wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
 
 BROWN = (8.0, 0.03, -0.02, 2e-3, -3e-5, 0.0, 4e-5, -3e-5, 2e-4, -1e-4)
@@ -154,12 +154,7 @@ def mapped(cam: Camera) -> Camera:
 
 def mapping_of(cam: Camera) -> Any:
     """The camera as :mod:`reseau.optics` has it."""
-    if cam.mapping is not None:
-        return cam.mapping.with_values(cam.values)
-    if cam.model == "opencv":
-        return OpenCV(cam.values)
-    grid, options = PixelGrid(cam.width, cam.height, cam.pitch_mm), cam.options
-    return Brown(cam.values, options["side"], options["balance_radius_mm"], grid)  # type: ignore[arg-type]
+    return cam.bare_mapping()
 
 
 def wong() -> Camera:

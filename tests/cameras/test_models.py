@@ -1,0 +1,352 @@
+"""One battery for every registered camera model, with two models that are registered here alone.
+
+Each model goes through mapping, kernel, files, bundle, `reseau calibrate`, report and export; none of the
+tests knows a model by its name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from reseau.bundle import Camera, Network, adjust_network
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
+from reseau.core.failure import Failure
+from reseau.io.network import CameraEntry, Network1
+from reseau.optics import CameraModel, PixelGrid, PlaneMapping, camera_model, camera_models, convert
+from reseau.optics.cameras import distortion_names, register_camera, unit_of
+from reseau.optics.cameras.kernels import CameraColumns, compiled
+from reseau_sims import FieldBench, Station
+
+from ..bundle import networks
+from . import division, equidistant
+
+Run = Callable[..., tuple[int, str, str]]
+
+GRID = PixelGrid(640, 480, (0.01, 0.0101))
+F = 800.0
+BEND = 3.0
+"""Effect of each distortion parameter at the corner, px."""
+
+
+class Case(NamedTuple):
+    """A model with one choice of its options, at a realistic place."""
+
+    model: CameraModel
+    options: dict[str, str | float]
+
+    def values(self, grid: PixelGrid = GRID, f: float = F, bend: float = BEND) -> Array:
+        """Values with a shifted centre, and distortions of `bend` px at the corner, of changing sign."""
+        values = self.model.start_values(f, grid)
+        corner = np.array([[grid.width, grid.height]]) / (2 * f)
+        effect = np.abs(
+            self.model.mapping(values, grid, self.options).derivatives(corner).d_parameters[0]
+        ).max(0)
+        for k, parameter in enumerate(self.model.parameters):
+            if parameter.role == "distortion":
+                values[k] = (-1) ** k * bend / effect[k] / (1 + k)
+            elif parameter.role == "centre":
+                values[k] += 2.0 / effect[k]
+        return values
+
+    def mapping(self) -> PlaneMapping:
+        return self.model.mapping(self.values(), GRID, self.options)
+
+
+def cases() -> list[object]:
+    found = []
+    for model in dict.fromkeys((*camera_models(), equidistant.MODEL, division.MODEL)):
+        texts = [[(o.name, choice) for choice in o.choices] for o in model.options if o.choices]
+        for chosen in product(*texts):
+            numbers = {o.name: 1.7 for o in model.options if not o.choices}
+            case = Case(model, dict(chosen) | numbers)
+            found.append(pytest.param(case, id="-".join([model.name, *(str(v) for _, v in chosen)])))
+    return found
+
+
+EVERY = pytest.mark.parametrize("case", cases())
+
+
+def directions(n: int = 40) -> Array:
+    return np.random.default_rng(2).uniform(-1, 1, (n, 2)) * [0.38, 0.28]
+
+
+def differences(function: Callable[[Array], Array], at: Array, h: Array) -> Array:
+    """Derivatives (…, u) of a function of u variables, central and of fourth order."""
+    columns = []
+    for step in np.diag(h):
+        near, far = (
+            function(at + step) - function(at - step),
+            function(at + 2 * step) - function(at - 2 * step),
+        )
+        columns.append((8 * near - far) / (12 * step.sum()))
+    return np.stack(columns, axis=-1)
+
+
+@EVERY
+def test_derivatives_are_those_of_differences(case: Case) -> None:
+    mapping, uv = case.mapping(), directions()
+    seen = mapping.derivatives(uv)
+    np.testing.assert_allclose(mapping(uv), seen.value, rtol=1e-13)
+    numeric = differences(lambda shift: mapping(uv + shift), np.zeros(2), np.full(2, 1e-3))
+    np.testing.assert_allclose(seen.d_xy, numeric, rtol=0, atol=1e-8 * F)
+    size = np.abs(seen.d_parameters).max(axis=(0, 1))
+    numeric = differences(lambda values: mapping.with_values(values)(uv), mapping.values, 0.01 / size)
+    np.testing.assert_allclose(seen.d_parameters / size, numeric / size, rtol=0, atol=1e-8)
+
+
+@EVERY
+def test_the_inverse_goes_back(case: Case) -> None:
+    mapping, uv = case.mapping(), directions()
+    np.testing.assert_allclose(mapping.inverse(mapping(uv)), uv, rtol=0, atol=1e-12)
+
+
+def kernel_at(case: Case, compiled_: bool, uv: Array, xy: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Misfits (n, 2) and their derivatives by u, v and by the parameters, of the kernel."""
+    assert case.model.kernel is not None
+    function = compiled(case.model.kernel) if compiled_ else case.model.kernel
+    options = case.model.checked_options(case.options)
+    columns = CameraColumns(
+        values[None],
+        np.asarray(case.model.constants(options), dtype=np.float64).reshape(1, -1),
+        np.array([[(GRID.width - 1) / 2, (GRID.height - 1) / 2, *GRID.pitch_mm]]),
+        np.zeros((1, 0)),
+        np.zeros(1),
+    )
+    n, u = len(uv), len(values)
+    off, by_uv, d = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, u))
+    for k in range(n):
+        function(k, 0, -1, uv[k, 0], uv[k, 1], xy, columns, by_uv[k], d[k], np.empty((2, 0)), off[k])
+    return off, by_uv, d
+
+
+WITH_KERNEL = pytest.mark.parametrize("case", [c for c in cases() if c.values[0].model.kernel is not None])
+
+
+@WITH_KERNEL
+def test_the_kernel_is_the_mapping(case: Case) -> None:
+    """To 1e-12 of the size; where the misfit is that of a corrected image point, with the slope of this."""
+    mapping, uv, values = case.mapping(), directions(), case.values()
+    seen = mapping.derivatives(uv)
+    off, by_uv, d = kernel_at(case, True, uv, seen.value, values)
+    assert np.abs(off).max() < 1e-12 * GRID.width
+    # Implicit function: v(u, v, p; x) = 0 on the image x(u, v, p), so that ∂v = −∂v/∂x · ∂x.
+    by_xy = -by_uv @ np.linalg.inv(seen.d_xy)
+    expected = -by_xy @ seen.d_parameters
+    size = np.abs(expected).max(axis=(0, 1))
+    np.testing.assert_allclose(d / size, expected / size, rtol=0, atol=1e-12)
+    numeric = differences(
+        lambda shift: kernel_at(case, True, uv, seen.value + shift, values)[0], np.zeros(2), np.full(2, 1.0)
+    )
+    np.testing.assert_allclose(by_xy, numeric, rtol=0, atol=1e-10)
+    explicit = np.abs(by_xy + np.eye(2)).max() < 1e-9
+    if explicit:
+        off, _, _ = kernel_at(case, True, uv, np.zeros_like(uv), values)
+        np.testing.assert_allclose(off, seen.value, rtol=1e-12)
+
+
+@WITH_KERNEL
+def test_the_compiled_kernel_computes_as_its_source_does(case: Case) -> None:
+    uv, values = directions(5), case.values()
+    xy = np.zeros_like(uv)
+    for ours, source in zip(
+        kernel_at(case, True, uv, xy, values), kernel_at(case, False, uv, xy, values), strict=True
+    ):
+        np.testing.assert_array_equal(ours, source)
+
+
+@EVERY
+def test_a_model_says_what_it_is(case: Case) -> None:
+    model = case.model
+    assert camera_model(model.name) is model
+    assert set(model.usual) <= set(model.names)
+    assert set(model.required) <= set(model.names)
+    assert set(model.of_role("scale")) <= set(model.required)
+    assert distortion_names(model.names, model.name) == model.of_role("distortion")
+    for name in model.names:
+        assert unit_of(name, model.name) == model.units[name]
+    flat = model.mapping(model.undistorted(model.start_values(F, GRID)), GRID)
+    slope = flat.derivatives([[0.0, 0.0]]).d_xy[0]
+    assert slope[0, 0] == pytest.approx(F)
+    assert np.sign(np.linalg.det(slope)) == 1
+    with pytest.raises(UsageError, match="is registered already"):
+        register_camera(model)
+    with pytest.raises(UsageError, match="has no option `pitch_angle`"):
+        model.mapping(model.start_values(F, GRID), GRID, {"pitch_angle": 1.0})
+
+
+@EVERY
+def test_it_is_converted_to_itself_and_to_every_other_model(case: Case) -> None:
+    camera = case.mapping()
+    same = convert(camera, GRID, case.model.name, case.options)
+    assert same.greatest_px < 1e-6
+    for model in camera_models():
+        other = convert(camera, GRID, model.name)
+        assert other.share == 1
+        assert other.greatest_px < 3 * BEND
+        off = other.mapping(directions()) - camera(directions())
+        assert np.hypot(*off.T).max() <= 1.5 * other.greatest_px + 1e-9
+
+
+def camera_of(case: Case, free: tuple[str, ...] | None = None, bend: float = BEND) -> Camera:
+    return Camera(
+        "cam", GRID.width, GRID.height, GRID.pitch_mm, case.model.name, case.values(bend=bend),
+        case.model.usual if free is None else free, case.options,
+    )  # fmt: skip
+
+
+def entry_of(camera: Camera) -> dict[str, object]:
+    """The entry of a network file."""
+    return {
+        "id": camera.id, "width": camera.width, "height": camera.height, "pitch_mm": list(camera.pitch_mm),
+        "model": camera.model, **camera.options, "parameters": camera.parameters, "free": list(camera.free),
+    }  # fmt: skip
+
+
+@EVERY
+def test_the_entry_of_a_file_is_read_back(case: Case) -> None:
+    camera = camera_of(case)
+    entry = CameraEntry.model_validate_json(json.dumps(entry_of(camera)))
+    again = CameraEntry.model_validate_json(entry.model_dump_json(exclude_none=True))
+    found = Camera.from_entry(again)
+    assert (found.model, found.free, found.options) == (camera.model, camera.free, camera.options)
+    np.testing.assert_array_equal(found.values, camera.values)
+    np.testing.assert_array_equal(found.plane_mapping()(directions()), case.mapping()(directions()))
+
+
+def network_file(case: Case, path: Path) -> tuple[networks.World, Path]:
+    """A world seen by the camera, and its network with approximate values of the camera in a file."""
+    world = networks.world(images=6, points=30, cameras=(camera_of(case),), sigma_px=0.02)
+    network = world.noisy(5)
+    start = case.model.rescaled(np.zeros(len(case.model.names)), 1.03 * F, GRID)
+    centred = case.model.start_values(F, GRID)
+    start = np.where(start == 0, case.model.undistorted(centred), start)
+    camera = entry_of(network.cameras[0]) | {
+        "parameters": dict(zip(case.model.names, start.tolist(), strict=True))
+    }
+    held = {k: v for k, v in network.cameras[0].parameters.items() if k not in network.cameras[0].free}
+    camera["parameters"] |= held  # type: ignore[operator]
+    sigma = np.sqrt(network.cov[:, [0, 1], [0, 1]])
+    document = {
+        "schema": "reseau-network/1", "unit": "m", "cameras": [camera],
+        "images": {"id": network.images, "camera": ["cam"] * 6, "X0": [None] * 6, "rotation": [None] * 6},
+        "points": {
+            "id": network.points,
+            "xyz": [
+                x.tolist() if s[0] == 0 else None
+                for x, s in zip(network.xyz, network.sigma, strict=True)
+            ],
+            "sigma": [[0, 0, 0] if s[0] == 0 else None for s in network.sigma],
+            "role": network.role,
+        },
+        "observations": {
+            "image": [network.images[i] for i in network.image_of],
+            "point": [network.points[j] for j in network.point_of],
+            "x": network.xy[:, 0].tolist(), "y": network.xy[:, 1].tolist(),
+            "sx": sigma[:, 0].tolist(), "sy": sigma[:, 1].tolist(),
+            "rho": (network.cov[:, 0, 1] / sigma.prod(axis=1)).tolist(),
+        },
+        "datum": "control",
+    }  # fmt: skip
+    path.write_text(json.dumps(document))
+    return world, path
+
+
+@EVERY
+def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
+    world, path = network_file(case, tmp_path / "network.json")
+    result = adjust_network(Network.from_document(Network1.read(path)))
+    assert not isinstance(result, Failure)
+    assert result.sigma0 == pytest.approx(1.0, abs=0.25)
+    names, _, values = result.camera_columns(0)
+    assert names == case.model.usual
+    true = world.network.cameras[0].parameters
+    off = values - [true[name] for name in names]
+    covariance = result.camera_covariance(0)
+    assert float(off @ np.linalg.solve(covariance, off)) < 4 * len(names)
+    tested = {test.name for test in result.camera_tests(0)}
+    assert tested == set(distortion_names(names, case.model.name))
+
+
+@EVERY
+def test_commands_take_it_and_write_report_and_calibration(case: Case, reseau: Run, tmp_path: Path) -> None:
+    """`reseau bundle`, and `reseau calibrate` of a testfield, with report, calibration and comparison."""
+    _, path = network_file(case, tmp_path / "network.json")
+    status, out, err = reseau("bundle", path, "--json", "--report", tmp_path / "B.html")
+    assert (status, err) == (0, "")
+    assert set(case.model.usual) <= set(json.loads(out)["cameras"][0]["parameters"])
+    assert all(name in (tmp_path / "B.html").read_text() for name in case.model.usual)
+
+    calibrated(case, tmp_path)
+    options = [f"--model-option={name}={value}" for name, value in case.options.items()]
+    pitch = ("--pitch", 0.027) if case.model.needs_pitch else ()
+    command = (
+        "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json", "--size", "240x240",
+        "--model", case.model.name, *options, *pitch,
+    )  # fmt: skip
+    free = ("--free", ",".join(case.model.of_role("scale", "centre")))
+    files = ("-o", tmp_path / "K.json", "--report", tmp_path / "F.html")
+    status, out, err = reseau(*command, *free, *files)
+    assert (status, err) == (0, "")
+    written = json.loads((tmp_path / "K.json").read_text())
+    assert written["model"]["model"] == case.model.name
+    assert {name: written["model"][name] for name in case.options} == case.options
+    for name, unit in case.model.units.items():
+        assert written["parameters"][name]["unit"] == unit
+    assert "<svg" in (tmp_path / "F.html").read_text()
+    f = next(iter(case.model.of_role("scale")))
+    expected = case.model.start_values(57.5 / 0.027, PixelGrid(240, 240, (0.027, 0.027)))
+    found = written["parameters"][f]
+    assert abs(found["value"] - expected[case.model.names.index(f)]) < 5 * found["sigma"]
+    status, out, err = reseau(*command, *free, "--against", tmp_path / "K.json")
+    assert (status, err) == (0, "")
+    assert "p = 1\n" in out
+
+
+def calibrated(case: Case, folder: Path) -> None:
+    """The design of a testfield, and coordinates of recordings by a camera of the model."""
+    bench, rng = FieldBench(seed=3, bend_mm=0.0), np.random.default_rng(0)
+    bench.design.write(folder / "field.json")
+    grid = PixelGrid(240, 240, (0.027, 0.027))
+    lens = case.model.mapping(case.model.start_values(57.5 / 0.027, grid), grid, case.options)
+    for k, (phi, kappa) in enumerate(product((0.0, 30.0, 45.0), (0.0, 90.0, 180.0))):
+        truth = bench.truth(Station(phi, kappa, kappa))
+        rows = np.flatnonzero(bench.inside(truth, 8.0))
+        # The bench has a lens without distortion: its image points give the directions.
+        xy = lens(bench.camera.inverse(truth.xy[rows])) + 0.005 * rng.normal(size=(len(rows), 2))
+        lines = [
+            f"{truth.names[j]},{x!r},{y!r},0.005,0.005" for j, (x, y) in zip(rows, xy.tolist(), strict=True)
+        ]
+        (folder / f"{k:02d}.csv").write_text("id,x,y,sx,sy\n" + "\n".join(lines) + "\n")
+
+
+def test_an_unknown_model_or_option_is_named_in_one_line(reseau: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("id,x,y\na,1,2\n")
+    FieldBench(seed=3).design.write(tmp_path / "field.json")
+    command = ("calibrate", tmp_path / "a.csv", "-d", tmp_path / "field.json", "--size", "240x240")
+    known = ", ".join(model.name for model in camera_models())
+    for arguments, words in (
+        (("--model", "pinhole"), f"camera model 'pinhole': is unknown; use one of {known}"),
+        (("--side", "image"), "camera model opencv: has no option `side`"),
+        (("--model", "brown"), "brown: needs the size of a pixel"),
+        (("--pitch", 0.01, "--model-option", "balance_radius_mm=-1"), "write a number that is not negative"),
+        (("--pitch", 0.01, "--model-option", "side"), "write name=value"),
+    ):
+        status, out, err = reseau(*command, *arguments)
+        assert (status, out) == (2, "")
+        assert words in err
+        assert err.count("\n") == 1
+    entry = entry_of(camera_of(Case(camera_model("opencv"), {})))
+    for change, words in (
+        ({"model": "pinhole"}, "'pinhole' is none of the models"),
+        ({"wide": 1}, "camera 'cam': unknown key `wide`"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            CameraEntry.model_validate_json(json.dumps(entry | change))
