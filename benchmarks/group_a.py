@@ -29,12 +29,13 @@ from scipy.stats import ncx2, norm
 from tables import ALPHA, SIZES, judged, print_power, rms
 
 from reseau.adjust import Adjustment, adjust
+from reseau.calibration import CameraCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau
 from reseau.measure import measure_reseau
 from reseau.measure.fitting import fit_mapping, mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import CameraCorrection, CorrectionFit, correct_camera
+from reseau.refine import CorrectionFit, correct_camera
 from reseau_sims import World
 
 COEFFICIENTS = RationalPolynomial.camera().names

@@ -24,10 +24,11 @@ from group_a import EVERYTHING, in_pixels
 from tables import ALPHA, SIZES, level_band, print_power
 
 from reseau.adjust import Elimination
+from reseau.calibration import CameraCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau, test_object
 from reseau.optics import RationalPolynomial
-from reseau.refine import CameraCorrection, correct_camera, correct_instrument
+from reseau.refine import correct_camera, correct_instrument
 
 __all__ = ["COEFFICIENTS", "f_tests"]
 

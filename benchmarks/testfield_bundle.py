@@ -18,7 +18,16 @@ import numpy as np
 import scipy.stats
 
 from reseau.adjust import compare
-from reseau.bundle import Additional, Camera, Lens, Network, Result, adjust_network, by_point, common_pattern
+from reseau.bundle import (
+    Additional,
+    Camera,
+    Network,
+    Result,
+    adjust_network,
+    by_point,
+    camera_mapping,
+    common_pattern,
+)
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import coded_testfield
 from reseau.io import SHAPES
@@ -130,10 +139,10 @@ def systematic(done: list[Recorded]) -> Result:
 
 def corrected(done: list[Recorded], calibrated: Result) -> list[Recorded]:
     """The recordings as a camera without distortion, and a board without bend, would have them."""
-    plain = Lens.of_result(calibrated, 0, f"group {group(done[0].station)}").mapping.camera  # type: ignore[attr-defined]
+    plain = camera_mapping(calibrated, 0, f"group {group(done[0].station)}").mapping.camera  # type: ignore[attr-defined]
     found = []
     for r in done:
-        lens = Lens.of_result(calibrated, 0, f"group {group(r.station)}")
+        lens = camera_mapping(calibrated, 0, f"group {group(r.station)}")
         xy = plain(lens.mapping.inverse(r.points.xy))
         found.append(replace(r, points=ImagePoints(r.points.names, xy, r.points.cov)))
     return found

@@ -10,7 +10,7 @@ import pytest
 from reseau.adjust import variance_components
 from reseau.bundle import BundleFit, Network, Options, Result, adjust_network, calibration_of
 from reseau.bundle.modelling.selection import Selection, cross_validation, eliminate_parameters
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration
 from reseau.core.errors import UsageError
 
 from . import networks

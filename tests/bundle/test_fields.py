@@ -7,16 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import (
-    Lens,
-    Result,
-    adjust_network,
-    calibration_difference,
-    calibration_of,
-    projection_field,
-    projection_field_at,
-)
-from reseau.bundle.diagnostics.fields import FieldDifference
+from reseau.bundle import Result, adjust_network, calibration_of, camera_mapping, projection_field_at
+from reseau.calibration import CameraMapping, FieldDifference, calibration_difference, projection_field
 from reseau.core.errors import UsageError
 
 from . import networks
@@ -26,14 +18,14 @@ RUNS = 120
 SIGMA = 0.091
 
 
-def lens_of(world: networks.World, seed: int) -> Lens:
+def lens_of(world: networks.World, seed: int) -> CameraMapping:
     fit = world.problem(world.noisy(seed)).adjusted().required()
-    return Lens.of_result(Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool)), 0)
+    return camera_mapping(Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool)), 0)
 
 
-def true_lens(world: networks.World) -> Lens:
+def true_lens(world: networks.World) -> CameraMapping:
     mapping = networks.mapping_of(world.network.cameras[0])
-    return Lens(mapping, 640, 480, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    return CameraMapping(mapping, 640, 480, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +98,7 @@ def test_a_field_is_worse_where_no_points_were() -> None:
     left = network.select(network.xy[:, 0] < 400)
     result = adjust_network(left)
     assert isinstance(result, Result)
-    sigma = projection_field(Lens.of_result(result, 0), 9).sigma
+    sigma = projection_field(camera_mapping(result, 0), 9).sigma
     assert sigma[:, -1].max() > 2 * sigma[:, 2].max()
 
 
@@ -115,7 +107,7 @@ def test_the_field_of_additional_parameters_has_derivatives_of_its_mapping(per: 
     world = networks.world(points=40, cameras=(networks.with_ebner(per),), images=8)
     result = adjust_network(world.noisy(0))
     assert isinstance(result, Result)
-    lens = Lens.of_result(result, 0, None if per == "camera" else "group g1")
+    lens = camera_mapping(result, 0, None if per == "camera" else "group g1")
     mapping, uv, step = lens.mapping, np.array([[0.1, -0.2], [-0.25, 0.15]]), 1e-6
     given = mapping.derivatives(uv)
     for k, value in enumerate(mapping.values):
@@ -132,14 +124,14 @@ def test_a_set_of_several_must_be_named() -> None:
     result = adjust_network(world.noisy(0))
     assert isinstance(result, Result)
     with pytest.raises(UsageError, match="no set of additional parameters"):
-        Lens.of_result(result, 0)
+        camera_mapping(result, 0)
 
 
 def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
     result = adjust_network(networks.world(points=40).noisy(1))
     assert isinstance(result, Result)
-    direct = Lens.of_result(result, 0)
-    read = Lens.of_calibration(calibration_of(result, "cam", name="cam"))
+    direct = camera_mapping(result, 0)
+    read = CameraMapping.from_calibration(calibration_of(result, "cam", name="cam"))
     np.testing.assert_allclose(
         projection_field(read).sigma, projection_field(direct).sigma, atol=1e-12, rtol=1e-9
     )

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from reseau.calibration.document import Calibration, Covariance, Quantity
+from reseau.calibration import Calibration, Covariance, Quantity
 from reseau.core.errors import FormatError
 
 
@@ -15,7 +15,13 @@ def calibration(**changes: object) -> Calibration:
     content = {
         "kind": "oscilloscope",
         "name": "c",
-        "model": "m",
+        "model": {
+            "name": "oscilloscope group A",
+            "unit": "mm",
+            "mapping": {},
+            "photo_system": {},
+            "object_system": {},
+        },
         "parameters": {
             "a": Quantity(value=1.0, sigma=0.1, unit="1"),
             "b": Quantity(value=2.0, sigma=0.0, unit="mm"),

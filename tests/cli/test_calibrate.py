@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration
 from reseau.io import ReseauMeasurement
 from reseau.io.images import write_image
 from reseau_sims import FieldBench, Station

@@ -14,7 +14,7 @@ import typer
 from scipy.special import ndtr
 
 from reseau.archive import Archive, Session
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration
 from reseau.cli import run
 from reseau.core.errors import ArchiveError
 from reseau.io.images import write_image

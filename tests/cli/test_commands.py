@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration
 from reseau.io import ReseauDesign, ReseauMeasurement
 from reseau.io.images import read_image, write_image
 

@@ -14,10 +14,9 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from reseau.archive import Archive, verify
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration, InstrumentCorrection
 from reseau.cli import run
 from reseau.io import ReseauDesign, ReseauMeasurement
-from reseau.refine import InstrumentCorrection
 from reseau_sims import World
 from reseau_sims.serving import aravis_is_installed
 

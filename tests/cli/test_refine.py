@@ -160,8 +160,8 @@ def test_a_missing_row_of_pins_a_turned_object_and_swapped_marks_are_named(bench
 @pytest.mark.parametrize(
     ("left_out", "said"),
     [
-        (("--object",), "--photo-ii and --object go together"),
-        (("--photo-ii", "--object"), "needs PHOTO II before it"),
+        (("--object",), "--photo-ii and --object must be given together"),
+        (("--photo-ii", "--object"), "needs PHOTO II"),
         (("--reseau",), "needs --photo-i and --reseau, or --calibration"),
     ],
 )
@@ -170,6 +170,22 @@ def test_what_does_not_go_together_is_refused_in_one_line(bench, capsys, left_ou
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+def test_a_stored_calibration_writes_its_result_and_a_report(bench, tmp_path, capsys):
+    assert _run(bench, "--out", tmp_path / "k.json") == 0
+    files = {"--calibration": tmp_path / "k.json"}
+    files |= {key: bench[key] for key in ("--photo-ii", "--photo-iii")}
+    capsys.readouterr()
+    assert _run(files, "--out", tmp_path / "r.json", "--report", tmp_path / "r.html", "--json") == 0
+    assert (tmp_path / "r.json").read_text("utf-8") == capsys.readouterr().out
+    test, points = json.loads((tmp_path / "r.json").read_text("utf-8"))
+    assert test["holds"] is True
+    assert points["points"]["id"] == list(_BODY)
+    page = (tmp_path / "r.html").read_text("utf-8")
+    assert "the coefficients still hold" in page
+    assert all(f"<td>{name}</td>" in page or name in page for name in _BODY)
+    assert page.count("SHA-256") == 3
 
 
 def test_a_calibration_of_the_camera_alone_says_what_to_do(bench, tmp_path, capsys):

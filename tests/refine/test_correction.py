@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from reseau.adjust import adjust
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration, CameraCorrection
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError
 from reseau.core.failure import Failure
@@ -17,7 +17,7 @@ from reseau.designs import regular_reseau
 from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.measure.fitting import mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import CameraCorrection, correct_camera
+from reseau.refine import correct_camera
 
 GRID = regular_reseau(11, 9, 10.0, Mark(shape="disk", size=1.0), name="grid")
 SIGMA = 0.01

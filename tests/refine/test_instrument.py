@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration, InstrumentCorrection
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError
 from reseau.core.failure import Failure
 from reseau.io import DesignPoint
-from reseau.refine import InstrumentCorrection, correct_camera, correct_instrument
+from reseau.refine import correct_camera, correct_instrument
 
 from .oscilloscope import INSTRUMENT, RESEAU, RODS, SCALE, displayed, measured, pixels, reseau_marks
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration, InstrumentCorrection
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
-from reseau.refine import InstrumentCorrection, correct_camera, correct_instrument, still_standard
+from reseau.refine import correct_camera, correct_instrument, still_standard
 
 from .oscilloscope import RESEAU, RODS, SIGMA_PX, displayed, measured, reseau_marks
 

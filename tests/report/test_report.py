@@ -8,12 +8,12 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from reseau.calibration import CameraCorrection, InstrumentCorrection
 from reseau.core.data import Frame, ImagePoints
 from reseau.core.errors import UsageError
 from reseau.core.provenance import Provenance
 from reseau.optics import RationalPolynomial
 from reseau.procedures.oscilloscope import PhotoI, PhotoII
-from reseau.refine import CameraCorrection, InstrumentCorrection
 from reseau.report import oscilloscope_report
 from reseau.report.comparison import compare_with_truth
 from reseau.report.equations import equations

@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from reseau.calibration.document import Calibration
+from reseau.calibration import Calibration, SensorCorrection
 from reseau.core.data import Array, Frame
 from reseau.core.errors import EstimationError, FormatError, UsageError
 from reseau.core.failure import Failure
-from reseau.sensor import Level, SensorCorrection, SensorResult, SensorSeries, calibrate_sensor
+from reseau.sensor import Level, SensorResult, SensorSeries, calibrate_sensor
 from reseau_sims.pixels import PixelSensor
 
 LIGHT = 0.25
@@ -65,7 +65,7 @@ def test_a_corrected_frame_is_flat_dark_and_straight() -> None:
     means = []
     for exposure in (1000.0, 4000.0, 8000.0):
         raw = np.mean([sensor.expose(LIGHT, exposure, rng) for _ in range(200)], axis=0)
-        clean = result.correction.apply(Frame(raw, sensor.full_scale), exposure).pixels
+        clean = result.correction.correct(Frame(raw, sensor.full_scale), exposure).pixels
         means.append(clean.mean() / exposure)
         # 200 frames leave σ/√200 of noise; the fields' own from 8 levels comes on top.
         noise = np.sqrt(sensor.read_noise**2 + LIGHT * exposure / sensor.gain)
@@ -88,10 +88,10 @@ def test_uneven_light_is_no_defect_and_goes_into_the_response() -> None:
 def test_a_file_gives_the_same_correction_back() -> None:
     sensor, result = calibrated(0)
     calibration = Calibration.parse(result.calibration("sensor", {}, {}).to_json(), where="file")
-    assert calibration.kind == "camera"
+    assert calibration.kind == "sensor"
     again = SensorCorrection.from_calibration(calibration)
     frame = Frame(sensor.expose(LIGHT, 5000.0, np.random.default_rng(1)), sensor.full_scale)
-    one, two = result.correction.apply(frame, 5000.0).pixels, again.apply(frame, 5000.0).pixels
+    one, two = result.correction.correct(frame, 5000.0).pixels, again.correct(frame, 5000.0).pixels
     # Steps of 16 bits: of the bias 2e-4, of the response 2e-6 of up to 2000.
     assert np.abs(one - two).max() < 0.02
     assert result.calibration("sensor", {}, {}).to_json() == result.calibration("sensor", {}, {}).to_json()
@@ -101,7 +101,7 @@ def test_frames_of_another_sensor_and_files_of_another_kind_are_refused() -> Non
     _, result = calibrated(0)
     for pixels, full_scale in ((np.zeros((8, 8)), 4095.0), (np.zeros((64, 96)), 255.0)):
         with pytest.raises(UsageError, match="calibrated sensor"):
-            result.correction.apply(Frame(pixels, full_scale))
+            result.correction.correct(Frame(pixels, full_scale))
     document = result.calibration("sensor", {}, {})
     with pytest.raises(FormatError, match="no calibration of a sensor"):
         SensorCorrection.from_calibration(document.model_copy(update={"model": "brown"}))

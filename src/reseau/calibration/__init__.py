@@ -1,5 +1,36 @@
-"""The calibration: one document, and the mappings that it is read back to."""
+"""The calibration: one document and one reader, which gives a mapping with covariance; apply, compare."""
 
+from .camera import CameraMapping
+from .compare import FieldDifference, ProjectionField, calibration_difference, projection_field
 from .document import Calibration, Covariance, Quantity
+from .film import FilmFrameMapping, calibration_of_frame
+from .mapping import CalibratedMapping
+from .oscilloscope import CameraCorrection, InstrumentCorrection, LocalModel, ObjectPlane
+from .raster import CorrectedImage, undistorted_camera, write_corrected
+from .reader import parse_calibration, read_calibration
+from .sensor import Fields, SensorCorrection
 
-__all__ = ["Calibration", "Covariance", "Quantity"]
+__all__ = [
+    "CalibratedMapping",
+    "Calibration",
+    "CameraCorrection",
+    "CameraMapping",
+    "CorrectedImage",
+    "Covariance",
+    "FieldDifference",
+    "Fields",
+    "FilmFrameMapping",
+    "InstrumentCorrection",
+    "LocalModel",
+    "ObjectPlane",
+    "ProjectionField",
+    "Quantity",
+    "SensorCorrection",
+    "calibration_difference",
+    "calibration_of_frame",
+    "parse_calibration",
+    "projection_field",
+    "read_calibration",
+    "undistorted_camera",
+    "write_corrected",
+]

@@ -1,20 +1,43 @@
-"""The calibration file ``reseau-calibration/1``: what every procedure ends in."""
+"""The calibration file ``reseau-calibration/1``: the result of every procedure."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Literal, NotRequired, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator, with_config
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from ..core.data import Array
+from ..core.errors import FormatError
 from ..io import Document, Strict
+from .mapping import CalibratedMapping
 
-__all__ = ["Calibration", "Covariance", "Quantity"]
+__all__ = [
+    "Calibration",
+    "CameraModel",
+    "Covariance",
+    "FilmFrameModel",
+    "Kind",
+    "OscilloscopeModel",
+    "Quantity",
+    "SensorModel",
+    "readable_as",
+]
+
+Kind = Literal["oscilloscope", "camera", "film_frame", "sensor"]
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class Quantity(Strict):
-    """A value with its standard deviation and unit; sigma 0 means held."""
+    """A value with its standard deviation and unit; a sigma of 0 means that the value was held fixed.
+
+    Examples
+    --------
+    >>> Quantity(value=8.0021, sigma=0.0004, unit="mm").value
+    8.0021
+    """
 
     value: float
     sigma: float = Field(ge=0)
@@ -22,24 +45,124 @@ class Quantity(Strict):
 
 
 class Covariance(Strict):
-    """Covariance matrix of the named parameters, in the products of their units."""
+    """Covariance matrix of the named parameters, in the products of their units.
+
+    Examples
+    --------
+    >>> Covariance(names=("c",), matrix=((1.6e-7,),)).names
+    ('c',)
+    """
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
 
 
+@with_config(_STRICT)
+class OscilloscopeModel(TypedDict):
+    """Groups A and B of an oscilloscope's photographs; `reseau` and `instrument` belong to group B."""
+
+    name: Literal["oscilloscope group A", "oscilloscope group A and group B"]
+    unit: str
+    mapping: dict[str, Any]
+    photo_system: dict[str, Any]
+    object_system: dict[str, Any]
+    reseau: NotRequired[dict[str, Any]]
+    instrument: NotRequired[dict[str, Any]]
+
+
+@with_config(ConfigDict(extra="allow", strict=True, allow_inf_nan=False))
+class CameraModel(TypedDict):
+    """A camera: the name of its model in the registry, its image, and the options of the model."""
+
+    model: str
+    width: int
+    height: int
+    pitch_mm: list[float]
+    additional: NotRequired[dict[str, Any]]
+
+
+@with_config(_STRICT)
+class FilmFrameModel(TypedDict):
+    """A scanned film frame; its parameters are the pixel coordinates of its corners."""
+
+    type: Literal["film_frame"]
+    image: str
+    format_mm: list[float]
+    transform: dict[str, Any] | None
+
+
+@with_config(_STRICT)
+class SensorModel(TypedDict):
+    """Fields and linearity of a sensor."""
+
+    type: Literal["sensor"]
+    b2: float
+    b3: float
+    full_scale: float
+    exposure_us: float
+    fields: dict[str, Any]
+    mtf: NotRequired[dict[str, list[float]]]
+
+
+def _tag(model: Any) -> str | None:
+    """Which model this is, by the key that each has for it."""
+    if not isinstance(model, dict):
+        return None
+    if "type" in model:
+        return str(model["type"])
+    return "camera" if "model" in model else "oscilloscope"
+
+
+def _present(kind: Any) -> Any:
+    """The kind under the name that it has now."""
+    return "film_frame" if kind == "frame" else kind
+
+
+Model = Annotated[
+    Annotated[OscilloscopeModel, Tag("oscilloscope")]
+    | Annotated[CameraModel, Tag("camera")]
+    | Annotated[FilmFrameModel, Tag("film_frame")]
+    | Annotated[SensorModel, Tag("sensor")],
+    Discriminator(_tag),
+]
+
+_READERS: dict[str, Callable[[Calibration], CalibratedMapping]] = {}
+
+
+def readable_as(kind: Kind) -> Callable[[Callable[[Calibration], Any]], Callable[[Calibration], Any]]:
+    """Register the function that turns a calibration of this kind into its mapping."""
+
+    def register(reader: Callable[[Calibration], Any]) -> Callable[[Calibration], Any]:
+        _READERS[kind] = reader
+        return reader
+
+    return register
+
+
 class Calibration(Document):
     """A calibration: parameters with full covariance, the tests they passed, and where they hold.
 
-    `model` says how the parameters are to be used, in a form that its own package reads back
-    (:meth:`reseau.optics.RationalPolynomial.from_dict` for the camera of an oscilloscope). `times` alone
-    holds clock times: without it, same inputs give the same bytes.
+    `kind` says what was calibrated, `model` what the parameters belong to; :meth:`mapping` gives both as a
+    mapping of points, images or frames. `times` alone holds clock times: without it, the same inputs give the
+    same bytes. Files of earlier versions are read too: the kind of a sensor was ``camera``, that of a film
+    frame ``frame``.
+
+    Examples
+    --------
+    >>> pinhole = Calibration(
+    ...     kind="camera", name="ideal", model={"model": "opencv", "width": 640, "height": 480,
+    ...                                         "pitch_mm": [1.0, 1.0]},
+    ...     parameters={name: Quantity(value=value, sigma=0.0, unit="px")
+    ...                 for name, value in {"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5}.items()},
+    ...     covariance=Covariance(names=(), matrix=()), sigma0=None, redundancy=0)
+    >>> pinhole.mapping().applies_to
+    ('points', 'images')
     """
 
     SCHEMA: ClassVar[str] = "reseau-calibration/1"
-    kind: Literal["oscilloscope", "camera", "frame"]
+    kind: Annotated[Kind, BeforeValidator(_present)]
     name: str
-    model: str | dict[str, Any]
+    model: Model
     parameters: dict[str, Quantity]
     covariance: Covariance
     sigma0: float | None
@@ -51,6 +174,10 @@ class Calibration(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if (self.kind, _tag(self.model)) == ("camera", "sensor"):  # as earlier versions wrote it
+            object.__setattr__(self, "kind", "sensor")
+        if _tag(self.model) != self.kind:
+            raise ValueError(f"a calibration of the kind {self.kind!r} has a model of {_tag(self.model)!r}")
         n = len(self.covariance.names)
         if len(self.covariance.matrix) != n or any(len(row) != n for row in self.covariance.matrix):
             raise ValueError(f"`covariance` has {n} names but no {n}×{n} matrix")
@@ -70,3 +197,20 @@ class Calibration(Document):
         where = [row[name] for name in self.covariance.names]
         full[np.ix_(where, where)] = np.array(self.covariance.matrix).reshape(len(where), len(where))
         return full
+
+    def mapping(self) -> CalibratedMapping:
+        """The mapping that this calibration describes.
+
+        Returns
+        -------
+        CalibratedMapping
+            Of the class that belongs to `kind`; see :mod:`reseau.calibration`.
+
+        Raises
+        ------
+        FormatError
+            When the model is damaged, or is of a kind that has no mapping.
+        """
+        if self.kind not in _READERS:
+            raise FormatError(f"of the kind {self.kind!r} has no mapping", where=f"calibration {self.name}")
+        return _READERS[self.kind](self)

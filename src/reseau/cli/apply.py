@@ -1,12 +1,13 @@
-"""`reseau apply`: correct points, or resample an image, by a stored calibration."""
+"""`reseau apply`: correct points, images, scans or frames by a calibration of any kind."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from ..core.errors import UsageError
 from .common import (
     AsJson,
     Out,
@@ -20,83 +21,298 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..refine import CameraCorrection
+    from ..calibration import CalibratedMapping, Calibration, CorrectedImage, SensorCorrection
+    from ..core.data import ImagePoints
 
 __all__ = ["apply"]
 
 _IMAGES = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
+_OF = {
+    "camera": "a camera",
+    "oscilloscope": "an oscilloscope",
+    "film_frame": "a film frame",
+    "sensor": "a sensor",
+}
+
+View = Literal["keep", "all"] | float
 
 
 def apply(
-    calibration: Annotated[Path, typer.Argument(help="Calibration file.")],
+    calibration: Annotated[
+        Path, typer.Argument(help="Calibration of a camera, an oscilloscope, a film frame or a sensor.")
+    ],
     source: Annotated[
-        Path, typer.Argument(metavar="IMAGE|POINTS", help="Image, or coordinates (JSON, CSV).")
+        Path, typer.Argument(metavar="IMAGE|POINTS", help="Image, or image coordinates (JSON, CSV).")
     ],
     out: Out = None,
     scale: Annotated[
-        float | None, typer.Option(help="Pixels per unit of the corrected image; default: about as before.")
+        float | None,
+        typer.Option(
+            help="Pixels per unit of the corrected image: per mm; of a camera, per pixel of the image. "
+            "Default: as in the image."
+        ),
+    ] = None,
+    fov: Annotated[
+        str,
+        typer.Option(
+            help="Field of view of an undistorted image: keep (size and scale of the image), "
+            "all (every pixel of it), or degrees across."
+        ),
+    ] = "keep",
+    directions: Annotated[
+        bool, typer.Option("--directions", help="Write points of a camera as directions x/z, y/z.")
+    ] = False,
+    object_system: Annotated[
+        bool, typer.Option("--object", help="Write points of an oscilloscope in the system of its object.")
+    ] = False,
+    exposure_ms: Annotated[
+        float | None, typer.Option(min=0.0, help="Exposure time of the frame; default: as calibrated.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Correct points, or resample an image into the corrected system."""
-    from ..calibration.document import Calibration
-    from ..refine import CameraCorrection
+    """Apply a calibration to points or to an image.
 
-    correction = CameraCorrection.from_calibration(Calibration.read(calibration))
+    Points are corrected, with covariances that contain those of the points and of the calibration. Images are
+    resampled: without distortion (camera), in the system of the reseau (oscilloscope), in millimetres of the
+    frame (film frame); or their grey values are corrected (sensor).
+    """
+    from ..calibration import SensorCorrection, read_calibration
+
+    if scale is not None and not scale > 0:
+        raise UsageError(f"{scale:g} is not above zero", where="--scale")
+    stored, view = read_calibration(calibration), _view(fov)
+    _only(stored.kind, "camera", {"--fov": fov != "keep", "--directions": directions})
+    _only(stored.kind, "oscilloscope", {"--object": object_system})
+    _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
+    mapping = _mapping(stored, object_system)
     if is_points(source):
-        _points(correction, source, out, as_json)
+        _points(mapping, source, out, as_json, None if directions else view, scale)
+    elif object_system or directions:
+        raise UsageError("applies to points only", where="--object" if object_system else "--directions")
+    elif isinstance(mapping, SensorCorrection):
+        _frame(mapping, calibration, source, out, exposure_ms, as_json)
     else:
-        _image(correction, calibration, source, out, scale, as_json)
+        _image(stored, mapping, calibration, source, out, view, scale, as_json)
 
 
-def _points(correction: CameraCorrection, source: Path, out: Path | None, as_json: bool) -> None:
+def _only(kind: str, belongs: str, given: dict[str, bool]) -> None:
+    """Refuse options that belong to another kind of calibration.
+
+    Raises
+    ------
+    UsageError
+        With the option.
+    """
+    for name, used in given.items():
+        if used and kind != belongs:
+            raise UsageError(f"needs a calibration of {_OF[belongs]}, not of {_OF[kind]}", where=name)
+
+
+def _view(text: str) -> View:
+    """The field of view.
+
+    Raises
+    ------
+    UsageError
+        When it is none.
+    """
+    if text in ("keep", "all"):
+        return cast(View, text)
+    try:
+        return float(text.removesuffix("°"))
+    except ValueError:
+        raise UsageError(
+            f"is {text!r}", where="--fov", do="write keep, all, or an angle in degrees"
+        ) from None
+
+
+def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
+    """The mapping; of an oscilloscope group A alone, unless the system of its object is wanted.
+
+    Raises
+    ------
+    UsageError
+        When the calibration has no group B.
+    """
+    from ..calibration import InstrumentCorrection
+
+    mapping = stored.mapping()
+    if isinstance(mapping, InstrumentCorrection):
+        return mapping if object_system else mapping.camera
+    if object_system:
+        raise UsageError(
+            "needs a calibration with group B", where="--object", do="make it with --photo-ii and --object"
+        )
+    return mapping
+
+
+def _raster(
+    mapping: CalibratedMapping, size: tuple[int, int], view: View, scale: float | None
+) -> CorrectedImage:
+    """The raster of the corrected image."""
+    from ..calibration import CameraCorrection, CameraMapping, CorrectedImage, FilmFrameMapping
+
+    if isinstance(mapping, CameraMapping):
+        return CorrectedImage.undistorted(mapping, view, 1.0 if scale is None else scale)
+    if isinstance(mapping, FilmFrameMapping):
+        return CorrectedImage.of_frame(mapping, scale)
+    assert isinstance(mapping, CameraCorrection)
+    return CorrectedImage.plan(mapping, size, scale)
+
+
+def _points(
+    mapping: CalibratedMapping,
+    source: Path,
+    out: Path | None,
+    as_json: bool,
+    view: View | None,
+    scale: float | None,
+) -> None:
+    """Correct points; those of a camera as pixels of the undistorted image, or as directions without view."""
+    from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
     from ..io import write_whole
 
+    if "points" not in mapping.applies_to:
+        raise UsageError("of a sensor moves no points", where="calibration", do="give an image")
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
-    points = correction.apply(read_measurement(source).image_points())
-    document = canonical_json(points_document(points, correction.unit, "common"))
+    measured = read_measurement(source).image_points()
+    points, why = mapping.apply(measured), mapping.why_not(measured)
+    unit, system = mapping.unit, mapping.system
+    more: dict[str, Any] = {}
+    if isinstance(mapping, CameraMapping) and view is not None:
+        raster = _raster(mapping, mapping.size, view, scale)
+        points, unit, system = _in_pixels(points, raster), "px", "undistorted"
+        more = {"camera": raster.pinhole}
+    content, text = points_document(points, unit, system) | more, points.to_csv()
+    if any(why):
+        content["points"] = _nullable(content["points"]) | {"ok": [not w for w in why], "why": list(why)}
+        head, *lines = text.splitlines()
+        rows = [f"{line},{int(not w)},{w}" for line, w in zip(lines, why, strict=True)]
+        text = "\n".join([f"{head},ok,why", *rows]) + "\n"
+    document = canonical_json(content)
     if out is not None:
-        write_whole(out, document if suffix == ".json" else points.to_csv())
+        write_whole(out, document if suffix == ".json" else text)
     if as_json:
         say(document)
     elif out is None:
-        say(points.to_csv())
+        say(text)
     else:
-        say(f"{out}: {len(points)} points in {correction.unit}\n")
+        say(f"{out}: {len(points)} points in {unit}\n")
+    _warn(points.names, why)
+
+
+def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
+    """Directions as pixels of the undistorted image."""
+    import numpy as np
+
+    from ..core.data import ImagePoints
+
+    slope = np.diag(raster.slope)
+    return ImagePoints(points.names, raster.of_system(points.xy), slope @ points.cov @ slope)
+
+
+def _nullable(table: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """Columns with null for the numbers of points that have no place."""
+    return {
+        key: [None if isinstance(v, float) and v != v else v for v in column] for key, column in table.items()
+    }
+
+
+def _warn(names: tuple[str, ...], why: tuple[str, ...]) -> None:
+    """Warn of points outside the validity: of the first ones, and of the number of the others."""
+    found = [f"point {name} {reason}" for name, reason in zip(names, why, strict=True) if reason]
+    if len(found) > 3:
+        found = [*found[:2], f"{len(found) - 2} more points are outside the validity, see the column `why`"]
+    for line in found:
+        typer.echo(f"warning: {line}", err=True)
 
 
 def _image(
-    correction: CameraCorrection,
-    calibration: Path,
+    stored: Calibration,
+    mapping: CalibratedMapping,
+    path: Path,
     source: Path,
     out: Path | None,
+    view: View,
     scale: float | None,
     as_json: bool,
 ) -> None:
-    from ..calibration.document import Calibration
-    from ..core.errors import UsageError
+    """Resample an image; that of a camera gets the parameters of its pinhole camera in a file beside it."""
+    from ..calibration import undistorted_camera, write_corrected
     from ..core.provenance import Provenance, canonical_json, sha256_of
-    from ..io.images import read_image
-    from ..refine import CorrectedImage, write_corrected
 
-    if scale is not None and not scale > 0:
-        raise UsageError(f"{scale:g} is not positive", where="--scale")
-    out = out or source.with_name(f"{source.stem}-corrected{source.suffix}")
+    suffix = {"camera": "undistorted", "film_frame": "frame"}.get(stored.kind, "corrected")
+    out = out or source.with_name(f"{source.stem}-{suffix}{source.suffix}")
     suffix_of(writable(out), _IMAGES)
-    frame = read_image(source)
-    validity = Calibration.read(calibration).validity
-    plan = CorrectedImage.plan(correction, (frame.width, frame.height), validity.get("extent"), scale)
-    with progress(f"resampling {source.name}", plan.bands) as step:
-        write_corrected(out, frame.pixels, plan, step)
-    provenance = Provenance(
-        {source.name: frame.sha256, calibration.name: sha256_of(calibration)}, {"scale": plan.scale}
-    )
+    planes = _planes(source, colours=stored.kind != "oscilloscope")
+    height, width = planes[0].shape
+    mapping.check_size(width, height, source)
+    raster = _raster(mapping, (width, height), view, scale)
+    with progress(f"resampling {source.name}", raster.bands) as step:
+        write_corrected(out, planes, raster, step)
+    inputs = {source.name: sha256_of(source), path.name: sha256_of(path)}
+    if stored.kind == "camera":
+        provenance = Provenance(inputs, {"fov": view, "scale": scale})
+        camera, beside = undistorted_camera(raster, stored, provenance.to_dict()), out.with_suffix(".json")
+        camera.write(beside)
+        if as_json:
+            say(camera.to_json())
+        else:
+            p = raster.pinhole
+            say(f"{out}: {p['width']} × {p['height']} px, fx {p['fx']:.2f}, fy {p['fy']:.2f}, ")
+            say(f"cx {p['cx']:.2f}, cy {p['cy']:.2f} px\n{beside}: camera of the undistorted image\n")
+        return
+    provenance = Provenance(inputs, {"scale": raster.scale[0]})
     if as_json:
-        say(canonical_json(plan.to_dict() | {"image": str(out), "provenance": provenance.to_dict()}))
+        say(canonical_json(raster.to_dict() | {"image": str(out), "provenance": provenance.to_dict()}))
     else:
-        x, y = plan.origin
+        (x, y), unit = raster.origin, mapping.unit
         say(
-            f"{out}: {plan.width} × {plan.height} px, {plan.scale:.6g} px/{correction.unit}, "
-            f"first pixel at ({x:.6g}, {y:.6g}) {correction.unit}\n"
+            f"{out}: {raster.width} × {raster.height} px, {raster.scale[0]:.6g} px/{unit}, "
+            f"first pixel at ({x:.6g}, {y:.6g}) {unit}\n"
         )
+
+
+def _planes(source: Path, *, colours: bool) -> tuple[Any, ...]:
+    """The channels of an image, each (height, width); grey values alone where colours are not wanted."""
+    from ..calibration.raster import planes_of
+    from ..io.images import open_scan, read_image
+
+    return planes_of(open_scan(source)) if colours else (read_image(source).pixels,)
+
+
+def _frame(
+    correction: SensorCorrection,
+    calibration: Path,
+    source: Path,
+    out: Path | None,
+    exposure_ms: float | None,
+    as_json: bool,
+) -> None:
+    """Correct the grey values of a frame: a TIFF of floats, or a PNG of 16 bit up to the full scale."""
+    import numpy as np
+
+    from ..core.provenance import Provenance, canonical_json, sha256_of
+    from ..io.images import read_image, write_image
+
+    out = out or source.with_name(f"{source.stem}-corrected.tif")
+    suffix = suffix_of(writable(out), (".tif", ".tiff", ".png"))
+    exposure_us = None if exposure_ms is None else 1000 * exposure_ms
+    frame = read_image(source)
+    correction.check_size(frame.width, frame.height, source)
+    found = correction.correct(frame, exposure_us)
+    pixels, step = found.pixels, 1.0
+    if suffix == ".png":
+        step = found.full_scale / 65535
+        pixels = np.clip(np.rint(pixels / step), 0, 65535).astype(np.uint16)
+    write_image(out, pixels)
+    used = correction.exposure_us if exposure_us is None else exposure_us
+    inputs = {source.name: frame.sha256, calibration.name: sha256_of(calibration)}
+    if as_json:
+        content = {"image": str(out), "dn_per_step": step, "full_scale_dn": found.full_scale}
+        provenance = Provenance(inputs, {"exposure_us": used})
+        say(canonical_json(content | {"provenance": provenance.to_dict()}))
+    else:
+        kind = f"16 bit, {step:.6g} DN per step" if suffix == ".png" else "32 bit float"
+        say(f"{out}: {found.width} × {found.height} px, {kind}, full scale {found.full_scale:.6g} DN\n")

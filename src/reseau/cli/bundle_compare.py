@@ -11,7 +11,7 @@ from .bundle_options import say_difference
 from .common import AsJson, Out, say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import FieldDifference, Lens
+    from ..calibration import CameraMapping, FieldDifference
 
 __all__ = ["compare", "read_lens"]
 
@@ -27,7 +27,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two calibrations as a field over the image, with its significance."""
-    from ..bundle import calibration_difference
+    from ..calibration import calibration_difference
     from ..core.provenance import canonical_json
     from ..io import write_whole
 
@@ -48,12 +48,12 @@ def compare(
         say_difference(second.name, found)
 
 
-def read_lens(path: Path) -> Lens:
+def read_lens(path: Path) -> CameraMapping:
     """A camera from its calibration."""
-    from ..bundle import Lens
+    from ..calibration import CameraMapping
     from ..calibration.document import Calibration
 
-    return Lens.of_calibration(Calibration.read(path))
+    return CameraMapping.from_calibration(Calibration.read(path))
 
 
 def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, Any]:

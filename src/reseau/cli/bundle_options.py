@@ -11,7 +11,8 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import FieldDifference, Kind, Result, Searched
+    from ..bundle import Kind, Result, Searched
+    from ..calibration import FieldDifference
 
 __all__ = [
     "Alpha",

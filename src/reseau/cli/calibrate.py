@@ -37,7 +37,8 @@ from .common import (
 from .measure import Channel
 
 if TYPE_CHECKING:
-    from ..bundle import FieldDifference, Kind, Lens
+    from ..bundle import Kind
+    from ..calibration import CameraMapping, FieldDifference
     from ..calibration.document import Calibration
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
@@ -245,18 +246,20 @@ def _size(text: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _differences(done: Calibrated, others: dict[str, Lens]) -> dict[str, FieldDifference]:
-    from ..bundle import Lens, calibration_difference
+def _differences(done: Calibrated, others: dict[str, CameraMapping]) -> dict[str, FieldDifference]:
+    from ..bundle import camera_mapping
+    from ..calibration import calibration_difference
 
     return {
-        name: calibration_difference(Lens.of_result(done.result, 0), lens) for name, lens in others.items()
+        name: calibration_difference(camera_mapping(done.result, 0), lens) for name, lens in others.items()
     }
 
 
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
     import numpy as np
 
-    from ..bundle import Lens, projection_field, projection_field_at, sigma_between_images
+    from ..bundle import camera_mapping, projection_field_at, sigma_between_images
+    from ..calibration import projection_field
 
     result = done.result
     count = sum(len(points) for points in done.measured.values())
@@ -270,7 +273,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for name, value, s, other in zip(names, values, sigmas, between, strict=True):
         by_images = f" (by images {other:.3g})" if np.isfinite(other) else ""
         say(f"  {name:<6} {value:14.7g} ± {s:.3g}{by_images}\n")
-    sigma = projection_field(Lens.of_result(result, 0)).sigma
+    sigma = projection_field(camera_mapping(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
     for away in distances:

@@ -15,10 +15,10 @@ from ..core.errors import EstimationError, InputError, UsageError
 
 if TYPE_CHECKING:
     from ..archive import Archive
+    from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
     from ..io import ReseauDesign, ReseauMeasurement, TestfieldDesign
-    from ..sensor import SensorCorrection
 
 T = TypeVar("T")
 
@@ -52,14 +52,13 @@ def corrected(frame: Frame, sensor: Path | None) -> Frame:
     UsageError
         When it is one of another sensor.
     """
-    return frame if sensor is None else _sensor_correction(sensor).apply(frame)
+    return frame if sensor is None else _sensor_correction(sensor).correct(frame)
 
 
 @cache
 def _sensor_correction(path: Path) -> SensorCorrection:
     """Read once for all frames of a command."""
-    from ..calibration.document import Calibration
-    from ..sensor import SensorCorrection
+    from ..calibration import Calibration, SensorCorrection
 
     return SensorCorrection.from_calibration(Calibration.read(path))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,12 +24,11 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..calibration.document import Calibration
+    from ..calibration import InstrumentCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
     from ..io import ReseauDesign
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
-    from ..refine import InstrumentCorrection
 
 __all__ = ["refine"]
 
@@ -57,8 +56,12 @@ class _Files:
         inputs = {path.name: sha256_of(path) for path in paths}
         return Provenance(inputs, {"alpha": self.alpha, "check": list(self.check)})
 
+    def photographs(self) -> list[Path]:
+        """The photographs that were given, in their order."""
+        return [path for path in (self.photo_i, self.photo_ii, *self.photo_iii) if path is not None]
+
     def frames(self) -> list[Frame | None]:
-        """The photographs in their order; None for those that are given as coordinates."""
+        """The photographs in their order; None for one that is given as coordinates."""
         from ..io.images import read_image
 
         paths = (self.photo_i, self.photo_ii, *self.photo_iii)
@@ -69,28 +72,28 @@ def refine(
     photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
     photo_ii: Annotated[
         Path | None,
-        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration: tests it."),
+        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, to test that."),
     ] = None,
-    photo_iii: Annotated[list[Path] | None, typer.Option(help="PHOTO III: the body to be measured.")] = None,
+    photo_iii: Annotated[list[Path] | None, typer.Option(help="PHOTO III: the body to measure.")] = None,
     reseau: Annotated[Path | None, typer.Option(help="Design of the reseau.")] = None,
     test_object: Annotated[
         Path | None, typer.Option("--object", help="Design of the test object: its rods.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="A stored calibration, for PHOTO III or to be tested.")
+        Path | None, typer.Option(help="Stored calibration, for PHOTO III or to be tested.")
     ] = None,
     points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
     out: Out = None,
     true: Annotated[Path | None, typer.Option(help="True coordinates to write (CSV, JSON).")] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
-    alpha: Annotated[float, typer.Option(help="Level of the tests of the coefficients.")] = 0.05,
-    check: Annotated[str, typer.Option(help="Marks and rods held out for a check: A1,B2,…")] = "",
+    alpha: Annotated[float, typer.Option(help="Significance level of the tests of the coefficients.")] = 0.05,
+    check: Annotated[str, typer.Option(help="Marks and rods to hold out for a check: A1,B2,…")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Refine oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
+    """Correct oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
 
-    Every photograph is an image, or a file of the coordinates of its marks, rods and points, told apart by
-    their names.
+    Each photograph is an image, or a file with the coordinates of its marks, rods and points, which are
+    identified by their names. With --calibration, --out is the result: true coordinates and the test.
     """
     from ..core.threads import one_thread
 
@@ -104,13 +107,13 @@ def refine(
             suffix_of(writable(path), suffixes)
     with one_thread():  # the same sums however many processors there are
         if calibration is not None:
-            _by_calibration(files, calibration, true, as_json)
+            _by_calibration(files, calibration, out, true, report, as_json)
         else:
             _by_photographs(files, out, true, report, as_json)
 
 
 def _checked(files: _Files) -> None:
-    """Refuse what cannot be meant together.
+    """Refuse options that contradict each other.
 
     Raises
     ------
@@ -123,24 +126,27 @@ def _checked(files: _Files) -> None:
         raise UsageError(f"{files.alpha:g} is not between 0 and 1", where="--alpha")
     if files.calibration is not None:
         if files.photo_i or files.reseau:
-            raise UsageError("holds PHOTO I and its reseau", where="--calibration", do="leave these out")
+            raise UsageError(
+                "contains PHOTO I and its reseau", where="--calibration", do="omit --photo-i and --reseau"
+            )
         if not files.photo_iii and not files.photo_ii:
             raise UsageError(
-                "wants a photograph", where="--calibration", do="give --photo-iii, or --photo-ii to test it"
+                "needs a photograph", where="--calibration", do="give --photo-iii, or --photo-ii to test it"
             )
         return
     if files.photo_i is None or files.reseau is None:
         raise UsageError("needs --photo-i and --reseau, or --calibration", where="refine")
     if (files.photo_ii is None) != (files.test_object is None):
-        raise UsageError("--photo-ii and --object go together", where="refine")
+        raise UsageError("--photo-ii and --object must be given together", where="refine")
     if files.photo_iii and files.photo_ii is None:
-        raise UsageError("needs PHOTO II before it", where="--photo-iii", do="give --photo-ii and --object")
+        raise UsageError("needs PHOTO II", where="--photo-iii", do="give --photo-ii and --object")
 
 
 def _by_photographs(
     files: _Files, out: Path | None, true: Path | None, report: Path | None, as_json: bool
 ) -> None:
     """PHOTO I, and PHOTO II and III where they are given."""
+    from ..core.data import Frame
     from ..core.errors import UsageError
     from ..io import ReseauDesign, write_whole
     from ..procedures.oscilloscope import photo_i
@@ -155,8 +161,10 @@ def _by_photographs(
         raise UsageError(f"names {unknown[0]!r}, which is none of the marks", where="--check")
     steps = 1 + (files.photo_ii is not None) + len(files.photo_iii)
     photo = read_photo(files.photo_i)
-    with progress("refining", steps) as step:
+    with progress("correcting", steps) as step:
         first = required(photo_i(photo, design, alpha=files.alpha, check=files.check), files.photo_i)
+        if isinstance(photo, Frame):
+            first = replace(first, camera=replace(first.camera, size=(photo.width, photo.height)))
         step("PHOTO I")
         second = None if rods is None else _second(files, design, rods, first)
         step("PHOTO II")
@@ -229,33 +237,57 @@ def _third(
     return results
 
 
-def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json: bool) -> None:
+def _by_calibration(
+    files: _Files,
+    calibration: Path,
+    out: Path | None,
+    true: Path | None,
+    report: Path | None,
+    as_json: bool,
+) -> None:
     """True coordinates by a stored calibration."""
-    from ..calibration.document import Calibration
+    from ..calibration import InstrumentCorrection, read_calibration
     from ..core.provenance import canonical_json
-    from ..refine import InstrumentCorrection
+    from ..io import ReseauDesign, write_whole
 
-    stored: Calibration = Calibration.read(calibration)
+    stored = read_calibration(calibration)
     instrument, design, rods = InstrumentCorrection.from_calibration(stored)
-    with progress("refining", len(files.photo_iii) + (files.photo_ii is not None)) as step:
+    with progress("correcting", len(files.photo_iii) + (files.photo_ii is not None)) as step:
         again = None
         if files.photo_ii is not None:
             again = _again(files, files.photo_ii, instrument, design, rods)
             step(files.photo_ii.name)
         third = _third(files, instrument, design, step)
+    documents = [] if again is None or files.photo_ii is None else [_standard(files.photo_ii, again)]
+    documents += [
+        points_document(found.true, instrument.unit, "object")
+        | {
+            "image": path.name,
+            "notes": [note.text for note in found.notes],
+            "note_codes": [note.code.value for note in found.notes],
+        }
+        for path, found in third
+    ]
+    content = canonical_json(documents[0] if len(documents) == 1 else documents)
+    page = None
+    if report is not None:
+        from ..report import applied_report
+
+        page = applied_report(
+            rods if files.test_object is None else ReseauDesign.read(files.test_object),
+            [found for _, found in third],
+            again,
+            frames=files.frames()[2:],
+            title=f"{stored.name}: {', '.join(path.name for path in files.photographs())}",
+            provenance=files.provenance(),
+        )
+    if out is not None:
+        write_whole(out, content)
+    if page is not None and report is not None:
+        write_whole(report, page)
     _write_true(third, true, instrument.unit)
     if as_json:
-        documents = [] if again is None or files.photo_ii is None else [_standard(files.photo_ii, again)]
-        documents += [
-            points_document(found.true, instrument.unit, "object")
-            | {
-                "image": path.name,
-                "notes": [note.text for note in found.notes],
-                "note_codes": [note.code.value for note in found.notes],
-            }
-            for path, found in third
-        ]
-        say(canonical_json(documents[0] if len(documents) == 1 else documents))
+        say(content)
     else:
         if again is not None and files.photo_ii is not None:
             _say_again(files.photo_ii, again, instrument.unit)
@@ -265,7 +297,7 @@ def _by_calibration(files: _Files, calibration: Path, true: Path | None, as_json
 def _again(
     files: _Files, path: Path, instrument: InstrumentCorrection, design: ReseauDesign, rods: ReseauDesign
 ) -> StillStandard:
-    """The stored coefficients held against a new PHOTO II; --object names another test object."""
+    """Test the stored coefficients by a new PHOTO II; --object names another test object."""
     from ..core.data import ImagePoints
     from ..io import ReseauDesign
     from ..procedures.oscilloscope import still_standard_in
@@ -305,7 +337,7 @@ def _standard(path: Path, again: StillStandard) -> dict[str, Any]:
 
 def _say_again(path: Path, again: StillStandard, unit: str) -> None:
     test = again.test
-    verdict = "still hold" if test.holds else "hold no longer"
+    verdict = "still hold" if test.holds else "no longer hold"
     rod, length = test.largest
     say(f"{path.name}: the coefficients {verdict} (χ² = {test.statistic:.1f}, {test.degrees} degrees of ")
     say(f"freedom, p = {test.p:.3f}); largest change {length:.3g} {unit} at rod {rod}\n")
@@ -357,7 +389,7 @@ def _say_second(path: Path, second: PhotoII) -> None:
         verdict = better.get(fit.displays.verdict, "neither the polynomials nor Wong's model explains")
         say(f"  {verdict} the rods better (p = {fit.displays.p:.3f})\n")
     if fit is not None and fit.local is not None and instrument.local is not None:
-        say(f"  what remains is no noise: a local model is taken off too (p = {fit.local.need.min():.3f})\n")
+        say(f"  a local model is subtracted: the residuals are not noise (p = {fit.local.need.min():.3f})\n")
     for note in second.notes:
         say(f"  note: {note}\n")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,13 +16,11 @@ from ..optics import PlaneMapping, RationalPolynomial
 from ..optics.field import SmoothField
 
 __all__ = [
-    "carried",
     "fit_mapping",
     "is_mirrored",
     "mapping_problem",
     "reduce_mapping",
     "residual_field",
-    "tests_of",
 ]
 
 
@@ -172,23 +170,6 @@ def _shortage(model: PlaneMapping, points: ImagePoints) -> Failure | None:
     return None
 
 
-def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
-    """Tests of every coefficient, dropped ones first in their order, as written in a calibration file."""
-    dropped = [(step.test, "dropped") for step in elimination.steps]
-    kept = [(test, "kept") for test in elimination.kept]
-    return tuple(
-        {
-            "parameter": test.name,
-            "distribution": test.distribution,
-            "statistic": float(test.statistic),
-            "critical": float(test.critical),
-            "p": float(test.p),
-            "verdict": verdict,
-        }
-        for test, verdict in dropped + kept
-    )
-
-
 def residual_field(
     model: PlaneMapping,
     points: ImagePoints,
@@ -227,12 +208,6 @@ def residual_field(
     white -= (white @ taken) @ taken.T
     null = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(points), 2))
     return SmoothField.fit(target, residuals, degree=0, null=null)
-
-
-def carried(mapping: PlaneMapping, points: ImagePoints) -> ImagePoints:
-    """Points transformed by a mapping, with propagated covariances; the mapping counts as free of error."""
-    value, slope, _ = mapping.derivatives(points.xy)
-    return ImagePoints(points.names, value, slope @ points.cov @ np.swapaxes(slope, 1, 2))
 
 
 def is_mirrored(first: Array, second: Array) -> bool:

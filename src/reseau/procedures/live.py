@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from ..archive import Verdict
-from ..bundle import Lens, Network, Result, adjust_network, calibration_of
+from ..bundle import Network, Result, adjust_network, calibration_of, camera_mapping
 from ..core.data import Frame, ImagePoints
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
@@ -228,7 +228,7 @@ def _joined(
 ) -> Network | None:
     """The network with an image from another pose; None when it would show next to nothing."""
     camera, pose = network.cameras[0], _predicted(network, result, mount, place, heights)
-    seen = project(Lens.of_result(result, 0).mapping, pose, network.xyz).xy
+    seen = project(camera_mapping(result, 0).mapping, pose, network.xyz).xy
     size = np.array([camera.width, camera.height]) - 1
     inside = np.flatnonzero(((seen >= _MARGIN_PX) & (seen <= size - _MARGIN_PX)).all(axis=1))
     if len(inside) < 4:

@@ -14,6 +14,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.failure import Code, Failure, Remark
 from ..io import ReseauDesign
@@ -29,9 +30,9 @@ from ..measure import (
 )
 from ..optics import RationalPolynomial
 from ..refine import (
-    CameraCorrection,
     Causes,
-    InstrumentCorrection,
+    FittedCamera,
+    FittedInstrument,
     Registration,
     StandardTest,
     causes_of,
@@ -73,14 +74,14 @@ class PhotoI(_Refined):
     ----------
     points : ImagePoints
         The reseau's marks in pixels.
-    camera : CameraCorrection
+    camera : FittedCamera
         Group A.
     measured : ReseauResult, optional
         How the marks were measured; None where they came from elsewhere.
     """
 
     points: ImagePoints
-    camera: CameraCorrection
+    camera: FittedCamera
     measured: ReseauResult | None
 
 
@@ -136,7 +137,7 @@ class PhotoII(_Refined):
     ----------
     pins : ImagePoints
         Images of the rods, in pixels of PHOTO I.
-    instrument : InstrumentCorrection
+    instrument : FittedInstrument
         Groups A and B.
     registration : Registration or None
         How the photograph was referred to PHOTO I; None where its reseau was not given.
@@ -150,7 +151,7 @@ class PhotoII(_Refined):
     """
 
     pins: ImagePoints
-    instrument: InstrumentCorrection
+    instrument: FittedInstrument
     registration: Registration | None
     causes: Causes | None
     notes: tuple[Remark, ...]

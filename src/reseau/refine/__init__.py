@@ -1,10 +1,9 @@
-"""Errors taken out of image coordinates: the camera's (group A), and those of what it looks at (group B)."""
+"""Image coordinates corrected for systematic errors: of the camera (group A) and the instrument (group B)."""
 
-from .camera import CameraCorrection, CorrectionFit, correct_camera, unit_of
+from .camera import CorrectionFit, FittedCamera, correct_camera
 from .causes import CAUSES, COEFFICIENTS, CONDITIONS, Causes, causes_of, physical_causes
-from .instrument import InstrumentCorrection, InstrumentFit, correct_instrument
+from .instrument import FittedInstrument, InstrumentFit, correct_instrument
 from .registration import Registration, register
-from .resampled import CorrectedImage, write_corrected
 from .rivals import Rivalry, leave_one_out, rivals
 from .standard import StandardTest, still_standard
 
@@ -12,11 +11,10 @@ __all__ = [
     "CAUSES",
     "COEFFICIENTS",
     "CONDITIONS",
-    "CameraCorrection",
     "Causes",
-    "CorrectedImage",
     "CorrectionFit",
-    "InstrumentCorrection",
+    "FittedCamera",
+    "FittedInstrument",
     "InstrumentFit",
     "Registration",
     "Rivalry",
@@ -29,6 +27,4 @@ __all__ = [
     "register",
     "rivals",
     "still_standard",
-    "unit_of",
-    "write_corrected",
 ]

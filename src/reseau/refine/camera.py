@@ -1,164 +1,33 @@
 """The correction of a camera by one frame of a reseau: group A of Wishahy's procedure.
 
 Photo-coordinates and coordinates of the reseau are referred to one **common system**, with its origin in the
-mark O and its x-axis through the mark S; what is left between them is the camera's and the film's doing.
+mark O and its x-axis through the mark S. The remaining differences are the errors of camera and film.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from ..adjust import Adjustment, Elimination, Options
-from ..calibration.document import Calibration, Covariance, Quantity
+from ..calibration.mapping import carried
+from ..calibration.oscilloscope import CameraCorrection, tests_of
 from ..core.data import Array, ImagePoints
-from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
-from ..measure.fitting import (
-    carried,
-    fit_mapping,
-    is_mirrored,
-    on_one_line,
-    reduce_mapping,
-    residual_field,
-    tests_of,
-)
+from ..measure.fitting import fit_mapping, is_mirrored, on_one_line, reduce_mapping, residual_field
 from ..optics import RationalPolynomial, Similarity
 from ..optics.field import SmoothField
-from ..optics.polynomials import monomials
 
-__all__ = ["CameraCorrection", "correct_camera"]
-
-_MODEL = "oscilloscope group A"
-_MODELS = (_MODEL, f"{_MODEL} and group B")
-
-
-@dataclass(frozen=True, eq=False)
-class CameraCorrection:
-    """From pixels to the plane of the reseau, refined of lens distortion and film deformation.
-
-    Parameters
-    ----------
-    model : RationalPolynomial
-        Photo-coordinates to coordinates of the reseau, both in the common system, mm.
-    cofactor : ndarray (u, u)
-        Covariance matrix of the model's parameters: a priori where χ² tests decided, which take the points'
-        covariances at their word, else a posteriori.
-    photo_system : Similarity
-        Pixels into the common system: scaled to the reseau, of the handedness of its design.
-    object_system : Similarity
-        Coordinates of the design into the common system.
-    unit : str
-        Of the design.
-    fit : CorrectionFit, optional
-        How the model came about; None for one read from a calibration.
-    """
-
-    model: RationalPolynomial
-    cofactor: Array
-    photo_system: Similarity
-    object_system: Similarity
-    unit: str
-    fit: CorrectionFit | None = None
-
-    def __bool__(self) -> bool:
-        return True
-
-    def required(self) -> CameraCorrection:
-        """The correction itself; see :meth:`~reseau.core.failure.Failure.required`."""
-        return self
-
-    def apply(self, points: ImagePoints) -> ImagePoints:
-        """Correct measured points.
-
-        Parameters
-        ----------
-        points : ImagePoints
-            In pixels.
-
-        Returns
-        -------
-        ImagePoints
-            In the common system, in the design's unit. The covariances contain the points' own and that of
-            the model; for points that the model was fitted to, the two are correlated, which is left out.
-            What the model cannot follow is no part of them: see `CorrectionFit.local` and the global test.
-        """
-        photo = carried(self.photo_system, points)
-        value, slope, by_parameter = self.model.derivatives(photo.xy)
-        cov = slope @ photo.cov @ np.swapaxes(slope, 1, 2)
-        cov = cov + by_parameter @ self.cofactor @ np.swapaxes(by_parameter, 1, 2)
-        return ImagePoints(points.names, value, cov)
-
-    def to_pixels(self, xy: Array) -> Array:
-        """Pixels (n, 2) at which points of the common system appear; NaN where the model has no inverse."""
-        return self.photo_system.inverse(self.model.inverse(xy))
-
-    def calibration(
-        self, *, name: str, provenance: dict[str, Any] | None = None, times: dict[str, str] | None = None
-    ) -> Calibration:
-        """The calibration file; `CameraCorrection.from_calibration` reads it back."""
-        sigma = np.sqrt(np.diagonal(self.cofactor))
-        free = [i for i, s in enumerate(sigma) if s > 0]
-        names = self.model.names
-        parameters = {
-            key: Quantity(value=float(value), sigma=float(s), unit=unit_of(self.model, key, self.unit))
-            for key, value, s in zip(names, self.model.values, sigma, strict=True)
-        }
-        matrix = self.cofactor[np.ix_(free, free)]
-        return Calibration(
-            kind="oscilloscope",
-            name=name,
-            model={
-                "name": _MODEL,
-                "unit": self.unit,
-                "mapping": self.model.to_dict(values=False),
-                "photo_system": system_to_dict(self.photo_system),
-                "object_system": system_to_dict(self.object_system),
-            },
-            parameters=parameters,
-            covariance=Covariance(
-                names=tuple(names[i] for i in free), matrix=tuple(tuple(map(float, row)) for row in matrix)
-            ),
-            sigma0=None if self.fit is None else float(self.fit.adjustment.sigma0),
-            redundancy=0 if self.fit is None else self.fit.adjustment.redundancy,
-            tests=() if self.fit is None else self.fit.tests(),
-            validity={} if self.fit is None else self.fit.validity(),
-            provenance=provenance or {},
-            times=times or {},
-        )
-
-    @classmethod
-    def from_calibration(cls, calibration: Calibration) -> CameraCorrection:
-        """Read a correction back from its file.
-
-        Raises
-        ------
-        FormatError
-            When the calibration is of another kind.
-        """
-        content = calibration.model
-        if not isinstance(content, dict) or content.get("name") not in _MODELS:
-            raise FormatError(f"is no calibration of {_MODEL}", where=f"calibration {calibration.name}")
-        try:
-            model = with_stored_values(RationalPolynomial.from_dict(content["mapping"]), calibration)
-            systems = [system_from_dict(content[key]) for key in ("photo_system", "object_system")]
-            unit = str(content["unit"])
-            row_of = {name: i for i, name in enumerate(calibration.parameters)}
-            order = [row_of[name] for name in model.names]
-        except (KeyError, TypeError, ValueError, UsageError) as error:
-            raise FormatError(
-                f"lacks or misstates {error}", where=f"model of calibration {calibration.name}"
-            ) from None
-        return cls(model, calibration.matrix()[np.ix_(order, order)], systems[0], systems[1], unit)
+__all__ = ["CorrectionFit", "FittedCamera", "correct_camera"]
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectionFit:
-    """How a correction came about.
+    """How the correction of a camera was fitted.
 
     Parameters
     ----------
@@ -175,8 +44,8 @@ class CorrectionFit:
     check_target : ndarray (c, 2)
         Their coordinates in the design.
     local : SmoothField or None
-        What the model leaves, as a smooth field; `local.need` is the probability, per axis, that white noise
-        alone would show as much. None with fewer than 20 marks.
+        What the model leaves, as a smooth field; `local.need` is the probability, per axis, of a field as
+        large from white noise alone. None with fewer than 20 marks.
     """
 
     elimination: Elimination
@@ -198,13 +67,21 @@ class CorrectionFit:
         return self.corrected.xy - self.target
 
     def tests(self) -> tuple[dict[str, Any], ...]:
-        """Of every coefficient, dropped ones first and in their order, as in the calibration file."""
+        """Tests of all coefficients as in the calibration file: dropped ones first, in their order."""
         return tests_of(self.elimination)
 
-    def validity(self) -> dict[str, Any]:
-        """Where the correction holds: the extent of its marks in the common system."""
-        low, high = self.target.min(axis=0), self.target.max(axis=0)
-        return {"extent": [*map(float, low), *map(float, high)], "marks": len(self.target)}
+
+@dataclass(frozen=True, eq=False)
+class FittedCamera(CameraCorrection):
+    """The correction of a camera, with the record of its fit.
+
+    Parameters
+    ----------
+    fit : CorrectionFit, optional
+        How the model was fitted.
+    """
+
+    fit: CorrectionFit | None = None
 
 
 def correct_camera(
@@ -216,7 +93,7 @@ def correct_camera(
     criterion: Literal["t", "chi2", "F"] = "chi2",
     check: Iterable[str] = (),
     trials: int = 499,
-) -> CameraCorrection | Failure:
+) -> FittedCamera | Failure:
     """Correct a camera by the marks of a reseau (Wishahy, steps i–iii).
 
     Parameters
@@ -239,13 +116,23 @@ def correct_camera(
 
     Returns
     -------
-    CameraCorrection or Failure
+    FittedCamera or Failure
         A failure when there are too few marks, or the adjustment fails.
 
     Notes
     -----
-    The common system is a choice of coordinates, frozen at the measured images of O and S: their errors turn,
-    shift and scale it, and a, b and c take that up. Sigmas of the coefficients are given this system.
+    The common system is a choice of coordinates, fixed by the measured images of O and S. Their errors
+    shift, rotate and scale it; a, b and c absorb that. The sigmas of the coefficients are conditional on
+    this system.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> reseau = standard_reseau()
+    >>> seen = reseau.xy * [9.0, -9.0] + [800.0, 600.0] + 1e-5 * reseau.xy**3
+    >>> camera = correct_camera(ImagePoints.with_sigma(reseau.ids, seen, 0.01), reseau, trials=0).required()
+    >>> bool(abs(camera.fit.residuals).max() < 0.02)
+    True
     """
     model = RationalPolynomial.camera() if model is None else model
     held = set(check)
@@ -286,7 +173,9 @@ def correct_camera(
     reduced = model.with_values(fit.values).without(*elimination.dropped)
     rows = [model.names.index(name) for name in reduced.names]
     cofactor = fit.covariance[np.ix_(rows, rows)]
-    correction = CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit)
+    correction = FittedCamera(
+        reduced, cofactor, photo_system, object_system, design.unit, extent=_extent(target[used])
+    )
     corrected = correction.apply(marks)
     residuals = (corrected.xy - target)[used]
     local = residual_field(reduced, photo.select(used), target[used], residuals, sigma[used, None], trials)
@@ -299,7 +188,13 @@ def correct_camera(
         target[~used],
         local,
     )
-    return CameraCorrection(reduced, cofactor, photo_system, object_system, design.unit, record)
+    return replace(correction, fit=record)
+
+
+def _extent(xy: Array) -> tuple[float, float, float, float]:
+    """Left, low, right and high end of points (n, 2)."""
+    (left, low), (right, high) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+    return left, low, right, high
 
 
 def _common_system(
@@ -374,26 +269,3 @@ def _origin_and_axis(marks: ImagePoints, plane: Array, design: ReseauDesign) -> 
         offset = plane - np.array([at.x, at.y], dtype=np.float64)
         axis = marks.names[int((offset[:, 0] - 2 * np.abs(offset[:, 1])).argmax())]
     return origin, axis
-
-
-def with_stored_values(model: RationalPolynomial, calibration: Calibration) -> RationalPolynomial:
-    """The model with its parameters' values of a calibration file, which may hold those of others too."""
-    values = calibration.values()
-    return model.with_values(np.array([values[name] for name in model.names]))
-
-
-def unit_of(model: RationalPolynomial, name: str, unit: str) -> str:
-    """Unit of a coefficient: that of X over the power of its monomials."""
-    part, text = next(iter(model.terms[name].items()))
-    exponent = (0 if part == "D" else 1) - max(i + j for i, j in monomials(text))
-    return "1" if exponent == 0 else unit if exponent == 1 else f"{unit}^{exponent}"
-
-
-def system_to_dict(system: Similarity) -> dict[str, Any]:
-    values = dict(zip(system.names, map(float, system.values), strict=True))
-    return values | {"mirrored": system.mirrored}
-
-
-def system_from_dict(content: dict[str, Any]) -> Similarity:
-    values = np.array([float(content[name]) for name in Similarity.names])
-    return Similarity(values, bool(content["mirrored"]))

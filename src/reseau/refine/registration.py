@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
+from ..calibration.mapping import carried
+from ..calibration.oscilloscope import CameraCorrection
 from ..core.data import Array, ImagePoints
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
-from ..measure.fitting import carried, fit_mapping
+from ..measure.fitting import fit_mapping
 from ..optics import RationalPolynomial, Similarity
 from ..optics.field import SmoothField
-from .camera import CameraCorrection
 
 __all__ = ["Registration", "register"]
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..calibration.oscilloscope import CameraCorrection, InstrumentCorrection
 from ..core.data import ImagePoints
 from ..core.failure import Code, Remark
 from ..io import ReseauDesign
-from .camera import CameraCorrection
-from .instrument import InstrumentCorrection
 from .registration import Registration
 from .standard import StandardTest
 

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
+from ..calibration.oscilloscope import InstrumentCorrection
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
-from .instrument import InstrumentCorrection
 
 __all__ = ["StandardTest", "still_standard"]
 

@@ -8,15 +8,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import (
-    FieldDifference,
-    Lens,
-    Result,
-    Searched,
-    projection_field,
-    projection_field_at,
-    sigma_between_images,
-)
+from ..bundle import Result, Searched, camera_mapping, projection_field_at, sigma_between_images
+from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Rows
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
@@ -165,13 +158,13 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
     }
 
 
-def _lens(result: Result, c: int) -> Lens | None:
+def _lens(result: Result, c: int) -> CameraMapping | None:
     """The camera by itself; None where it has several sets of parameters, or no mapping."""
-    return Lens.of_result(result, c) if result.network.cameras[c].has_plane_mapping else None
+    return camera_mapping(result, c) if result.network.cameras[c].has_plane_mapping else None
 
 
 def _fields(
-    result: Result, c: int, lens: Lens, rows: Rows, distances: Sequence[float]
+    result: Result, c: int, lens: CameraMapping, rows: Rows, distances: Sequence[float]
 ) -> list[tuple[str, Markup]]:
     """How well the projection is known, of directions and at distances: what each is of, and its figure."""
     network, values = result.network, result.fit.values

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
-from ..bundle import Lens, Result
+from ..bundle import Result
+from ..calibration import CameraMapping
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, nice, to_svg
 from ..optics.cameras import distortion_names
@@ -109,12 +110,12 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
         return to_svg(figure)
 
 
-def distortion_figure(lens: Lens) -> str | None:
+def distortion_figure(lens: CameraMapping) -> str | None:
     """Draw the radial part of the distortion with its band, and the standard deviation by itself.
 
     Parameters
     ----------
-    lens : Lens
+    lens : CameraMapping
         A calibrated camera.
 
     Returns
@@ -142,7 +143,7 @@ def distortion_figure(lens: Lens) -> str | None:
         return to_svg(figure)
 
 
-def _radial(lens: Lens) -> tuple[Array, Array, Array] | None:
+def _radial(lens: CameraMapping) -> tuple[Array, Array, Array] | None:
     """Radius, radial distortion in the mean of all directions, and its standard deviation (px).
 
     The distortion is what the mapping adds to the central projection by its own slope on the axis.

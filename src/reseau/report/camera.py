@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import Lens, Result
+from ..bundle import Result, camera_mapping
 from .bundle_figures import distortion_figure, network_figure
 from .tables import Row, symbol
 
@@ -41,7 +41,7 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
         "rows": rows,
         "rms": f"{np.sqrt(np.mean(errors**2)):.2f}",
         "network": Markup(network_figure(result)),
-        "distortion": _markup(distortion_figure(Lens.of_result(result, 0))),
+        "distortion": _markup(distortion_figure(camera_mapping(result, 0))),
     }
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Failure
@@ -13,7 +14,7 @@ from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
 from ..optics import PlaneMapping, RationalPolynomial
 from ..procedures.oscilloscope import PhotoII, PhotoIII
-from ..refine import InstrumentCorrection, correct_instrument
+from ..refine import correct_instrument
 from .tables import rms_pair
 from .truth import Factor, Known, KnownPoints
 

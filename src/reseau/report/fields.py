@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from ..bundle import FieldDifference, ProjectionField
+from ..calibration import FieldDifference, ProjectionField
 from ..core.data import Array
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, nice, to_svg
 

@@ -12,7 +12,7 @@ from ..core.errors import UsageError
 from ..core.numbers import aligned
 from ..core.provenance import Provenance
 from ..io import ReseauDesign
-from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
 from .factors import FACTORS, factor_by_factor
 from .photo_i import photo_i_section
 from .photo_ii import photo_ii_section
@@ -21,7 +21,7 @@ from .tables import Row
 from .template import rendered
 from .truth import Comparison, Factor, Pair
 
-__all__ = ["oscilloscope_report"]
+__all__ = ["applied_report", "oscilloscope_report"]
 
 
 def oscilloscope_report(
@@ -73,7 +73,7 @@ def oscilloscope_report(
         When a correction was read from a file and has no residuals, or a photograph lacks those before it.
     """
     if (second is None) != (test_object is None):
-        raise UsageError("and its test object go together", where="PHOTO II")
+        raise UsageError("needs its test object, and the test object needs PHOTO II", where="PHOTO II")
     if third and second is None:
         raise UsageError("needs PHOTO II before it", where="PHOTO III")
     pictures = [frame for _, frame in zip_longest(range(2 + len(third)), frames)]
@@ -92,6 +92,75 @@ def oscilloscope_report(
         camera=camera,
         **more,
     )
+
+
+def applied_report(
+    rods: ReseauDesign,
+    third: Sequence[PhotoIII] = (),
+    again: StillStandard | None = None,
+    *,
+    frames: Sequence[Frame | None] = (),
+    title: str = "Oscilloscope images corrected",
+    provenance: Provenance | None = None,
+) -> str:
+    """Render the report of photographs that were corrected by a stored calibration.
+
+    Parameters
+    ----------
+    rods : ReseauDesign
+        The test object of the calibration.
+    third : sequence of PhotoIII
+        Bodies measured by the calibration.
+    again : StillStandard, optional
+        The test of the calibration by a new PHOTO II.
+    frames : sequence of Frame or None
+        The photographs of `third`; where one is missing or None the page has no picture of it.
+    title : str
+        Heading of the page.
+    provenance : Provenance, optional
+        Inputs, options, version.
+
+    Returns
+    -------
+    str
+        An HTML page without any external resource and without clock times.
+    """
+    pictures = [frame for _, frame in zip_longest(range(len(third)), frames)]
+    return rendered(
+        "applied.html.j2",
+        title=title,
+        two={"design": rods},
+        three=[
+            photo_iii_section(found, rods, frame, None)
+            for found, frame in zip(third, pictures[: len(third)], strict=True)
+        ],
+        again=None if again is None else _test_of_the_calibration(again, rods.unit),
+        provenance=(provenance or Provenance()).to_dict(),
+    )
+
+
+def _test_of_the_calibration(again: StillStandard, unit: str) -> Row:
+    """Everything the section about a test of the calibration shows."""
+    test = again.test
+    rod, length = test.largest
+    verdict = "still hold" if test.holds else "no longer hold"
+    return {
+        "summary": [
+            (str(len(test.names)), "", "rods compared"),
+            (f"{test.p:.3f}", "", f"probability: the coefficients {verdict}"),
+            (f"{length:.3g}", unit, f"largest change, at rod {rod}"),
+        ],
+        "object": "the same test object" if test.same_object else "another test object",
+        "verdict": verdict,
+        "statistic": f"{test.statistic:.1f}",
+        "degrees": test.degrees,
+        "critical": f"{test.critical:.1f}",
+        "alpha": f"{test.alpha:g}",
+        "p": f"{test.p:.3f}",
+        "largest": f"{length:.3g} {unit}",
+        "rod": rod,
+        "notes": again.notes,
+    }
 
 
 def _of_the_instrument(

@@ -8,13 +8,15 @@ import numpy as np
 import scipy.special
 from markupsafe import Markup
 
+from ..calibration import InstrumentCorrection
+from ..calibration.oscilloscope import unit_of
 from ..core.data import Array, Frame
 from ..core.figures import Panel
 from ..core.numbers import aligned, power
 from ..io import ReseauDesign
 from ..optics import RationalPolynomial, wong_display
 from ..procedures.oscilloscope import PhotoII
-from ..refine import CAUSES, Causes, InstrumentCorrection, InstrumentFit, Rivalry, unit_of
+from ..refine import CAUSES, Causes, InstrumentFit, Rivalry
 from .equations import equations
 from .factors import FACTORS, correctors, rods_of
 from .figures import distortion_figure, residual_figure

@@ -1,21 +1,18 @@
 """A sensor calibrated: what it adds in the dark, how it answers to light, its scatter, which pixels fail."""
 
-from .correction import SensorCorrection
 from .edge import EdgeSpread, FreeCurve, measure_edge
-from .fields import Fields, estimate_fields
+from .fields import estimate_fields
 from .sensor import SensorResult, calibrate_sensor, with_edge
 from .series import Level, LevelSums, SensorSeries
 from .transfer import Linearity, PhotonTransfer, fit_linearity, fit_transfer
 
 __all__ = [
     "EdgeSpread",
-    "Fields",
     "FreeCurve",
     "Level",
     "LevelSums",
     "Linearity",
     "PhotonTransfer",
-    "SensorCorrection",
     "SensorResult",
     "SensorSeries",
     "calibrate_sensor",

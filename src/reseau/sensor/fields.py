@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import stats
 
+from ..calibration.sensor import Fields
 from ..core.data import Mask
 from ..core.threads import one_thread
 from .series import Image32, Level, SensorSeries
 
-__all__ = ["Fields", "estimate_fields"]
+__all__ = ["estimate_fields"]
 
 _FALSE_ALARMS = 0.5
 """Good pixels that are taken for defective ones, on average over a whole sensor."""
@@ -19,32 +18,6 @@ _TESTS = 4
 _BRIGHTEST = 0.8
 """Share of the full scale up to which levels tell the response."""
 _MAD = 1.4826
-
-
-@dataclass(frozen=True, eq=False)
-class Fields:
-    """Of each pixel.
-
-    Parameters
-    ----------
-    bias : ndarray (height, width)
-        Grey value in the dark at no exposure.
-    dark_current : ndarray (height, width)
-        Grey values that a microsecond of exposure adds in the dark.
-    response : ndarray (height, width)
-        To light, of a mean of 1 over the good pixels.
-    defects : ndarray (height, width) of bool
-        Pixels that are not to be used.
-    """
-
-    bias: Image32
-    dark_current: Image32
-    response: Image32
-    defects: Mask
-
-    def dark(self, exposure_us: float) -> Image32:
-        """Grey values in the dark."""
-        return (self.bias + self.dark_current * np.float32(exposure_us)).astype(np.float32)
 
 
 def estimate_fields(series: SensorSeries) -> Fields:

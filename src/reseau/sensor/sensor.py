@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from ..calibration.document import Calibration, Covariance, Quantity
+from ..calibration.document import Calibration, Covariance, Quantity, SensorModel
+from ..calibration.sensor import Fields, SensorCorrection
 from ..core.data import Array, Frame
 from ..core.errors import EstimationError
 from ..core.failure import Failure
-from .correction import SensorCorrection
 from .edge import EdgeSpread, measure_edge
-from .fields import Fields, estimate_fields
+from .fields import estimate_fields
 from .series import Level, SensorSeries
 from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
 
@@ -111,7 +111,7 @@ class SensorResult:
         return noise / (exposures * self.fields.response.astype(np.float64) ** 2)
 
     def calibration(self, name: str, provenance: Mapping[str, Any], times: Mapping[str, str]) -> Calibration:
-        """As a ``reseau-calibration/1`` of the kind camera, whose model is a sensor."""
+        """The calibration file ``reseau-calibration/1`` of the kind ``sensor``."""
         fit = self.transfer.fit
         names: tuple[str, ...] = ("gain", "read_noise")
         matrix = np.zeros((4, 4))
@@ -125,9 +125,9 @@ class SensorResult:
         tests = [{"name": "photon transfer", "passed": test.passed, "statistic": test.statistic}]
         model = self.correction.to_model()
         if isinstance(self.edge, EdgeSpread):
-            tests, model = tests + self.edge.tests(), model | self.edge.to_model()
+            tests, model = tests + self.edge.tests(), cast(SensorModel, model | self.edge.to_model())
         return Calibration(
-            kind="camera",
+            kind="sensor",
             name=name,
             model=model,
             parameters=self.quantities(),
@@ -200,7 +200,7 @@ def with_edge(
         Where nothing else is; by default the whole frame.
     """
     frame = Frame(edge.mean, result.full_scale, "edge")
-    corrected = result.correction.apply(frame, edge.exposure_us)
+    corrected = result.correction.correct(frame, edge.exposure_us)
     if (well := result.transfer.saturation) is not None:
         corrected = replace(corrected, full_scale=min(corrected.full_scale, _FULL * well))
     variance = result.variance(frame, edge.count, edge.exposure_us)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..adjust import Adjustment, GaussHelmert, GaussMarkov, Options, Parameters, adjust
+from ..calibration.sensor import Fields
 from ..core.data import Array, Mask
 from ..core.failure import Code, Failure
-from .fields import Fields
 from .series import SensorSeries
 
 __all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", "fit_transfer"]

@@ -2,32 +2,21 @@
 
 from .checks import checks, listed
 from .control_check import doubtful_control
-from .fields import (
-    FieldDifference,
-    ProjectionField,
-    calibration_difference,
-    projection_field,
-    projection_field_at,
-)
+from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
-from .lens import Lens
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .result import Result
 
 __all__ = [
     "CommonPattern",
-    "FieldDifference",
-    "Lens",
-    "ProjectionField",
     "Result",
     "by_place",
     "by_point",
-    "calibration_difference",
+    "camera_mapping",
     "checks",
     "common_pattern",
     "doubtful_control",
     "listed",
-    "projection_field",
     "projection_field_at",
     "sigma_between_images",
 ]

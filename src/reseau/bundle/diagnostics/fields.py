@@ -1,130 +1,55 @@
-"""What a calibration is worth at each place of the image, and how two calibrations differ there.
-
-A shift of the principal point and a small tilt of the camera move an image alike, up to the squares of
-directions. The standard deviations of single parameters hold what is common to both, which no ray ever shows.
-Fields are therefore referred to the rotation that fits best over the image: with the derivatives G by a
-rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ) J (an S-transformation, Baarda 1973);
-and two calibrations are compared after the rotation that brings the rays of the one nearest those of the
-other (Kogan, *mrcal*: differences with the implied transformation, for points at infinity).
-"""
+"""Uncertainty of the projection at finite distances, and a camera of an adjustment by itself."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-import scipy.special
 
+from ...calibration.camera import CameraMapping
+from ...calibration.compare import ProjectionField, by_rotation, places
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
-from ...optics.poses import rotation_matrix
-from ..network import finite
-from .lens import Lens, own_columns
 from .result import Result
 
-__all__ = [
-    "FieldDifference",
-    "ProjectionField",
-    "calibration_difference",
-    "projection_field",
-    "projection_field_at",
-]
-
-# Singular values of the covariance root, over the largest, that are rounding.
-_RANK = 1e-6
-_ROUNDS = 6
+__all__ = ["camera_mapping", "projection_field_at"]
 
 
-@dataclass(frozen=True, eq=False)
-class ProjectionField:
-    """Uncertainty of the projection over the image.
+def camera_mapping(result: Result, c: int, additional: str | None = None) -> CameraMapping:
+    """A camera as an adjustment left it.
 
     Parameters
     ----------
-    xy : ndarray (rows, columns, 2)
-        Places, pixels.
-    cov : ndarray (rows, columns, 2, 2)
-        Covariances (px²) of where the ray is imaged that is imaged there; NaN where no ray is.
+    result : Result
+        The adjustment.
+    c : int
+        Row of the camera.
+    additional : str, optional
+        Which set of additional parameters, ``group G`` or ``image I``, where there are several.
+
+    Raises
+    ------
+    UsageError
+        When there is no such set, or several and none is named.
     """
-
-    xy: Array
-    cov: Array
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviation in the worst direction (rows, columns), px."""
-        return _worst(self.cov)
+    camera = result.network.cameras[c]
+    names, columns, values = own_columns(result, c, additional)
+    covariance = result.fit.cofactors.reduced[np.ix_(columns, columns)] * result.fit.variance
+    found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
+    size = (camera.width, camera.height)
+    return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance)
 
 
-@dataclass(frozen=True, eq=False)
-class FieldDifference:
-    """Difference of two independent calibrations over the image.
-
-    Parameters
-    ----------
-    xy : ndarray (rows, columns, 2)
-        Places in the image of the first, pixels.
-    difference : ndarray (rows, columns, 2)
-        Where the second images the ray, less where the first does, px.
-    cov : ndarray (rows, columns, 2, 2)
-        Covariances of the differences.
-    rotation : ndarray (3,)
-        Rotation vector (rad) by which the rays of the second were turned.
-    statistic, degrees : float, int
-        χ² of the field as a whole, and of how many degrees of freedom.
-    """
-
-    xy: Array
-    difference: Array
-    cov: Array
-    rotation: Array
-    statistic: float
-    degrees: int
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviation in the worst direction (rows, columns), px."""
-        return _worst(self.cov)
-
-    @property
-    def p(self) -> float:
-        """Probability of a field that differs as much, when the calibrations are of the same camera."""
-        return float(scipy.special.chdtrc(self.degrees, self.statistic)) if self.degrees else 1.0
-
-    @property
-    def p_at(self) -> Array:
-        """The same of each place by itself (rows, columns); NaN where no ray is imaged."""
-        known = np.isfinite(self.sigma) & (np.linalg.det(self.cov) > 0)
-        p = np.full(known.shape, np.nan)
-        d = self.difference[known]
-        square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])
-        p[known] = np.exp(-0.5 * square)
-        return p
-
-
-def projection_field(lens: Lens, across: int = 25, down: int | None = None) -> ProjectionField:
-    """Uncertainty of the projection over the image.
-
-    Parameters
-    ----------
-    lens : Lens
-        A calibrated camera.
-    across, down : int
-        Places along the axes, from edge to edge; `down` by default in proportion.
-
-    Notes
-    -----
-    It covers the noise of the observations alone, not what the model cannot follow; towards corners without
-    points it is what the model makes of the rest.
-    """
-    xy, shape = _places(lens, across, down)
-    uv = lens.mapping.inverse(xy)
-    known = np.isfinite(uv).all(axis=1)
-    seen = lens.mapping.derivatives(uv[known])
-    slope = _referred(seen.d_xy @ _by_rotation(uv[known]), seen.d_parameters[:, :, lens.rows])
-    cov = np.full((len(xy), 2, 2), np.nan)
-    cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
-    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:
+    """Names, columns and values of what was estimated of a camera, of its additional parameters one set."""
+    names, columns, values = result.camera_columns(c)
+    camera = result.network.cameras[c]
+    if camera.additional is None or camera.additional.per == "camera":
+        return names, columns, values
+    keep = [k for k, name in enumerate(names) if " of " not in name]
+    own = [k for k, name in enumerate(names) if name.endswith(f" of {additional}")]
+    if not own:
+        raise UsageError("is no set of additional parameters of it", where=f"{additional or 'none'}")
+    keep += own
+    return tuple(names[k].partition(" of ")[0] for k in keep), columns[keep], values[keep]
 
 
 def projection_field_at(
@@ -164,13 +89,13 @@ def projection_field_at(
     """
     if not distance > 0:
         raise UsageError(f"{distance:g} is not above zero", where="distance")
-    lens = Lens.of_result(result, c, additional)
+    camera = camera_mapping(result, c, additional)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)
-    xy, shape = _places(lens, across, down)
-    uv = lens.mapping.inverse(xy)
+    xy, shape = places(camera, across, down)
+    uv = camera.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1)
-    seen = lens.mapping.derivatives(uv[known])
+    seen = camera.mapping.derivatives(uv[known])
     ray = np.column_stack([uv[known], np.ones(int(known.sum()))])
     z = distance / np.linalg.norm(ray, axis=1)
     by_point = np.zeros((len(z), 2, 3))
@@ -178,8 +103,8 @@ def projection_field_at(
     by_point[:, :, 2] = -uv[known] / z[:, None]
     slope = np.concatenate(
         [
-            seen.d_parameters[:, :, lens.rows],
-            seen.d_xy @ _by_rotation(uv[known]),
+            seen.d_parameters[:, :, camera.rows],
+            seen.d_xy @ by_rotation(uv[known]),
             seen.d_xy @ by_point,
         ],
         axis=2,
@@ -205,127 +130,3 @@ def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:
     cofactor = turn @ result.fit.cofactors.reduced[np.ix_(at, at)] @ turn.T
     covariance: Array = cofactor * result.fit.variance
     return covariance
-
-
-def calibration_difference(
-    first: Lens, second: Lens, across: int = 25, down: int | None = None
-) -> FieldDifference:
-    """Difference of two independent calibrations as a field over the image, with its significance.
-
-    Parameters
-    ----------
-    first, second : Lens
-        Calibrations of images of the same size, not necessarily by the same model.
-    across, down : int
-        Places along the axes, from edge to edge.
-
-    Raises
-    ------
-    UsageError
-        When the images differ in size, or no ray is imaged by both.
-
-    Notes
-    -----
-    The test of the whole compares the part of the difference that the parameters' errors can make with their
-    covariances; what is beyond them, as between models of different kind, does not count in it.
-    """
-    if (first.width, first.height) != (second.width, second.height):
-        raise UsageError(
-            f"{first.width}×{first.height} and {second.width}×{second.height} pixels cannot be compared",
-            where="calibrations",
-        )
-    xy, shape = _places(first, across, down)
-    uv = first.mapping.inverse(xy)
-    known = finite(uv) & finite(second.mapping(uv))
-    if known.sum() < 2:
-        raise UsageError("image no ray in common", where="calibrations")
-    uv, turn = uv[known], np.eye(3)
-    for _ in range(_ROUNDS):
-        turned, by_uv = _turned(turn, uv)
-        there = second.mapping.derivatives(turned)
-        g = there.d_xy @ _by_rotation(turned)
-        off = there.value - xy[known]
-        step = -np.linalg.lstsq(g.reshape(-1, 3), off.ravel(), rcond=None)[0]
-        turn = rotation_matrix(step) @ turn
-    here = first.mapping.derivatives(uv)
-    own = there.d_parameters[:, :, second.rows]
-    carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
-    root = _joint_root(first, second, _referred(g, carried), _referred(g, own))
-    statistic, degrees = _chi2(root.reshape(2 * len(root), root.shape[2]), off.ravel())
-    difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
-    difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
-    # The camera is turned against its rays.
-    angle = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    return FieldDifference(
-        xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
-        degrees,
-    )  # fmt: skip
-
-
-def _joint_root(first: Lens, second: Lens, by_first: Array, by_second: Array) -> Array:
-    """A root (g, 2, k) of the covariance of the differences."""
-    if type(first.mapping) is type(second.mapping) and first.names == second.names:
-        # Derivatives at two estimates differ by their errors, and must not make up dimensions of their own.
-        mean: Array = (by_first + by_second) / 2 @ _root(first.covariance + second.covariance)
-        return mean
-    parts = [by_first @ _root(first.covariance), by_second @ _root(second.covariance)]
-    return np.concatenate(parts, axis=2)
-
-
-def _places(lens: Lens, across: int, down: int | None) -> tuple[Array, tuple[int, int]]:
-    """A grid over the image (g, 2), and its rows and columns."""
-    down = max(2, round(across * lens.height / lens.width)) if down is None else down
-    if across < 2 or down < 2:
-        raise UsageError(f"{across} × {down} places are no field", where="across, down")
-    x, y = np.meshgrid(np.linspace(0, lens.width - 1, across), np.linspace(0, lens.height - 1, down))
-    return np.column_stack([x.ravel(), y.ravel()]), (down, across)
-
-
-def _by_rotation(uv: Array) -> Array:
-    """Derivatives (n, 2, 3) of directions by a small rotation of the rays about the camera's axes."""
-    u, v = uv.T
-    one = np.ones_like(u)
-    return np.stack(
-        [np.stack([-u * v, one + u * u, -v], axis=1), np.stack([-one - v * v, u * v, u], axis=1)], axis=1
-    )
-
-
-def _turned(turn: Array, uv: Array) -> tuple[Array, Array]:
-    """Directions of turned rays (n, 2), and their derivatives by the directions before (n, 2, 2)."""
-    ray = np.column_stack([uv, np.ones(len(uv))]) @ turn.T
-    turned = ray[:, :2] / ray[:, 2:]
-    slope = (turn[:2, :2] - turned[:, :, None] * turn[2, :2]) / ray[:, 2, None, None]
-    return turned, slope
-
-
-def _referred(by_rotation: Array, slope: Array) -> Array:
-    """Derivatives (g, 2, u) without the part that a rotation makes."""
-    g, flat = by_rotation.reshape(-1, 3), slope.reshape(2 * len(slope), slope.shape[2])
-    part = np.linalg.lstsq(g, flat, rcond=None)[0]
-    free: Array = (flat - g @ part).reshape(slope.shape)
-    return free
-
-
-def _root(covariance: Array) -> Array:
-    """A root L (u, k) with C = L Lᵀ, of a covariance that may be singular."""
-    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    scale = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    root: Array = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
-
-
-def _chi2(root: Array, off: Array) -> tuple[float, int]:
-    """χ² of differences with the covariance L Lᵀ, in the space that this spans, and its dimension."""
-    if not root.size:
-        return 0.0, 0
-    u, s, _ = np.linalg.svd(root, full_matrices=False)
-    keep = s > _RANK * s[0]
-    return float((((u.T @ off)[keep] / s[keep]) ** 2).sum()), int(keep.sum())
-
-
-def _worst(cov: Array) -> Array:
-    """Root of the larger eigenvalue of 2×2 covariances."""
-    a, b, c = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
-    worst: Array = np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))
-    return worst

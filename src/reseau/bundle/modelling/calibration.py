@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from ...calibration.document import Calibration, Covariance, Quantity
+from ...calibration.document import Calibration, CameraModel, Covariance, Quantity
 from ...core.errors import UsageError
 from ...optics.cameras import unit_of
 from ..diagnostics import Result, sigma_between_images
@@ -80,15 +80,15 @@ def calibration_of(
     )  # fmt: skip
 
 
-def _model(camera: Camera) -> dict[str, Any]:
+def _model(camera: Camera) -> CameraModel:
     """What the parameters are parameters of."""
-    model: dict[str, Any] = {
+    model: CameraModel = {
         "model": camera.model,
         "width": camera.width,
         "height": camera.height,
         "pitch_mm": list(camera.pitch_mm),
     }
-    model |= camera.options
+    model = cast(CameraModel, model | dict(camera.options))
     extra = camera.additional
     if extra is not None:
         model["additional"] = {"model": extra.model, "base_mm": extra.base_mm, "per": extra.per}

@@ -1,0 +1,400 @@
+"""Images resampled by a calibration: the raster of the result, and the file, band by band."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.data import Array
+from ..core.errors import ImageError, InputError, UsageError
+from ..io.images import MAX_PIXELS, write_image
+from ..io.scans import Scan
+from ..optics.resampling import resample
+from .camera import CameraMapping
+from .document import Calibration, CameraModel, Covariance, Quantity
+from .film import FilmFrameMapping
+from .mapping import BEYOND, CalibratedMapping
+from .oscilloscope import CameraCorrection
+
+__all__ = ["CorrectedImage", "planes_of", "undistorted_camera", "write_corrected"]
+
+_BAND = 256
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedImage:
+    """The raster of an image that is resampled into the system of a calibration.
+
+    Parameters
+    ----------
+    mapping : CalibratedMapping
+        From pixels of the image to the system.
+    origin : (float, float)
+        Coordinates of the centre of the first pixel in the system.
+    scale : (float, float)
+        Pixels per unit of the system, along columns and rows.
+    width, height : int
+        Columns and rows.
+    up : bool
+        Whether y increases upwards in the image; rows then run against y.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 640, 480, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    >>> raster = CorrectedImage.undistorted(camera, "keep")
+    >>> raster.to_source(np.array([[319.5, 239.5], [639.0, 479.0]])).round(2)
+    array([[319.5 , 239.5 ],
+           [631.04, 473.03]])
+    """
+
+    mapping: CalibratedMapping
+    origin: tuple[float, float]
+    scale: tuple[float, float]
+    width: int
+    height: int
+    up: bool
+
+    @classmethod
+    def plan(
+        cls,
+        correction: CameraCorrection,
+        size: tuple[int, int],
+        scale: float | None = None,
+    ) -> CorrectedImage:
+        """The raster of a photograph in the common system, as far as the correction holds.
+
+        Parameters
+        ----------
+        correction : CameraCorrection
+            Group A.
+        size : (int, int)
+            Width and height of the photograph.
+        scale : float, optional
+            Pixels per unit; by default that of the photograph.
+
+        Raises
+        ------
+        UsageError
+            When the raster would be larger than images may be, or shows nothing of the photograph.
+        """
+        scale = 1 / correction.photo_system.scale if scale is None else scale
+        photo = correction.photo_system(_border(size))
+        corrected = correction.model(photo)
+        corrected = corrected[correction.model.one_to_one(photo)]
+        low, high = np.array([[-np.inf] * 2, [np.inf] * 2])
+        if len(corrected):
+            low, high = corrected.min(axis=0), corrected.max(axis=0)
+        if correction.extent is not None:
+            marks = np.array(correction.extent, dtype=np.float64).reshape(2, 2)
+            reach = BEYOND * (marks[1] - marks[0])
+            low, high = np.maximum(low, marks[0] - reach), np.minimum(high, marks[1] + reach)
+        up = correction.photo_system.mirrored
+        return cls._over(correction, low, high, (scale, scale), up)
+
+    @classmethod
+    def undistorted(
+        cls, camera: CameraMapping, fov: Literal["keep", "all"] | float = "keep", scale: float = 1.0
+    ) -> CorrectedImage:
+        """The raster of an image without distortion, as a pinhole camera on the same axis sees it.
+
+        Parameters
+        ----------
+        camera : CameraMapping
+            The calibrated camera.
+        fov : {"keep", "all"} or float
+            Field of view. ``keep``: the size, principal point and scale on the axis stay. ``all``: every
+            pixel of the image is shown. A number: horizontal field of view in degrees, about the axis; the
+            image keeps its size.
+        scale : float
+            Pixels of the result per pixel of the image: on the axis, or for a field of view in degrees over
+            the width.
+
+        Raises
+        ------
+        UsageError
+            When the raster would be larger than images may be, or the field of view is not possible.
+        """
+        if not scale > 0:
+            raise UsageError(f"{scale:g} is not above zero", where="scale")
+        axis = camera.mapping.derivatives(np.zeros((1, 2)))
+        focal = np.abs(np.diagonal(axis.d_xy[0])) * scale
+        if fov == "all":
+            uv = camera.mapping.inverse(_border((camera.width, camera.height)))
+            uv = uv[np.isfinite(uv).all(axis=1)]
+            if not len(uv):
+                raise UsageError("sees no direction at its border", where="camera", do="use `keep`")
+            return cls._over(camera, uv.min(axis=0), uv.max(axis=0), (focal[0], focal[1]), False)
+        width, height = (max(2, round(n * scale)) for n in (camera.width, camera.height))
+        if fov == "keep":
+            centre = (axis.value[0] + 0.5) * scale - 0.5
+        else:
+            angle = float(fov)
+            if not 1 <= angle <= 175:
+                raise UsageError(f"{angle:g}° is not between 1° and 175°", where="fov")
+            focal = focal * (width / 2 / np.tan(np.deg2rad(angle) / 2) / focal[0])
+            centre = np.array([(width - 1) / 2, (height - 1) / 2])
+        _affordable(width, height)
+        x, y = (-centre / focal).tolist()
+        return cls(camera, (x, y), (float(focal[0]), float(focal[1])), width, height, False)
+
+    @classmethod
+    def of_frame(cls, frame: FilmFrameMapping, scale: float | None = None) -> CorrectedImage:
+        """The raster of a film frame in photo-coordinates.
+
+        Parameters
+        ----------
+        frame : FilmFrameMapping
+            The orientation of the frame.
+        scale : float, optional
+            Pixels per millimetre; by default that of the scan.
+
+        Raises
+        ------
+        UsageError
+            When the raster would be larger than images may be.
+        """
+        scale = float(np.mean(frame.px_per_mm)) if scale is None else scale
+        extent = np.array(frame.extent).reshape(2, 2)
+        return cls._over(frame, extent[0], extent[1], (scale, scale), True)
+
+    @classmethod
+    def _over(
+        cls, mapping: CalibratedMapping, low: Array, high: Array, scale: tuple[float, float], up: bool
+    ) -> CorrectedImage:
+        if not min(scale) > 0:
+            raise UsageError(f"{min(scale):g} is not above zero", where="scale")
+        counts = (high - low) * scale
+        if not (np.isfinite(counts).all() and (counts >= 1).all()):
+            raise UsageError("shows nothing of the region the calibration holds for", where="frame")
+        width, height = (int(n) + 1 for n in counts)
+        _affordable(width, height)
+        origin = (float(low[0]), float(high[1] if up else low[1]))
+        return cls(mapping, origin, (float(scale[0]), float(scale[1])), width, height, up)
+
+    @property
+    def bands(self) -> int:
+        """Number of bands in which it is made."""
+        return -(-self.height // _BAND)
+
+    def to_source(self, xy: Array) -> Array:
+        """Pixels of the image (n, 2) of pixels of the raster (n, 2)."""
+        return self.mapping.to_pixels(self.to_system(xy))
+
+    def to_system(self, xy: Array) -> Array:
+        """Coordinates in the system of the calibration (n, 2) of pixels of the raster (n, 2)."""
+        direction = np.array([1.0, -1.0 if self.up else 1.0])
+        place: Array = np.array(self.origin) + xy * direction / self.scale
+        return place
+
+    def of_system(self, xy: Array) -> Array:
+        """Pixels of the raster (n, 2) of coordinates in the system of the calibration (n, 2)."""
+        pixels: Array = (xy - np.array(self.origin)) * self.slope
+        return pixels
+
+    @property
+    def slope(self) -> Array:
+        """Derivatives (2,) of the pixels of the raster by the coordinates, the diagonal."""
+        return np.array(self.scale) * [1.0, -1.0 if self.up else 1.0]
+
+    @property
+    def pinhole(self) -> dict[str, float]:
+        """Size, focal lengths and principal point (px) of the camera of an undistorted image."""
+        fx, fy = self.scale
+        cx, cy = -self.origin[0] * fx, -self.origin[1] * fy
+        return {"width": self.width, "height": self.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The raster as JSON-ready data."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "first_pixel": list(self.origin),
+            "px_per_unit": self.scale[0],
+            "unit": self.mapping.unit,
+            "y": "up" if self.up else "down",
+        }
+
+
+def _border(size: tuple[int, int]) -> Array:
+    """Pixels around the border of an image."""
+    along = np.linspace(0, 1, 33)
+    edge = np.concatenate([np.stack([along, 0 * along + k], 1) for k in (0, 1)])
+    border: Array = np.concatenate([edge, edge[:, ::-1]]) * (np.array(size) - 1.0)
+    return border
+
+
+def _affordable(width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise UsageError(f"asks for {width}×{height} pixels", where="scale", do="choose a smaller one")
+
+
+def undistorted_camera(
+    raster: CorrectedImage, calibration: Calibration, provenance: dict[str, Any] | None = None
+) -> Calibration:
+    """The pinhole camera of an undistorted image, as a calibration.
+
+    Its parameters are chosen, not estimated, and have no covariance; that of the distortion that was removed
+    is in the calibration of the image.
+
+    Parameters
+    ----------
+    raster : CorrectedImage
+        By :meth:`CorrectedImage.undistorted`.
+    calibration : Calibration
+        The camera of the image.
+    provenance : dict, optional
+        Inputs and options.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = {"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1}
+    >>> distorted = Calibration(
+    ...     kind="camera", name="lens", sigma0=None, redundancy=0,
+    ...     model={"model": "opencv", "width": 640, "height": 480, "pitch_mm": [1.0, 1.0]},
+    ...     parameters={key: Quantity(value=value, sigma=0.0, unit="px") for key, value in lens.items()},
+    ...     covariance=Covariance(names=(), matrix=()))
+    >>> raster = CorrectedImage.undistorted(distorted.mapping(), "keep")
+    >>> undistorted_camera(raster, distorted).values()
+    {'fx': 800.0, 'fy': 800.0, 'cx': 319.5, 'cy': 239.5}
+    """
+    model: CameraModel = {
+        "model": "opencv",
+        "width": raster.width,
+        "height": raster.height,
+        "pitch_mm": [1.0, 1.0],
+    }
+    validity: dict[str, Any] = {"undistorted_from": calibration.name}
+    mapping = cast(CameraMapping, raster.mapping)
+    if mapping.extent is not None:
+        left, top, right, bottom = mapping.extent
+        along = np.linspace(0, 1, 33)[:, None]
+        a, b, c, d = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        rim = np.concatenate([p + along * (q - p) for p, q in ((a, b), (b, c), (c, d), (d, a))])
+        seen = raster.of_system(mapping.mapping.inverse(rim))
+        seen = seen[np.isfinite(seen).all(axis=1)]
+        if len(seen):
+            last = np.array([raster.width, raster.height]) - 1.0
+            low, high = np.clip(seen.min(axis=0), 0, last), np.clip(seen.max(axis=0), 0, last)
+            validity |= {"extent": [*low.tolist(), *high.tolist()], "unit": "px"}
+    values = {key: raster.pinhole[key] for key in ("fx", "fy", "cx", "cy")}
+    return Calibration(
+        kind="camera",
+        name=f"{calibration.name}, undistorted",
+        model=model,
+        parameters={key: Quantity(value=float(v), sigma=0.0, unit="px") for key, v in values.items()},
+        covariance=Covariance(names=(), matrix=()),
+        sigma0=None,
+        redundancy=0,
+        validity=validity,
+        provenance=provenance or {},
+    )
+
+
+class _Plane:
+    """One channel of a scan, which is read window by window where it is sliced."""
+
+    def __init__(self, scan: Scan, channel: int) -> None:
+        self._scan, self._channel = scan, channel
+        self.shape = (scan.height, scan.width)
+        self.dtype = scan.window(0, 1, 0, 1).dtype
+
+    def __getitem__(self, at: tuple[slice, slice]) -> NDArray[Any]:
+        (top, bottom, _), (left, right, _) = (s.indices(n) for s, n in zip(at, self.shape, strict=True))
+        return self._scan.window(top, bottom, left, right)[:, :, self._channel]
+
+
+def planes_of(scan: Scan) -> tuple[NDArray[Any], ...]:
+    """The channels of a scan as planes that :func:`write_corrected` reads window by window."""
+    return tuple(cast(NDArray[Any], _Plane(scan, k)) for k in range(len(scan.channels)))
+
+
+def write_corrected(
+    path: Path,
+    planes: Sequence[NDArray[Any]],
+    raster: CorrectedImage,
+    step: Callable[[], None] = lambda: None,
+) -> None:
+    """Resample an image into a file, which appears whole or not at all.
+
+    A TIFF is written band by band; other formats are held in memory, in the type of the image.
+
+    Parameters
+    ----------
+    path : Path
+        File; its suffix gives the format.
+    planes : sequence of ndarray (h, w)
+        The image: one plane, or red, green and blue.
+    raster : CorrectedImage
+        The raster of the result.
+    step : callable
+        Called after each band.
+
+    Raises
+    ------
+    ImageError
+        When the format cannot hold the grey values.
+    InputError
+        When the file cannot be written.
+    """
+    suffix, dtype = path.suffix.lower(), planes[0].dtype
+    deepest = {".png": 2, ".jpg": 1, ".jpeg": 1}.get(suffix, 8)
+    if deepest < 8 and (dtype.kind != "u" or dtype.itemsize > deepest):
+        raise ImageError(f"cannot hold grey values of type {dtype}", where=path, do="use .tif")
+    shape = (raster.height, raster.width)
+
+    def bands() -> Iterator[NDArray[Any]]:
+        parts = (resample(plane, raster.to_source, shape, band=_BAND) for plane in planes)
+        for channels in zip(*parts, strict=True):
+            yield channels[0] if len(channels) == 1 else np.stack(channels, axis=-1)
+            step()
+
+    full = shape if len(planes) == 1 else (*shape, len(planes))
+    if suffix in (".tif", ".tiff"):
+        _write_tiff(path, bands(), raster, full, dtype)
+        return
+    whole = np.empty(full, dtype=dtype)
+    for k, band in enumerate(bands()):
+        whole[k * _BAND : k * _BAND + len(band)] = band
+    write_image(path, whole)
+
+
+def _write_tiff(
+    path: Path,
+    bands: Iterator[NDArray[Any]],
+    raster: CorrectedImage,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+) -> None:
+    import tifffile
+
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    per_cm = raster.scale[0] * {"mm": 10.0, "cm": 1.0, "m": 0.01}.get(raster.mapping.unit, 0.0)
+    try:
+        with tifffile.TiffWriter(draft, bigtiff=int(np.prod(shape)) * dtype.itemsize > 3e9) as tiff:
+            tiff.write(
+                bands,
+                shape=shape,
+                dtype=dtype,
+                photometric="minisblack" if len(shape) == 2 else "rgb",
+                rowsperstrip=_BAND,
+                resolution=(per_cm, per_cm) if per_cm else None,
+                resolutionunit="CENTIMETER" if per_cm else None,
+                software=False,
+                metadata=None,
+            )
+        draft.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", where=path) from None
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
