@@ -128,9 +128,7 @@ class CameraMapping(CalibratedMapping):
                 np.array([values.get(name, 0.0) for name in registered.names]),
                 PixelGrid(model["width"], model["height"], (model["pitch_mm"][0], model["pitch_mm"][1])),
                 {key: value for key, value in model.items() if key not in _KEYS},
-                None
-                if more is None or extra is None
-                else more.build(np.zeros(len(more.names)), extra["base_mm"]),
+                more,
             )
         except (UsageError, KeyError, IndexError) as error:
             raise FormatError(f"has a damaged or unknown model: {error}", where=where) from None
