@@ -159,7 +159,7 @@ def _test_of_the_calibration(again: StillStandard, unit: str) -> Row:
         "p": f"{test.p:.3f}",
         "largest": f"{length:.3g} {unit}",
         "rod": rod,
-        "notes": again.notes,
+        "notes": tuple(note.text for note in again.notes),
     }
 
 
