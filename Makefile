@@ -1,4 +1,4 @@
-# Everything a fresh checkout needs: Python >= 3.11 with venv and pip, and make.
+# A fresh checkout needs Python >= 3.11 with venv and pip, and make; nothing else of the system.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -8,7 +8,7 @@ WORKERS ?= 2
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
 ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test lint rig slow aravis clean
+.PHONY: demo test lint docs rig slow aravis clean
 
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
@@ -22,13 +22,19 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The site: guides, mathematics, decisions and the reference of the API, in build/docs; warnings are errors.
+docs: $(VENV)/.docs
+	rm -rf docs/api/generated
+	$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/doctrees docs build/docs
+	@echo build/docs/index.html
+
 rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow
 
-# Where Aravis is installed, what Python uses it with (built from its source); without, all else works.
+# Where Aravis is installed: PyGObject, which Python uses it with (built from source). All else works without.
 aravis: $(VENV)/.core
 ifneq ($(ARAVIS),)
 	@$(BIN)/python -c 'import gi' 2>/dev/null || $(PIP) -e '.[aravis]' >$(VENV)/aravis.log 2>&1 \
@@ -49,4 +55,8 @@ $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
 
 $(VENV)/.test: $(VENV)/.core
 	$(PIP) -e '.[test]'
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.core
+	$(PIP) -e '.[docs]'
 	touch $@

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import ReseauError
+from ..core.optional import missing
 from ..core.version import __version__
 from . import (
     apply,
@@ -82,6 +83,11 @@ def run(arguments: list[str] | None = None) -> int:
         return int(app(arguments, standalone_mode=False) or 0)
     except ReseauError as error:
         return _report(str(error), error.exit_status)
+    except ModuleNotFoundError as error:
+        package = missing(error)
+        if package is None:
+            raise
+        return _report(str(package), package.exit_status)
     except KeyboardInterrupt:
         return _report("interrupted", 130)
     except BrokenPipeError:  # the reader of the output has closed it

@@ -153,7 +153,6 @@ def _write(
     design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
 ) -> None:
     """Write drawings and design where they are wanted, either all of them or none, and say so."""
-    from ..designs.drawing import design_pdf, design_svg
     from ..io import write_whole
 
     to_stdout = out is not None and str(out) == "-"
@@ -161,11 +160,14 @@ def _write(
     for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
         if path is not None:
             suffix_of(writable(path), (suffix,))
-    files = {
-        path: content(design)
-        for path, content in ((svg, design_svg), (pdf, design_pdf), (out, lambda d: d.to_json()))
-        if path is not None
-    }
+    files: dict[Path, str | bytes] = {}
+    if svg is not None or pdf is not None:
+        from ..designs.drawing import design_pdf, design_svg  # needs matplotlib
+
+        drawn = ((svg, design_svg), (pdf, design_pdf))
+        files = {path: content(design) for path, content in drawn if path is not None}
+    if out is not None:
+        files[out] = design.to_json()
     for path, content in files.items():
         write_whole(path, content)
     if to_stdout:

@@ -225,7 +225,7 @@ def _open_tiff(path: Path) -> Scan:
     except ImageError:
         raise
     except Exception as error:  # tifffile and its codecs raise exceptions of every kind on damaged files
-        raise ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN) from None
+        raise _damaged(path, error) from None
     dtype = np.dtype(np.uint8 if page.dtype.kind == "b" else page.dtype)
     return Scan(
         path.name,
@@ -237,6 +237,13 @@ def _open_tiff(path: Path) -> Scan:
         dtype,
         _as_stored(window, page, path, dtype, full_scale),
     )
+
+
+def _damaged(path: Path, error: Exception) -> ImageError:
+    if "imagecodecs" in str(error):  # tifffile's message where its optional package is not installed
+        what = "is a TIFF in a compression that needs imagecodecs, which is not installed"
+        return ImageError(what, where=path, do="pip install imagecodecs")
+    return ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN)
 
 
 def _usable(page: Any, path: Path) -> float:
@@ -344,7 +351,7 @@ def _decoding(page: Any, path: Path) -> Window:
             try:
                 found = decode(coded, index, jpegtables=tables, jpegheader=header)[0]
             except Exception as error:
-                raise ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN) from None
+                raise _damaged(path, error) from None
             # Enough for one row of segments.
             while len(kept) >= max(2 * across * planes, 4):
                 kept.pop(next(iter(kept)))

@@ -1,0 +1,55 @@
+"""Sphinx: the pages of this folder and the reference of the API, built without a network by `make docs`."""
+
+import sys
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[1]
+for _folder in ("src", "drivers", "sims"):
+    sys.path.insert(0, str(_ROOT / _folder))
+
+from reseau.core.version import __version__  # noqa: E402
+
+project = "reseau"
+author = "the authors of reseau"
+copyright = author
+version = release = __version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+    "myst_parser",
+]
+exclude_patterns = ["api/_templates"]
+
+templates_path = ["api/_templates"]
+source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
+root_doc = "api/index"
+
+autosummary_generate = True
+autosummary_imported_members = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+# Optional libraries: the reference is the same where they are not installed.
+autodoc_mock_imports = ["gi"]
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+numpydoc_xref_param_type = False
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+# Links from the pages to files of the project outside this folder, which are not part of the site.
+suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure"]
+keep_warnings = True
+
+html_theme = "pydata_sphinx_theme"
+html_theme_options = {
+    "show_nav_level": 2,
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": ["page-toc"],
+}
+html_static_path: list[str] = []
+html_show_sourcelink = False
+# Formulas are shown by the reader's browser; the build itself fetches nothing.
+mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@4/tex-mml-chtml.js"

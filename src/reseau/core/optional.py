@@ -1,0 +1,78 @@
+"""Packages that only some features need: a missing one is one line that names it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from .errors import UsageError
+
+__all__ = ["missing", "optional"]
+
+_DISTRIBUTIONS = {
+    "bluesky": "bluesky",
+    "fsspec": "fsspec",
+    "gi": "reseau[aravis]",
+    "imagecodecs": "imagecodecs",
+    "jinja2": "jinja2",
+    "markupsafe": "jinja2",
+    "matplotlib": "matplotlib",
+    "mpl_toolkits": "matplotlib",
+    "numba": "numba",
+    "pandas": "pandas",
+    "psycopg": "reseau[scale]",
+    "pydicom": "reseau[dicom]",
+    "pyvisa": "pyvisa pyvisa-py pyusb libusb-package",
+    "serial": "pyserial",
+    "sqlalchemy": "sqlalchemy",
+    "tifffile": "tifffile imagecodecs",
+    "usb": "pyusb libusb-package",
+    "zaber_motion": "zaber-motion",
+}
+"""What to install, by the package that is imported."""
+
+
+def missing(error: ImportError) -> UsageError | None:
+    """Return the error that names a missing package, or None when the error is not about an optional one.
+
+    Parameters
+    ----------
+    error : ImportError
+        As raised by the import.
+
+    Examples
+    --------
+    >>> print(missing(ModuleNotFoundError("No module named 'serial'", name="serial.tools")))
+    needs serial, which is not installed; pip install pyserial
+    """
+    package = (error.name or "").partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError) or package not in _DISTRIBUTIONS:
+        return None
+    wanted = _DISTRIBUTIONS[package]
+    quoted = f"'{wanted}'" if "[" in wanted else wanted
+    return UsageError(f"needs {package}, which is not installed", do=f"pip install {quoted}")
+
+
+@contextmanager
+def optional() -> Iterator[None]:
+    """Raise a UsageError where an import in this context misses an optional package.
+
+    Raises
+    ------
+    UsageError
+        With the name of the package and the command that installs it.
+
+    Examples
+    --------
+    >>> with optional():
+    ...     raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib")
+    Traceback (most recent call last):
+    reseau.core.errors.UsageError: needs matplotlib, which is not installed; pip install matplotlib
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        named = missing(error)
+        if named is None:
+            raise
+        raise named from None

@@ -1,0 +1,60 @@
+"""The wheel contains every file of the packages, and runs `reseau demo` in a clean environment."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = {"reseau": ROOT / "src", "reseau_drivers": ROOT / "drivers", "reseau_sims": ROOT / "sims"}
+UNREACHABLE = re.compile(r"No matching distribution|Connection|Max retries|Temporary failure|timed out")
+
+
+def pip(python: Path | str, *arguments: object) -> None:
+    """Run pip; skip the test, and say so, where no registry can be reached."""
+    command = [str(python), "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    if done.returncode and UNREACHABLE.search(done.stderr):
+        pytest.skip(f"no package registry: {done.stderr.strip().splitlines()[-1]}")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip(sys.executable, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ".")
+    (path,) = folder.glob("reseau-*.whl")
+    return path
+
+
+@pytest.mark.slow
+def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        stored = set(archive.namelist())
+    wanted = {
+        path.relative_to(folder).as_posix()
+        for package, folder in SOURCES.items()
+        for path in (folder / package).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert any(name.endswith(".rules") for name in wanted)
+    assert any(name.endswith(".html.j2") for name in wanted)
+    assert wanted <= stored
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_wheel_runs_the_demo_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=True)
+    pip(tmp_path / "venv/bin/python", "install", "--quiet", "-c", "constraints.txt", wheel)
+    command = [tmp_path / "venv/bin/reseau", "demo", "--out", tmp_path / "out"]
+    environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out/report.html").stat().st_size > 10_000
