@@ -1,4 +1,4 @@
-"""The report of a bundle adjustment: a page that stands alone, same to the byte for the same input."""
+"""The report of a bundle adjustment: a self-contained page, the same bytes for the same input."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def bundle_report(
     provenance : Provenance, optional
         Inputs, options, version.
     against : mapping of str to FieldDifference, optional
-        Differences from other calibrations, by what these are called.
+        Differences from other calibrations, by their names.
     distances : sequence of float
-        At which the uncertainty of the projection is mapped beside that of directions; by default at the
-        median distance of the points.
+        Distances at which the uncertainty of the projection is mapped, in addition to that of directions; by
+        default the median distance of the points.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def bundle_report(
 
 
 def _shown(result: Result) -> list[int]:
-    """Cameras of which anything was estimated."""
+    """Cameras with estimated parameters."""
     return [
         c
         for c in range(len(result.network.cameras))
@@ -87,7 +87,7 @@ def _shown(result: Result) -> list[int]:
 
 
 def _rows(result: Result, c: int) -> Rows:
-    """Image points of a camera that take part."""
+    """Image points of a camera that are used."""
     seen = result.network.camera_of[result.network.image_of] == c
     return np.flatnonzero(seen & result.fit.usable.observations & ~result.rejected).astype(np.intp)
 
@@ -109,7 +109,7 @@ def _summary(result: Result) -> list[tuple[str, str, str]]:
 
 
 def _reliability(result: Result) -> list[tuple[str, str, str]]:
-    """What errors of image coordinates the test finds, and what those it does not find can do."""
+    """Smallest detectable errors of image coordinates, and effects of undetected ones."""
     n = 2 * len(result.network.xy)
     error, length = result.minimal_detectable_errors(), result.fit.external_lengths()[:n]
     kept = np.repeat(result.fit.usable.observations & ~result.rejected, 2)
@@ -118,9 +118,9 @@ def _reliability(result: Result) -> list[tuple[str, str, str]]:
     if not len(error) or not len(length):
         return []
     return [
-        (f"{np.median(error):.2g}", "px", "error of an image coordinate that is found, median"),
-        (f"{np.median(length):.2g}", "σ", "most that one not found does to any result, median"),
-        (f"{length.max():.2g}", "σ", "the same, at most"),
+        (f"{np.median(error):.2g}", "px", "smallest detectable error of an image coordinate, median"),
+        (f"{np.median(length):.2g}", "σ", "largest effect of an undetected error on any result, median"),
+        (f"{length.max():.2g}", "σ", "the same, maximum"),
     ]
 
 
@@ -159,14 +159,14 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
 
 
 def _lens(result: Result, c: int) -> CameraMapping | None:
-    """The camera by itself; None where it has several sets of parameters, or no mapping."""
+    """The mapping of the camera; None where it has several sets of parameters, or no mapping."""
     return camera_mapping(result, c) if result.network.cameras[c].has_plane_mapping else None
 
 
 def _fields(
     result: Result, c: int, lens: CameraMapping, rows: Rows, distances: Sequence[float]
 ) -> list[tuple[str, Markup]]:
-    """How well the projection is known, of directions and at distances: what each is of, and its figure."""
+    """Uncertainty of the projection of directions and at distances: description and figure of each."""
     network, values = result.network, result.fit.values
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))

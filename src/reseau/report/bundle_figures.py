@@ -22,7 +22,7 @@ _DIRECTIONS, _RADII = 24, 60
 
 
 def network_figure(result: Result) -> str:
-    """Plan and elevation: projection centres, points, and ellipses of their standard deviations, enlarged."""
+    """Draw plan and elevation: projection centres, points, and enlarged standard ellipses."""
     values, part = result.fit.values, result.fit.usable
     points = np.flatnonzero(part.points)
     points = points[:: max(1, len(points) // _MANY_POINTS)].astype(np.intp)
@@ -49,7 +49,7 @@ def network_figure(result: Result) -> str:
 
 
 def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], size: float) -> float:
-    """Standard ellipses of some points, and how much they are enlarged."""
+    """Draw standard ellipses of some points; return the factor of enlargement."""
     some = points[:: max(1, len(points) // _ELLIPSES)]
     q = result.point_covariance[some][:, plane][:, :, plane]
     values, vectors = np.linalg.eigh(q)
@@ -58,7 +58,7 @@ def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], 
     if median == 0:
         return 1.0
     power = nice(size / median)
-    # Weak points, which the warnings name, would cover the others.
+    # Weak points, which the warnings list, would cover the others.
     shown = axis[:, 1] <= _WEAK * median
     some, axis, vectors = some[shown], axis[shown], vectors[shown]
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
@@ -73,7 +73,7 @@ def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], 
 
 
 def residual_figure(result: Result, c: int, rows: Rows) -> str:
-    """Coverage of the image, mean residuals in its cells, and test values against the normal distribution."""
+    """Draw coverage of the image, mean residuals of its cells, and the distribution of test values."""
     camera, network = result.network.cameras[c], result.network
     across, down = _CELLS, max(2, round(_CELLS * camera.height / camera.width))
     xy, v = network.xy[rows], result.residuals[rows]
@@ -111,7 +111,7 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
 
 
 def distortion_figure(lens: CameraMapping) -> str | None:
-    """Draw the radial part of the distortion with its band, and the standard deviation by itself.
+    """Draw the radial distortion with its confidence band, and its standard deviation.
 
     Parameters
     ----------
@@ -144,9 +144,9 @@ def distortion_figure(lens: CameraMapping) -> str | None:
 
 
 def _radial(lens: CameraMapping) -> tuple[Array, Array, Array] | None:
-    """Radius, radial distortion in the mean of all directions, and its standard deviation (px).
+    """Radius, mean radial distortion over all directions, and its standard deviation (px).
 
-    The distortion is what the mapping adds to the central projection by its own slope on the axis.
+    Distortion is the difference between the mapping and the central projection with its slope on the axis.
     """
     bent = distortion_names(lens.names)
     own = [k for k, name in enumerate(lens.names) if name in bent]

@@ -1,4 +1,4 @@
-"""Tables of a bundle adjustment: images, the worst image points, how its model was found."""
+"""Tables of a bundle adjustment: images, image points with the largest test values, model search."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..core.data import Array
 __all__ = ["components_table", "dropped_table", "images_table", "left_out_table", "worst_points"]
 
 _WORST = 20
-"""Image points that are listed."""
+"""Number of image points listed."""
 
 
 def images_table(result: Result) -> list[tuple[str, ...]]:
-    """A row for each image: points, residuals, factors on sigmas, reliability, orientation."""
+    """Return a row for each image: points, residuals, factors on sigmas, reliability, orientation."""
     network = result.network
     v = np.where(result.rejected[:, None], np.nan, result.residuals)
     r, least, effect = (
@@ -49,7 +49,7 @@ def images_table(result: Result) -> list[tuple[str, ...]]:
 
 
 def worst_points(result: Result) -> list[tuple[str, ...]]:
-    """The image points of the largest test values, with all their reliability."""
+    """Return the image points with the largest test values, with their reliability."""
     network, w = result.network, np.nan_to_num(result.test_values)
     order = np.argsort(-w.max(axis=1), kind="stable")[:_WORST]
     v, r = result.residuals, result.redundancy_numbers
@@ -70,7 +70,7 @@ def worst_points(result: Result) -> list[tuple[str, ...]]:
 
 
 def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
-    """What data snooping left out: image, point, test value, bound."""
+    """Return the image points rejected by data snooping: image, point, test value, bound."""
     tests = result.rejected_tests[np.flatnonzero(result.rejected)]
     return [
         (image, point, f"{value:.1f}", f"{critical:.1f}")
@@ -79,7 +79,7 @@ def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
 
 
 def components_table(searched: Searched) -> list[tuple[str, str, str, str]]:
-    """Variance components: name, factor, its standard deviation, redundancy."""
+    """Return variance components: name, factor, its standard deviation, redundancy."""
     found = searched.components
     if found is None:
         return []
@@ -88,7 +88,7 @@ def components_table(searched: Searched) -> list[tuple[str, str, str, str]]:
 
 
 def dropped_table(searched: Searched) -> dict[str, Any] | None:
-    """Parameters dropped, and how well points are predicted before and after; None where it was not asked."""
+    """Return dropped parameters and the errors of prediction before and after; None without elimination."""
     if searched.eliminated is None:
         return None
     before, after = searched.validation or (np.nan, np.nan)

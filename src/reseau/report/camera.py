@@ -1,4 +1,4 @@
-"""The section of a camera that was calibrated by a testfield, beside what its parameters truly are."""
+"""The section on a camera calibrated with a testfield, compared with its true parameters."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ __all__ = ["camera_section"]
 
 
 def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Row:
-    """What the template of the section shows.
+    """Return the content of the section's template.
 
     Parameters
     ----------
     result : Result
-        Of the bundle adjustment; its network has one camera.
+        Result of the bundle adjustment of one camera.
     images : int
-        Frames that were taken.
+        Number of frames.
     true : mapping of str to float
-        Parameters as a simulator knows them.
+        True parameters of the simulator.
     """
     names, _, values = result.camera_columns(0)
     sigma = np.sqrt(np.diag(result.camera_covariance(0)))
@@ -46,7 +46,7 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
 
 
 def _alike(*values: float) -> tuple[str, ...]:
-    """Estimate, sigma and truth with as many decimals as give the sigma two digits."""
+    """Estimate, sigma and truth with two digits of the sigma."""
     decimals = max(0, 1 - int(np.floor(np.log10(values[1]))))
     return tuple(f"{value:.{decimals}f}" for value in values)
 

@@ -1,4 +1,4 @@
-"""What was found against the truth, where a simulator knows it."""
+"""Comparison of results with the truth of a simulator."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ __all__ = ["compare_camera", "compare_with_truth", "similarity_residuals"]
 def similarity_residuals(
     points: ImagePoints, target: Array, others: ImagePoints, others_target: Array
 ) -> tuple[Array, Array]:
-    """What the best similarity leaves of points and of others that it was not fitted to.
+    """Return the residuals of the best similarity at fitted points and at other points.
 
     Parameters
     ----------
     points, others : ImagePoints
         Photo-coordinates.
     target, others_target : ndarray (n, 2), (m, 2)
-        Designed coordinates.
+        Design coordinates.
 
     Returns
     -------
     ndarray (n, 2), ndarray (m, 2)
-        Transformed minus designed.
+        Transformed minus design coordinates.
     """
     best = best_similarity(points.xy, target)
     return best(points.xy) - target, best(others.xy) - others_target
@@ -48,14 +48,14 @@ def compare_with_truth(
     test_object: ReseauDesign | None = None,
     third: Sequence[PhotoIII] = (),
 ) -> Comparison:
-    """Compare what the procedure found with the truth.
+    """Compare the results of the procedure with the truth.
 
     Parameters
     ----------
     known : Known
         The truth.
     first, second, third : PhotoI, PhotoII, sequence of PhotoIII
-        What was found in the photographs.
+        Results for the photographs.
     reseau, test_object : ReseauDesign
         The designs.
 

@@ -1,4 +1,4 @@
-"""A fitted polynomial written out as the two equations it is, in symbols and in numbers."""
+"""A fitted polynomial as two equations, with symbols and with numbers."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _SQUARE = {(4, 0): 1.0, (2, 2): 2.0, (0, 4): 1.0}
 def equations(
     model: RationalPolynomial, value: Mapping[str, float], sigma: Mapping[str, float]
 ) -> tuple[Equation, Equation]:
-    """Write down X and Y.
+    """Return the equations of X and Y.
 
     Parameters
     ----------
     model : RationalPolynomial
-        Gives the terms; one without denominators.
+        The model, without denominators.
     value, sigma : mapping of str to float
-        Of the coefficients that are to stand in the equations, by name; each gets the digits that its sigma
-        allows.
+        Values and sigmas of the coefficients in the equations, by name; each is printed with the digits
+        that its sigma supports.
     """
     x, y = (_written(model, value, sigma, part) for part in "XY")
     return x, y
@@ -56,7 +56,7 @@ def _written(
 
 
 def _term(text: str) -> Markup:
-    """A sum of monomials as it is printed; nothing for the constant."""
+    """A printed sum of monomials; empty for the constant."""
     found = monomials(text)
     if found == {(0, 0): 1.0}:
         return Markup("")

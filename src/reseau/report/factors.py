@@ -1,4 +1,4 @@
-"""Factor by factor: what is left of the errors of points as one cause after the other is taken off."""
+"""Remaining errors of points after correcting for one group, the other, and both."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ __all__ = [
 ]
 
 FACTORS = ("scales and best similarity", "group A", "group B", "groups A and B", "(7a, b) without group A")
-"""What is taken off; the last for comparison, one polynomial fitted to photo-coordinates as they are."""
+"""Corrections; the last is for comparison: one polynomial fitted directly to the photo-coordinates."""
 
 Corrector = Callable[[Array], Array]
 """From pixels of PHOTO I to object coordinates, (n, 2)."""
 
 _GATE = 0.3
-"""How far off a known point a found one may lie to be taken for it, in the least distance of known points."""
+"""Largest distance of a found point from a true one, as part of the least distance between true points."""
 
 
 def best_similarity(source: Array, target: Array) -> PlaneMapping:
-    """The similarity that takes points nearest to their targets, all of one weight.
+    """Return the least-squares similarity from points to their targets, with equal weights.
 
     Raises
     ------
     EstimationError
-        When there is none.
+        When it is not determined.
     """
     model = RationalPolynomial.similarity()
     names = [str(i) for i in range(len(source))]
@@ -55,7 +55,7 @@ def best_similarity(source: Array, target: Array) -> PlaneMapping:
 
 
 def rods_of(second: PhotoII) -> ImagePoints:
-    """Images of the rods that group B was fitted to, in pixels of PHOTO I.
+    """Return the images of the rods used to fit group B, in pixels of PHOTO I.
 
     Raises
     ------
@@ -69,10 +69,10 @@ def rods_of(second: PhotoII) -> ImagePoints:
 
 
 def correctors(instrument: InstrumentCorrection, rods: ImagePoints, target: Array) -> dict[str, Corrector]:
-    """Ways to object coordinates that take off more and more.
+    """Return functions from pixels to object coordinates, with more and more corrections.
 
-    Each but the whole and the last is followed by the best similarity of the rods: what a correction leaves
-    of position, rotation and scale is not held against it. All use the scales λ1 and λ2.
+    Each except the complete one and the last is followed by the best similarity to the rods, so that
+    position, rotation and scale do not count. All use the scales λ1 and λ2.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def correctors(instrument: InstrumentCorrection, rods: ImagePoints, target: Arra
     Returns
     -------
     dict
-        By the names of `FACTORS`; without the last where it cannot be fitted.
+        By the names in `FACTORS`; without the last where it cannot be fitted.
     """
     photo, camera = instrument.camera.photo_system, instrument.camera.model
     model, plane = instrument.model, instrument.plane
@@ -115,7 +115,7 @@ def correctors(instrument: InstrumentCorrection, rods: ImagePoints, target: Arra
 
 
 def _quiet(corrector: Corrector) -> Corrector:
-    """No points, no coordinates; a mapping wants at least one."""
+    """Return no coordinates for no points; a mapping needs at least one."""
     return lambda xy: corrector(xy) if len(xy) else np.zeros((0, 2))
 
 
@@ -125,7 +125,7 @@ def factor_by_factor(
     third: Sequence[PhotoIII] = (),
     known: Known | None = None,
 ) -> tuple[Factor, ...]:
-    """What is left of the errors as one cause after the other is taken off.
+    """Return the remaining errors after each correction.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def factor_by_factor(
     third : sequence of PhotoIII
         Points of bodies.
     known : Known, optional
-        The truth; without it there are the rods alone.
+        The truth; without it only the rods are compared.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def _known_body(third: Sequence[PhotoIII], known: Known | None) -> tuple[Array, 
 def _had_rods_been_known(
     second: PhotoII, test_object: ReseauDesign, known: Known | None
 ) -> dict[str, Corrector]:
-    """The ways to object coordinates had the rods been measured where they truly are."""
+    """The corrections computed with the true coordinates of the rods."""
     if known is None or known.rods is None:
         return {}
     exact = with_rods_as_made(test_object, known.rods)
@@ -187,7 +187,7 @@ def _had_rods_been_known(
 
 
 def with_rods_as_made(test_object: ReseauDesign, made: KnownPoints) -> ReseauDesign:
-    """The test object with the coordinates that its rods truly have, free of tolerance."""
+    """Return the test object with the true coordinates of its rods, without tolerance."""
     true = dict(zip(made.names, made.object_xy.tolist(), strict=True))
     points = tuple(
         point.model_copy(update={"x": true[point.id][0], "y": true[point.id][1], "sigma": None})
@@ -197,12 +197,12 @@ def with_rods_as_made(test_object: ReseauDesign, made: KnownPoints) -> ReseauDes
 
 
 def identified(true: ImagePoints, known: KnownPoints) -> Array:
-    """For each point found the row of the known one that it is, −1 where it is none, (n,)."""
+    """Return for each point found the row of the true point, −1 where there is none, (n,)."""
     apart = np.hypot(*(known.object_xy[:, None] - known.object_xy[None]).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     off = np.hypot(*(true.xy[:, None] - known.object_xy[None]).transpose(2, 0, 1))
     row = off.argmin(axis=1)
-    # Each takes the nearest, if no other lies nearer to that.
+    # The nearest true point is taken if no other found point is nearer to it.
     mine = off.argmin(axis=0)[row] == np.arange(len(true))
     near = off.min(axis=1) < _GATE * apart.min()
     return np.where(mine & near, row, -1)

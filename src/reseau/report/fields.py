@@ -19,7 +19,7 @@ _SIZE = (8.6, 5.2)
 """Inches."""
 _ARROWS = 13
 _SURE = 0.01
-"""Level at which the difference of a place by itself is marked as significant."""
+"""Level at which the difference at a single place is marked as significant."""
 
 
 def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> str:
@@ -28,9 +28,9 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
     Parameters
     ----------
     field : ProjectionField
-        What is known of the camera.
+        The uncertainty.
     points : ndarray (n, 2), optional
-        Image points that it is known from.
+        Image points used in the calibration.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def difference_figure(found: FieldDifference) -> str:
 
 
 def _contours(axes: Axes, xy: Array, sigma: Array) -> None:
-    """Contours over the image, y down."""
+    """Draw contours over the image, y down."""
     x, y = xy[0, :, 0], xy[:, 0, 1]
     levels, digits = _levels(sigma)
     shown = np.ma.masked_invalid(sigma)
@@ -100,7 +100,7 @@ def _contours(axes: Axes, xy: Array, sigma: Array) -> None:
 
 
 def _levels(sigma: Array) -> tuple[list[float], int]:
-    """Round levels in geometric steps between the least and the largest, and their significant digits."""
+    """Rounded levels in geometric steps over the range of the values, and their significant digits."""
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(known):
         return [0.0, 1.0], 1

@@ -33,7 +33,7 @@ Triple = tuple[Array, Array, Array]
 
 
 def _two_panels(at: Array, pitch: float, below: float = 2.2) -> tuple[Figure, list[Axes]]:
-    """A figure as high as two panels of these points side by side want it."""
+    """A figure with two panels side by side, as high as the points require."""
     width, height = np.ptp(at, axis=0) + pitch * np.array([2.0, 1.0 + below])
     inches = 0.95 + float(np.clip(_PANEL * height / width, 2.0, 4.5))
     figure = Figure(figsize=(_WIDTH, inches), layout=ConstrainedLayoutEngine(wspace=0.05))
@@ -41,17 +41,16 @@ def _two_panels(at: Array, pitch: float, below: float = 2.2) -> tuple[Figure, li
 
 
 def residual_figure(marks: Triple, check: Triple, panel: Panel, titles: tuple[str, str]) -> str:
-    """Vectors that are left before a correction, and those left after it, side by side.
+    """Draw residual vectors before and after a correction side by side.
 
     Parameters
     ----------
     marks, check : (ndarray (n, 2), ndarray (n, 2), ndarray (n, 2))
-        Designed coordinates, residuals before, and residuals after; of the fitted marks, and of those held
-        out.
+        Design coordinates, residuals before, and residuals after; of fitted and of check marks.
     panel : Panel
-        How they are drawn.
+        Options.
     titles : (str, str)
-        Of the two panels.
+        Titles of the two panels.
 
     Returns
     -------
@@ -68,16 +67,16 @@ def residual_figure(marks: Triple, check: Triple, panel: Panel, titles: tuple[st
 
 
 def distortion_figure(model: PlaneMapping, target: Array, panel: Panel) -> str:
-    """What a correction takes off the image beyond a similarity: a bent grid, and its magnitude.
+    """Draw the distortion that a correction removes beyond a similarity: a bent grid, and its magnitude.
 
     Parameters
     ----------
     model : PlaneMapping
         The correction, between coordinates of the common system.
     target : ndarray (n, 2)
-        Marks in the common system, which mark out the region.
+        Marks in the common system, which define the region.
     panel : Panel
-        How it is drawn; its pitch is that of the grid.
+        Options; the pitch is that of the grid.
 
     Returns
     -------
@@ -95,7 +94,7 @@ def distortion_figure(model: PlaneMapping, target: Array, panel: Panel) -> str:
         right.contourf(*fine, magnitude, levels=[0, *levels, highest * 1.01], cmap="Blues", alpha=0.35)
         right.clabel(lines, fmt=lambda v: length(round(v, 6), panel.unit), fontsize=7.5, colors=[INK])
         frame_of(right, target, pitch, below=1.0)
-        plane_axes(right, panel, "its magnitude")
+        plane_axes(right, panel, "magnitude")
         left.set_ylabel(f"${panel.labels[1]}$ / {panel.unit}")
         return to_svg(figure)
 
@@ -103,7 +102,7 @@ def distortion_figure(model: PlaneMapping, target: Array, panel: Panel) -> str:
 def draw_distortion(
     axes: Axes, model: PlaneMapping, target: Array, panel: Panel, title: str = "distortion"
 ) -> tuple[list[Array], Array]:
-    """Draw a square grid as it is seen before a correction, enlarged; see :func:`distortion_figure`.
+    """Draw a square grid as imaged before the correction, enlarged; see :func:`distortion_figure`.
 
     Returns
     -------

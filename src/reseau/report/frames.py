@@ -1,4 +1,4 @@
-"""Pictures of oriented frames: copies with their corners marked, and one overview of all edges."""
+"""Pictures of oriented frames: copies with marked corners, and an overview of all frames."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ __all__ = ["contact_sheet", "frame_tile", "write_marked"]
 _STRIPE = 512
 """Rows copied at a time."""
 _SIDE, _ZOOM, _PART = 420, 208, 0.02
-"""Sides of a frame's picture and of that of a corner, pixels, and the part of an edge that it shows at least
-to both sides."""
+"""Side of the picture of a frame and of a corner in pixels, and the least part of an edge shown on both sides
+of a corner."""
 _COLOURS = {"oriented": (60, 170, 60), "three-edges": (230, 150, 30), "declined": (200, 50, 50)}
 
 
@@ -32,16 +32,16 @@ def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
     Parameters
     ----------
     path : Path
-        Where to; appears whole or not at all.
+        File to write; it is complete or not written at all.
     scan : Scan
         The scan, copied stripe by stripe.
     corners : sequence of ndarray (4, 2)
-        Of each frame. The pixel of a corner is white, in a black cross of 15 pixels with a gap around it.
+        Corners of each frame. The pixel of a corner becomes white, in a black cross of 15 px with a gap.
 
     Raises
     ------
     InputError
-        When the place cannot be written to.
+        When the file cannot be written.
     """
     import tifffile
 
@@ -83,7 +83,7 @@ def _mark(image: NDArray[Any], xy: Array, white: float) -> None:
 
 
 def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) of one frame: its edges drawn over it, beside it its corners, enlarged."""
+    """Return a picture (h, w, 3) of one frame with its edges, and enlarged pictures of its corners."""
     overview, r = scan.overview(_SIDE)
     step = np.quantile(overview, [0.002, 0.998]).astype(np.float64)
     small = _shown(overview, step)
@@ -99,14 +99,14 @@ def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
             tile[y : y + _ZOOM, x : x + _ZOOM] = zoom
     tile[22 : 22 + small.shape[0], : small.shape[1]] = small
     text = f"{found.image}  {found.status}"
-    # The built-in letters know ASCII alone.
+    # OpenCV's built-in fonts contain ASCII characters only.
     text = text.encode("ascii", "replace").decode()
     cv2.putText(tile, text, (2, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (34, 39, 43), 1, cv2.LINE_AA)
     return tile
 
 
 def _shown(grey: NDArray[Any], step: Array) -> NDArray[np.uint8]:
-    """Grey values between two of them as RGB of 8 bits."""
+    """Grey values between two limits as 8-bit RGB."""
     scaled = np.clip((grey.astype(np.float32) - step[0]) / max(step[1] - step[0], 1e-9), 0, 1) * 255
     eight = np.rint(scaled).astype(np.uint8)
     return np.ascontiguousarray(eight if eight.shape[2] == 3 else np.repeat(eight, 3, axis=2))
@@ -115,7 +115,7 @@ def _shown(grey: NDArray[Any], step: Array) -> NDArray[np.uint8]:
 def _corner(
     scan: Scan, points: Array, k: int, step: Array, colour: tuple[int, int, int]
 ) -> NDArray[np.uint8]:
-    """The surroundings of a corner, enlarged, with the two edges that meet there."""
+    """An enlarged picture of a corner with its two edges."""
     side = float(np.hypot(*(points[(k + 1) % 4] - points[k])))
     half = max(_ZOOM // 8, round(_PART * side))
     zoom = _ZOOM / (2 * half)
@@ -139,7 +139,7 @@ def _corner(
 
 
 def contact_sheet(path: Path, tiles: Sequence[NDArray[np.uint8]]) -> None:
-    """Write pictures of frames as one, six in a row at most."""
+    """Write pictures of frames as one sheet, at most six in a row."""
     if not tiles:
         return
     across = min(6, int(np.ceil(np.sqrt(len(tiles)))))

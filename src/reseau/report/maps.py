@@ -14,10 +14,10 @@ from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, drawing, length, nic
 __all__ = ["PROBABILITY", "body_map", "draw_body"]
 
 PROBABILITY = 0.95
-"""That a point lies within its ellipse."""
+"""Probability that a point lies within its ellipse."""
 _SIZE = (4.1, 4.1)
 _SHOWN = 4.0
-"""Semi-axis of a median ellipse, per hundred of the extent of the map."""
+"""Semi-axis of a median ellipse, in percent of the extent of the map."""
 
 
 def body_map(true: ImagePoints, rods: Array, unit: str, errors: Array | None = None) -> tuple[str, float]:
@@ -28,18 +28,18 @@ def body_map(true: ImagePoints, rods: Array, unit: str, errors: Array | None = N
     true : ImagePoints
         True coordinates with covariances.
     rods : ndarray (m, 2)
-        The rods of the test object, which mark out where the correction holds.
+        The rods of the test object, which show the validity of the correction.
     unit : str
-        Of the coordinates.
+        Unit of the coordinates.
     errors : ndarray (n, 2), optional
-        Of the coordinates, where the truth is known; NaN where not.
+        Errors of the coordinates where the truth is known, else NaN.
 
     Returns
     -------
     svg : str
         An SVG element.
     enlarged : float
-        How many times the ellipses are enlarged.
+        Factor of enlargement of the ellipses.
     """
     with drawing():
         figure = Figure(figsize=_SIZE, layout="constrained")
@@ -58,7 +58,7 @@ def draw_body(
     *,
     named: bool = True,
 ) -> float:
-    """Draw into axes what :func:`body_map` draws; returns how many times the ellipses are enlarged."""
+    """Draw the content of :func:`body_map` into axes; return the factor of enlargement."""
     variance, axis = np.linalg.eigh(true.cov)
     semi = np.sqrt(variance * scipy.stats.chi2.ppf(PROBABILITY, 2))
     both = np.concatenate([true.xy, rods])
@@ -102,7 +102,7 @@ def draw_body(
 
 
 def _scale_bar(axes: Axes, enlarged: float, shown: float, unit: str) -> None:
-    """A bar below right that is `shown` long in the scale of the ellipses."""
+    """Draw a bar at the lower right that is `shown` long in the scale of the ellipses."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     end, y = right - 0.02 * (right - left), low + 0.045 * (high - low)
     tick = 0.008 * (high - low)

@@ -1,4 +1,4 @@
-"""A frame with what was found in it, as an SVG element: the picture as JPEG, marks as lines over it."""
+"""A frame with measured marks as an SVG element: the picture as JPEG, the marks as lines."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ __all__ = ["Arcs", "Marks", "frame_overlay", "preview"]
 _WIDTH = 1200
 _FOUND, _CHECK = "#1f8a70", "#e0a100"
 _ON_DARK = ("#35c79f", "#f0603f")
-"""Found and declined, over the dark screen of an instrument."""
+"""Colours of measured and rejected marks on the dark screen of an instrument."""
 
 _AROUND = np.array([(0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, -1), (1, 1), (-1, 1)])
-"""Directions in which a label may stand from its mark."""
+"""Directions of a label from its mark."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """Middle lines of the arcs of pins, in columns over n of them: v = ½·curvature·u² along a chord.
+    """Centre lines of the arcs of pins, in columns: v = ½·curvature·u² along a chord.
 
     Parameters
     ----------
     length, curvature, tilt : ndarray (n,)
-        Of the chord (px), in the middle (1/px), of the chord against the rows (rad).
+        Length of the chord (px), curvature in the middle (1/px), angle of the chord with the rows (rad).
     """
 
     length: Array
@@ -41,22 +41,22 @@ class Arcs:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """What is drawn over a frame.
+    """Marks drawn over a frame.
 
     Parameters
     ----------
     ids : tuple of str (n,)
-        Marks.
+        Names.
     xy : ndarray (n, 2)
-        Positions of those measured, predictions of the others; NaN where there is neither.
+        Measured positions, predicted positions of the others; NaN without either.
     ok : ndarray of bool (n,)
-        Which were measured.
+        True for measured marks.
     check : tuple of str
-        Which were held out.
+        Names of check marks.
     arcs : Arcs, optional
-        Where the marks are arcs: drawn instead of circles.
+        Arcs to draw instead of circles.
     labels : dict
-        What is written beside some of them, by their names.
+        Labels by name.
     """
 
     ids: tuple[str, ...]
@@ -68,7 +68,7 @@ class Marks:
 
 
 def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
-    """The frame in 8 bits, between its 0.1 and 99.9 percentiles, at most so wide."""
+    """Return the frame with 8 bits, stretched between its 0.1 and 99.9 percentiles, reduced to the width."""
     step = max(1, frame.pixels.size // 1_000_000)
     low, high = np.percentile(frame.pixels.reshape(-1)[::step], [0.1, 99.9])
     factor = min(1.0, width / frame.width)
@@ -86,9 +86,9 @@ def frame_overlay(frame: Frame, marks: Marks) -> str:
     Parameters
     ----------
     frame : Frame
-        What was measured in.
+        The frame.
     marks : Marks
-        What was found, and what was not.
+        The marks.
 
     Returns
     -------
@@ -126,10 +126,9 @@ def frame_overlay(frame: Frame, marks: Marks) -> str:
 
 
 def _placed(marks: Marks, size: float) -> list[tuple[int, float, float]]:
-    """Rows of marks and the middles of their labels, where these cover neither a mark nor one another.
+    """Rows of marks and the centres of their labels, placed so that they cover neither marks nor each other.
 
-    The first free place of those around is taken, above before below, beside, and farther off; where there is
-    none, that above.
+    The first free place is taken: above, below, beside, then farther away; if none is free, the one above.
     """
     known = np.flatnonzero(np.isfinite(marks.xy).all(axis=1))
     half = np.full((len(marks.xy), 2), 0.5 * size)
@@ -164,7 +163,7 @@ def _cross(x: float, y: float, d: float) -> str:
 
 
 def _arc(x: float, y: float, arcs: Arcs, row: int, tick: float) -> str:
-    """The middle line of an arc, a parabola, and a tick across its middle."""
+    """The centre line of an arc, a parabola, with a tick across its middle."""
     half, bend, tilt = arcs.length[row] / 2, arcs.curvature[row], arcs.tilt[row]
     c, s = np.cos(tilt), np.sin(tilt)
     # A parabola is a quadratic Bézier curve; its third point lies as far above the vertex as the ends below.

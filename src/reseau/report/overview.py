@@ -1,4 +1,4 @@
-"""One picture that shows the procedure at a glance: the photographs, and below each what came out."""
+"""An overview of the procedure in one figure: the photographs, and below each its result."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def overview_png(
     Parameters
     ----------
     first, second, third : PhotoI, PhotoII, PhotoIII
-        What was found.
+        Results.
     test_object : ReseauDesign
         The rods.
     frames : sequence of Frame (3)
         The photographs.
     truth : Comparison, optional
-        What a simulator knows.
+        Comparison with the truth of a simulator.
 
     Returns
     -------
@@ -65,7 +65,7 @@ def overview_png(
         photos, results = figure.subplots(2, 3, height_ratios=(1, 1.16))
         _photo(photos[0], frames[0], first.points.xy, "PHOTO I: the reseau")
         _photo(photos[1], frames[1], second.pins.xy, "PHOTO II: a test object behind it")
-        _photo(photos[2], frames[2], third.points.xy, "PHOTO III: a body nobody has measured")
+        _photo(photos[2], frames[2], third.points.xy, "PHOTO III: an unknown body")
         _camera(results[0], fit, unit)
         draw_distortion(
             results[1],
@@ -92,7 +92,7 @@ def _photo(axes: Axes, frame: Frame, at: Array, title: str) -> None:
 
 
 def _camera(axes: Axes, fit: CorrectionFit, unit: str) -> None:
-    """What group A leaves of the marks."""
+    """Residuals of the marks after group A."""
     left = length(float(f"{rms(fit.residuals):.2g}"), unit)
     check = (fit.check_target, fit.check.xy - fit.check_target)
     draw_vectors(axes, (fit.target, fit.residuals), check, Panel(unit), f"camera corrected: rms {left}")

@@ -1,4 +1,4 @@
-"""The report of the oscilloscope procedure: a page that stands alone, same to the byte for the same input."""
+"""The report of the oscilloscope procedure: a self-contained page, the same bytes for the same input."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def oscilloscope_report(
     third: Sequence[PhotoIII] = (),
     *,
     frames: Sequence[Frame | None] = (),
-    title: str = "Oscilloscope images refined",
+    title: str = "Correction of oscilloscope images",
     provenance: Provenance | None = None,
     truth: Comparison | None = None,
     camera: Row | None = None,
 ) -> str:
-    """Render the report of as much of the procedure as was done.
+    """Render the report of the steps of the procedure that were done.
 
     Parameters
     ----------
@@ -50,15 +50,15 @@ def oscilloscope_report(
     test_object : ReseauDesign, optional
         Its rods; needed with `second`.
     third : sequence of PhotoIII
-        Bodies measured by both.
+        Bodies measured with both corrections.
     frames : sequence of Frame or None
-        The photographs in their order; where one is lacking or None the page has no picture of it.
+        The photographs in their order; a missing one or None omits its picture.
     title : str
-        Its heading.
+        Heading of the page.
     provenance : Provenance, optional
         Inputs, options, version.
     truth : Comparison, optional
-        What a simulator knows.
+        Comparison with the truth of a simulator.
     camera : dict, optional
         A camera calibrated in another session; see :func:`~reseau.report.camera.camera_section`.
 
@@ -170,7 +170,7 @@ def _of_the_instrument(
     pictures: Sequence[Frame | None],
     truth: Comparison | None,
 ) -> Row:
-    """The sections of PHOTO II and III, and the table factor by factor."""
+    """The sections on PHOTO II and III, and the table of remaining errors."""
     rods, bodies, factors = (None, (), ()) if truth is None else (truth.rods, truth.bodies, truth.factors)
     return {
         "two": photo_ii_section(second, test_object, pictures[0], rods),
@@ -183,11 +183,11 @@ def _of_the_instrument(
 
 
 def _factors(factors: Sequence[Factor]) -> Row:
-    """The table factor by factor: titles of the columns that have anything, and rows of cells."""
+    """The table of remaining errors: titles of the columns with content, and rows of cells."""
     columns: list[tuple[str, str, list[Pair | None]]] = [
-        ("rods", "against their design", [factor.rods for factor in factors]),
-        ("check rods", "against their design", [factor.check for factor in factors]),
-        ("points of PHOTO III", "against the truth", [factor.body for factor in factors]),
+        ("rods", "compared with their design", [factor.rods for factor in factors]),
+        ("check rods", "compared with their design", [factor.check for factor in factors]),
+        ("points of PHOTO III", "compared with the truth", [factor.body for factor in factors]),
         ("the same,", "rods free of error", [factor.ideal for factor in factors]),
     ]
     shown = [column for column in columns if any(pair is not None for pair in column[2])]
@@ -205,7 +205,7 @@ def _factors(factors: Sequence[Factor]) -> Row:
 
 
 def _left(factors: Sequence[Factor]) -> tuple[str, str] | None:
-    """What both groups leave of a point's error, and what they would with rods free of error."""
+    """Remaining error of a point after both corrections, and the same with rods free of error."""
     both = next((factor for factor in factors if factor.name == FACTORS[3]), None)
     if both is None or both.body is None or both.ideal is None:
         return None

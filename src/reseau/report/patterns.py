@@ -1,4 +1,4 @@
-"""What the residuals of several images have in common, in words and in figures."""
+"""Common residuals of several images, as text and figures."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
 __all__ = ["patterns_of"]
 
 _PANELS, _ACROSS = 8, 4
-"""Groups of images that are drawn, and how many of them side by side."""
+"""Number of groups of images drawn, and number of panels side by side."""
 _SURE = 0.01
-"""Level at which the shift of a class by itself is marked as significant."""
+"""Level at which the shift of a single class is marked as significant."""
 
 
 def patterns_of(result: Result) -> list[dict[str, Any]]:
-    """Common patterns of a network, as a report shows them: by place of each camera, and by groups of images.
+    """Return the common residuals of a network: by place in each camera's image, and by groups of images.
 
-    Where there is no test, `why_not` says why.
+    Without a test, `why_not` gives the reason.
     """
     network = result.network
     patterns = [
-        (f"at one place of all images of {camera.label}", by_place(result, c), False)
+        (f"at the same place in all images of {camera.label}", by_place(result, c), False)
         for c, camera in enumerate(network.cameras)
     ]
     if any(group is not None for group in network.groups):
-        patterns.append(("of one point in the images of a group", by_point(result, network.groups), True))
+        patterns.append(
+            ("of the same point in the images of a group", by_point(result, network.groups), True)
+        )
     found = list[dict[str, Any]]()
     for title, key, grouped in patterns:
         try:
@@ -55,7 +57,7 @@ def patterns_of(result: Result) -> list[dict[str, Any]]:
 
 
 def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
-    """Shifts as arrows at their mean places, a panel for each group; significant ones in colour."""
+    """Draw shifts as arrows at their mean places, one panel for each group; significant ones in colour."""
     network = result.network
     labels = np.full(len(pattern.count), "", dtype=object)
     if grouped:
@@ -85,5 +87,5 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_title(str(name), color=FAINT if not grouped else INK)
-        figure.suptitle(f"shifts × {enlarged:g}; the longest {size.max():.2g} px", fontsize=10.5)
+        figure.suptitle(f"shifts × {enlarged:g}; longest {size.max():.2g} px", fontsize=10.5)
         return to_svg(figure)

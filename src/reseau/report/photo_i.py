@@ -1,4 +1,4 @@
-"""What the report says about PHOTO I: the camera and its film, group A."""
+"""The section of the report on PHOTO I: camera and film, group A."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ __all__ = ["photo_i_section"]
 def photo_i_section(
     found: PhotoI, design: ReseauDesign, frame: Frame | None, truth: CameraComparison | None
 ) -> Row:
-    """Everything its template shows.
+    """Return the content of the section's template.
 
     Parameters
     ----------
     found : PhotoI
-        What the procedure found.
+        Result of the procedure.
     design : ReseauDesign
         The reseau.
     frame : Frame or None
-        The photograph; without it there is no picture.
+        The photograph; None omits the picture.
     truth : CameraComparison or None
-        What a simulator knows.
+        Comparison with the truth of a simulator.
 
     Raises
     ------
     UsageError
-        When the correction was read from a file: it has no residuals to show.
+        When the correction was read from a file and has no residuals.
     """
     fit = found.camera.fit
     if fit is None:
@@ -117,7 +117,7 @@ def _overlay(found: PhotoI, frame: Frame, fit: CorrectionFit) -> str:
 
 
 def _estimates(found: PhotoI) -> Estimates:
-    """Of the coefficients that remained."""
+    """Estimates of the remaining coefficients."""
     camera = found.camera
     quantities = camera.calibration(name="").parameters
     return Estimates(
@@ -128,7 +128,7 @@ def _estimates(found: PhotoI) -> Estimates:
 
 
 def _check(fit: CorrectionFit) -> list[tuple[str, ...]]:
-    """Check marks: designed coordinates, what the correction leaves (µm), sigma (µm), and their ratio."""
+    """Check marks: design coordinates, remaining errors (µm), sigmas (µm), and their ratio."""
     left, sigma = (fit.check.xy - fit.check_target) * 1000, fit.check.sigma * 1000
     columns = [
         *(aligned(fit.check_target[:, k], 2) for k in range(2)),
@@ -140,10 +140,10 @@ def _check(fit: CorrectionFit) -> list[tuple[str, ...]]:
 
 
 def _truth(truth: CameraComparison) -> list[tuple[Any, ...]]:
-    """What the simulator knows: quantity, x, y, unit."""
+    """Comparison with the truth: quantity, x, y, unit."""
     return [
         ("error of the measured positions", *aligned(truth.position_px, 4), "px"),
-        ("the same in their standard deviations", *aligned(truth.position_normalised, 2), ""),
+        ("the same in units of their standard deviations", *aligned(truth.position_normalised, 2), ""),
         ("approximation error of the model", *aligned(np.array(truth.approximation) * 1000, 2), "µm"),
-        ("check marks in their standard deviations", *aligned(truth.check_normalised, 2), ""),
+        ("check marks in units of their standard deviations", *aligned(truth.check_normalised, 2), ""),
     ]

@@ -1,4 +1,4 @@
-"""What the report says about PHOTO II: the ultrasonic instrument, group B."""
+"""The section of the report on PHOTO II: the ultrasonic instrument, group B."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from .truth import RodComparison
 __all__ = ["photo_ii_section"]
 
 _PITCH = 0.1
-"""Of the grid of the distortion and of the longest vectors, in the extent of the rods."""
+"""Grid step of the distortion and length of the longest vectors, as part of the extent of the rods."""
 
 _MEANING = {
     "P0": ("orientation", "displacement of the picture in x"),
@@ -61,7 +61,7 @@ _MEANING = {
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """Rods against their designed object coordinates: places, before and after group B; the same held out."""
+    """Residuals of fitted and of check rods: design coordinates, residuals before and after group B."""
 
     fitted: tuple[Array, Array, Array]
     check: tuple[Array, Array, Array]
@@ -70,23 +70,23 @@ class _Residuals:
 def photo_ii_section(
     found: PhotoII, design: ReseauDesign, frame: Frame | None, truth: RodComparison | None
 ) -> Row:
-    """Everything its template shows.
+    """Return the content of the section's template.
 
     Parameters
     ----------
     found : PhotoII
-        What the procedure found.
+        Result of the procedure.
     design : ReseauDesign
         The rods of the test object.
     frame : Frame or None
-        The photograph; without it there is no picture.
+        The photograph; None omits the picture.
     truth : RodComparison or None
-        What a simulator knows.
+        Comparison with the truth of a simulator.
 
     Raises
     ------
     UsageError
-        When the correction was read from a file: it has no residuals to show.
+        When the correction was read from a file and has no residuals.
     """
     left, instrument = _residuals(found, design), found.instrument
     fit = instrument.fit
@@ -124,7 +124,7 @@ def photo_ii_section(
 
 
 def _model(found: PhotoII, fit: InstrumentFit, unit: str) -> Row:
-    """The coefficients and their tests, the causes, and the model's rival."""
+    """The coefficients with their tests, the causes, and the alternative model."""
     instrument, elimination = found.instrument, fit.elimination
     return {
         "coefficients": coefficient_rows(elimination, _estimates(instrument)),
@@ -160,12 +160,12 @@ def _summary(found: PhotoII, design: ReseauDesign, left: _Residuals, tolerance: 
         (f"{rms(left.fitted[2]):.3f}", unit, "rms after group B"),
     ]
     if tolerance:
-        items.append((f"{np.sqrt(2) * tolerance:.3f}", unit, "what the rods’ tolerance amounts to"))
+        items.append((f"{np.sqrt(2) * tolerance:.3f}", unit, "tolerance of the rods (length of the vector)"))
     return items
 
 
 def _overlay(found: PhotoII, frame: Frame) -> str:
-    """Rods with the middle lines of their arcs; those declined with their names."""
+    """Rods with the centre lines of their arcs; rejected ones with their names."""
     measured, fit = found.measured, found.instrument.fit
     check = () if fit is None else fit.check.names
     if measured is None:
@@ -178,7 +178,7 @@ def _overlay(found: PhotoII, frame: Frame) -> str:
 
 
 def _setup(found: PhotoII) -> list[tuple[Markup, str, str]]:
-    """Scales and rotation of the photograph: symbol, value, what it is."""
+    """Scales and rotation of the photograph: symbol, value, meaning."""
     plane, registration = found.instrument.plane, found.registration
     rows = [
         (Markup("<i>λ</i><sub>1</sub>"), f"{plane.scale[0]:.5f}", "scale along M′N′"),
@@ -192,7 +192,7 @@ def _setup(found: PhotoII) -> list[tuple[Markup, str, str]]:
 
 
 def _estimates(instrument: InstrumentCorrection) -> Estimates:
-    """Of the coefficients that are applied, with what group A leaves of doubt in them."""
+    """Estimates of the applied coefficients, including the uncertainty of group A."""
     names, first = instrument.model.names, len(instrument.camera.model.names)
     sigma = np.sqrt(np.diagonal(instrument.covariance))[first:]
     return Estimates(
@@ -203,7 +203,7 @@ def _estimates(instrument: InstrumentCorrection) -> Estimates:
 
 
 def _reduced(model: RationalPolynomial, fit: InstrumentFit) -> Row:
-    """What the tests of every monomial leave, as two equations; of every coefficient, where rods are few."""
+    """The model reduced by tests of every monomial (of every coefficient with few rods), as two equations."""
     record = fit.elimination if fit.monomials is None else fit.monomials
     reduced = record.adjustment
     kept = [name for name in reduced.names if name not in record.dropped]
@@ -225,7 +225,7 @@ def _causes(causes: Causes, fit: InstrumentFit, unit: str) -> Row:
     rows = []
     for name in CAUSES:
         value = adjustment[name]
-        # The coefficients' covariance is taken at its word: three conditions are too few to scale it by.
+        # The a priori covariance of the coefficients is used: three conditions are too few to scale it.
         sigma = float(np.sqrt(adjustment.cofactor[adjustment.index(name), adjustment.index(name)]))
         alone = RationalPolynomial({name: display.terms[name]}, np.array([value]))
         p = float(scipy.special.chdtrc(1, (value / sigma) ** 2))
@@ -261,13 +261,13 @@ def _causes(causes: Causes, fit: InstrumentFit, unit: str) -> Row:
 
 
 def _condition(text: str) -> Markup:
-    """A condition with its coefficients as they are printed."""
+    """A condition with its coefficients as printed symbols."""
     words = [Markup("<i>{}</i>").format(symbol(word)) if word.isalnum() else word for word in text.split()]
     return Markup(" ").join(words)
 
 
 def _displays(found: Rivalry) -> Row:
-    """The polynomials and Wong's model: number of parameters, sigma0, leave-one-out rms; the verdict."""
+    """Polynomials and Wong's model: number of parameters, sigma0, leave-one-out rms; the verdict."""
     models = ((found.first, "polynomials (7a, b)"), (found.second, "Wong’s display model"))
     columns = [aligned(found.rms[:, k], 3) for k in range(2)]
     rows = [
@@ -286,9 +286,9 @@ def _displays(found: Rivalry) -> Row:
 
 
 def _truth(truth: RodComparison, unit: str) -> list[tuple[str, ...]]:
-    """What the simulator knows: quantity, x, y, unit."""
+    """Comparison with the truth: quantity, x, y, unit."""
     return [
         ("error of the measured positions", *aligned(truth.position_px, 3), "px"),
-        ("the same in their standard deviations", *aligned(truth.position_normalised, 2), ""),
-        ("rods as they were made less as designed", *aligned(truth.made, 3), unit),
+        ("the same in units of their standard deviations", *aligned(truth.position_normalised, 2), ""),
+        ("true minus design coordinates of the rods", *aligned(truth.made, 3), unit),
     ]

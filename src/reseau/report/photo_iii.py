@@ -1,4 +1,4 @@
-"""What the report says about PHOTO III: true coordinates of a body without control points."""
+"""The section of the report on PHOTO III: true coordinates of a body without control points."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from .truth import BodyComparison
 __all__ = ["errors_of", "photo_iii_section"]
 
 _SHOWN_FROM = 0.2
-"""Brightness beside the brightest echo from which a declined spot is crossed out in the picture."""
+"""Brightness, relative to the brightest echo, above which a rejected spot is crossed out in the picture."""
 
 
 def photo_iii_section(
     found: PhotoIII, design: ReseauDesign, frame: Frame | None, truth: BodyComparison | None
 ) -> Row:
-    """Everything its template shows.
+    """Return the content of the section's template.
 
     Parameters
     ----------
     found : PhotoIII
-        What the procedure found.
+        Result of the procedure.
     design : ReseauDesign
         The rods of the test object.
     frame : Frame or None
-        The photograph; without it there is no picture.
+        The photograph; None omits the picture.
     truth : BodyComparison or None
-        What a simulator knows.
+        Comparison with the truth of a simulator.
     """
     errors = None if truth is None else errors_of(found, truth)
     drawn, enlarged = body_map(found.true, design.xy, design.unit, errors)
@@ -59,7 +59,7 @@ def photo_iii_section(
 
 
 def errors_of(found: PhotoIII, truth: BodyComparison) -> Array:
-    """Errors of the true coordinates in their order, NaN where the truth knows no such point, (n, 2)."""
+    """Return the errors of the true coordinates (n, 2), NaN for points that the truth does not contain."""
     unknown = (np.nan, np.nan)
     return np.array([truth.errors.get(name, unknown) for name in found.true.names]).reshape(-1, 2)
 
@@ -79,7 +79,7 @@ def _summary(found: PhotoIII, unit: str, truth: BodyComparison | None) -> list[I
 
 
 def _overlay(found: PhotoIII, frame: Frame) -> str:
-    """Points with their names; declined spots as bright as a point may be, crossed out."""
+    """Points with their names; bright rejected spots are crossed out."""
     measured = found.measured
     if measured is None:
         names, xy = found.points.names, found.points.xy
@@ -97,7 +97,7 @@ def _overlay(found: PhotoIII, frame: Frame) -> str:
 
 
 def _points(found: PhotoIII, truth: BodyComparison | None) -> list[tuple[str, ...]]:
-    """True coordinates with sigmas; with the truth the point's own name and the errors."""
+    """True coordinates with sigmas; with the truth also the names of the true points and the errors."""
     true = found.true
     columns = [
         *(aligned(true.xy[:, k], 3) for k in range(2)),
@@ -111,11 +111,11 @@ def _points(found: PhotoIII, truth: BodyComparison | None) -> list[tuple[str, ..
 
 
 def _truth(truth: BodyComparison, unit: str) -> list[tuple[str, ...]]:
-    """What the simulator knows: quantity, x, y, unit."""
+    """Comparison with the truth: quantity, x, y, unit."""
     return [
         ("error of the measured positions", *aligned(truth.position_px, 3), "px"),
-        ("the same in their standard deviations", *aligned(truth.position_normalised, 2), ""),
+        ("the same in units of their standard deviations", *aligned(truth.position_normalised, 2), ""),
         ("error of the true coordinates", *aligned(truth.error, 3), unit),
         ("their standard deviations", *aligned(truth.sigma, 3), unit),
-        ("the errors in their standard deviations", *aligned(truth.error_normalised, 2), ""),
+        ("the errors in units of their standard deviations", *aligned(truth.error_normalised, 2), ""),
     ]

@@ -1,4 +1,4 @@
-"""The report of a sensor's calibration: a page that stands alone, same to the byte for the same input."""
+"""The report of a sensor calibration: a self-contained page, the same bytes for the same input."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["mtf_figure", "sensor_report", "transfer_figure"]
 
 _SIZE = (8.6, 3.6)
 _MEANING = {
-    "gain": "gain: electrons to a grey value",
-    "read_noise": "noise of reading",
+    "gain": "gain, electrons per grey value",
+    "read_noise": "read noise",
     "full_well": "full well",
-    "b2": "linearity, square",
-    "b3": "linearity, cube",
+    "b2": "linearity, quadratic term",
+    "b3": "linearity, cubic term",
     "psf": "width of a Gaussian point-spread function",
-    "mtf50": "half of the modulation, by the Gaussian",
-    "mtf50_free": "half of the modulation, by the free curve",
-    "mtf_nyquist_free": "modulation at half a cycle per pixel, by the free curve",
+    "mtf50": "frequency of 50 % modulation, Gaussian",
+    "mtf50_free": "frequency of 50 % modulation, free curve",
+    "mtf_nyquist_free": "modulation at half a cycle per pixel, free curve",
 }
 _UNITS = {"e-/DN": "e⁻/DN", "e-": "e⁻", "1/px": "px⁻¹", "1": ""}
 
@@ -67,16 +67,16 @@ def _summary(result: SensorResult) -> list[tuple[str, str, str]]:
     height, width = result.fields.bias.shape
     levels = result.transfer.curve
     return [
-        (f"{width} × {height}", "px", "calibrated"),
-        (f"{levels.bright.sum()} + {(~levels.bright).sum()}", "", "exposures in light and in the dark"),
-        (f"{result.dsnu:.3g}", "DN", "σ of the dark from pixel to pixel"),
-        (f"{100 * result.prnu:.3g}", "%", "σ of the response, uneven light included"),
+        (f"{width} × {height}", "px", "calibrated region"),
+        (f"{levels.bright.sum()} + {(~levels.bright).sum()}", "", "bright and dark exposures"),
+        (f"{result.dsnu:.3g}", "DN", "σ of the dark signal between pixels (DSNU)"),
+        (f"{100 * result.prnu:.3g}", "%", "σ of the response, including non-uniform light (PRNU)"),
         (f"{int(result.fields.defects.sum())}", "", "defective pixels"),
     ]
 
 
 def _rows(result: SensorResult) -> list[tuple[str, str, str, str]]:
-    """What was estimated: meaning, value and sigma of the same decimals, unit."""
+    """Estimates: meaning, value and sigma with the same decimals, unit."""
     rows = []
     for name, each in result.quantities().items():
         digits = 1 - int(np.floor(np.log10(each.sigma))) if each.sigma > 0 else 4
@@ -120,7 +120,7 @@ def _axes(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def mtf_figure(edge: EdgeSpread) -> str:
-    """The free curve with its 95 % band, the Gaussian's, and the edge-spread function they were found by.
+    """Draw the free curve with its 95 % band, the Gaussian curve, and the line-spread functions.
 
     Returns
     -------
@@ -166,7 +166,7 @@ def _spread(axes: Axes, edge: EdgeSpread, free: FreeCurve) -> None:
 
 
 def transfer_figure(result: SensorResult) -> str:
-    """Photon transfer and linearity: levels, what was fitted to them, and those beyond saturation.
+    """Draw photon transfer and linearity: levels, fitted curves, and levels close to saturation.
 
     Returns
     -------
@@ -196,5 +196,5 @@ def transfer_figure(result: SensorResult) -> str:
             ]
             right.plot(linear / scale / 1000, signal, color=BLUE, lw=1.0, zorder=0)
         _axes(left, "photon transfer", "signal / DN", "variance / DN²")
-        _axes(right, "answer to light", "exposure / ms", "signal / DN")
+        _axes(right, "response to light", "exposure / ms", "signal / DN")
         return to_svg(figure)

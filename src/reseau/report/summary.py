@@ -1,4 +1,4 @@
-"""The comparison with the truth as a short table of text."""
+"""The comparison with the truth as a short text table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LABEL = 33
 
 
 def comparison_table(truth: Comparison) -> str:
-    """The comparison, at most 80 characters wide."""
+    """Return the comparison as text, at most 80 characters wide."""
     lines = _camera(truth.camera, truth.unit)
     if truth.rods is not None:
         lines += ["", *_rods(truth.rods, truth.unit)]
@@ -22,7 +22,7 @@ def comparison_table(truth: Comparison) -> str:
 
 
 def _line(label: str, *pairs: Pair | None, decimals: int = 4) -> str:
-    """A label and pairs of numbers; blanks where there is none."""
+    """A label and pairs of numbers; blank where there is none."""
     cells = "".join(
         " " * 17
         if pair is None
@@ -42,7 +42,7 @@ def _camera(camera: CameraComparison, unit: str) -> list[str]:
     lines += [
         _line("approximation by the model", camera.approximation),
         _line("error of the positions, px", camera.position_px),
-        _line("… in their sigmas", camera.position_normalised, camera.check_normalised, decimals=2),
+        _line("… in units of sigma", camera.position_normalised, camera.check_normalised, decimals=2),
     ]
     return lines
 
@@ -51,8 +51,8 @@ def _rods(rods: RodComparison, unit: str) -> list[str]:
     return [
         *_head(f"PHOTO II, {rods.rods} of {rods.known} rods"),
         _line("error of the positions, px", rods.position_px),
-        _line("… in their sigmas", rods.position_normalised, decimals=2),
-        _line(f"rods as made less designed, {unit}", rods.made),
+        _line("… in units of sigma", rods.position_normalised, decimals=2),
+        _line(f"true minus design coordinates, {unit}", rods.made),
     ]
 
 
@@ -60,10 +60,10 @@ def _body(body: BodyComparison, unit: str) -> list[str]:
     return [
         *_head(f"PHOTO III, {body.points} of {body.known} points"),
         _line("error of the positions, px", body.position_px),
-        _line("… in their sigmas", body.position_normalised, decimals=2),
+        _line("… in units of sigma", body.position_normalised, decimals=2),
         _line(f"error of true coordinates, {unit}", body.error),
         _line(f"their sigmas, {unit}", body.sigma),
-        _line("error in sigmas", body.error_normalised, decimals=2),
+        _line("error in units of sigma", body.error_normalised, decimals=2),
     ]
 
 

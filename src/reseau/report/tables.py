@@ -1,4 +1,4 @@
-"""What the sections of a report have in common: tables of coefficients, of tests and of eliminations."""
+"""Tables shared by the sections of a report: coefficients, tests, eliminations."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ __all__ = [
 ]
 
 Item = tuple[str, str, str]
-"""A figure at the head of the page: number, unit, what it is."""
+"""A number in the summary of a page: number, unit, meaning."""
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Coefficients as a table shows them.
+    """Coefficients for a table.
 
     Parameters
     ----------
     value, sigma : mapping of str to float
-        By name; a name without value was dropped from the model.
+        By name; a name without a value was dropped from the model.
     unit : mapping of str to str
         As in calibration files: ``mm^-2``, ``1``.
     """
@@ -77,7 +77,7 @@ def rms_pair(values: Array) -> tuple[float, float]:
 
 
 def symbol(name: str) -> Markup:
-    """A coefficient's name as it is printed.
+    """Return the printed symbol of a coefficient.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def symbol(name: str) -> Markup:
 
 
 def unit_markup(unit: str) -> Markup:
-    """A unit with its exponent raised: mm^-3 as mm⁻³; nothing for a number without unit."""
+    """Return a unit with a raised exponent: mm^-3 as mm⁻³; empty for the unit 1."""
     base, _, exponent = unit.partition("^")
     if unit == "1":
         return Markup("")
@@ -115,7 +115,7 @@ def unit_text(unit: str) -> str:
 
 
 def probability(p: float) -> str:
-    """Three decimals, and no pretence below.
+    """Return a probability with three decimals, or an upper limit.
 
     Examples
     --------
@@ -126,7 +126,7 @@ def probability(p: float) -> str:
 
 
 def coefficient_rows(elimination: Elimination, estimates: Estimates) -> list[Row]:
-    """All coefficients of the full model with their tests, in their order.
+    """Return all coefficients of the full model with their tests.
 
     The test of a coefficient is that of the step in which it was dropped, or of the last step for one kept.
     """
@@ -150,7 +150,7 @@ def coefficient_rows(elimination: Elimination, estimates: Estimates) -> list[Row
 
 
 class Measured(Protocol):
-    """Marks or rods as they were, or were not, measured."""
+    """Marks or rods with the success of their measurement."""
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -166,14 +166,14 @@ class Measured(Protocol):
 
 
 def declined_rows(measured: Measured) -> list[tuple[str, str]]:
-    """Names of what was not measured, with the reasons."""
+    """Return names of marks that were not measured, with the reasons."""
     return [
         (name, why) for name, why, ok in zip(measured.ids, measured.why, measured.ok, strict=True) if not ok
     ]
 
 
 def step_rows(elimination: Elimination) -> list[Row]:
-    """The coefficients dropped, in their order."""
+    """Return the dropped coefficients in the order of elimination."""
     return [
         {
             "name": symbol(step.name),
@@ -188,7 +188,7 @@ def step_rows(elimination: Elimination) -> list[Row]:
 
 
 def model_tests(fit: Adjustment, alpha: float, local: SmoothField | None) -> Row:
-    """The global test of an adjustment, and that for a local model on top."""
+    """Return the global test of an adjustment and the test for an additional local model."""
     globally = fit.global_test(alpha) if fit.redundancy > 0 else None
     need = None if local is None else [float(p) for p in np.atleast_1d(local.need)]
     return {
@@ -209,16 +209,16 @@ def model_tests(fit: Adjustment, alpha: float, local: SmoothField | None) -> Row
 def axis_rows(
     stages: list[tuple[str, list[Array]]], decimals: int, *, largest: bool = False
 ) -> list[tuple[str, ...]]:
-    """Root mean squares per axis of vectors, a row for each stage, in columns of equal decimals.
+    """Return root mean squares of vectors per axis, one row for each stage, in columns of equal decimals.
 
     Parameters
     ----------
     stages : list of (name, list of ndarray (n, 2))
-        Every stage has the same groups of vectors; a group without any shows as a dash.
+        Every stage has the same groups of vectors; an empty group gives a dash.
     decimals : int
-        Of all numbers.
+        Number of decimals.
     largest : bool
-        Whether to add the largest magnitude of each group.
+        Add the largest magnitude of each group.
     """
     table = []
     for _, groups in stages:

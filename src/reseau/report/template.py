@@ -1,4 +1,4 @@
-"""How every report becomes a page: its template, filled in, with figures and tables numbered as they come."""
+"""Render the templates of reports, with figures and tables numbered in order."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["rendered"]
 
 
 def rendered(template: str, **content: object) -> str:
-    """A page of a template.
+    """Render a page from a template.
 
     Parameters
     ----------
     template : str
-        Name of the file among the templates of reports.
+        File name of the template.
     content : object
-        What it asks for; a name that it asks for in vain is an error.
+        Values of the template; a missing one is an error.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("reseau.report"),
@@ -27,6 +27,6 @@ def rendered(template: str, **content: object) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    # Numbered as they come: which there are depends on what was done.
+    # Numbered in order of appearance, which depends on the steps done.
     counters = {"figure": partial(next, count(1)), "table": partial(next, count(1))}
     return environment.get_template(template).render(content, **counters)

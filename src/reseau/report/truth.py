@@ -1,4 +1,4 @@
-"""What a simulator knows of the truth, and what a comparison with it says."""
+"""The truth of a simulator, and the comparison of results with it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Pair = tuple[float, float]
 
 
 class KnownPoints(Protocol):
-    """Rods as they were made or points of a body, as a simulator knows them."""
+    """True rods or points of a body in a simulator."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -43,16 +43,16 @@ class KnownPoints(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """All that a simulator knows.
+    """The truth of a simulator.
 
     Parameters
     ----------
     view : PlaneMapping
         From the plane of the reseau to PHOTO I, without noise.
     rods : KnownPoints, optional
-        The rods as they were made, and where PHOTO II shows them.
+        The true rods, and their positions in PHOTO II.
     bodies : sequence of KnownPoints
-        What each PHOTO III shows.
+        The points in each PHOTO III.
     """
 
     view: PlaneMapping
@@ -62,7 +62,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Stage:
-    """Root mean square of what is left of the errors of some marks, per axis, in the unit of the design."""
+    """Root mean square of the remaining errors of marks, per axis, in the unit of the design."""
 
     name: str
     fitted: Pair
@@ -71,26 +71,26 @@ class Stage:
 
 @dataclass(frozen=True)
 class CameraComparison:
-    """What the truth says about group A.
+    """Comparison of group A with the truth.
 
     Parameters
     ----------
     marks, checked : int
-        Marks that were fitted, and marks held out.
+        Numbers of fitted and of check marks.
     position_px : (float, float)
         Root mean square error of the measured positions.
     position_normalised : (float, float)
-        The same in units of their standard deviations: 1 where those are right.
+        The same in units of their standard deviations; 1 when these are realistic.
     stages : tuple of Stage
-        Marks against their designed coordinates: in the common system only, after the best similarity, and
+        Marks compared with their design coordinates: in the common system only, after the best similarity, and
         corrected.
     approximation : (float, float)
-        What the model leaves of noise-free positions: its own error, apart from that of the measurement.
+        Residuals of the model for noise-free positions: the error of the model without that of the measurement.
     check_normalised : (float, float)
-        Corrected check marks against the same adjustment of noise-free positions, in units of their
+        Corrected check marks compared with the same adjustment of noise-free positions, in units of their
         standard deviations.
     coefficients_normalised : float
-        The same of the coefficients.
+        The same for the coefficients.
     """
 
     marks: int
@@ -105,16 +105,16 @@ class CameraComparison:
 
 @dataclass(frozen=True)
 class RodComparison:
-    """What the truth says about the rods in PHOTO II.
+    """Comparison of the rods in PHOTO II with the truth.
 
     Parameters
     ----------
     rods, known : int
-        Rods measured, and rods that there are.
+        Numbers of measured and of existing rods.
     position_px, position_normalised : (float, float)
         Errors of the measured positions, and the same in units of their standard deviations.
     made : (float, float)
-        Rods as they were made less as they were designed: what their tolerance was in fact.
+        True minus design coordinates of the rods: their actual tolerance.
     """
 
     rods: int
@@ -126,20 +126,20 @@ class RodComparison:
 
 @dataclass(frozen=True)
 class BodyComparison:
-    """What the truth says about the points of a body in PHOTO III.
+    """Comparison of the points of a body in PHOTO III with the truth.
 
     Parameters
     ----------
     points, known, strays : int
-        Points found that there are, points that there are, and points found that are none.
+        Numbers of true points found, of existing points, and of false points found.
     position_px, position_normalised : (float, float)
         Errors of the measured positions, and the same in units of their standard deviations.
     error, error_normalised : (float, float)
-        Errors of the true coordinates likewise.
+        Errors of the true coordinates, and the same in units of their standard deviations.
     sigma : (float, float)
-        What their standard deviations say.
+        Their standard deviations.
     identity : dict
-        Names of known points by the names they were found under.
+        Names of true points, by the names of the points found.
     errors : dict
         Errors of the true coordinates by the same names.
     """
@@ -158,18 +158,18 @@ class BodyComparison:
 
 @dataclass(frozen=True)
 class Factor:
-    """What is left of the errors of points when a group is taken off; None where there are no such points.
+    """Remaining errors of points after correcting for a group; None where there are no such points.
 
     Parameters
     ----------
     name : str
-        What was taken off.
+        Name of the correction.
     rods, check : (float, float) or None
-        Rods that were fitted, and rods held out, against their designed coordinates.
+        Fitted rods and check rods, compared with their design coordinates.
     body : (float, float) or None
-        Points of bodies against the truth.
+        Points of bodies compared with the truth.
     ideal : (float, float) or None
-        The same when the rods are given the coordinates that they truly have: the rods' tolerance apart.
+        The same computed with the true coordinates of the rods, without the effect of their tolerance.
     """
 
     name: str
@@ -181,7 +181,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the truth says about the whole procedure; what was not done is None or empty.
+    """Comparison of the whole procedure with the truth; steps that were not done are None or empty.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class Comparison:
     bodies : tuple of BodyComparison
         PHOTO III.
     factors : tuple of Factor
-        What each group takes off.
+        Effect of each correction.
     """
 
     unit: str
@@ -204,5 +204,5 @@ class Comparison:
     factors: tuple[Factor, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready data."""
+        """Return the comparison as JSON values."""
         return asdict(self)
