@@ -82,10 +82,10 @@ class CameraComparison:
     position_normalised : (float, float)
         The same in units of their standard deviations; 1 when these are realistic.
     stages : tuple of Stage
-        Marks compared with their design coordinates: in the common system only, after the best similarity, and
-        corrected.
+        Marks compared with their design coordinates: in the common system only, after the best similarity,
+        and corrected.
     approximation : (float, float)
-        Residuals of the model for noise-free positions: the error of the model without that of the measurement.
+        Residuals of the model for noise-free positions: the model's error without measurement errors.
     check_normalised : (float, float)
         Corrected check marks compared with the same adjustment of noise-free positions, in units of their
         standard deviations.
