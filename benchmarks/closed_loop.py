@@ -19,8 +19,8 @@ from reseau.core.threads import one_thread
 from reseau.designs import coded_testfield
 from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraOptions
-from reseau.procedures.live import LiveTestfield
-from reseau.procedures.measuring import measurer_of
+from reseau.procedures.target_measurement import measurer_of
+from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station
 
 AXES = ("tilt", "roll", "camera_roll")
@@ -45,7 +45,7 @@ class Session:
         self.bench = FieldBench(seed=seed, bend_mm=0.0)
         model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(DESIGN, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
-        self.procedure = LiveTestfield(DESIGN, measure, model, name="closed loop")
+        self.procedure = TestfieldProcedure(DESIGN, measure, model, name="closed loop")
         self.poses = 0
 
     def take(self, step: Step) -> None:

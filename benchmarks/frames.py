@@ -28,7 +28,7 @@ from reseau.core.data import Array
 from reseau.io.images import open_scan
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
-from reseau.procedures.frame import helped
+from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
 _FILM = {"perforations": True, "print": True, "neighbours": True}
@@ -100,7 +100,7 @@ def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float
     """Status of a frame that was not oriented alone, by the shape of its roll, and its largest error."""
     before, frame, roll = doubtful
     options = FrameOptions(formats=(frame.format[:2],))
-    result = helped(scan_of(frame.scan(), dpi=frame.dpi), roll, [before], options)[0]
+    result = reorient_scan(scan_of(frame.scan(), dpi=frame.dpi), roll, [before], options)[0]
     return result.status, float(np.abs(_errors(result, frame)[0]).max())
 
 

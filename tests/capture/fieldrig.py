@@ -20,8 +20,8 @@ from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Set
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraOptions
-from reseau.procedures.live import LiveTestfield
-from reseau.procedures.measuring import measurer_of
+from reseau.procedures.target_measurement import measurer_of
+from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station
 
 AXES = ("tilt", "roll", "camera_roll")
@@ -169,13 +169,15 @@ class FieldRig:
 
     def procedure(
         self, design: TestfieldDesign = DESIGN, sigmas: tuple[float, float, float] | None = None
-    ) -> LiveTestfield:
+    ) -> TestfieldProcedure:
         """The testfield procedure with Brown's model, as the paper's camera wants it."""
         model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(design, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
-        return LiveTestfield(design, measure, model, name="field", sigmas=sigmas)
+        return TestfieldProcedure(design, measure, model, name="field", sigmas=sigmas)
 
-    def acquisition(self, kept: Session, procedure: LiveTestfield | None = None, **more: Any) -> Acquisition:
+    def acquisition(
+        self, kept: Session, procedure: TestfieldProcedure | None = None, **more: Any
+    ) -> Acquisition:
         """An acquisition on this bench."""
         return Acquisition(
             self.bench,

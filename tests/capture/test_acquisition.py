@@ -401,5 +401,5 @@ def test_the_closed_loop_says_when_no_pose_helps(rig: FieldRig, kept: Session) -
 
 def test_a_goal_for_what_is_not_estimated_is_told(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept, rig.procedure())
-    with pytest.raises(EstimationError, match="is none of c, x0, y0, K1"):
+    with pytest.raises(EstimationError, match="is not estimated; use c, x0, y0, K1"):
         carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))

@@ -20,7 +20,7 @@ from reseau.capture import Acquisition, Bench, BenchFile, Decision, InstrumentEn
 from reseau.capture.plans import NO_EXPOSURE_LIMITS, SensorSeriesPlan, sensor
 from reseau.core.data import Frame
 from reseau.core.errors import DeadlineError, EstimationError, StateError
-from reseau.procedures.live_sensor import LiveSensor
+from reseau.procedures.sensor import SensorProcedure
 from reseau_drivers.camera import v4l2
 from reseau_sims.pixels import PixelSensor
 from reseau_sims.serving import LampScene, SimulatedCamera, VideoCamera
@@ -50,7 +50,7 @@ class Rig:
 
     def carry_out(self, kept: Session, plan: SensorSeriesPlan = PLAN, decision: Decision = "stop") -> None:
         run = Acquisition(
-            self.bench, kept, LiveSensor(name="eye"), limits=NO_EXPOSURE_LIMITS, operator=self.operator,
+            self.bench, kept, SensorProcedure(name="eye"), limits=NO_EXPOSURE_LIMITS, operator=self.operator,
             watch=lambda kind, facts: self.events.append((kind, facts)),
         )  # fmt: skip
         carry_out(run, sensor(run, plan), paused=lambda: decision)
@@ -132,7 +132,7 @@ def test_interrupted_in_the_middle_of_a_series_it_goes_on_there(
     assert kept.status == "done"
     steps = [frame.step for frame in kept.frames(kind="frame")]
     assert len(steps) == len(set(steps)) == PLAN.count
-    (again,) = rerun(kept, LiveSensor(name="eye"))
+    (again,) = rerun(kept, SensorProcedure(name="eye"))
     assert again.same
 
 
@@ -158,7 +158,7 @@ def test_exposures_reach_from_little_light_to_saturation(kept: Session, light: f
 def test_the_procedure_holds_no_frames() -> None:
     rng, peaks = np.random.default_rng(0), []
     for count in (10, 200):
-        live = LiveSensor(name="eye")
+        live = SensorProcedure(name="eye")
         tracemalloc.start()
         for k in range(count):
             frame = Frame(rng.integers(0, 4095, (200, 300)).astype(np.uint16), 4095.0)
@@ -171,7 +171,7 @@ def test_the_procedure_holds_no_frames() -> None:
 
 
 def test_what_is_no_frame_of_the_series_is_no_good() -> None:
-    live = LiveSensor(name="eye")
+    live = SensorProcedure(name="eye")
     frame = Frame(np.full((8, 8), 100, dtype=np.uint8), 255.0)
     assert not live.on_frame(frame, Step("00000")).ok
     assert live.on_frame(frame, Step("light 00 000", exposure_us=1.0)).ok
@@ -194,7 +194,7 @@ def work(place: Path) -> None:
 
 def ended(place: Path, after_s: float | None) -> bool:
     """Whether a process came to its end before it was killed."""
-    code = exit_code(work, (place,), after_s, ["reseau.procedures.live_sensor"])
+    code = exit_code(work, (place,), after_s, ["reseau.procedures.sensor"])
     assert code in (0, -signal.SIGKILL)
     return code == 0
 
@@ -223,7 +223,7 @@ def test_killed_at_any_moment_no_frame_is_lost_or_doubled(tmp_path: Path) -> Non
             kept = archive.session("s")
             assert kept.status == "done"
             assert len(stored(place)) == PLAN.count
-            (again,) = rerun(kept, LiveSensor(name="eye"))
+            (again,) = rerun(kept, SensorProcedure(name="eye"))
             assert again.same
             inputs = json.loads(kept.content(kept.results()[-1]))["provenance"]["inputs"]
             assert inputs == stored(place)

@@ -9,7 +9,7 @@ import pytest
 from reseau.core.data import Array
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
-from reseau.procedures.frame import helped
+from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
 BUSY = Beside(perforations=True, print=True, neighbours=True, dust=40, scratches=3)
@@ -100,7 +100,7 @@ def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None
     assert alone.status == "declined"
     roll = roll_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0)
     assert isinstance(roll, Roll)
-    (found,) = helped(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
+    (found,) = reorient_scan(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
     assert found.status == "oriented", found.why
     assert "roll" in found.why
     assert np.abs(errors(found, frame)).max() < 0.5

@@ -13,7 +13,7 @@ from reseau.designs import coded_testfield
 from reseau.optics import Brown, PixelGrid, Pose, project
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
-from reseau.procedures.heights import Heights
+from reseau.procedures.z_stage import Heights
 
 DESIGN = coded_testfield()
 READINGS = (0.0, 250.0, 500.0)

@@ -176,7 +176,7 @@ def _processes(images: list[Path], jobs: int | None) -> int:
 
     count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
     if count > 1:
-        start_early(["reseau.procedures.measuring"])
+        start_early(["reseau.procedures.target_measurement"])
     return count
 
 

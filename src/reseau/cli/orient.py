@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..io import FrameCorners, FrameOrientation
-    from ..procedures.frame import FrameOptions, FrameResult, Roll
+    from ..procedures.film_frame import FrameOptions, FrameResult, Roll
 
 __all__ = ["orient"]
 
@@ -147,7 +147,7 @@ def _prepare(out: Path) -> None:
 def _options(job: _Job) -> FrameOptions:
     import numpy as np
 
-    from ..procedures.frame import FrameOptions
+    from ..procedures.film_frame import FrameOptions
 
     size = _format(job.frame)
     near = None
@@ -162,17 +162,17 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
     """Orient the frames of one image and write what came of them; in a process of its own."""
     from ..io import FrameCorners
     from ..io.images import open_scan
-    from ..procedures.frame import described, helped, orient_scan
+    from ..procedures.film_frame import orient_scan, orientation_of, reorient_scan
 
     try:
         scan = open_scan(job.image)
         if job.roll is None or before is None:
             results = orient_scan(scan, _options(job))
         else:
-            results = helped(scan, job.roll, before.results, _options(job))
+            results = reorient_scan(scan, job.roll, before.results, _options(job))
         calibrated: FrameCorners | None = FrameCorners.read(job.corners) if job.corners else None
         documents = [
-            required(described(result, calibrated, job.transform), job.image)  # type: ignore[arg-type]
+            required(orientation_of(result, calibrated, job.transform), job.image)  # type: ignore[arg-type]
             for result in results
         ]
         if job.out is not None:
@@ -271,7 +271,7 @@ def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iter
 def _common(done: dict[str, _Done]) -> Roll | None:
     """What the frames of the images have in common, if they are many enough."""
     from ..core.failure import Failure
-    from ..procedures.frame import roll_of
+    from ..procedures.film_frame import roll_of
 
     found = roll_of([result for item in done.values() for result in item.results])
     return None if isinstance(found, Failure) else found

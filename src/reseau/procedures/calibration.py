@@ -21,8 +21,8 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
-from .heights import Heights
-from .measuring import Measurer, measured_in_order, measurer_of
+from .target_measurement import Measurer, measured_in_order, measurer_of
+from .z_stage import Heights
 
 __all__ = [
     "Calibrated",
@@ -192,7 +192,7 @@ def calibrate_camera(
     design : PlaneDesign
         The target.
     measure : callable
-        What measures it in a frame; see :func:`~reseau.procedures.measuring.measurer_of`.
+        What measures it in a frame; see :func:`~reseau.procedures.target_measurement.measurer_of`.
     size : (int, int), optional
         Width and height in pixels, where no frame tells.
     model : CameraOptions, optional

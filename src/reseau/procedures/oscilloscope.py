@@ -1,22 +1,25 @@
-"""The oscilloscope procedure (Wishahy): images refined by successive elimination of each factor.
+"""The oscilloscope procedure (Wishahy): images corrected for one systematic error after the other.
 
-Three photographs tell the factors apart. PHOTO I shows the reseau alone: its distortion is that of the camera
-and the film (group A). PHOTO II shows a test object behind the reseau: what is left of it once it is refined
-of group A is the ultrasonic instrument's doing (group B). In PHOTO III both are known, and an object without
-any control point gets its true coordinates. The steps carry the paper's numbers and symbols.
+Three photographs separate the errors. PHOTO I shows the reseau alone: its distortion is that of camera and
+film (group A). PHOTO II shows a test object behind the reseau: after the correction for group A, its
+distortion is that of the ultrasonic instrument (group B). In PHOTO III both groups are known, and an object
+without control points gets true coordinates. The steps have the numbers and symbols of the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 
+from ..archive import Verdict
 from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import Frame, ImagePoints
+from ..core.errors import EstimationError
 from ..core.failure import Code, Failure, Remark
+from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from ..measure import (
     PinDetections,
@@ -44,6 +47,7 @@ from ..refine import (
 from ..refine.remarks import of_the_camera, of_the_change, of_the_object
 
 __all__ = [
+    "OscilloscopeProcedure",
     "PhotoI",
     "PhotoII",
     "PhotoIII",
@@ -54,12 +58,23 @@ __all__ = [
     "still_standard_in",
 ]
 
-_STOOD_STILL_PX = 6.0
-"""How far the reseau is looked for from where PHOTO I had it, before it is looked for everywhere."""
+_STATIONARY_PX = 6.0
+"""Search distance of the reseau from its position in PHOTO I; beyond it, the whole image is searched."""
 
 
-class _Refined:
-    """What a step gives where it does not fail."""
+class _Named(Protocol):
+    """A step; see :class:`reseau.capture.Step`."""
+
+    @property
+    def name(self) -> str:
+        """PHOTO I, PHOTO II or PHOTO III."""
+
+
+P = TypeVar("P", bound=_Named)
+
+
+class _Corrected:
+    """Result of a step that did not fail."""
 
     def required(self) -> Self:
         """The result itself; see :meth:`~reseau.core.failure.Failure.required`."""
@@ -67,17 +82,17 @@ class _Refined:
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoI(_Refined):
-    """PHOTO I refined.
+class PhotoI(_Corrected):
+    """Corrected PHOTO I.
 
     Parameters
     ----------
     points : ImagePoints
-        The reseau's marks in pixels.
+        Marks of the reseau (px).
     camera : FittedCamera
         Group A.
     measured : ReseauResult, optional
-        How the marks were measured; None where they came from elsewhere.
+        Measurement of the marks; None if they were measured elsewhere.
     """
 
     points: ImagePoints
@@ -100,18 +115,18 @@ def photo_i(
     Parameters
     ----------
     photo : Frame or ImagePoints
-        The photograph of the reseau, or its marks measured elsewhere, in pixels.
+        The photograph of the reseau, or its marks measured elsewhere (px).
     reseau : ReseauDesign
         The reseau.
     options : ReseauOptions, optional
-        How the marks are measured.
+        Options of the measurement.
     model, alpha, criterion, check
         As in :func:`reseau.refine.correct_camera`; by default equations (5a, b) with χ² tests at 0.05.
 
     Returns
     -------
     PhotoI or Failure
-        A failure when the reseau is not found in the photograph, or has too few marks in it.
+        A failure if the reseau is not found, or too few of its marks.
     """
     # (i) object and photo-coordinates of the reseau
     measured = None
@@ -130,24 +145,24 @@ def photo_i(
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoII(_Refined):
-    """PHOTO II refined.
+class PhotoII(_Corrected):
+    """Corrected PHOTO II.
 
     Parameters
     ----------
     pins : ImagePoints
-        Images of the rods, in pixels of PHOTO I.
+        Images of the rods (px of PHOTO I).
     instrument : FittedInstrument
         Groups A and B.
     registration : Registration or None
-        How the photograph was referred to PHOTO I; None where its reseau was not given.
+        Registration to PHOTO I; None without marks of the reseau.
     causes : Causes or None
-        The physical causes of group B's coefficients, and the conditions they impose; None for another model
-        than equations (7a, b).
+        Physical causes of the coefficients of group B, and their conditions; None for another model than
+        equations (7a, b).
     notes : tuple of Remark
-        What the user should look into.
+        Warnings for the user.
     measured : PinResult, optional
-        How the pins were measured; None where they came from elsewhere.
+        Measurement of the pins; None if they were measured elsewhere.
     """
 
     pins: ImagePoints
@@ -159,21 +174,21 @@ class PhotoII(_Refined):
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoIII(_Refined):
-    """PHOTO III refined.
+class PhotoIII(_Corrected):
+    """Corrected PHOTO III.
 
     Parameters
     ----------
     points : ImagePoints
-        The body's points in pixels of PHOTO I.
+        Points of the body (px of PHOTO I).
     true : ImagePoints
-        Their true coordinates in the object's plane, with covariances.
+        Their true coordinates in the plane of the object, with covariances.
     registration : Registration or None
-        How the photograph was referred to PHOTO I.
+        Registration to PHOTO I.
     notes : tuple of Remark
-        What the user should look into.
+        Warnings for the user.
     measured : PinDetections, optional
-        How the points were measured; None where they came from elsewhere.
+        Measurement of the points; None if they were measured elsewhere.
     """
 
     points: ImagePoints
@@ -202,15 +217,15 @@ def photo_ii(
     Parameters
     ----------
     photo : Frame or ImagePoints
-        The photograph of the test object behind the reseau, or its pins measured elsewhere, in pixels.
+        The photograph of the test object behind the reseau, or its pins measured elsewhere (px).
     reseau, test_object : ReseauDesign
         The reseau; the rods, with M and N as `origin` and `axis` and their tolerance as sigmas.
     camera : CameraCorrection
         Group A, from PHOTO I.
     marks : ImagePoints, optional
-        The reseau's marks in this photograph, where the pins came from elsewhere.
+        Marks of the reseau in this photograph, if the pins were measured elsewhere.
     options, pins
-        How reseau and pins are measured.
+        Options of the measurements.
     model, alpha, criterion, check
         As in :func:`reseau.refine.correct_instrument`; by default equations (7a, b) with F-tests
         at 0.05.
@@ -218,9 +233,9 @@ def photo_ii(
     Returns
     -------
     PhotoII or Failure
-        A failure when reseau or test object are not found, or too few of their points.
+        A failure if reseau or test object are not found, or too few of their points.
     """
-    # (iv) photo-coordinates of the test object, (v) into the common system by way of PHOTO I
+    # (iv) photo-coordinates of the test object, (v) in the common system by PHOTO I
     seen = _pins_in(photo, reseau, test_object, camera, marks, options, pins)
     if isinstance(seen, Failure):
         return seen
@@ -246,28 +261,28 @@ def photo_iii(
     options: ReseauOptions | None = None,
     pins: PinOptions | None = None,
 ) -> PhotoIII | Failure:
-    """True coordinates of a body without control points in PHOTO III, step (viii).
+    """Determine true coordinates of a body without control points in PHOTO III, step (viii).
 
     Parameters
     ----------
     photo : Frame or ImagePoints
-        The photograph, or points of the body measured elsewhere, in pixels.
+        The photograph, or points of the body measured elsewhere (px).
     instrument : InstrumentCorrection
         Groups A and B.
     reseau : ReseauDesign
         The reseau.
     points : ImagePoints, optional
-        Points of the body in a frame; by default all echoes that are found in it.
+        Points of the body in a frame. Default: all echoes found in it.
     marks : ImagePoints, optional
-        The reseau's marks, where they were measured elsewhere; without any the camera is taken to have stood
-        still.
+        Marks of the reseau, if they were measured elsewhere. Without marks the camera is assumed not to
+        have moved.
     options, pins
-        How reseau and echoes are measured.
+        Options of the measurements.
 
     Returns
     -------
     PhotoIII or Failure
-        A failure when the reseau is not found, or the photograph shows nothing.
+        A failure if the reseau is not found, or no echo.
     """
     measured = None
     if isinstance(photo, Frame):
@@ -283,7 +298,7 @@ def photo_iii(
     else:
         body = photo
     if not len(body):
-        return Failure("the photograph shows no echo of a body", Code.NOT_FOUND)
+        return Failure("no echo of a body found", Code.NOT_FOUND)
     registration = None
     if marks is not None:
         registered = register(marks, reseau, instrument.camera)
@@ -295,19 +310,19 @@ def photo_iii(
 
 
 @dataclass(frozen=True, eq=False)
-class StillStandard(_Refined):
-    """Stored coefficients held against a new PHOTO II.
+class StillStandard(_Corrected):
+    """Test of stored coefficients with a new PHOTO II.
 
     Parameters
     ----------
     test : StandardTest
-        Whether they still hold.
+        The test.
     registration : Registration or None
-        How the photograph was referred to PHOTO I; None where its reseau was not given.
+        Registration to PHOTO I; None without marks of the reseau.
     notes : tuple of Remark
-        What has changed, and what it points to.
+        What has changed, and the probable cause.
     measured : PinResult, optional
-        How the pins were measured; None where they came from elsewhere.
+        Measurement of the pins; None if they were measured elsewhere.
     """
 
     test: StandardTest
@@ -328,11 +343,11 @@ def still_standard_in(
     same_object: bool = True,
     alpha: float = 0.05,
 ) -> StillStandard | Failure:
-    """Test whether stored coefficients are still the instrument's, by a new PHOTO II.
+    """Test whether stored coefficients are still valid for the instrument, with a new PHOTO II.
 
-    Taken from another place than PHOTO I, the photograph shows as well whether the phosphor lies behind the
-    reseau: from one place a gap g looks like a larger scale, (1 + g/D) about the foot of the camera at the
-    distance D, and group B takes it up; a camera pushed by t sees the display shift by g·t/D.
+    Taken from another position than PHOTO I, the photograph also shows a gap g between reseau and phosphor.
+    From one position at the distance D, the gap is equivalent to a scale of (1 + g/D), which group B absorbs;
+    a camera displaced by t sees the display shifted by g·t/D.
 
     Parameters
     ----------
@@ -343,14 +358,14 @@ def still_standard_in(
     reseau, test_object : ReseauDesign
         The reseau and the rods.
     same_object : bool
-        Whether the rods are those that the calibration was made with.
+        Whether the rods are those of the calibration.
     alpha : float
         Level of the test.
 
     Returns
     -------
     StillStandard or Failure
-        A failure when reseau or test object are not found, or too few of their points.
+        A failure if reseau or test object are not found, or too few of their points.
     """
     seen = _pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
     if isinstance(seen, Failure):
@@ -373,7 +388,7 @@ def _pins_in(
     options: ReseauOptions | None,
     pins: PinOptions | None,
 ) -> tuple[ImagePoints, Registration | None, PinResult | None] | Failure:
-    """Images of the rods in pixels of PHOTO I, how they came there, and how they were measured."""
+    """Images of the rods (px of PHOTO I), their registration, and their measurement."""
     measured = None
     if isinstance(photo, Frame):
         seen = _reseau_in(photo, reseau, camera, options)
@@ -397,16 +412,116 @@ def _pins_in(
 def _reseau_in(
     photo: Frame, reseau: ReseauDesign, camera: CameraCorrection, options: ReseauOptions | None
 ) -> ReseauResult | Failure:
-    """The reseau where PHOTO I had it; found anew where that leaves out what may be a row of it.
+    """Measure the reseau at its position in PHOTO I; search it if that may have missed a row.
 
-    A camera that was moved by the pitch of the reseau shows its marks where others stood.
+    If the camera was moved by the pitch of the reseau, marks appear at the positions of others.
     """
     o = options or ReseauOptions()
     expected = camera.to_pixels(camera.object_system(reseau.xy))
-    near = replace(o, nominal=True, nominal_within_px=_STOOD_STILL_PX)
+    near = replace(o, nominal=True, nominal_within_px=_STATIONARY_PX)
     known = measure_reseau(photo, reseau.expected_at(expected), near)
     found = known.found if isinstance(known, ReseauResult) else 0
     if len(reseau.ids) - found <= 0.5 * np.sqrt(len(reseau.ids)):
         return known
     anew = measure_reseau(photo, reseau, o)
     return anew if isinstance(anew, ReseauResult) and anew.found > found else known
+
+
+class OscilloscopeProcedure:
+    """The procedure in an acquisition: corrects PHOTO I, II and III as they are taken.
+
+    The same frames give the same results to the byte, live and from the archive.
+
+    Parameters
+    ----------
+    reseau, test_object : ReseauDesign
+        The reseau and the rods.
+    name : str
+        Name of the calibration.
+    options, inputs : mapping
+        Provenance: parameters, and SHA-256 of the input files by name.
+    check : iterable of str
+        Marks of PHOTO I used as check points only.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau, test_object
+    >>> procedure = OscilloscopeProcedure(standard_reseau(), test_object(), name="monday")
+    >>> procedure.finish()
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.EstimationError: PHOTO I: could not be corrected; see the verdicts on its frames
+    """
+
+    def __init__(
+        self,
+        reseau: ReseauDesign,
+        test_object: ReseauDesign,
+        *,
+        name: str,
+        options: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
+        check: Iterable[str] = (),
+    ) -> None:
+        self.reseau, self.test_object, self.name = reseau, test_object, name
+        self._check = tuple(check)
+        self._options, self._inputs = dict(options or {}), dict(inputs or {})
+        self.first: PhotoI | None = None
+        self.second: PhotoII | None = None
+        self.third: PhotoIII | None = None
+
+    def on_frame(self, frame: Frame, step: _Named) -> Verdict:
+        """Correct a photograph; the name of its step says which one it is."""
+        found = self._corrected(frame, step.name)
+        if isinstance(found, Failure):
+            return Verdict(False, found.reason)
+        self._inputs[step.name] = frame.sha256
+        points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
+        return Verdict(True, facts={"points": len(getattr(found, points))})
+
+    def _corrected(self, frame: Frame, photo: str) -> PhotoI | PhotoII | PhotoIII | Failure:
+        if photo == "PHOTO I":
+            one = photo_i(frame, self.reseau, check=self._check)
+            self.first = None if isinstance(one, Failure) else one
+            return one
+        if photo == "PHOTO II":
+            if self.first is None:
+                return Failure("PHOTO I is not corrected", Code.PREREQUISITE_MISSING)
+            two = photo_ii(frame, self.reseau, self.test_object, self.first.camera)
+            self.second = None if isinstance(two, Failure) else two
+            return two
+        if photo == "PHOTO III":
+            if self.second is None:
+                return Failure("PHOTO II is not corrected", Code.PREREQUISITE_MISSING)
+            three = photo_iii(frame, self.second.instrument, self.reseau)
+            self.third = None if isinstance(three, Failure) else three
+            return three
+        return Failure(f"{photo} is not a photograph of this procedure", Code.UNKNOWN_STEP)
+
+    def progress(self) -> dict[str, float]:
+        """Return nothing: no standard deviations are known before the end."""
+        return {}
+
+    def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
+        """Return None: the photographs are taken from one position."""
+        return None
+
+    def finish(self) -> dict[str, str]:
+        """Return the calibration of camera and instrument, and the true coordinates of the body if present.
+
+        Raises
+        ------
+        EstimationError
+            If PHOTO I or II could not be corrected.
+        """
+        if self.second is None:
+            what = "PHOTO I" if self.first is None else "PHOTO II"
+            raise EstimationError("could not be corrected", where=what, do="see the verdicts on its frames")
+        provenance = Provenance(self._inputs, self._options)
+        calibration = self.second.instrument.calibration(
+            self.reseau, self.test_object, name=self.name, provenance=provenance.to_dict(), times={}
+        )
+        made = {"calibration.json": calibration.to_json()}
+        if self.third is not None:
+            made["true.csv"] = self.third.true.to_csv()
+        return made

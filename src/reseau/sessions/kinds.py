@@ -23,8 +23,9 @@ from .parameters import (
 )
 
 if TYPE_CHECKING:
-    from ..procedures.live import LiveOscilloscope, LiveTestfield
-    from ..procedures.live_sensor import LiveSensor
+    from ..procedures.oscilloscope import OscilloscopeProcedure
+    from ..procedures.sensor import SensorProcedure
+    from ..procedures.testfield import TestfieldProcedure
 
 __all__ = ["KINDS", "Reported", "SessionKind", "kind_of", "own_plan", "read_design"]
 
@@ -203,13 +204,13 @@ def _oscilloscope(run: Acquisition, given: OscilloscopeParameters) -> Plan:
     return plans.oscilloscope(run, given.body, given.average, given.checks)
 
 
-def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> LiveOscilloscope:
-    from ..procedures.live import LiveOscilloscope
+def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> OscilloscopeProcedure:
+    from ..procedures.oscilloscope import OscilloscopeProcedure
 
     reseau, rods = (
         ReseauDesign.parse(session.input(name), where=name) for name in ("reseau.json", "object.json")
     )
-    return LiveOscilloscope(
+    return OscilloscopeProcedure(
         reseau, rods, name=session.name, options=session.parameters, inputs=_hashes(session),
         check=given.check,
     )  # fmt: skip
@@ -225,22 +226,22 @@ def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
     return plans.homed(run, plan) if given.home else plan
 
 
-def _testfield_procedure(session: Session, given: TestfieldParameters) -> LiveTestfield:
+def _testfield_procedure(session: Session, given: TestfieldParameters) -> TestfieldProcedure:
     from ..measure import TestfieldOptions
-    from ..procedures.live import LiveTestfield
-    from ..procedures.measuring import measurer_of
+    from ..procedures.target_measurement import measurer_of
+    from ..procedures.testfield import TestfieldProcedure
 
     design = read_design(session.input("design.json"), "design.json")
     # The poses and the goal have no influence on the result of given frames.
     options = {key: value for key, value in session.parameters.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
-    return LiveTestfield(
+    return TestfieldProcedure(
         design, measure, given.camera_options(), name=session.name, options=options, inputs=_hashes(session),
         sigmas=given.sigmas,
     )  # fmt: skip
 
 
-def _testfield_results(procedure: LiveTestfield, session: Session) -> dict[str, str]:
+def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
     from ..report.bundle import bundle_report
 
     results = procedure.finish()
@@ -254,13 +255,13 @@ def _sensor(run: Acquisition, given: SensorParameters) -> Plan:
     return plans.sensor(run, given.series)
 
 
-def _sensor_procedure(session: Session, given: SensorParameters) -> LiveSensor:
-    from ..procedures.live_sensor import LiveSensor
+def _sensor_procedure(session: Session, given: SensorParameters) -> SensorProcedure:
+    from ..procedures.sensor import SensorProcedure
 
-    return LiveSensor(name=session.name, region=given.region, options=session.parameters)
+    return SensorProcedure(name=session.name, region=given.region, options=session.parameters)
 
 
-def _sensor_results(procedure: LiveSensor, session: Session) -> dict[str, str]:
+def _sensor_results(procedure: SensorProcedure, session: Session) -> dict[str, str]:
     from ..report.sensor import sensor_report
 
     probes = session.frames(kind="probe")

@@ -1,8 +1,8 @@
-"""A plane target on a z-stage: photographs of one pose at several heights, as of one spatial target.
+"""A plane target on a z-stage: images of one pose at several heights form a spatial target.
 
-The target at a height is the target moved along the axis of the stage by what was read. Images of one pose
-have one exterior orientation; see :class:`reseau.bundle.Stage`. The design is taken at its word to a standard
-deviation: it gives the scale that a plane seen at right angles leaves to the principal distance.
+At each height the target is displaced along the axis of the stage by the reading. Images of one pose have one
+exterior orientation; see :class:`reseau.bundle.Stage`. The coordinates of the design are observations: they
+give the scale, which a plane parallel to the image does not separate from the principal distance.
 """
 
 from __future__ import annotations
@@ -24,20 +24,26 @@ _LEAST_POINTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """What is known of target and stage.
+    """Readings of the stage and their standard deviations.
 
     Parameters
     ----------
     pose : mapping of str to int
-        Pose of each image: those of one differ in height alone.
+        Number of the pose of each image; images of one pose differ only in height.
     reading : mapping of str to float
-        Height that was read in each image, in the unit of the design.
+        Height of each image, in the unit of the design.
     sigma : float
         Standard deviation of a reading.
     axis_sigma : float
-        Standard deviation of each of the two angles (rad) by which its axis is off the target's normal.
+        Standard deviation of each of the two angles between axis and normal of the target (rad).
     field_sigma : float
-        Standard deviation of each coordinate of the design's points, their unevenness too.
+        Standard deviation of each coordinate of the design, including flatness.
+
+    Examples
+    --------
+    >>> heights = Heights({"a": 0, "b": 0}, {"a": 0.0, "b": 50.0}, 0.01, 1e-3, 0.05)
+    >>> heights.stage(["a", "b"], np.array([0.0, 0.0, 1.0])).reading.tolist()
+    [0.0, 50.0]
     """
 
     pose: Mapping[str, int]
@@ -56,7 +62,7 @@ class Heights:
                 raise UsageError("must be larger than 0", where=f"standard deviation of {name}")
 
     def stage(self, images: Sequence[str], axis: Array) -> Stage | None:
-        """What was read in some images; nothing where no pose was seen at two heights."""
+        """Return the readings of some images; None if no pose has two heights."""
         pose = np.array([self.pose[name] for name in images], dtype=np.intp)
         reading = np.array([self.reading[name] for name in images])
         seen = {(int(p), float(h)) for p, h in zip(pose, reading, strict=True)}
@@ -65,7 +71,7 @@ class Heights:
         return Stage(pose, reading, self.sigma, axis, self.axis_sigma)
 
     def lifted(self, network: Network) -> Network:
-        """A network of plane images with the stage, and the design's coordinates as observations."""
+        """Return a network of images of a plane with the stage, and with the design as observations."""
         p, camera = len(network.points), network.cameras[0]
         network = replace(
             network, sigma=np.full((p, 3), self.field_sigma), role=("control",) * p, datum="control"
@@ -77,16 +83,16 @@ class Heights:
         f = _focal_length(frames)
         if f is not None and 0.2 < f / max(camera.width, camera.height) < 100:
             network = replace(network, cameras=(camera.rescaled(f),))
-        # Towards the camera or away from it: with the right one the three directions are right-handed.
+        # Towards the camera or away from it: the three directions must be right-handed.
         sign = -1.0 if len(frames) and float(np.sign(np.linalg.det(frames)).sum()) < 0 else 1.0
         return replace(network, stage=replace(stage, axis=np.array([0.0, 0.0, sign])))
 
 
 def _frames(network: Network, stage: Stage) -> Iterator[Array]:
-    """μ K R of each pose seen at several heights (3, 3), K = diag(f, f, 1).
+    """μ K R (3, 3) of each pose with several heights, K = diag(f, f, 1).
 
-    The first two columns of the projectivity of the plane at a height h are K R without its last column, and
-    the last one moves by h K r₃; all but for one factor of each image, which the first two tell.
+    The first two columns of the projectivity of the plane at height h are those of K R, and the last column
+    changes by h K r₃, up to one factor for each image, which follows from the first two columns.
     """
     camera = network.cameras[0]
     middle = (np.array([camera.width, camera.height]) - 1) / 2
@@ -111,7 +117,7 @@ def _frames(network: Network, stage: Stage) -> Iterator[Array]:
 
 
 def _projectivity(network: Network, image: int, middle: Array) -> Array | None:
-    """From the plane of the design to an image, from its middle; positive before the camera."""
+    """Projectivity from the plane of the design to an image with its origin in the centre."""
     rows = np.flatnonzero(network.image_of == image)
     if len(rows) < _LEAST_POINTS:
         return None
@@ -120,10 +126,10 @@ def _projectivity(network: Network, image: int, middle: Array) -> Array | None:
 
 
 def _focal_length(frames: Array) -> float | None:
-    """f in pixels by which the columns g of each μ K R (k, 3, 3) are of one length and at right angles.
+    """f (px) for which the columns g of each μ K R (k, 3, 3) are orthogonal and of equal length.
 
-    (g_x g'_x + g_y g'_y)/f² + g_z g'_z = μ² for a column with itself, 0 for one with another: linear in 1/f²
-    and the μ².
+    (g_x g'_x + g_y g'_y)/f² + g_z g'_z is μ² for a column with itself and 0 for two columns: linear in 1/f²
+    and μ².
     """
     k = len(frames)
     if not k:

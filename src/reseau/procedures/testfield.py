@@ -1,14 +1,16 @@
-"""The procedures as an acquisition needs them: frame by frame as they come, what has been reached, what next.
+"""The testfield procedure (Vosselman and Förstner) in an acquisition: calibrate, and choose the next pose.
 
-The calls are those that work on files, in another order of arrival: the same frames give the same results,
-to the byte.
+G. Vosselman and W. Förstner, The precision of a digital camera. Each frame is measured as it is taken
+(sections 2 and 3) and joins the bundle adjustment. Live and from files the same functions are called: the
+same frames give the same results to the byte. For files, the procedure is
+:func:`reseau.procedures.calibration.calibrate_camera`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -18,16 +20,14 @@ from ..core.data import Frame, ImagePoints
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
-from ..io import ReseauDesign
 from ..optics import Pose, project
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
-from .heights import Heights
-from .measuring import Measurer
-from .mount import HEIGHT, Mount
-from .oscilloscope import PhotoI, PhotoII, PhotoIII, photo_i, photo_ii, photo_iii
+from .target_measurement import Measurer
+from .turntable import HEIGHT, Mount
+from .z_stage import Heights
 
-__all__ = ["LiveOscilloscope", "LiveTestfield", "Place"]
+__all__ = ["Place", "TestfieldProcedure"]
 
 _LEAST_IMAGES = 3
 _MARGIN_PX = 6.0
@@ -39,41 +39,51 @@ class Place(Protocol):
 
     @property
     def name(self) -> str:
-        """What its frame is called."""
+        """Name of its frame."""
 
     @property
     def position(self) -> Mapping[str, float]:
-        """Where the axes stand."""
+        """Positions of the axes."""
 
 
 P = TypeVar("P", bound=Place)
 
 
-class LiveTestfield:
-    """A camera calibrated while its photographs of a target come in.
+class TestfieldProcedure:
+    """Calibration of a camera during the acquisition of its images of a target.
 
     Parameters
     ----------
     design : PlaneDesign
         The target.
     measure : callable
-        What measures it in a frame.
+        Measures the target in a frame.
     model : CameraOptions
-        What is to be estimated.
+        Camera model and parameters to estimate.
     name : str
-        Of the calibration.
+        Name of the calibration.
     options : mapping
-        What of the parameters influenced the result, for its provenance.
+        Parameters that influence the result, for the provenance.
     inputs : mapping
-        SHA-256 of the files that it works with, by name; for its provenance.
+        SHA-256 of the input files by name, for the provenance.
     least_points : int
-        A frame with fewer is no good.
+        Smallest number of points of a usable frame.
     sigmas : (float, float, float), optional
-        Standard deviations of a height that the axis ``z`` was moved to, of the two angles (rad) by which it
-        is off the target's normal, and of the design's coordinates.
-        With them frames taken one after the other that differ in height alone are of one pose; without, each
-        has its own.
+        Standard deviations of a height of the axis ``z`` (mm), of the two angles between this axis and the
+        normal of the target (rad), and of the coordinates of the design (mm). With `sigmas`, consecutive
+        frames that differ only in height have one orientation; without, each frame has its own.
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> from reseau.procedures.target_measurement import measurer_of
+    >>> design = coded_testfield()
+    >>> procedure = TestfieldProcedure(design, measurer_of(design), CameraOptions(), name="monday")
+    >>> procedure.progress()
+    {}
     """
+
+    __test__: ClassVar[bool] = False  # not a class of tests
 
     def __init__(
         self,
@@ -107,21 +117,21 @@ class LiveTestfield:
         self._size = (frame.width, frame.height)
         self._measured[step.name] = found.points
         self._places[step.name], self._inputs[step.name] = dict(step.position), frame.sha256
-        self._stands = self._at(step)  # of good frames alone: no others come when it is computed again
+        self._stands = self._at(step)  # only good frames: a rerun has no others
         self._pose[step.name] = self._stands[0]
         return Verdict(True, facts={"points": len(found.points)})
 
     def _at(self, place: Place) -> tuple[int, dict[str, float] | None]:
-        """The number of a pose, and where all axes stand in it but that of the height.
+        """The number of a pose, and the positions of all its axes except the height.
 
-        A table that has been elsewhere does not come back to the same pose, but to another near it.
+        A table that has moved does not return to exactly the same pose.
         """
         number, before = self._stands
         position = {axis: value for axis, value in place.position.items() if axis != HEIGHT}
         return (number, before) if position == before else (number + 1, position)
 
     def _heights(self, more: Place | None = None) -> Heights | None:
-        """Poses and heights of what was measured; of a place, too, to which the table might go next."""
+        """Poses and heights of the images, optionally with a candidate pose."""
         if self._sigmas is None:
             return None
         reading = {name: float(place.get(HEIGHT, 0.0)) for name, place in self._places.items()}
@@ -131,7 +141,7 @@ class LiveTestfield:
         return Heights(pose, reading, *self._sigmas)
 
     def calibrated(self) -> Calibrated | Failure:
-        """The calibration by what has been measured so far."""
+        """Return the calibration from the frames so far."""
         count = len(self._measured)
         if self._current is None or self._current[0] != count:
             points = list(self._measured.items())
@@ -142,11 +152,11 @@ class LiveTestfield:
 
     @property
     def provenance(self) -> Provenance:
-        """What the calibration was made of."""
+        """Inputs and parameters of the calibration."""
         return Provenance(self._inputs, self._options)
 
     def progress(self) -> dict[str, float]:
-        """Standard deviations of the camera's parameters, and sigma0; nothing before the third image."""
+        """Return standard deviations of the camera parameters, and sigma0; nothing before the third image."""
         if len(self._measured) < _LEAST_IMAGES:
             return {}
         found = self.calibrated()
@@ -158,17 +168,16 @@ class LiveTestfield:
         return reached | {"sigma0": float(found.result.sigma0)}
 
     def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
-        """The pose that lowers the standard deviation of a parameter most, and to what.
+        """Return the pose that lowers the standard deviation of a parameter most, and the predicted value.
 
-        Each candidate's image is predicted, and joins the network as if it had been measured as the others
-        were: its covariance follows from the design matrix alone. While there are too few images for any
-        calibration it is the first candidate, and nothing is predicted.
+        The image of each candidate is predicted and added to the network with the covariance of the other
+        images; the standard deviation follows from the design matrix alone. While there are too few images
+        for a calibration, the first candidate is returned without a prediction.
 
         Raises
         ------
         EstimationError
-            When the parameter is not estimated, or the table's axes do not turn the target as its mount's
-            should.
+            If the parameter is not estimated, or the axes of the table do not match the mount of a testfield.
         """
         if not candidates:
             return None
@@ -181,7 +190,8 @@ class LiveTestfield:
             return candidates[0], None
         names, _, _ = found.result.camera_columns(0)
         if wanted not in names:
-            raise EstimationError(f"is none of {', '.join(names)}", where=f"sigma_{wanted}")
+            do = f"use {', '.join(names)}"
+            raise EstimationError("is not estimated", where=f"sigma_{wanted}", do=do)
         column = names.index(wanted)
         network, result = _adjusted(found.result), found.result
         mount = Mount.of(
@@ -201,12 +211,12 @@ class LiveTestfield:
         return best
 
     def finish(self) -> dict[str, str]:
-        """The calibration; ``times`` stay empty, the archive knows them.
+        """Return the calibration; its ``times`` are empty, because the archive stores them.
 
         Raises
         ------
         EstimationError
-            When it fails.
+            If it fails.
         """
         found = self.calibrated()
         if isinstance(found, Failure):
@@ -217,7 +227,7 @@ class LiveTestfield:
 
 
 def _adjusted(result: Result) -> Network:
-    """The network begun at its estimates: adjusted again, it is there at once."""
+    """The network with its estimates as approximate values, for fast convergence."""
     network, values = result.network, result.fit.values
     camera = replace(network.cameras[0], values=values.cameras[0, : len(network.cameras[0].values)])
     return replace(network, cameras=(camera,), x0=values.x0, rotation=result.rotation, xyz=values.xyz)
@@ -226,7 +236,7 @@ def _adjusted(result: Result) -> Network:
 def _joined(
     network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None
 ) -> Network | None:
-    """The network with an image from another pose; None when it would show next to nothing."""
+    """The network with an image from another pose; None if the image shows fewer than four points."""
     camera, pose = network.cameras[0], _predicted(network, result, mount, place, heights)
     seen = project(camera_mapping(result, 0).mapping, pose, network.xyz).xy
     size = np.array([camera.width, camera.height]) - 1
@@ -254,15 +264,15 @@ def _joined(
 
 
 def _predicted(network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None) -> Pose:
-    """Where the camera would be: moved by the stage from where it is in the same pose, or by the mount."""
-    told = mount.pose(place.position)
+    """Predicted orientation: that of the same pose moved by the stage, or that given by the mount."""
+    by_mount = mount.pose(place.position)
     same = [
         k
         for k, name in enumerate(network.images)
         if heights is not None and heights.pose[name] == heights.pose[_PREDICTED]
     ]
     if heights is None or not same:
-        return told
+        return by_mount
     k, stage = same[-1], result.fit.values.stage
     axis = np.array([0.0, 0.0, mount.lifts]) if stage is None else stage.axis
     stood = heights.reading[network.images[k]] if stage is None else float(stage.reading[k])
@@ -270,97 +280,8 @@ def _predicted(network: Network, result: Result, mount: Mount, place: Place, hei
 
 
 def _sigma(network: Network, column: int) -> float:
-    """Standard deviation of unit weight one that a network gives a parameter of its camera."""
+    """Standard deviation of a parameter of the camera, for unit variance factor."""
     found = adjust_network(network)
     if isinstance(found, Failure):
         return float("inf")
     return float(np.sqrt(found.camera_covariance(0)[column, column] / found.fit.variance))
-
-
-class LiveOscilloscope:
-    """The oscilloscope procedure while PHOTO I, II and III come in.
-
-    Parameters
-    ----------
-    reseau, test_object : ReseauDesign
-        The reseau; the rods.
-    name : str
-        Of the calibration.
-    options, inputs : mapping
-        For its provenance: parameters, and the SHA-256 of the files that it works with, by name.
-    check : iterable of str
-        Marks to be held out of PHOTO I.
-    """
-
-    def __init__(
-        self,
-        reseau: ReseauDesign,
-        test_object: ReseauDesign,
-        *,
-        name: str,
-        options: Mapping[str, Any] | None = None,
-        inputs: Mapping[str, str] | None = None,
-        check: Iterable[str] = (),
-    ) -> None:
-        self.reseau, self.test_object, self.name = reseau, test_object, name
-        self._check = tuple(check)
-        self._options, self._inputs = dict(options or {}), dict(inputs or {})
-        self.first: PhotoI | None = None
-        self.second: PhotoII | None = None
-        self.third: PhotoIII | None = None
-
-    def on_frame(self, frame: Frame, step: Place) -> Verdict:
-        """Refine a photograph; which one it is, its step says."""
-        found = self._refined(frame, step.name)
-        if isinstance(found, Failure):
-            return Verdict(False, found.reason)
-        self._inputs[step.name] = frame.sha256
-        points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
-        return Verdict(True, facts={"points": len(getattr(found, points))})
-
-    def _refined(self, frame: Frame, photo: str) -> PhotoI | PhotoII | PhotoIII | Failure:
-        if photo == "PHOTO I":
-            one = photo_i(frame, self.reseau, check=self._check)
-            self.first = None if isinstance(one, Failure) else one
-            return one
-        if photo == "PHOTO II":
-            if self.first is None:
-                return Failure("PHOTO I is not refined", Code.PREREQUISITE_MISSING)
-            two = photo_ii(frame, self.reseau, self.test_object, self.first.camera)
-            self.second = None if isinstance(two, Failure) else two
-            return two
-        if photo == "PHOTO III":
-            if self.second is None:
-                return Failure("PHOTO II is not refined", Code.PREREQUISITE_MISSING)
-            three = photo_iii(frame, self.second.instrument, self.reseau)
-            self.third = None if isinstance(three, Failure) else three
-            return three
-        return Failure(f"{photo} is no photograph of this procedure", Code.UNKNOWN_STEP)
-
-    def progress(self) -> dict[str, float]:
-        """Sigma of the refined image coordinates, where there is a correction."""
-        return {}
-
-    def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
-        """None: its three photographs are taken from one place."""
-        return None
-
-    def finish(self) -> dict[str, str]:
-        """The calibration of camera and instrument, and the true coordinates of the body, where there is one.
-
-        Raises
-        ------
-        EstimationError
-            When PHOTO I or II could not be refined.
-        """
-        if self.second is None:
-            what = "PHOTO I" if self.first is None else "PHOTO II"
-            raise EstimationError("could not be refined", where=what, do="see the verdicts on its frames")
-        provenance = Provenance(self._inputs, self._options)
-        calibration = self.second.instrument.calibration(
-            self.reseau, self.test_object, name=self.name, provenance=provenance.to_dict(), times={}
-        )
-        made = {"calibration.json": calibration.to_json()}
-        if self.third is not None:
-            made["true.csv"] = self.third.true.to_csv()
-        return made

@@ -1,4 +1,4 @@
-"""A sensor calibrated while its frames come in; each is taken into sums and let go."""
+"""Calibration of a sensor during the acquisition; frames are added to sums and not kept."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any, Protocol, TypeVar
 from ..archive import Verdict
 from ..core.data import Frame
 from ..core.errors import EstimationError, UsageError
-from ..core.failure import Failure
 from ..core.provenance import Provenance
 from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
 
-__all__ = ["Exposed", "LiveSensor"]
+__all__ = ["Exposed", "SensorProcedure"]
 
 _SATURATED = 0.01
-"""Share of an edge's pixels at full scale."""
+"""Largest share of pixels of an edge at full scale."""
 
 
 class Exposed(Protocol):
@@ -23,27 +22,32 @@ class Exposed(Protocol):
 
     @property
     def name(self) -> str:
-        """Begins with light, dark or edge."""
+        """Name that starts with light, dark or edge."""
 
     @property
     def exposure_us(self) -> float | None:
-        """Exposure time."""
+        """Exposure time (µs)."""
 
 
 P = TypeVar("P", bound=Exposed)
 
 
-class LiveSensor:
-    """The calibration of a sensor; what it holds are two images of each exposure, however many frames come.
+class SensorProcedure:
+    """Calibration of a sensor during an acquisition, with two images in memory for each exposure.
 
     Parameters
     ----------
     name : str
-        Of the session, in messages.
+        Name of the session, for messages.
     region : (left, top, width, height), optional
-        Of the edge.
+        Region of the slanted edge (px).
     options : mapping
-        For the provenance.
+        Parameters, for the provenance.
+
+    Examples
+    --------
+    >>> SensorProcedure(name="monday").progress()
+    {}
     """
 
     def __init__(
@@ -61,12 +65,12 @@ class LiveSensor:
         self._made: tuple[int, SensorResult] | None = None
 
     def on_frame(self, frame: Frame, step: Exposed) -> Verdict:
-        """Take a frame into the sums of its level; levels come one after the other."""
+        """Add a frame to the sums of its level; levels follow one another."""
         key, exposure = step.name.rpartition(" ")[0], step.exposure_us
         if key.partition(" ")[0] not in self._levels or exposure is None:
-            return Verdict(False, f"{step.name} is no frame of a sensor's calibration")
+            return Verdict(False, f"{step.name} is not a step of a sensor series")
         if key.startswith("edge") and (frame.pixels >= frame.full_scale).mean() > _SATURATED:
-            return Verdict(False, "the edge is saturated; expose less")
+            return Verdict(False, "the edge is saturated: expose less")
         if self._open is None or self._open[0] != key:
             self._close()
             self._open = key, LevelSums(exposure)
@@ -83,20 +87,20 @@ class LiveSensor:
         self._open = None
 
     def progress(self) -> dict[str, float]:
-        """Nothing: what is found, is found in the end."""
+        """Return nothing: results are known at the end only."""
         return {}
 
     def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
-        """None: its frames are taken from one place."""
+        """Return None: the frames are taken from one position."""
         return None
 
     def result(self) -> SensorResult:
-        """The calibration by all that came.
+        """Return the calibration from all frames.
 
         Raises
         ------
         EstimationError
-            When frames are missing, or gain and noise cannot be had.
+            If frames are missing, or gain and noise cannot be determined.
         """
         self._close()
         if self._made is None or self._made[0] != len(self._inputs):
@@ -113,25 +117,20 @@ class LiveSensor:
 
     @property
     def provenance(self) -> Provenance:
-        """What the calibration was made of."""
+        """Inputs and parameters of the calibration."""
         return Provenance(self._inputs, self._options)
 
     def calibrated(self, name: str) -> dict[str, str]:
-        """The calibration under the camera's name; ``times`` stay empty, the archive knows them.
+        """Return the calibration with the name of the camera; ``times`` are empty, the archive stores them.
 
         Raises
         ------
         EstimationError
-            When it fails.
+            If it fails.
         """
         made = self.result().calibration(name, self.provenance.to_dict(), {})
         return {"calibration.json": made.to_json()}
 
     def finish(self) -> dict[str, str]:
-        """The calibration under the session's name; see :meth:`calibrated`."""
+        """Return the calibration with the name of the session; see :meth:`calibrated`."""
         return self.calibrated(self.name)
-
-    def shortcoming(self) -> str:
-        """Why there is no sharpness, where an edge was shown; empty where nothing is wrong."""
-        edge = self.result().edge
-        return edge.reason if isinstance(edge, Failure) else ""

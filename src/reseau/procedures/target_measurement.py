@@ -1,4 +1,4 @@
-"""Targets measured in many photographs, in several processes at once."""
+"""Measure a target in many photographs, in parallel processes."""
 
 from __future__ import annotations
 
@@ -22,22 +22,28 @@ from ..measure.points import Measured
 __all__ = ["Measurer", "measured_in_order", "measurer_of"]
 
 Measurer = Callable[[Frame], Measured | Failure]
-"""What measures a target in a frame; all that a procedure knows of how that is done."""
-# Frames sent ahead of each process, so that none waits.
+"""A function that measures a target in a frame."""
+# Frames queued for each process, so that none is idle.
 _AHEAD = 2
 
 
 def measurer_of(
     design: TestfieldDesign | ReseauDesign, testfield: TestfieldOptions | None = None
 ) -> Measurer:
-    """What measures a design in a frame.
+    """Return the function that measures a design in a frame.
 
     Parameters
     ----------
     design : TestfieldDesign or ReseauDesign
         A coded testfield, or any design of marks.
     testfield : TestfieldOptions, optional
-        How a testfield is measured.
+        Options of the measurement of a testfield.
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> callable(measurer_of(coded_testfield()))
+    True
     """
     if isinstance(design, TestfieldDesign):
         return partial(measure_testfield, design=design, options=testfield)
@@ -47,21 +53,26 @@ def measurer_of(
 def measured_in_order(
     frames: Iterable[Frame | tuple[str, ImagePoints]], measure: Measurer, workers: int = 1
 ) -> Iterator[tuple[str, ImagePoints | Failure]]:
-    """Names of frames with the points measured in them, in their order.
+    """Yield names of frames with their measured points, in the order of the frames.
 
     Parameters
     ----------
     frames : iterable of Frame, or of (name, ImagePoints)
-        Read as they are needed; what was measured before is passed on.
+        Read when needed; points that were measured before are passed on.
     measure : callable
-        Something that can be sent to a process, where there are several.
+        Measures a frame; must be picklable with several processes.
     workers : int
-        Processes; with one all is done in this one.
+        Number of processes; with one, this process measures.
 
     Raises
     ------
     ReseauError
-        What reading or measuring raises; EstimationError where a process dies.
+        Errors of reading and measuring; EstimationError if a process dies.
+
+    Examples
+    --------
+    >>> list(measured_in_order([], measure=None))
+    []
     """
     work = partial(_points, measure)
     if workers == 1:
@@ -82,7 +93,7 @@ def measured_in_order(
 
 
 def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
-    # Sums of one thread and of several differ in their last digits: the same bytes, however many processes.
+    # Sums of one and of several threads differ in the last digits; results must not depend on `workers`.
     with one_thread():
         found = measure(frame)
     return found if isinstance(found, Failure) else found.points
@@ -98,11 +109,11 @@ def _next(
         return name, found.result()
     except BrokenProcessPool:
         raise EstimationError(
-            "a process that measured has died", where=name, do="use fewer processes: memory may be short"
+            "a measuring process died", where=name, do="use fewer processes if memory is short"
         ) from None
 
 
 def _one_thread() -> None:
-    """A core for each process."""
+    """Use one core in each process."""
     cv2.setNumThreads(1)
     always_one_thread()
