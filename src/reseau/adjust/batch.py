@@ -73,6 +73,14 @@ class BatchOptions:
     damping: float = 1e-3
     reweight: Reweight | None = None
 
+    def __post_init__(self) -> None:
+        if self.max_iterations < 0 or not self.share > 0 or not self.damping > 0:
+            raise UsageError(
+                "share and damping must be positive, max_iterations not negative", where="BatchOptions"
+            )
+        if self.tolerance is not None and self.share != BatchOptions.share:
+            raise UsageError("must not be given together", where="BatchOptions.tolerance and share")
+
 
 @dataclass(frozen=True, eq=False)
 class BatchAdjustment:

@@ -39,25 +39,35 @@ class Options:
     method : {"levenberg-marquardt", "gauss-newton"}
         Gauss–Newton halves a step until the sum of squares decreases.
     max_iterations : int
-        Corrections tried at most.
+        Maximum number of corrections tried.
     tolerance : float
-        Relative offset at which the iteration has converged: what is left to correct, in standard deviations
-        a posteriori.
+        Relative offset at which the iteration has converged: the correction still to come, in standard
+        deviations a posteriori.
     damping : float
         Initial damping of Levenberg–Marquardt, relative to the scaled columns of length one.
     curvature : float
-        Levenberg–Marquardt refuses a step v whose geodesic acceleration a has 2|a|/|v| above this, in scaled
-        parameters.
+        Levenberg–Marquardt rejects a step v whose geodesic acceleration a has 2|a|/|v| above this, in scaled
+        parameters. For Gauss–Markov problems only.
     rank_tolerance : float, optional
-        Singular values of the scaled design below this part of the largest count as zero. By default 1e-13
-        with analytic derivatives and 1e-9 with differences.
+        Singular values of the scaled design below this fraction of the largest are treated as zero. By
+        default 1e-13 with analytic derivatives and 1e-9 with differences.
     scale : {"a-posteriori", "a-priori"}
         Whether :attr:`Adjustment.covariance` and :attr:`Adjustment.sigma` are multiplied by the estimated
-        variance factor, or take the covariance of the observations at its word. Without redundancy it is
+        variance factor, or computed from the input covariance of the observations alone. Without redundancy
         always a priori.
     check_jacobian : float, optional
         Compare analytic derivatives with differences at the approximate values, and raise `UsageError` when
-        they differ by more than this, relative to the greatest of each column.
+        they differ by more than this, relative to the largest value of each column.
+
+    Raises
+    ------
+    UsageError
+        For an unknown method or scale, for values out of range, and for an option that the method ignores.
+
+    Examples
+    --------
+    >>> Options(method="gauss-newton", max_iterations=20).max_iterations
+    20
     """
 
     method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
@@ -74,8 +84,23 @@ class Options:
             raise UsageError(f"is no method: {self.method!r}", where="Options.method")
         if self.scale not in ("a-posteriori", "a-priori"):
             raise UsageError(f"is no scale: {self.scale!r}", where="Options.scale")
-        if self.max_iterations < 0 or not self.tolerance > 0 or not self.damping > 0:
-            raise UsageError("max_iterations, tolerance and damping must be positive", where="Options")
+        if (
+            self.max_iterations < 0
+            or not self.tolerance > 0
+            or not self.damping > 0
+            or not self.curvature > 0
+        ):
+            raise UsageError(
+                "tolerance, damping and curvature must be positive, max_iterations not negative",
+                where="Options",
+            )
+        if self.rank_tolerance is not None and not 0 <= self.rank_tolerance < 1:
+            raise UsageError("must be in [0, 1)", where="Options.rank_tolerance")
+        usual = (Options.damping, Options.curvature)
+        if self.method == "gauss-newton" and (self.damping, self.curvature) != usual:
+            raise UsageError(
+                "apply to levenberg-marquardt only", where="Options.damping and Options.curvature"
+            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -153,10 +178,13 @@ def solve(model: Model, options: Options) -> Solved | AdjustmentFailure:
     Raises
     ------
     UsageError
-        When `options.check_jacobian` is given and the derivatives disagree with differences.
+        When `options.check_jacobian` is given and the derivatives disagree with differences, and for an
+        option that the model cannot honour.
     """
     if options.check_jacobian is not None:
         _check(model, options.check_jacobian)
+    if options.curvature != Options.curvature and not model.constant_weights:
+        raise UsageError("applies to Gauss-Markov problems only", where="Options.curvature")
     return _Run(model, options).solve()
 
 
@@ -210,7 +238,8 @@ class _Run:
     ) -> tuple[State, Linearised | AdjustmentFailure] | AdjustmentFailure | None:
         """The next better point; None when rounding leaves none, which is the minimum."""
         if linear.reducible <= 1e-9 * state.cost + self.floor:
-            closer = self._closer(state, linear)
+            left = self.iterations < self.options.max_iterations
+            closer = self._closer(state, linear) if left else None
             if closer is not None or self._offset(linear, state) < 1e-6:
                 return closer
         self.length = 1.0

@@ -147,10 +147,11 @@ def robust(
     """
     if scale not in ("mad", "a-priori"):
         raise UsageError(f"is no scale: {scale!r}", where="robust")
+    if max_iterations < 1:
+        raise UsageError("must be at least 1", where="max_iterations")
     stages: list[WeightName] = ["huber"] if weights == "huber" else ["huber", weights]
     runs, unit, total = _Rounds(problem, options), 1.0, 0
     factors = np.ones(problem.observations.shape)
-    fit: F | Failure = Failure("no adjustment was asked for", Code.PREREQUISITE_MISSING)
     for stage in stages:
         function = weight_function(stage, tuning if stage == weights else None)
         for _ in range(max_iterations):
@@ -169,7 +170,7 @@ def robust(
             return Failure(
                 f"the robust weights have not settled in {max_iterations} adjustments", Code.NOT_CONVERGED
             )
-    return fit if isinstance(fit, Failure) else Robust(fit, factors, unit, total)
+    return Robust(fit, factors, unit, total)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,156 @@
+"""Each option is honoured by every function that accepts it, or refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.adjust import (
+    BatchOptions,
+    GaussHelmert,
+    GaussMarkov,
+    Options,
+    Parameters,
+    adjust,
+    adjust_batch,
+    data_snooping,
+    eliminate,
+    robust,
+    variance_components,
+)
+from reseau.core.errors import UsageError
+from reseau.core.failure import Code, Failure
+
+T = np.linspace(0.0, 4.0, 30)
+NOISY = 2.0 * np.exp(-0.8 * T) + 0.5 + np.random.default_rng(3).normal(0, 0.01, len(T))
+
+
+def decay(x):
+    return x[0] * np.exp(-x[1] * T) + x[2]
+
+
+def derivatives(x):
+    e = np.exp(-x[1] * T)
+    return np.stack([e, -x[0] * T * e, np.ones_like(T)], axis=1)
+
+
+def markov(jacobian=derivatives):
+    return GaussMarkov(decay, NOISY, 0.02, Parameters("abc", [1.0, 1.0, 0.0]), jacobian)
+
+
+def helmert(jacobian=derivatives):
+    def both(observed, x):
+        return -jacobian(x), np.eye(len(T))
+
+    return GaussHelmert(
+        lambda observed, x: observed - decay(x), NOISY, 0.02, Parameters("abc", [1.0, 1.0, 0.0]), both
+    )
+
+
+def grouped(problem, options):
+    half = np.arange(len(T)) < len(T) // 2
+    found = variance_components(problem, {"first": half, "second": ~half}, options)
+    return found if isinstance(found, Failure) else found.adjustment
+
+
+def adjusted(found):
+    return found if isinstance(found, Failure) else found.adjustment
+
+
+PATHS = {
+    "adjust": adjust,
+    "method": lambda problem, options: problem.adjusted(options),
+    "robust": lambda problem, options: adjusted(robust(problem, options=options)),
+    "snooping": lambda problem, options: adjusted(data_snooping(problem, options=options)),
+    "elimination": lambda problem, options: adjusted(eliminate(problem, options=options)),
+    "components": grouped,
+}
+path = pytest.mark.parametrize("run", PATHS.values(), ids=PATHS)
+kind = pytest.mark.parametrize("problem", [markov, helmert])
+
+
+@path
+@kind
+def test_no_iterations_give_no_result(run, problem):
+    found = run(problem(), Options(max_iterations=0))
+    assert isinstance(found, Failure)
+    assert found.code is Code.NOT_CONVERGED
+    assert found.iterations == 0
+
+
+@path
+@kind
+def test_the_scale_decides_on_the_covariance(run, problem):
+    prior, posterior = (run(problem(), Options(scale=s)) for s in ("a-priori", "a-posteriori"))
+    assert (prior.scale, posterior.scale) == ("a-priori", "a-posteriori")
+    np.testing.assert_array_equal(prior.values, posterior.values)
+    np.testing.assert_array_equal(prior.covariance, prior.cofactor)
+    np.testing.assert_allclose(posterior.covariance, posterior.cofactor * posterior.sigma0**2, rtol=1e-12)
+
+
+@path
+@kind
+def test_wrong_derivatives_are_refused_where_they_are_checked(run, problem):
+    wrong = problem(lambda x: derivatives(x) * [1.0, 1.01, 1.0])
+    with pytest.raises(UsageError, match="derivative with respect to b"):
+        run(wrong, Options(check_jacobian=1e-6))
+    assert run(problem(), Options(check_jacobian=1e-6))
+
+
+@path
+@kind
+def test_the_rank_tolerance_decides_on_a_rank_defect(run, problem):
+    found = run(problem(), Options(rank_tolerance=0.5))
+    assert isinstance(found, Failure)
+    assert found.code is Code.RANK_DEFECT
+
+
+@pytest.mark.parametrize("problem", [markov, helmert])
+def test_tolerance_damping_and_method_change_the_iterations(problem):
+    usual = adjust(problem()).required()
+    assert adjust(problem(), Options(tolerance=0.1)).required().iterations < usual.iterations
+    assert adjust(problem(), Options(damping=1e3)).required().iterations > usual.iterations
+    newton = adjust(problem(), Options(method="gauss-newton")).required()
+    assert newton.costs[:2] != usual.costs[:2]
+    np.testing.assert_allclose(newton.values, usual.values, rtol=1e-8)
+
+
+def test_a_small_limit_of_the_curvature_costs_iterations():
+    usual = adjust(markov()).required()
+    assert adjust(markov(), Options(curvature=0.02)).required().iterations > usual.iterations
+
+
+def test_an_option_without_effect_is_refused():
+    for call in (
+        lambda: Options(method="gauss-newton", damping=1.0),
+        lambda: Options(method="gauss-newton", curvature=0.5),
+        lambda: Options(curvature=0.0),
+        lambda: Options(rank_tolerance=-1.0),
+        lambda: Options(max_iterations=-1),
+        lambda: adjust(helmert(), Options(curvature=0.5)),
+        lambda: robust(markov(), max_iterations=0),
+        lambda: BatchOptions(share=0.0),
+        lambda: BatchOptions(max_iterations=-1),
+        lambda: BatchOptions(tolerance=1e-3, share=1e-2),
+    ):
+        with pytest.raises(UsageError):
+            call()
+
+
+def test_options_of_a_batch_change_its_iterations():
+    def function(x, rows):
+        return np.stack([decay(p) for p in x]), np.stack([derivatives(p) for p in x])
+
+    def run(**options):
+        return adjust_batch(function, [[1.0, 1.0, 0.0]], [NOISY], options=BatchOptions(**options))
+
+    usual = run()
+    assert usual.converged.all()
+    none = run(max_iterations=0)
+    assert not none.converged.any()
+    assert none.iterations.tolist() == [0]
+    assert run(tolerance=0.5).iterations < usual.iterations
+    assert run(share=0.5).iterations < usual.iterations
+    assert run(damping=1e3).iterations > usual.iterations
+    weighted = run(reweight=lambda t: np.where(np.abs(t) > 2.0, 0.0, 1.0))
+    assert (weighted.factors == 0).any()
