@@ -1,4 +1,4 @@
-"""Least squares: a problem in, estimates with covariance, reliability and tests out."""
+"""Least-squares adjustment: estimates with covariance, reliability and tests."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Many small Gauss–Markov problems of one shape, adjusted side by side.
 
-The mathematics is that of :func:`reseau.adjust.adjust`; here it is written over a leading axis, so that
-hundreds of image patches are matched in the time of a few. The problems share nothing: each has its own
-damping and leaves the work as soon as it has converged, and one that cannot be solved is marked without
-touching the others.
+The mathematics is that of :func:`reseau.adjust.adjust`, vectorised over a leading axis, so that hundreds of
+image patches are matched in the time of a few. The problems are independent: each has its own damping and
+ends when it has converged; one without a solution is marked and does not affect the others.
 """
 
 from __future__ import annotations
@@ -37,7 +36,13 @@ that the next may promise."""
 
 
 class BatchReason(IntEnum):
-    """Why a problem of the batch left the iterations."""
+    """Why the iteration of a problem ended.
+
+    Examples
+    --------
+    >>> BatchReason(2).name
+    'SINGULAR'
+    """
 
     CONVERGED = 0
     MAX_ITERATIONS = 1
@@ -48,23 +53,34 @@ class BatchReason(IntEnum):
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How a batch is iterated.
+    """Options of :func:`adjust_batch`.
 
     Parameters
     ----------
     max_iterations : int
-        Evaluations of the function after that at the initial values.
+        Maximum number of evaluations after that at the initial values.
     tolerance : array_like (u,) or float, optional
         A problem has converged when no parameter is corrected by more than this, in the parameter's unit.
-        By default when the whole correction is small against its own standard deviation, see `share`.
+        By default `share` decides.
     share : float
-        That share; what is left then adds its square to the variance.
+        A problem has converged when the correction is below this fraction of its own standard deviation; the
+        variance then increases by at most its square. Must not be given together with `tolerance`.
     damping : float
         Initial Levenberg–Marquardt damping, relative to the unit diagonal of the scaled normal equations.
     reweight : callable, optional
         `reweight(t)` with t (m, n), the residuals over a robust scale (1.4826 × the median of their absolute
         values, of each problem), gives factors (m, n) on the weights in [0, 1]; see
-        :func:`reseau.adjust.weight_function`. Renewed in each iteration.
+        :func:`reseau.adjust.weight_function`. Evaluated in each iteration.
+
+    Raises
+    ------
+    UsageError
+        For values out of range, or when both `tolerance` and `share` are given.
+
+    Examples
+    --------
+    >>> BatchOptions(max_iterations=7, share=0.05).damping
+    0.001
     """
 
     max_iterations: int = 20
@@ -84,12 +100,12 @@ class BatchOptions:
 
 @dataclass(frozen=True, eq=False)
 class BatchAdjustment:
-    """What came out, in columns over the k problems.
+    """Results of :func:`adjust_batch`, in columns over the k problems.
 
     Parameters
     ----------
     estimates : ndarray (k, u)
-        Estimated parameters; of problems that did not converge, the last ones reached.
+        Estimated parameters; for problems that did not converge, those of the last iteration.
     cofactor : ndarray (k, u, u)
         Inverse of the normal equations; NaN where they are singular. The covariance is `sigma0² · cofactor`.
     residuals : ndarray (k, n)
@@ -99,13 +115,17 @@ class BatchAdjustment:
     redundancy : ndarray (k,)
         Observations of weight above zero, and priors, less parameters.
     converged : ndarray of bool (k,)
-        Which may be used.
+        Problems with a usable result.
     iterations : ndarray of int (k,)
-        Evaluations of each after the initial one.
+        Number of evaluations of each after the initial one.
     reasons : ndarray of int (k,)
         One :class:`BatchReason` each.
     factors : ndarray (k, n)
-        What `reweight` made of the weights at last; ones without it.
+        Final factors of `reweight`; ones without it.
+
+    Examples
+    --------
+    See :func:`adjust_batch`.
     """
 
     estimates: Array
@@ -133,7 +153,7 @@ class BatchAdjustment:
 
 
 class _Marquardt:
-    """The state of all problems while the batch is iterated."""
+    """State of all problems during the iteration."""
 
     def __init__(
         self,
@@ -369,7 +389,7 @@ def _floating(values: ArrayLike) -> Array:
 
 
 class _Chord(_Marquardt):
-    """Corrections from the Jacobian of an earlier iteration, as long as they do what they promise.
+    """Chord method: reuse an earlier Jacobian while the corrections agree with the prediction.
 
     Near the solution they shrink by a nearly constant rate (Kelley 1995, *Iterative Methods for Linear and
     Nonlinear Equations*, 5.4.1), so that a correction times that rate is what is left after it: a problem has
@@ -451,33 +471,34 @@ def adjust_batch(
     ----------
     function : callable
         `function(x, rows)` with x (m, u), the parameters, and rows (m,), the indices of the problems they
-        belong to, gives the computed observations (m, n) and their Jacobian (m, n, u). Only problems still
-        active are asked for. Values that are not finite refuse a step; they do no harm at weight zero.
+        belong to, gives the computed observations (m, n) and their Jacobian (m, n, u). Only active
+        problems are evaluated. A step to values that are not finite is rejected; at weight zero they have no
+        effect.
     initial : array_like (k, u)
         Approximate values.
     observations : array_like (k, n)
-        What was observed; may be NaN where the weight is zero.
+        Observations; may be NaN where the weight is zero.
     weights : array_like (k, n), optional
         1/σ² of the observations up to a common factor; zero for those that are missing. Ones by default.
     prior : (mean, sigma), optional
         Observed parameters: mean (k, u) with the standard deviations (u,) of unit weight; infinite where a
         parameter is not observed.
     values : callable, optional
-        `values(x, rows)` gives the computed observations (m, n) alone. Worth while where that is much cheaper
-        than with the Jacobian: then each problem keeps its Jacobian as long as it serves; see
+        `values(x, rows)` gives the computed observations (m, n) alone. Useful where that is much cheaper
+        than with the Jacobian: each problem then keeps its Jacobian as long as it is accurate enough; see
         Kelley (1995), 5.4.1.
     options : BatchOptions, optional
-        How to iterate.
+        Options of the iteration.
 
     Returns
     -------
     BatchAdjustment
-        Of all problems; look at `converged`.
+        Results of all problems; check `converged`.
 
     Raises
     ------
     UsageError
-        When the shapes do not belong together, or weights or sigmas are negative or NaN.
+        When shapes disagree, or weights or sigmas are negative or NaN.
 
     Notes
     -----

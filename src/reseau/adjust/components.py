@@ -1,4 +1,4 @@
-"""Variance components: how good each group of observations really is."""
+"""Variance components: one estimated variance factor for each group of observations."""
 
 from __future__ import annotations
 
@@ -31,16 +31,20 @@ class VarianceComponents(Generic[F]):
     names : tuple of str (g,)
         Groups.
     factors : ndarray (g,)
-        The true standard deviations over those given.
+        Estimated standard deviations over the input ones.
     sigma : ndarray (g,)
         Standard deviations of the factors, to first order; factor/√(2·redundancy) where groups are not
         correlated with each other.
     redundancy : ndarray (g,)
         Redundancy of each group.
     adjustment : Adjustment
-        With the weights so found; its variance factor is one.
+        With the estimated weights; its variance factor is one.
     iterations : int
-        Adjustments needed.
+        Number of adjustments.
+
+    Examples
+    --------
+    See :func:`variance_components`.
     """
 
     names: tuple[str, ...]
@@ -57,7 +61,7 @@ class VarianceComponents(Generic[F]):
         return float(self.factors[self.names.index(name)])
 
     def required(self) -> VarianceComponents[F]:
-        """The components themselves; see :meth:`Failure.required`."""
+        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
         return self
 
 
@@ -73,21 +77,21 @@ def variance_components(
     Parameters
     ----------
     problem : GaussMarkov, GaussHelmert, or any Adjustable
-        With the covariance as far as it is known.
+        With the input covariance.
     groups : mapping of str to array_like of bool
         Masks of the observations' shape. Observations in no group keep their variance. Groups may be
-        correlated with each other: their correlations stay, their standard deviations are multiplied.
+        correlated with each other: the correlations are kept, the standard deviations are multiplied.
     options : Options, optional
-        How to adjust.
+        Options of each adjustment.
     tolerance : float
-        Relative change of all factors at which they have converged.
+        The factors have converged when none changes by more than this, relatively.
     max_iterations : int
-        Adjustments at most.
+        Maximum number of adjustments.
 
     Returns
     -------
     VarianceComponents or Failure
-        A failure when an adjustment fails, a group has next to no redundancy, or the factors do not settle.
+        A failure when an adjustment fails, a group has almost no redundancy, or the factors do not converge.
 
     Raises
     ------
@@ -138,7 +142,7 @@ def variance_components(
             sigma = factors * np.sqrt(np.diag(np.linalg.inv(weight)) / 2.0)
             return VarianceComponents(names, factors, sigma, r, fit, iteration)
     return Failure(
-        f"the variance components have not settled in {max_iterations} adjustments", Code.NOT_CONVERGED
+        f"the variance components have not converged in {max_iterations} adjustments", Code.NOT_CONVERGED
     )
 
 

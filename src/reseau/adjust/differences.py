@@ -1,4 +1,4 @@
-"""Derivatives by differences, and whether a Jacobian agrees with them."""
+"""Numerical derivatives, and the comparison of a Jacobian with them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def differences(function: Callable[[Array], Array], x: Array, columns: Mask | No
     Parameters
     ----------
     function : callable
-        Of x (u,), gives an ndarray of any shape.
+        Maps x (u,) to an ndarray of any shape.
     x : ndarray (u,)
-        Where.
+        Point of differentiation.
     columns : ndarray of bool (u,), optional
-        Which derivatives; the others are left zero.
+        Columns to compute; the others are zero.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def _differences(function: Callable[[Array], Array], x: Array, columns: Mask) ->
 
 
 def _step_from_zero(function: Callable[[Array], Array], x: Array, j: int, here: Array) -> float:
-    """A step for a value of zero, which tells no size: one within which the function is nearly straight."""
+    """A step for a value of zero, which has no scale: the function is nearly linear within this step."""
 
     def slope(h: float) -> Array:
         moved = x.copy()
@@ -87,16 +87,21 @@ def _step_from_zero(function: Callable[[Array], Array], x: Array, j: int, here: 
 
 @dataclass(frozen=True)
 class JacobianCheck:
-    """How far an analytic Jacobian is from differences.
+    """Largest disagreement of an analytic Jacobian with differences.
 
     Parameters
     ----------
     error : float
-        Greatest difference in any column, relative to the greatest value of the column.
+        Largest difference in any column, relative to the largest value of the column.
     worst : str
         Parameter of the column where it occurs.
     row : int
         Observation or condition where it occurs.
+
+    Examples
+    --------
+    >>> JacobianCheck(error=3e-9, worst="K1", row=4).agrees()
+    True
     """
 
     error: float

@@ -1,4 +1,4 @@
-"""Backward elimination: drop the parameters the observations do not ask for, one after the other."""
+"""Backward elimination: drop insignificant parameters, one at a time."""
 
 from __future__ import annotations
 
@@ -18,23 +18,27 @@ from .significance import CoefficientTest
 __all__ = ["Elimination", "EliminationStep", "eliminate"]
 
 _LOOKED_AT = 2
-"""Parameters that are tested in a step."""
+"""Number of parameters tested in each step."""
 
 Criterion = Literal["t", "chi2", "F"]
 
 
 @dataclass(frozen=True)
 class EliminationStep:
-    """One parameter dropped.
+    """One dropped parameter.
 
     Parameters
     ----------
     test : CoefficientTest
-        Of the parameter that was dropped: its name, the value of its test, the critical value and p.
+        Test of the dropped parameter.
     parameters : int
-        Free parameters before.
+        Number of free parameters before.
     sigma0_before, sigma0_after : float
-        Standard deviation of unit weight with it and without.
+        Standard deviation of unit weight with and without the parameter.
+
+    Examples
+    --------
+    See :func:`eliminate`.
     """
 
     test: CoefficientTest
@@ -50,22 +54,26 @@ class EliminationStep:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """What was dropped and what remained; truthy.
+    """Record and result of a backward elimination; truthy.
 
     Parameters
     ----------
     steps : tuple of EliminationStep
-        In the order of dropping.
+        Dropped parameters in their order.
     kept : tuple of CoefficientTest
-        Tests of the candidates that remain: all significant.
+        Tests of the remaining candidates, all significant.
     full : Adjustment
         With all parameters.
     adjustment : Adjustment
-        With those that remain; the dropped ones are fixed.
+        With the remaining parameters; the dropped ones are fixed.
     criterion : str
-        Test that decided.
+        Test used.
     alpha : float
         Its level.
+
+    Examples
+    --------
+    See :func:`eliminate`.
     """
 
     steps: tuple[EliminationStep, ...]
@@ -84,7 +92,7 @@ class Elimination:
         return tuple(step.name for step in self.steps)
 
     def required(self) -> Elimination:
-        """The elimination itself; see :meth:`Failure.required`."""
+        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
         return self
 
 
@@ -96,23 +104,23 @@ def eliminate(
     value: float = 0.0,
     options: Options | None = None,
 ) -> Elimination | Failure:
-    """Drop the least significant parameter, adjust again, and so on until all that remain are significant.
+    """Drop the least significant parameter and adjust again, until all remaining ones are significant.
 
     Parameters
     ----------
     problem : GaussMarkov or GaussHelmert
         With all parameters.
     alpha : float
-        Level of each test. A parameter stays when it is significant at this level.
+        Level of each test. A parameter is kept when it is significant at this level.
     criterion : {"t", "chi2", "F"}
-        Student's t with the estimated variance factor; χ² with the sigmas taken at their word; or the F test
-        of the model without the parameter against that with it, both adjusted, for non-linear models.
+        Student's t with the estimated variance factor; χ² with the input sigmas; or the F test of the model
+        without the parameter against that with it, both adjusted, for non-linear models.
     keep : iterable of str
-        Parameters not to be dropped.
+        Parameters that must not be dropped.
     value : float
-        What a parameter is fixed at when it is dropped.
+        Value at which a dropped parameter is fixed.
     options : Options, optional
-        How to adjust.
+        Options of each adjustment; `scale` has no effect on the tests.
 
     Returns
     -------
@@ -123,9 +131,19 @@ def eliminate(
     ------
     UsageError
         For an unknown criterion or name, and for t and F without redundancy.
+
+    Examples
+    --------
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> y = [0.1, 0.9, 2.1, 2.9, 4.1, 4.9]
+    >>> terms = np.arange(6.0)[:, None] ** [0, 1, 2]
+    >>> names = Parameters("abc", [0.0, 0.0, 0.0])
+    >>> problem = GaussMarkov(lambda x: terms @ x, y, 0.1, names, lambda x: terms)
+    >>> eliminate(problem, keep=["a"]).required().dropped
+    ('c',)
     """
     if criterion not in ("t", "chi2", "F"):
-        raise UsageError(f"is no criterion: {criterion!r}", where="eliminate")
+        raise UsageError(f"{criterion!r} is not one of t, chi2, F", where="criterion")
     kept = set(keep)
     for name in kept:
         problem.parameters.index(name)
@@ -154,10 +172,10 @@ def eliminate(
 
 
 def _weakest(fit: Adjustment, names: list[str], value: float) -> list[str]:
-    """Those of the names whose estimates lie nearest to the value, in their standard deviations.
+    """The names whose estimates are closest to the value, in their standard deviations.
 
-    In a linear model the first of them is the least significant by any criterion; a few are looked at for the
-    sake of those that are not.
+    In a linear model the first one is the least significant by every criterion; a second one is tested for
+    non-linear models.
     """
     at = [fit.index(name) for name in names]
     ratio = np.abs(fit.values[at] - value) / np.sqrt(np.maximum(np.diagonal(fit.cofactor)[at], 1e-300))
@@ -177,7 +195,7 @@ def _tests(
 
 
 def _without(fit: Adjustment, name: str, value: float) -> Adjustment | AdjustmentFailure:
-    """The adjustment with one parameter fixed, begun at the estimates with it."""
+    """The adjustment with one parameter fixed, starting at the estimates with it."""
     start = fit.problem.parameters if fit.problem.datum else fit.parameters
     return adjust(fit.problem.with_parameters(start.fix(name, at=value)), fit.options)
 

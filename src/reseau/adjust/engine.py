@@ -1,9 +1,9 @@
 """The least-squares engine: Levenberg–Marquardt and Gauss–Newton over either kind of problem.
 
-What decides is the *relative offset* (Bates & Watts 1981): the length of the residual vector in the space of
-the parameters over its length outside, each per degree of freedom; that is the correction still to come in
-units of the standard deviations. Near the minimum the sum of squares no longer tells two points apart in
-double precision while the offset still does, so that there the offset judges the steps.
+Convergence is decided by the *relative offset* (Bates & Watts 1981): the length of the residual vector in the
+space of the parameters over its length outside, each per degree of freedom. It is the correction still to
+come, in standard deviations. Near the minimum, in double precision, the sum of squares no longer
+distinguishes two points while the offset still does; there the offset decides on the steps.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LEAST_LENGTH = 2.0**-20
 
 @dataclass(frozen=True)
 class Options:
-    """How to adjust.
+    """Options of an adjustment.
 
     Parameters
     ----------
@@ -81,9 +81,11 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.method not in ("levenberg-marquardt", "gauss-newton"):
-            raise UsageError(f"is no method: {self.method!r}", where="Options.method")
+            raise UsageError(
+                f"{self.method!r} is not levenberg-marquardt or gauss-newton", where="Options.method"
+            )
         if self.scale not in ("a-posteriori", "a-priori"):
-            raise UsageError(f"is no scale: {self.scale!r}", where="Options.scale")
+            raise UsageError(f"{self.scale!r} is not a-posteriori or a-priori", where="Options.scale")
         if (
             self.max_iterations < 0
             or not self.tolerance > 0
@@ -189,7 +191,7 @@ def solve(model: Model, options: Options) -> Solved | AdjustmentFailure:
 
 
 class _Run:
-    """One adjustment on its way."""
+    """State of one adjustment."""
 
     def __init__(self, model: Model, options: Options) -> None:
         self.model, self.problem, self.options = model, model.problem, options
@@ -236,7 +238,7 @@ class _Run:
     def _advance(
         self, state: State, linear: Linearised
     ) -> tuple[State, Linearised | AdjustmentFailure] | AdjustmentFailure | None:
-        """The next better point; None when rounding leaves none, which is the minimum."""
+        """The next better point; None at the minimum to rounding."""
         if linear.reducible <= 1e-9 * state.cost + self.floor:
             left = self.iterations < self.options.max_iterations
             closer = self._closer(state, linear) if left else None
@@ -256,7 +258,9 @@ class _Run:
                 if self._offset(linear, state) < 1e-4 or state.cost <= 1e6 * self._rounding(state, linear):
                     return None
                 return self._failure(
-                    "no step decreases the sum of squares, nor is it at a minimum", Code.NOT_CONVERGED, state
+                    "no step decreases the sum of squares, and this is not a minimum",
+                    Code.NOT_CONVERGED,
+                    state,
                 )
         return self._failure(f"not converged in {self.iterations} iterations", Code.NOT_CONVERGED, state)
 
@@ -290,7 +294,7 @@ class _Run:
         return 0.5 * bent
 
     def _closer(self, state: State, linear: Linearised) -> tuple[State, Linearised] | None:
-        """Where the sum of squares is flat to rounding: the full step, if the offset says it is nearer."""
+        """Where the sum of squares is flat to rounding: the full step, if it decreases the offset."""
         trial = self._trial(state, linear, 0.0, 1.0)
         if not trial.usable or trial.cost > state.cost * (1.0 + 1e-8) + self.floor:
             return None
@@ -301,7 +305,7 @@ class _Run:
         return trial, following
 
     def _rounding(self, state: State, linear: Linearised) -> float:
-        """What rounding of the observations and of the function's terms leaves of an exact fit, squared."""
+        """Squared rounding error of the observations and of the function's terms at an exact fit."""
         terms = np.abs(linear.design) @ np.abs(state.x[self.free].astype(np.float64))
         return self.floor + _EPS**2 * float(terms @ terms)
 
@@ -311,7 +315,7 @@ class _Run:
         self.growth = 2.0
 
     def _restrain(self) -> bool:
-        """Shorten the next step; False when it can hardly be shorter."""
+        """Shorten the next step; False when it cannot be shortened further."""
         if self.marquardt:
             self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
             self.growth *= 2.0
@@ -327,9 +331,8 @@ class _Run:
             return self._failure(
                 f"the derivatives with respect to {name} are not finite", Code.NOT_FINITE, state
             )
-        # After Moré (1978): a column that was long a short while ago is still scaled as such, so that a
-        # parameter about to lose its influence does not run away. The memory fades, or narrow valleys would
-        # take for ever.
+        # After Moré (1978): the scale of a column decreases slowly, so that a parameter that loses its
+        # influence does not diverge; it does decrease, because narrow valleys would be slow otherwise.
         self.lengths = np.maximum(_MEMORY * self.lengths, np.sqrt((design**2).sum(axis=0)))
         return linearise(design, state.whitened, self.constraints, self.rank_tolerance, self.lengths)
 
@@ -402,7 +405,7 @@ class _Run:
         )
 
     def _null_vectors(self, linear: Linearised) -> tuple[NullVector, ...]:
-        """A basis of the null space with as many zeros as may be: reduced by pivots, in scaled parameters."""
+        """A sparse basis of the null space: reduced by pivots, in scaled parameters."""
         vectors = linear.scaled_null.copy()
         count = vectors.shape[1]
         for column in range(count):

@@ -1,8 +1,8 @@
-"""What all adjustments have in common, whatever solved them: residuals, reliability, tests.
+"""Common part of all adjustments, dense or sparse: residuals, reliability, tests.
 
-An adjustment of some hundred unknowns keeps its design and its cofactor matrix (:class:`Adjustment`); one of
-a hundred thousand keeps the structure of its normal equations instead. The statistics ask of either no more
-than the cofactors of the adjusted observations, block by block.
+A dense adjustment keeps its design and its cofactor matrix (:class:`~reseau.adjust.Adjustment`); a bundle
+adjustment keeps the structure of its normal equations instead. The statistics need only the cofactors of the
+adjusted observations, block by block.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["Adjustable", "Fitted", "compare"]
 
 
 class Fitted:
-    """An adjustment that converged; truthy. What its attributes are is said in :class:`Adjustment`."""
+    """An adjustment that converged; truthy. For its attributes see :class:`~reseau.adjust.Adjustment`."""
 
     problem: Any
     sigma0: float
@@ -41,12 +41,12 @@ class Fitted:
         return True
 
     def required(self) -> Self:
-        """The adjustment itself; see :meth:`Failure.required`."""
+        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
         return self
 
     @property
     def converged(self) -> bool:
-        """True: what has not converged is a :class:`Failure`."""
+        """True; an adjustment that has not converged is a failure."""
         return True
 
     @property
@@ -56,7 +56,7 @@ class Fitted:
 
     @property
     def observed(self) -> int:
-        """Number of observations, those left out too."""
+        """Number of observations, including those with weight zero."""
         return int(self._observed.observations.size)
 
     @property
@@ -72,7 +72,7 @@ class Fitted:
 
     @property
     def rejected(self) -> Mask:
-        """Which observations were left out."""
+        """Observations with weight zero."""
         if self._observed.weights is None:
             return np.zeros(self._observed.observations.shape, dtype=bool)
         return np.asarray(self._observed.weights == 0)
@@ -89,7 +89,7 @@ class Fitted:
 
     @property
     def redundancy_numbers(self) -> Array:
-        """How much of each observation's error shows in its own residual; they sum to the redundancy."""
+        """Fraction of each observation's error that shows in its own residual; the sum is the redundancy."""
         return self._of_observations(self.standardised.redundancy_numbers)
 
     @property
@@ -99,13 +99,13 @@ class Fitted:
 
     @property
     def weighted_squares(self) -> Array:
-        """Each observation's part vᵢ (P v)ᵢ of vᵀPv; zero where it was left out."""
+        """Contribution vᵢ (P v)ᵢ of each observation to vᵀPv; zero where its weight is zero."""
         weighted = self._of_observations(self._whitened.weighted_residuals())
         return np.where(self.rejected, 0.0, self.residuals * weighted)
 
     @property
     def w(self) -> Array:
-        """Baarda's test value of each observation, N(0, 1) when the covariance is true."""
+        """Baarda's test value of each observation, N(0, 1) when the input covariance is correct."""
         return self._of_observations(self.standardised.w)
 
     @property
@@ -119,28 +119,28 @@ class Fitted:
         return self.w / self.sigma0
 
     def minimal_detectable_errors(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """Errors of single observations that the w-test finds with the given power (Baarda 1968).
+        """Errors of single observations that the w-test detects with the given power (Baarda 1968).
 
         Parameters
         ----------
         alpha : float
             Level of the two-sided test.
         power : float
-            Probability of finding the error.
+            Probability of detecting the error.
 
         Returns
         -------
         ndarray
-            In the units of the observations, of their shape; infinite where nothing controls one. For a
-            variance factor of one.
+            In the units and the shape of the observations, for a variance factor of one; infinite for
+            observations that no other observation controls.
         """
         return self._of_observations(noncentrality(alpha, power) * self.standardised.unit_error)
 
     def external_lengths(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """What an undetected error does to the parameters, at most, in their standard deviations.
+        """Maximum effect of an undetected error on the parameters, in their standard deviations.
 
-        Baarda's λ̄, its root: no function of the parameters changes by more than this many of its standard
-        deviations by an error of the minimal detectable size; see :class:`ExternalReliability`.
+        The square root of Baarda's λ̄: an error of the minimal detectable size changes no function of the
+        parameters by more than this number of its standard deviations; see :class:`ExternalReliability`.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class Fitted:
         Returns
         -------
         ndarray
-            Of the observations' shape; NaN where nothing controls one.
+            Of the observations' shape; NaN where no other observation controls one.
         """
         with np.errstate(invalid="ignore"):
             lengths = np.sqrt(np.maximum(self._whitened.diagonal_hats(), 0.0)) * self.standardised.unit_error
@@ -162,12 +162,12 @@ class Fitted:
 
 
 def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
-    """Whether a model with fewer parameters (or more constraints) does as well as the wider one.
+    """Test a model with fewer parameters (or more constraints) against a wider one.
 
     Parameters
     ----------
     nested, full : Adjustment, or any other fit
-        Of the same observations with the same covariance, `nested` a special case of `full`.
+        Adjustments of the same observations with the same covariance; `nested` is a special case of `full`.
     alpha : float
         Level.
     scale : {"a-posteriori", "a-priori"}, optional
@@ -176,7 +176,7 @@ def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None
     Returns
     -------
     NestedTest
-        F test of the increase of vᵀPv, or χ² test when the sigmas are taken at their word.
+        F test of the increase of vᵀPv, or χ² test with the input sigmas.
 
     Raises
     ------
@@ -187,6 +187,16 @@ def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None
     -----
     Koch (1999), *Parameter Estimation and Hypothesis Testing in Linear Models*, ch. 4; for non-linear
     models the likelihood ratio in the same form.
+
+    Examples
+    --------
+    >>> from reseau.adjust import GaussMarkov, Parameters, adjust
+    >>> t, both = np.arange(6.0), Parameters("ab", [0.0, 0.0])
+    >>> y = [0.1, 0.9, 2.1, 2.9, 4.1, 4.9]
+    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, y, 0.1, both)
+    >>> level = line.with_parameters(both.fix("b"))
+    >>> compare(adjust(level).required(), adjust(line).required()).significant
+    True
     """
     restrictions = nested.redundancy - full.redundancy
     if restrictions < 1 or nested.observed != full.observed:
@@ -203,29 +213,29 @@ F = TypeVar("F", bound=Fitted)
 
 
 class Adjustable(Protocol[F]):
-    """What robust estimation, rejection and variance components ask of a problem, however it is solved."""
+    """Interface of a problem for robust estimation, data snooping and variance components."""
 
     @property
     def observations(self) -> NDArray[Any]:
-        """What was observed, in any shape."""
+        """Observations, in any shape."""
 
     @property
     def covariance(self) -> Covariance:
-        """Its covariance, as in :class:`GaussMarkov`."""
+        """Covariance of the observations, as in :class:`GaussMarkov`."""
 
     @property
     def weights(self) -> Array | None:
-        """Factors on the weights, of the observations' shape; zero leaves one out."""
+        """Factors on the weights, of the observations' shape; zero leaves an observation out."""
 
     @property
     def marks(self) -> NDArray[np.intp] | None:
-        """Numbers alike for observations that leave together, of their shape; None where each is alone."""
+        """Mark number of each observation; a mark is rejected as a whole. None: each observation is alone."""
 
     def with_weights(self, weights: ArrayLike | None) -> Self:
         """The same problem with other factors on the weights of the observations."""
 
     def continued(self, fit: F) -> Self:
-        """The same problem, to be begun at the estimates of an adjustment of it."""
+        """The same problem, starting at the estimates of an adjustment."""
 
     def adjusted(self, options: Options | None = None) -> F | Failure:
         """Adjust it."""

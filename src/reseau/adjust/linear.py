@@ -1,8 +1,9 @@
-"""The linear problem of one iteration: columns scaled, constraints eliminated, solved by orthogonal factors.
+"""The linear problem of one iteration: scale the columns, eliminate constraints, solve by QR and SVD.
 
-The normal equations are never formed: QR of the scaled design, then the singular values of R. So the error
-of the correction goes with the condition number and not with its square, every damping costs only a product,
-and the null space is there to be named when there is one (Golub & Van Loan, *Matrix Computations*, ch. 5).
+The normal equations are never formed: QR of the scaled design, then the singular values of R. The error of
+the correction is therefore proportional to the condition number and not to its square, each damping costs
+only a product, and the null space is available for the diagnosis of a rank defect (Golub & Van Loan, *Matrix
+Computations*, ch. 5).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class ConstraintMatrix:
         return len(self.value)
 
     def onto(self, x: Array) -> Array:
-        """The correction of least relative size that makes x (f,) keep the constraints."""
+        """The correction of least relative norm after which x (f,) satisfies the constraints."""
         if not len(self):
             return np.zeros_like(x)
         scale = np.where(x != 0, np.abs(x), np.abs(x).max(initial=0.0) or 1.0)
@@ -66,7 +67,7 @@ def constraint_matrix(
     rest = left[:, rank:].T @ value
     if np.abs(rest).max(initial=0.0) > 1e-8 * max(1.0, float(np.abs(value).max())):
         raise UsageError("contradict each other or the fixed parameters", where="constraints")
-    # Dependent ones say nothing new.
+    # Dependent constraints are redundant.
     return ConstraintMatrix(right[:rank], (left[:, :rank].T @ value) / singular[:rank])
 
 
@@ -85,9 +86,9 @@ class Linearised:
     projected : ndarray (q,)
         Uᵀ Qᵀ r.
     rank : int
-        Number of singular values that count.
+        Numerical rank.
     null : ndarray (f, q − rank)
-        Corrections of the parameters that no observation opposes.
+        Corrections of the parameters that leave all residuals unchanged.
     scaled_null : ndarray (f, q − rank)
         The same in the scaled parameters, orthonormal.
     outside : float
@@ -110,7 +111,7 @@ class Linearised:
         return -self.basis[:, : self.rank] @ (s / (s**2 + damping) * g)
 
     def predicted(self, damping: float) -> float:
-        """Decrease of the sum of squares that :meth:`step` promises."""
+        """Decrease of the sum of squares predicted for :meth:`step`."""
         s, g = self.singular[: self.rank], self.projected[: self.rank]
         left = damping / (s**2 + damping)
         return float(((1.0 - left**2) * g**2).sum())
@@ -122,13 +123,13 @@ class Linearised:
 
     @property
     def reducible(self) -> float:
-        """The part of the sum of squares that a correction can still take away, to first order."""
+        """The decrease of the sum of squares that a correction can still give, to first order."""
         g = self.projected[: self.rank]
         return float(g @ g)
 
     @property
     def factor(self) -> Array:
-        """F (f, rank) with the cofactor matrix of the parameters F Fᵀ; least norm where rank is lacking."""
+        """F (f, rank) with the cofactor matrix of the parameters F Fᵀ; least norm at a rank defect."""
         return self.basis[:, : self.rank] / self.singular[: self.rank]
 
 
@@ -150,7 +151,7 @@ def linearise(
     constraints : ConstraintMatrix
         On the free parameters.
     tolerance : float
-        Singular values of the scaled design below this part of the largest count as zero.
+        Singular values of the scaled design below this fraction of the largest are treated as zero.
     """
     length = np.sqrt((design**2).sum(axis=0)) if lengths is None else lengths
     scale = 1.0 / np.where(length > 0, length, 1.0)

@@ -1,6 +1,6 @@
-"""A problem made ready for the iterations: whitened residuals and design at any values of the parameters.
+"""Whitened residuals and design of a problem at any values of the parameters.
 
-Both kinds of problem come to the same: least squares of a whitened vector r(x). In the Gauss–Markov model
+Both kinds of problem reduce to least squares of a whitened vector r(x). In the Gauss–Markov model
 r = W (f(x) − l). In the Gauss–Helmert model the residuals v of given x are found first, as those of least
 vᵀPv that keep the conditions; then r = L⁻¹(g − B v) with L Lᵀ = B Q Bᵀ (Mikhail 1976, ch. 7; Förstner &
 Wrobel 2016, ch. 4), so that rᵀr = vᵀPv, and L⁻¹A is its derivative to first order. Observed parameters
@@ -107,12 +107,12 @@ class State:
 
     @property
     def usable(self) -> bool:
-        """Whether the function had finite values."""
+        """Whether the function has finite values."""
         return bool(np.isfinite(self.cost))
 
 
 class Model:
-    """What both kinds share: arithmetic of the parameters, and the rows of the observed ones."""
+    """Common part of both kinds: arithmetic of the parameters, and the rows of prior observations."""
 
     def __init__(self, problem: Specification) -> None:
         self.problem = problem
@@ -145,7 +145,7 @@ class Model:
 
     def evaluate(self, x: Values, near: State | None = None) -> State:
         """Residuals at x; `near` is a state not far away."""
-        # What overflows at a bold step is refused by its cost; it need not warn as well.
+        # A step that overflows is rejected by its cost; suppress the warning.
         try:
             with np.errstate(all="ignore"):
                 state = self._evaluate(x, near)
@@ -187,7 +187,7 @@ class Model:
 
     @property
     def floor(self) -> float:
-        """A sum of squares that is no more than the rounding of the observations."""
+        """Sum of squares due to the rounding of the observations."""
         if self._kind is not None:
             return 0.0
         eps = float(np.finfo(self._dtype).eps)
@@ -274,7 +274,7 @@ class MarkovModel(Model):
 
     def _evaluate(self, x: Values, near: State | None) -> State | None:
         residuals = (self._compute(x) - self.problem.observations.reshape(-1)).astype(np.float64)
-        # What is left out may be anything, but must not reach the others as 0 · NaN.
+        # Observations of weight zero may be NaN and must not reach the others as 0 · NaN.
         counted = residuals if self.factors is None else np.where(self.factors == 0, 0.0, residuals)
         whitened = self._with_prior(x, self.weighting.whiten(counted))
         return State(x, residuals, whitened, float(whitened @ whitened))

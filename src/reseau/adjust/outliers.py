@@ -36,13 +36,17 @@ class Robust(Generic[F]):
     Parameters
     ----------
     adjustment : Adjustment
-        With the last weights; its covariance takes them as given, and so is somewhat too small.
+        With the final weights. Its covariance regards them as constant and is therefore slightly too small.
     factors : ndarray
         Factors on the weights, of the observations' shape.
     scale : float
-        Robust standard deviation of unit weight that residuals were measured with.
+        Robust standard deviation of unit weight by which the residuals were divided.
     iterations : int
-        Adjustments needed.
+        Number of adjustments.
+
+    Examples
+    --------
+    See :func:`robust`.
     """
 
     adjustment: F
@@ -54,7 +58,7 @@ class Robust(Generic[F]):
         return True
 
     def required(self) -> Robust[F]:
-        """The robust adjustment itself; see :meth:`Failure.required`."""
+        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
         return self
 
 
@@ -73,12 +77,12 @@ def weight_function(name: WeightName, tuning: float | None = None) -> Callable[[
     Returns
     -------
     callable
-        Of t, an array, gives factors in [0, 1] of its shape.
+        Maps an array t to factors in [0, 1] of the same shape.
 
     Raises
     ------
     UsageError
-        For an unknown name or a k that is not above zero.
+        For an unknown name or a k that is not positive.
 
     Examples
     --------
@@ -115,35 +119,46 @@ def robust(
     tolerance: float = 1e-4,
     options: Options | None = None,
 ) -> Robust[F] | Failure:
-    """Adjust with weights that fall with the residuals, by iteration (Holland & Welsch 1977).
+    """Adjust with weights that decrease with the residuals, iteratively (Holland & Welsch 1977).
 
     Parameters
     ----------
     problem : GaussMarkov, GaussHelmert, or any Adjustable
-        What is to be adjusted.
+        Problem to adjust.
     weights : {"huber", "tukey", "danish"}
-        See :func:`weight_function`. Those that have several minima begin at Huber's estimate.
+        See :func:`weight_function`. Tukey's and the Danish function have several minima and start at Huber's
+        estimate.
     tuning : float, optional
         Constant of the weight function.
     scale : {"mad", "a-priori"}
-        What residuals over their sigmas are measured with: the median of their absolute values, made
-        consistent for normal errors, or one.
+        Unit of the standardised residuals: the median of their absolute values, made consistent for normal
+        errors, or one.
     max_iterations : int
-        Adjustments at most.
+        Maximum number of adjustments with each weight function, at least 1.
     tolerance : float
-        Greatest change of a factor at which they have settled.
+        The weights have converged when no factor changes by more than this.
     options : Options, optional
-        How to adjust.
+        Options of each adjustment.
 
     Returns
     -------
     Robust or Failure
-        Of conditions between the coordinates of marks each mark has one factor.
+        For conditions between the coordinates of marks, each mark has one factor.
 
     Raises
     ------
     UsageError
-        For an unknown weight function.
+        For an unknown weight function or scale, and for `max_iterations` below 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> t, y = np.arange(6.0), [0.1, 0.9, 2.1, 9.0, 4.1, 4.9]
+    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, y, 0.1, Parameters("ab", [0.0, 0.0]))
+    >>> found = robust(line, "tukey").required()
+    >>> found.factors.round(1).tolist()[3], round(found.adjustment["b"], 1)
+    (0.0, 1.0)
     """
     if scale not in ("mad", "a-priori"):
         raise UsageError(f"is no scale: {scale!r}", where="robust")
@@ -156,9 +171,10 @@ def robust(
         function = weight_function(stage, tuning if stage == weights else None)
         for _ in range(max_iterations):
             total += 1
-            fit = runs.adjust(factors == 0, factors)
-            if isinstance(fit, Failure):
-                return fit
+            found = runs.adjust(factors == 0, factors)
+            if isinstance(found, Failure):
+                return found
+            fit = found
             t = runs.standardised(fit)
             if scale == "mad":
                 unit = max(float(np.median(t[runs.eligible])) / runs.median, np.finfo(float).tiny)
@@ -168,25 +184,30 @@ def robust(
                 break
         else:
             return Failure(
-                f"the robust weights have not settled in {max_iterations} adjustments", Code.NOT_CONVERGED
+                f"the robust weights have not converged in {max_iterations} adjustments", Code.NOT_CONVERGED
             )
     return Robust(fit, factors, unit, total)
 
 
 @dataclass(frozen=True)
 class SnoopingStep:
-    """One observation left out or taken back.
+    """One observation rejected or restored.
 
     Parameters
     ----------
     index : tuple of int
-        Where it stands among the observations.
+        Index in the array of observations.
     statistic : float
-        Its test value at that time.
+        Its test value in this step.
     critical : float
-        What it was compared with.
+        Critical value.
     restored : bool
-        Whether it was taken back.
+        Whether it was restored; otherwise it was rejected.
+
+    Examples
+    --------
+    >>> SnoopingStep((3,), statistic=7.2, critical=3.29, restored=False).index
+    (3,)
     """
 
     index: tuple[int, ...]
@@ -197,18 +218,22 @@ class SnoopingStep:
 
 @dataclass(frozen=True, eq=False)
 class Rejection(Generic[F]):
-    """An adjustment after observations have been left out; truthy.
+    """An adjustment without the rejected observations; truthy.
 
     Parameters
     ----------
     adjustment : Adjustment
         Without them.
     rejected : ndarray of bool
-        Which were left out, of the observations' shape; those left out from the start are not among them.
+        Rejected observations, of the observations' shape; those with weight zero from the start not included.
     steps : tuple of SnoopingStep
-        How it came about.
+        Rejections and restorations in their order.
     rounds : int
-        Adjustments needed.
+        Number of adjustments.
+
+    Examples
+    --------
+    See :func:`data_snooping`.
     """
 
     adjustment: F
@@ -220,7 +245,7 @@ class Rejection(Generic[F]):
         return True
 
     def required(self) -> Rejection[F]:
-        """The rejection itself; see :meth:`Failure.required`."""
+        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
         return self
 
 
@@ -232,34 +257,44 @@ def data_snooping(
     options: Options | None = None,
     groups: NDArray[np.intp] | None = None,
 ) -> Rejection[F] | Failure:
-    """Leave out the observation of the greatest significant test value, one at a time (Baarda 1968).
+    """Reject the observation with the largest significant test value, one at a time (Baarda 1968).
 
     Parameters
     ----------
     problem : GaussMarkov, GaussHelmert, or any Adjustable
-        What is to be adjusted.
+        Problem to adjust.
     alpha : float
-        Level of the single test.
+        Level of a single test.
     test : {"w", "tau"}
-        Baarda's w, which takes the sigmas at their word, or Pope's τ, which estimates the variance factor.
+        Baarda's w, which assumes that the input sigmas are correct, or Pope's τ, which uses the estimated
+        variance factor.
     max_fraction : float
-        Part of the observations that may be left out.
+        Maximum fraction of the observations that may be rejected.
     options : Options, optional
-        How to adjust.
+        Options of each adjustment.
     groups : ndarray of int, optional
-        Numbers of the observations' shape: in each round the greatest of every number leaves or comes back,
-        where observations of different numbers hardly know of each other.
+        Group numbers, of the observations' shape: each round rejects or restores one observation per group.
+        Use it where observations of different groups hardly influence each other.
 
     Returns
     -------
     Rejection or Failure
-        With each step. When no test is significant any more, the one left out that now fits best is taken
-        back, if it passes the test among the others.
+        With all steps. When no test is significant any more, the rejected observation that fits best is
+        restored if it passes the test together with the others.
 
     Raises
     ------
     UsageError
-        For an unknown test, levels and fractions that cannot be.
+        For an unknown test, and for levels and fractions out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> t, y = np.arange(6.0), [0.1, 0.9, 2.1, 9.0, 4.1, 4.9]
+    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, y, 0.1, Parameters("ab", [0.0, 0.0]))
+    >>> data_snooping(line).required().rejected.tolist()
+    [False, False, False, True, False, False]
     """
     if test not in ("w", "tau") or not 0 < max_fraction < 1 or not 0 < alpha < 1:
         raise UsageError("needs test 'w' or 'tau', alpha and max_fraction in (0, 1)", where="data_snooping")
@@ -292,7 +327,7 @@ def data_snooping(
 
 
 def _foremost(values: Array, label: NDArray[np.intp]) -> list[tuple[int, ...]]:
-    """Where the greatest value of each label stands, of those that have one above zero; greatest first."""
+    """Indices of the largest value of each label, where it is above zero; largest first."""
     order = np.argsort(-values, axis=None, kind="stable")
     order = order[: int((values > 0).sum())]
     _, first = np.unique(label.ravel()[order], return_index=True)
@@ -312,7 +347,7 @@ def _tests(fit: Fitted, test: str, alpha: float) -> tuple[Array, float]:
 def _restored(
     runs: _Rounds[F], fit: F, out: Mask, seen: set[bytes], level: tuple[str, float], label: NDArray[np.intp]
 ) -> tuple[F, Mask, list[SnoopingStep]] | None:
-    """The adjustment with the best fitting of those left out taken back, one of each label, if they pass."""
+    """The adjustment with the best fitting rejected observation of each label restored, if they pass."""
     if not out.any():
         return None
     t = runs.standardised(fit) / (fit.sigma0 if level[0] == "tau" and fit.sigma0 > 0 else 1.0)
@@ -320,7 +355,7 @@ def _restored(
     several = label.any()
     best = _foremost(size, label)
     if several:
-        # The best alone is tried whatever its residual; more at once only when they look good.
+        # The best one is always tried; several at once only when their residuals are small.
         best = [place for k, place in enumerate(best) if k == 0 or t[place] <= _tests(fit, *level)[1]]
     fewer = out.copy()
     for place in best:
@@ -349,12 +384,12 @@ def _restored(
 
 def _too_many(count: int, runs: _Rounds[F]) -> Failure:
     total = int(runs.eligible.sum())
-    reason = f"{count} of {total} observations would have to be left out"
-    return Failure(f"{reason}: look at the model before the observations", Code.TOO_MANY_OUTLIERS)
+    reason = f"{count} of {total} observations would be rejected; check the model first"
+    return Failure(reason, Code.TOO_MANY_OUTLIERS)
 
 
 class _Rounds(Generic[F]):
-    """A problem adjusted again and again with other weights, each time from the last estimates."""
+    """Repeated adjustments of one problem with different weights, each starting at the last estimates."""
 
     def __init__(self, problem: Adjustable[F], options: Options | None) -> None:
         self.problem, self.options, self.start = problem, options, problem
@@ -366,11 +401,11 @@ class _Rounds(Generic[F]):
         diagonal = [np.diagonal(part, axis1=1, axis2=2).ravel() for part in blocks]
         self.sigma: Array = np.sqrt(np.concatenate(diagonal)).reshape(shape)
         self.eligible: Mask = ~self.whole(np.asarray(self.base == 0, dtype=bool))
-        # Median of what `standardised` gives for normal errors: of χ with one degree of freedom.
+        # Median of `standardised` for normal errors: that of χ with one degree of freedom.
         self.median = float(scipy.special.ndtri(0.75))
 
     def adjust(self, out: Mask, factors: Array | None = None) -> F | Failure:
-        """The adjustment with some left out, and with factors on the weights of the others."""
+        """Adjust without some observations, and with factors on the weights of the others."""
         weights = np.where(out, 0.0, self.base if factors is None else self.base * factors)
         fit = self.start.with_weights(weights).adjusted(self.options)
         if not isinstance(fit, Failure):
@@ -378,7 +413,7 @@ class _Rounds(Generic[F]):
         return fit
 
     def standardised(self, fit: F) -> Array:
-        """|v|/σ of each observation, with σ as it was given.
+        """|v|/σ of each observation, with the input σ.
 
         For marks of conditions √(vᵀPv / c) of their c conditions, the same for all coordinates of the mark.
         """
@@ -393,7 +428,7 @@ class _Rounds(Generic[F]):
         return np.repeat(length[:, None], k, axis=1)
 
     def whole(self, mask: Mask) -> Mask:
-        """The mask with whole marks."""
+        """The mask extended to whole marks."""
         if self.marks is None:
             return mask
         touched = np.zeros(int(self.marks.max(initial=-1)) + 1, dtype=bool)
@@ -402,5 +437,5 @@ class _Rounds(Generic[F]):
         return whole
 
     def mark(self, place: tuple[int, ...]) -> Mask | tuple[int, ...]:
-        """What leaves together with one observation."""
+        """The observations that are rejected together with one observation."""
         return place if self.marks is None else np.asarray(self.marks == self.marks[place])

@@ -1,4 +1,4 @@
-"""The unknowns of an adjustment: named, fixed or free, observed beforehand or not, bound by conditions."""
+"""The unknowns of an adjustment: named, fixed or free, with prior observations and linear constraints."""
 
 from __future__ import annotations
 
@@ -16,16 +16,26 @@ __all__ = ["Constraint", "Parameters", "Prior"]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Observed parameters: values from elsewhere with their covariance.
+    """Prior observations of parameters, with their covariance.
 
     Parameters
     ----------
     names : sequence of str (p,)
-        Which parameters.
+        Names of the parameters.
     values : array_like (p,)
-        What was observed of them.
+        Observed values.
     covariance : array_like (p,) or (p, p)
         Standard deviations or a full covariance matrix, in the units of the parameters.
+
+    Raises
+    ------
+    UsageError
+        When the shapes disagree or a name occurs twice.
+
+    Examples
+    --------
+    >>> Prior(["c", "x0"], [35.0, 0.0], [0.1, 0.02]).select(["x0"]).values
+    array([0.])
     """
 
     names: tuple[str, ...]
@@ -45,7 +55,7 @@ class Prior:
             raise UsageError("names a parameter twice", where="Prior")
 
     def select(self, keep: Iterable[str]) -> Prior:
-        """What is known of some of the parameters: the marginal of the covariance."""
+        """The observations of some of the parameters, with the marginal of the covariance."""
         kept = set(keep)
         rows = np.array([i for i, name in enumerate(self.names) if name in kept], dtype=np.intp)
         diagonal = self.covariance.ndim == 1
@@ -63,6 +73,11 @@ class Constraint:
         By the names of the parameters.
     value : float
         The right-hand side.
+
+    Examples
+    --------
+    >>> Constraint({"H1": 1.0, "H2": -1.0}, 0.25)  # H1 − H2 = 0.25
+    Constraint(coefficients={'H1': 1.0, 'H2': -1.0}, value=0.25)
     """
 
     coefficients: Mapping[str, float]
@@ -78,18 +93,18 @@ class Parameters:
     names : sequence of str (u,)
         Unique names.
     values : array_like (u,)
-        Approximate values where free, true values where fixed.
+        Approximate values of free parameters, exact values of fixed ones.
     free : sequence of str, optional
-        Names of those to be estimated; all by default.
+        Names of the parameters to estimate; all by default.
     prior_sigma : mapping of str to float, optional
-        Standard deviations of those whose `values` are observations as well.
+        Standard deviations of parameters whose `values` are also observations.
     prior : Prior, optional
-        Observed parameters whose observed value is not the approximate one, or which are correlated.
+        Prior observations that differ from the approximate values, or are correlated.
 
     Raises
     ------
     UsageError
-        For names that stand twice or are unknown, and values that are not finite.
+        For duplicate or unknown names, and values that are not finite.
 
     Examples
     --------
@@ -120,7 +135,7 @@ class Parameters:
             )
         if len(set(self.names)) != len(self.names):
             twice = next(name for i, name in enumerate(self.names) if name in self.names[:i])
-            raise UsageError("stands twice among the parameters", where=twice)
+            raise UsageError("occurs twice among the parameters", where=twice)
         wanted = set(self.names) if free is None else set(self._known(free))
         object.__setattr__(self, "free", tuple(name for name in self.names if name in wanted))
         if prior_sigma:
@@ -140,23 +155,23 @@ class Parameters:
 
     @property
     def mask(self) -> Mask:
-        """True for the free ones, (u,)."""
+        """True for free parameters, (u,)."""
         free = set(self.free)
         return np.array([name in free for name in self.names], dtype=bool)
 
     def index(self, name: str) -> int:
-        """Where a parameter stands.
+        """Index of a parameter.
 
         Raises
         ------
         UsageError
-            When there is none of this name.
+            When there is no parameter of this name.
         """
         self._known([name])
         return self.names.index(name)
 
     def fix(self, *names: str, at: float | None = None) -> Parameters:
-        """The same with these held fixed, at their present values or at the one given."""
+        """A copy with these parameters fixed, at their present values or at `at`."""
         gone = set(self._known(names))
         values = self.values.copy()
         if at is not None:
@@ -164,11 +179,11 @@ class Parameters:
         return Parameters(self.names, values, [n for n in self.free if n not in gone], prior=self.prior)
 
     def release(self, *names: str) -> Parameters:
-        """The same with these free."""
+        """A copy with these parameters free."""
         return Parameters(self.names, self.values, (*self.free, *self._known(names)), prior=self.prior)
 
     def with_values(self, values: ArrayLike) -> Parameters:
-        """The same with other (approximate) values, (u,); what was observed of them stays."""
+        """A copy with other (approximate) values (u,); prior observations are kept."""
         return Parameters(self.names, values, self.free, prior=self.prior)
 
     def _known(self, names: Iterable[str]) -> list[str]:

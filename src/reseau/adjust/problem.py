@@ -26,7 +26,12 @@ __all__ = ["Adjustment", "GaussHelmert", "GaussMarkov", "Problem", "adjust", "ch
 
 
 class Problem:
-    """What both kinds of problem hold, and how they are changed."""
+    """Common part of both kinds of problem.
+
+    Examples
+    --------
+    See :class:`GaussMarkov` and :class:`GaussHelmert`.
+    """
 
     observations: Values
     covariance: Covariance
@@ -45,7 +50,7 @@ class Problem:
             weights = np.asarray(self.weights, dtype=np.float64)
             if weights.shape != self.observations.shape or not (weights >= 0).all():
                 raise UsageError(f"must be {self.observations.shape} and not negative", where="weights")
-            # Denormal factors would overflow in the covariance; they say zero.
+            # Denormal factors would overflow in the covariance; treat them as zero.
             object.__setattr__(self, "weights", np.where(weights < 1e-200, 0.0, weights))
         blocks_of(self.covariance, self.observations.shape)
 
@@ -63,9 +68,9 @@ class Problem:
         return replace(self, weights=weights)  # type: ignore[type-var]
 
     def continued(self, fit: Adjustment) -> Self:
-        """The same problem, to be begun at the estimates of an adjustment of it.
+        """The same problem, starting at the estimates of an adjustment.
 
-        Inner constraints refer to the approximate values, which therefore stay.
+        With inner constraints it is unchanged, because they refer to the approximate values.
         """
         return self if self.datum else self.with_parameters(fit.parameters)
 
@@ -79,7 +84,7 @@ class Problem:
 
     @property
     def marks(self) -> NDArray[np.intp] | None:
-        """Numbers alike for observations that leave together; None where each is alone."""
+        """Mark number of each observation; a mark is rejected as a whole. None: each observation is alone."""
         return None
 
 
@@ -94,8 +99,8 @@ class GaussMarkov(Problem):
         observations, of the observations' shape.
     observations : array_like
         n observations in any shape. Where they are of an extended type (``numpy.longdouble``, or
-        ``decimal.Decimal`` in an array of objects) the parameters are carried in it too and `function` is
-        given them so: the corrections are found in double precision, the residuals formed in the wider one.
+        ``decimal.Decimal`` in an array of objects) the parameters have this type too when `function` is
+        called: corrections are computed in double precision, residuals in the extended one.
     covariance : array_like, optional
         Of the observations: standard deviations of their shape (or one for all), a full matrix (n, n), blocks
         (m, k, k) with m·k = n, or a list of ndarrays of these kinds, one after the other. Ones by default.
@@ -103,19 +108,19 @@ class GaussMarkov(Problem):
         Names, approximate values, which are free, and what was observed of them.
     jacobian : callable, optional
         `jacobian(x)` with x (u,) in double precision gives the derivatives, the observations' shape + (u,).
-        By default differences of `function`, good for some ten digits.
+        By default differences of `function`, accurate to about ten digits.
     constraints : sequence of Constraint
-        Linear conditions between parameters, held exactly.
+        Linear conditions between parameters, satisfied exactly.
     datum : sequence of str
-        Names over which the norm of the corrections is least among all solutions, where the observations
-        leave a datum defect (inner constraints).
+        Names of the parameters of inner constraints: at a datum defect the solution with the least norm of
+        their corrections is taken.
     weights : array_like, optional
         Factors on the weights, of the observations' shape: zero leaves an observation out.
 
     Raises
     ------
     UsageError
-        When these do not belong together.
+        When shapes or names disagree.
 
     Examples
     --------
@@ -154,9 +159,9 @@ class GaussHelmert(Problem):
     conditions : callable
         `conditions(l, x)` with l of the observations' shape and x (u,), all parameters. Of observations (n,)
         it gives the conditions (r,). Of observations (m, k), m marks of k coordinates, it gives (m, c): c
-        conditions for each mark in which no other mark takes part. Then nothing of the size (n, n) is formed.
+        conditions for each mark, independent of the other marks. Then no matrix of the size (n, n) is formed.
     observations : array_like (n,) or (m, k)
-        What was observed.
+        Observations.
     covariance : array_like, optional
         As in :class:`GaussMarkov`.
     parameters : Parameters
@@ -165,12 +170,22 @@ class GaussHelmert(Problem):
         `jacobians(l, x)` gives A = ∂g/∂x and B = ∂g/∂l: (r, u) and (r, n), or (m, c, u) and (m, c, k). By
         default differences of `conditions`.
     constraints, datum, weights
-        As in :class:`GaussMarkov`; among marks an observation of weight zero takes its whole mark out.
+        As in :class:`GaussMarkov`; weight zero of one observation leaves its whole mark out.
 
     Raises
     ------
     UsageError
-        When these do not belong together.
+        When shapes or names disagree.
+
+    Examples
+    --------
+    A straight line y = a + b x through points with errors in both coordinates:
+
+    >>> xy = np.array([[0.0, 1.1], [1.0, 2.9], [2.0, 5.1], [3.0, 6.9]])
+    >>> conditions = lambda l, x: (x[0] + x[1] * l[:, 0] - l[:, 1])[:, None]
+    >>> fit = GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 1.0])).adjusted().required()
+    >>> round(fit["b"], 3)
+    1.963
     """
 
     conditions: Conditions
@@ -211,7 +226,7 @@ def _tidy(problem: Problem) -> None:
         observed = np.array(observed, dtype=np.float64)
     if not np.isfinite(observed.astype(np.float64)).all():
         raise UsageError(
-            "are not finite", where="observations", do="give those missing any value and weight 0"
+            "are not finite", where="observations", do="give missing ones any value and weight 0"
         )
     object.__setattr__(problem, "observations", observed)
     constraints: Iterable[Constraint] = problem.constraints or ()
@@ -223,14 +238,14 @@ def _tidy(problem: Problem) -> None:
 class Adjustment(Fitted):
     """An adjustment that converged; truthy.
 
-    What stands in columns over the observations has their shape: residuals, redundancy numbers, test values.
-    Of observed parameters the same is in the attributes beginning with `prior_`. For observations left out
-    (weight zero), and those no other observation controls, test values are NaN.
+    Residuals, redundancy numbers and test values have the shape of the observations. The same quantities of
+    prior observations of parameters are in attributes beginning with `prior_`. Test values are NaN for
+    observations with weight zero, and for those that no other observation controls.
 
     Parameters
     ----------
     problem : GaussMarkov or GaussHelmert
-        What was adjusted.
+        The adjusted problem.
     names : tuple of str (u,)
         Names of all parameters.
     exact_values : ndarray (u,)
@@ -248,15 +263,23 @@ class Adjustment(Fitted):
     scale : {"a-posteriori", "a-priori"}
         What `covariance` and `sigma` are scaled with.
     iterations : int
-        Corrections tried.
+        Number of corrections tried.
     costs : tuple of float
-        vᵀPv at the approximate values and after each correction taken.
+        vᵀPv at the approximate values and after each accepted correction.
     datum_defect : int
-        Rank defect that inner constraints made good.
+        Rank defect that inner constraints removed.
     options : Options
-        How it was adjusted.
+        Options of the adjustment.
     solution : Solution
-        The linearised problem at the estimates, of which the reliability is made.
+        The linearised problem at the estimates, from which the reliability is computed.
+
+    Examples
+    --------
+    >>> t = np.arange(4.0)
+    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, [1.1, 2.9, 5.1, 6.9], 0.1, Parameters("ab", [0, 0]))
+    >>> fit = adjust(line).required()
+    >>> fit.redundancy, round(fit.sigma0, 3), fit.values.round(3)
+    (2, 1.265, array([1.06, 1.96]))
     """
 
     problem: Problem
@@ -278,7 +301,7 @@ class Adjustment(Fitted):
         return float(self.values[self.index(name)])
 
     def index(self, name: str) -> int:
-        """Where a parameter stands; raises UsageError when there is none of this name."""
+        """Index of a parameter; raises UsageError for an unknown name."""
         return self.problem.parameters.index(name)
 
     @cached_property
@@ -307,9 +330,9 @@ class Adjustment(Fitted):
         Parameters
         ----------
         *names : str
-            Which; all, fixed ones included, when none is given.
+            Parameters; by default all, including fixed ones.
         scaled : bool, optional
-            Whether multiplied with the variance factor a posteriori; as `scale` says by default.
+            Whether to multiply by the variance factor a posteriori; by default according to `scale`.
 
         Raises
         ------
@@ -327,17 +350,17 @@ class Adjustment(Fitted):
 
     @property
     def covariance(self) -> Array:
-        """Covariance of all parameters (u, u), scaled as `scale` says."""
+        """Covariance of all parameters (u, u), scaled according to `scale`."""
         return self.covariance_of()
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of all parameters (u,), scaled as `scale` says; zero for fixed ones."""
+        """Standard deviations of all parameters (u,), scaled according to `scale`; zero for fixed ones."""
         sigma: Array = np.sqrt(np.diag(self.covariance))
         return sigma
 
     def sigma_of(self, name: str) -> float:
-        """Standard deviation of one parameter, scaled as `scale` says."""
+        """Standard deviation of one parameter, scaled according to `scale`."""
         return float(self.sigma[self.index(name)])
 
     @cached_property
@@ -351,7 +374,7 @@ class Adjustment(Fitted):
         return correlation
 
     def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> ExternalReliability:
-        """What an undetected error as large as the minimal detectable one does to the parameters.
+        """Effects of undetected errors of the minimal detectable size on the parameters.
 
         Parameters
         ----------
@@ -405,25 +428,33 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Adj
     Parameters
     ----------
     problem : GaussMarkov or GaussHelmert
-        What is to be adjusted.
+        Problem to adjust.
     options : Options, optional
-        How.
+        Options of the iteration.
 
     Returns
     -------
-    Adjustment or Failure
-        A failure is falsy and carries its reason; `.required()` of either returns the adjustment or raises.
+    Adjustment or AdjustmentFailure
+        A failure is falsy and has a reason and a code; `.required()` returns the adjustment or raises.
 
     Raises
     ------
     UsageError
-        When parts of the problem do not fit together.
+        When functions return arrays of a wrong shape, or an option cannot be honoured.
 
     Notes
     -----
     Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
     ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
     *Technometrics* 23, 179–183.
+
+    Examples
+    --------
+    >>> t = np.arange(4.0)
+    >>> decay = lambda x: x[0] * np.exp(-x[1] * t)
+    >>> fit = adjust(GaussMarkov(decay, [2.0, 1.0, 0.5, 0.25], 0.01, Parameters("ab", [1.0, 1.0]))).required()
+    >>> fit.values.round(6)
+    array([2.      , 0.693147])
     """
     options = options or Options()
     with one_thread():
@@ -458,17 +489,25 @@ def check_jacobian(problem: Problem, at: Array | None = None) -> JacobianCheck:
         With `jacobian` or `jacobians`; for the latter the derivatives by the observations are compared too,
         and are named ``observation 0``, ``observation 1`` … by their column.
     at : ndarray (u,), optional
-        Where; at the approximate values by default.
+        Parameters; the approximate values by default.
 
     Returns
     -------
     JacobianCheck
-        The greatest disagreement of all free parameters.
+        The largest disagreement of all free parameters.
 
     Raises
     ------
     UsageError
         When the problem has no analytic derivatives.
+
+    Examples
+    --------
+    >>> t = np.arange(4.0)
+    >>> jacobian = lambda x: np.stack([np.ones(4), t], axis=1)
+    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, t, 0.1, Parameters("ab", [0, 1]), jacobian)
+    >>> check_jacobian(line).agrees()
+    True
     """
     x = np.array(problem.parameters.values if at is None else at, dtype=np.float64)
     return problem.model().check(x)

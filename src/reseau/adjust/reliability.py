@@ -1,6 +1,7 @@
-"""Reliability: how well observations control each other (Baarda 1968), for any covariance and either model.
+"""Reliability of observations (Baarda 1968), for any covariance and either model.
 
-With P v = T r and D = I − A Q Aᵀ in the whitened space, all follows from the blocks of T D Tᵀ = P Qᵥᵥ P:
+With P v = T r and D = I − A Q Aᵀ in the whitened space, everything follows from the blocks of
+T D Tᵀ = P Qᵥᵥ P:
 redundancy numbers are the diagonal of Q P Qᵥᵥ P … = (Qᵥᵥ P), and for an error in observation i alone (the
 conventional alternative hypothesis) the test value is w = (P v)ᵢ / √(P Qᵥᵥ P)ᵢᵢ.
 """
@@ -29,7 +30,7 @@ __all__ = [
     "noncentrality",
 ]
 
-# A redundancy number below this is rounding: nothing controls the observation.
+# A redundancy number below this is due to rounding: no other observation controls this one.
 _UNCONTROLLED = 1e-10
 
 
@@ -42,9 +43,9 @@ class Standardised:
     redundancy_numbers : ndarray (N,)
         Diagonal of Qᵥᵥ P.
     w : ndarray (N,)
-        Test values for a variance factor of one; NaN where nothing controls the observation.
+        Test values for a variance factor of one; NaN where no other observation controls this one.
     unit_error : ndarray (N,)
-        Error whose test value is one in the mean, 1/√(P Qᵥᵥ P)ᵢᵢ; infinite where nothing controls it.
+        Error whose expected test value is one, 1/√(P Qᵥᵥ P)ᵢᵢ; infinite where nothing controls it.
     """
 
     redundancy_numbers: Array
@@ -62,10 +63,17 @@ class ExternalReliability:
         Parameters.
     effects : ndarray (..., u)
         Change of each parameter, for a minimal detectable error in each observation; of the observations'
-        shape. Infinite or NaN where nothing controls the observation.
+        shape. Infinite or NaN where no other observation controls it.
     lengths : ndarray (...)
-        Length of the change in the metric of the parameters, √(∇xᵀ Q⁻¹ ∇x) (Baarda's λ̄, its root): no
-        function of the parameters changes by more than this many of its standard deviations.
+        Length of the change in the metric of the parameters, √(∇xᵀ Q⁻¹ ∇x) (square root of Baarda's λ̄): no
+        function of the parameters changes by more than this number of its standard deviations.
+
+    Examples
+    --------
+    >>> from reseau.adjust import GaussMarkov, Parameters, adjust
+    >>> mean = GaussMarkov(lambda x: np.full(4, x[0]), [1.0, 1.1, 0.9, 1.0], 0.1, Parameters("m", [0.0]))
+    >>> adjust(mean).required().external_reliability().effects.round(3).ravel()
+    array([0.119, 0.119, 0.119, 0.119])
     """
 
     names: tuple[str, ...]
@@ -74,7 +82,7 @@ class ExternalReliability:
 
 
 class Whitened(ABC):
-    """The whitened linear problem at the estimates, as far as reliability asks for it.
+    """The part of the whitened linear problem at the estimates that reliability needs.
 
     Subclasses have `whitened` (N',), the whitened residuals; `influence`, the blocks of T with P v = T r; and
     `cofactors`, the covariances of the observations and observed parameters that belong to these blocks.
@@ -159,7 +167,7 @@ class Solution(Whitened):
 
 
 def noncentrality(alpha: float, power: float) -> float:
-    """Baarda's δ₀: mean of a normal test value found by a two-sided test of level alpha with this power.
+    """Baarda's δ₀: mean of a normal test value that a two-sided test of level alpha detects with this power.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Tests of an adjustment: its variance factor, its coefficients, and one model within another."""
+"""Tests of the variance factor, of single parameters, and of nested models."""
 
 from __future__ import annotations
 
@@ -30,11 +30,16 @@ class GlobalTest:
     redundancy : int
         Degrees of freedom.
     lower, upper : float
-        Bounds the statistic keeps with probability 1 − alpha.
+        The statistic lies between these with probability 1 − alpha.
     p : float
-        Two-sided probability of a statistic as extreme.
+        Two-sided p-value.
     passed : bool
-        Whether the bounds are kept.
+        Whether the statistic lies between the bounds.
+
+    Examples
+    --------
+    >>> global_test(cost=12.0, redundancy=10, alpha=0.05).passed
+    True
     """
 
     statistic: float
@@ -54,13 +59,19 @@ class CoefficientTest:
     name : str
         Parameter.
     distribution : {"t", "chi2", "F"}
-        Of the statistic.
+        Distribution of the statistic.
     statistic, critical : float
-        Value of the test (its magnitude for t), and the value it exceeds with probability alpha.
+        Test value (its magnitude for t), and its critical value at level alpha.
     p : float
-        Probability of exceeding the statistic when the parameter has the value.
+        p-value.
     significant : bool
-        Whether the parameter differs from the value.
+        Whether the parameter differs significantly from the value.
+
+    Examples
+    --------
+    >>> test = ratio_test("K3", 3.0, 1.0, 100)
+    >>> test.distribution, test.significant
+    ('t', True)
     """
 
     name: str
@@ -78,15 +89,19 @@ class NestedTest:
     Parameters
     ----------
     distribution : {"F", "chi2"}
-        F when the variance factor is estimated, χ² when the sigmas are taken at their word.
+        F with the estimated variance factor, χ² with the input sigmas.
     statistic, critical : float
-        Value of the test, and the value it exceeds with probability alpha.
+        Test value, and its critical value at level alpha.
     degrees : (int, int)
         Restrictions, and the redundancy of the wider model.
     p : float
-        Probability of exceeding the statistic when the restrictions hold.
+        p-value.
     significant : bool
-        Whether the wider model is needed.
+        Whether the wider model fits significantly better.
+
+    Examples
+    --------
+    See :func:`reseau.adjust.compare`.
     """
 
     distribution: str
@@ -112,7 +127,7 @@ def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
     """
     _level(alpha)
     if redundancy < 1:
-        raise UsageError("there is nothing to test without redundancy", where="global_test")
+        raise UsageError("is not possible without redundancy", where="global_test")
     lower = float(scipy.special.chdtri(redundancy, 1.0 - alpha / 2.0))
     upper = float(scipy.special.chdtri(redundancy, alpha / 2.0))
     tail = float(scipy.special.chdtrc(redundancy, cost))
@@ -122,16 +137,16 @@ def global_test(cost: float, redundancy: int, alpha: float) -> GlobalTest:
 def ratio_test(
     name: str, ratio: float, sigma0: float | None, redundancy: int, alpha: float = 0.05
 ) -> CoefficientTest:
-    """Test of an estimate whose difference from a value is `ratio` times the root of its cofactor.
+    """Test an estimate whose difference from a value is `ratio` times the square root of its cofactor.
 
     Parameters
     ----------
     name : str
-        What was estimated.
+        Name of the parameter.
     ratio : float
-        Difference over the root of the cofactor.
+        Difference over the square root of the cofactor.
     sigma0 : float, optional
-        Standard deviation of unit weight a posteriori, for Student's t; without it χ² a priori.
+        Standard deviation of unit weight a posteriori, for Student's t; without it χ² with the input sigmas.
     redundancy : int
         Degrees of freedom of sigma0.
     alpha : float

@@ -1,4 +1,4 @@
-"""Covariances of observations, in blocks: sigmas, full matrices, and anything between, treated alike."""
+"""Covariances of observations as diagonal blocks: standard deviations, full matrices, and blocks."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ def blocks_of(covariance: Covariance, shape: tuple[int, ...], where: str = "cova
     shape : tuple of int
         Shape of the observations, n in all.
     where : str
-        What to call it in an error.
+        Name used in error messages.
 
     Raises
     ------
     UsageError
-        When it does not fit the observations, is not symmetric or not positive.
+        When its size does not match the observations, or it is not symmetric or not positive.
     """
     n = int(np.prod(shape))
     if covariance is None:
@@ -112,7 +112,7 @@ def _one_kind(given: Array, shape: tuple[int, ...] | None, where: str) -> Array:
 
 
 class Weighting:
-    """Observations of a covariance made uncorrelated and of unit weight.
+    """Whitening: makes observations uncorrelated and of unit weight.
 
     W is the inverse of the lower Cholesky factor of the covariance, so that P = Wᵀ W.
 
@@ -150,7 +150,7 @@ def _root(matrices: Array, factors: Array, where: str) -> tuple[Array, Array]:
     widen = 1.0 / np.sqrt(np.where(out, 1.0, factors))
     cofactor = matrices * widen[:, :, None] * widen[:, None, :]
     if out.any():
-        # An observation left out is cut from its block: what remains is the marginal of the others.
+        # Remove an observation of weight zero from its block; the marginal of the others remains.
         cofactor = np.where(out[:, :, None] | out[:, None, :], 0.0, cofactor)
     k = matrices.shape[1]
     index = np.arange(k)
