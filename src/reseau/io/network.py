@@ -1,4 +1,4 @@
-"""``reseau-network/1``: cameras, images, points and what was observed of them, for a bundle adjustment."""
+"""``reseau-network/1``: cameras, images, points and their observations, for a bundle adjustment."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class _Columns(Strict):
 
 
 class ImageColumns(_Columns):
-    """Images: the camera each was taken with, and its pose where it is known."""
+    """Images: the camera of each, and its pose where it is known."""
 
     id: tuple[str, ...]
     camera: tuple[str, ...]
@@ -141,7 +141,7 @@ class ImageColumns(_Columns):
 
 
 class PointColumns(_Columns):
-    """Points of the object: coordinates where they are known, and how well."""
+    """Object points: coordinates where they are known, with their standard deviations."""
 
     id: tuple[str, ...]
     xyz: tuple[Triple | None, ...]
@@ -162,7 +162,7 @@ class ObservationColumns(_Columns):
 
 
 class DistanceColumns(_Columns):
-    """Distances between points, as of scale bars."""
+    """Observed distances between points, such as scale bars."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -254,7 +254,7 @@ class Network1(Document):
                 )
 
     def to_dict(self) -> dict[str, Any]:
-        """The content as it stands in the file; keys that may be missing and say nothing are left out."""
+        """The content of the file; optional keys without a value are left out."""
         return {"schema": self.SCHEMA} | self.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 
@@ -265,7 +265,7 @@ def _known(name: str, names: Sequence[str]) -> str:
 
 
 def _twice(names: Iterable[T]) -> T | None:
-    """The first name that stands twice."""
+    """The first name that occurs twice."""
     seen: set[T] = set()
     for name in names:
         if name in seen:

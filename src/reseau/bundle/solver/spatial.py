@@ -20,7 +20,7 @@ __all__ = ["Pair", "Resection", "directions", "intersect", "relative_orientation
 
 
 class Resection(NamedTuple):
-    """Pose of an image: rotation matrix, projection centre, and the points that agree with it (k,)."""
+    """Pose of an image: rotation matrix, projection centre, and the points consistent with it (k,)."""
 
     rotation: Array
     x0: Array
@@ -36,7 +36,7 @@ class Pair(NamedTuple):
 
 
 def directions(network: Network) -> Array:
-    """Ideal directions u = xc/zc, v = yc/zc (n, 2) of all image coordinates, by the cameras as given."""
+    """Ideal directions u = xc/zc, v = yc/zc (n, 2) of all image coordinates, for the cameras as given."""
     found = np.full((len(network.xy), 2), np.nan)
     camera = network.camera_of[network.image_of]
     for c, entry in enumerate(network.cameras):
@@ -49,7 +49,7 @@ def directions(network: Network) -> Array:
 def _inverse(camera: Camera, xy: Array) -> Array:
     found = camera.bare_mapping().inverse(xy)
     if camera.registered is not None:
-        # Beyond the fold of a distortion that is not known yet, the ray without it is near enough.
+        # Beyond the fold of a distortion that is not known yet, the ray without distortion is near enough.
         beyond = ~np.isfinite(found).all(axis=1)
         found[beyond] = camera.bare_mapping(distorted=False).inverse(xy[beyond])
     return found
@@ -58,7 +58,7 @@ def _inverse(camera: Camera, xy: Array) -> Array:
 def intersect(
     image: Rows, point: Rows, uv: Array, rotation: Array, x0: Array, points: int
 ) -> tuple[Array, Array]:
-    """Points nearest all their rays, and how well the rays cut.
+    """Points nearest to all their rays, and the angles at which the rays intersect.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def intersect(
     Returns
     -------
     ndarray (p, 3), ndarray (p,)
-        Points, NaN with less than two rays; the angle (rad) at which rays cut, 0 for parallel ones.
+        Points, NaN with less than two rays; the angle (rad) at which the rays intersect, 0 for parallel ones.
     """
     ray = np.einsum("nji,nj->ni", rotation[image], np.column_stack([uv, np.ones(len(uv))]))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -85,7 +85,7 @@ def intersect(
     np.add.at(normal, point, across)
     np.add.at(side, point, np.einsum("nij,nj->ni", across, begin - centre))
     count = np.bincount(point, minlength=points)
-    # Of two rays that cut at an angle θ the least eigenvalue is 1 − cos θ.
+    # For two rays that intersect at an angle θ the least eigenvalue is 1 − cos θ.
     least = np.linalg.eigvalsh(normal)[:, 0]
     angle = np.where(count > 1, np.arccos(np.clip(1.0 - 2.0 * least / np.maximum(count, 2), -1.0, 1.0)), 0.0)
     good = (count > 1) & (least > 1e-12)
@@ -95,7 +95,7 @@ def intersect(
 
 
 def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
-    """Pose of an image from four points or more, the largest set that agrees.
+    """Pose of an image from four points or more: that of the largest consistent set.
 
     Parameters
     ----------
@@ -104,12 +104,12 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     uv : ndarray (k, 2)
         Ideal directions.
     tolerance : float
-        Greatest misfit of an ideal direction that agrees.
+        Greatest misfit of the ideal direction of a consistent point.
 
     Returns
     -------
     Resection or None
-        None where fewer than four points agree.
+        None where fewer than four points are consistent.
     """
     if len(xyz) < 4:
         return None
@@ -172,7 +172,7 @@ def relative_orientation(first: Array, second: Array, tolerance: float) -> Pair 
     first, second : ndarray (k, 2)
         Ideal directions of the same points.
     tolerance : float
-        Greatest distance from an epipolar line that agrees.
+        Greatest distance of a consistent point from its epipolar line.
     """
     if len(first) < 6:
         return None
