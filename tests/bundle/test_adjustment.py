@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 from reseau.adjust import variance_components
-from reseau.bundle import BundleFit, Network, Options, Result, adjust_network, calibration_of
-from reseau.bundle.modelling.selection import Selection, cross_validation, eliminate_parameters
+from reseau.bundle import (
+    BundleFit,
+    Network,
+    Options,
+    Result,
+    Selection,
+    adjust_network,
+    calibration_of,
+    cross_validation,
+    eliminate_parameters,
+)
 from reseau.calibration import Calibration
 from reseau.core.errors import UsageError
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Network, Options, Result, adjust_network, to_document
+from reseau.bundle import Camera, Network, Options, Result, ResultDocument, adjust_network
 from reseau.core.data import Array
 from reseau.optics.poses import rotation_matrix
 
@@ -96,7 +96,7 @@ def test_the_bad_corners_of_left02_are_among_those_left_out(seen: dict[str, Arra
     assert {f"{row}:0" for row in range(6)} <= bad
     assert result.rejected.sum() < 0.05 * len(result.rejected)
     # Every rejection is listed with its test value, those of the blunder the largest.
-    table = to_document(result)["left_out"]
+    table = ResultDocument.of(result).to_dict()["left_out"]
     assert list(zip(table["image"], table["point"], strict=True)) == list(zip(images, points, strict=True))
     assert all(value > critical for value, critical in zip(table["w"], table["critical"], strict=True))
     worst = sorted(zip(table["w"], table["image"], table["point"], strict=True), reverse=True)[:4]

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 from reseau.adjust import compare
-from reseau.bundle import Additional, Camera, Network, Result, adjust_network, by_place, common_pattern
-from reseau.bundle.modelling.selection import Selection, eliminate_parameters
+from reseau.bundle import (
+    Additional,
+    Camera,
+    Network,
+    Result,
+    Selection,
+    adjust_network,
+    by_place,
+    common_pattern,
+    eliminate_parameters,
+)
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
 from reseau.optics.poses import matrix_to_vector

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from .diagnostics import (
+    CameraEstimate,
     CommonPattern,
+    Eliminated,
+    ImageEstimates,
+    PointEstimates,
     Result,
     by_place,
     by_point,
@@ -12,12 +16,21 @@ from .diagnostics import (
     projection_field_at,
     sigma_between_images,
 )
-from .document import searched_document, to_document
-from .modelling.adjustment import Options, adjust_network, problem_of
-from .modelling.calibration import calibration_of
-from .modelling.components import Kind, estimate_components, reweighted
-from .modelling.model_search import Searched, search_model
-from .network import Additional, Camera, ControlPoints, Network, Stage
+from .document import ResultDocument, model_search_entries
+from .modelling import (
+    Kind,
+    Options,
+    Selection,
+    adjust_network,
+    calibration_of,
+    cross_validation,
+    eliminate_parameters,
+    estimate_components,
+    problem_of,
+    reweighted,
+    search_model,
+)
+from .network import Additional, Camera, ControlPoints, Network, Stage, example_network
 from .solver import Approximate, BundleFit, BundleProblem, approximate
 
 __all__ = [
@@ -26,13 +39,18 @@ __all__ = [
     "BundleFit",
     "BundleProblem",
     "Camera",
+    "CameraEstimate",
     "CommonPattern",
     "ControlPoints",
+    "Eliminated",
+    "ImageEstimates",
     "Kind",
     "Network",
     "Options",
+    "PointEstimates",
     "Result",
-    "Searched",
+    "ResultDocument",
+    "Selection",
     "Stage",
     "adjust_network",
     "approximate",
@@ -41,12 +59,14 @@ __all__ = [
     "calibration_of",
     "camera_mapping",
     "common_pattern",
+    "cross_validation",
+    "eliminate_parameters",
     "estimate_components",
+    "example_network",
+    "model_search_entries",
     "problem_of",
     "projection_field_at",
     "reweighted",
     "search_model",
-    "searched_document",
     "sigma_between_images",
-    "to_document",
 ]

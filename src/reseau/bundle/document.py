@@ -1,209 +1,415 @@
-"""The result as a document ``reseau-bundle/1``."""
+"""The result of an adjustment as a document ``reseau-bundle/1``."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
+from ..adjust.significance import CoefficientTest
 from ..core.data import Array
+from ..core.provenance import Provenance
+from ..io import Document, Strict
 from .diagnostics import Result, sigma_between_images
-from .modelling.model_search import Searched
 from .network import finite
 
-__all__ = ["SCHEMA", "searched_document", "to_document"]
+__all__ = ["ResultDocument", "model_search_entries"]
 
-SCHEMA = "reseau-bundle/1"
+Column = tuple[float | None, ...]
+Rows = tuple[tuple[float, ...] | None, ...]
+Matrix = tuple[tuple[float, ...], ...]
 
 
-def to_document(result: Result, *, covariances: bool = False) -> dict[str, Any]:
-    """The result in columns, JSON values; what is not determined is null.
+class Estimate(Strict):
+    """A parameter with its standard deviation; zero for a parameter that is held."""
 
-    Parameters
-    ----------
-    result : Result
-        Of a bundle adjustment.
-    covariances : bool
-        Whether points have their full covariances.
+    value: float
+    sigma: float
+
+
+class Correlation(Strict):
+    """Correlation matrix of the estimated parameters."""
+
+    names: tuple[str, ...]
+    matrix: Matrix
+
+
+class Significance(Strict):
+    """Test of a distortion parameter against zero."""
+
+    statistic: float | None
+    critical: float
+    p: float
+    significant: bool
+
+
+class CameraResult(Strict):
+    """A camera: parameters, their standard deviations from the scatter between images, correlation, tests."""
+
+    id: str
+    parameters: dict[str, Estimate]
+    # By the scatter between images; null where there are too few.
+    sigma_between_images: dict[str, float | None]
+    correlation: Correlation
+    tests: dict[str, Significance]
+
+
+class ImagesResult(Strict):
+    """Images in columns; `sigma` is that of X0, Y0, Z0 and of the rotation vector (rad).
+
+    `factors` are those by which the standard deviations given for x and y should have been multiplied.
     """
-    fit = result.fit
-    observations, unknowns, constraints = fit.counts
-    test = result.global_test()
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "sigma0": _number(result.sigma0),
-        "observations": observations,
-        "unknowns": unknowns,
-        "constraints": constraints,
-        "redundancy": result.redundancy,
-        "iterations": fit.iterations,
-        "cameras": [_camera(result, c) for c in range(len(result.network.cameras))],
-        "images": _images(result),
-        "points": _points(result, covariances),
-        "image_points": _image_points(result),
-        "global_test": None if test is None else {
-            "statistic": test.statistic, "redundancy": test.redundancy, "lower": test.lower,
-            "upper": test.upper, "p": test.p, "passed": test.passed,
-        },
-        "warnings": [remark.text for remark in result.warnings],
-        "warning_codes": [remark.code.value for remark in result.warnings],
-    }  # fmt: skip
-    if result.rejected.any():
-        document["left_out"] = _left_out(result)
-    if len(result.network.distance):
-        document["distances"] = _distances(result)
-    return document
+
+    id: tuple[str, ...]
+    camera: tuple[str, ...]
+    X0: Rows
+    rotation: Rows
+    sigma: Rows
+    angles_deg: Rows
+    angles_sigma_deg: Rows
+    factors: Rows
 
 
-def searched_document(searched: Searched) -> dict[str, Any]:
-    """How the model of an adjustment was found, JSON values; empty where nothing was looked for."""
+class PointsResult(Strict):
+    """Points in columns; `check` are differences at check points, computed less given."""
+
+    id: tuple[str, ...]
+    role: tuple[str, ...]
+    xyz: Rows
+    sigma: Rows
+    rays: tuple[int, ...]
+    cov: tuple[Matrix | None, ...] | None = None
+    check: Rows | None = None
+
+
+class ImagePointsResult(Strict):
+    """Image coordinates in columns: residuals (px), redundancy numbers, test values, reliability.
+
+    `mx`, `my` are minimal detectable errors (px); `ex`, `ey` the largest effect of errors of this size on any
+    result, in its standard deviations.
+    """
+
+    image: tuple[str, ...]
+    point: tuple[str, ...]
+    vx: Column
+    vy: Column
+    rx: Column
+    ry: Column
+    wx: Column
+    wy: Column
+    rejected: tuple[bool, ...]
+    mx: Column
+    my: Column
+    ex: Column
+    ey: Column
+
+
+class GlobalTestResult(Strict):
+    """Test of the variance factor against one."""
+
+    statistic: float
+    redundancy: int
+    lower: float
+    upper: float
+    p: float
+    passed: bool
+
+
+class LeftOut(Strict):
+    """Image points that data snooping rejected, with the test values at rejection."""
+
+    image: tuple[str, ...]
+    point: tuple[str, ...]
+    w: Column
+    critical: Column
+
+
+class DistancesResult(Strict):
+    """Observed distances in columns: residuals, redundancy numbers, test values."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    from_: tuple[str, ...] = Field(alias="from")
+    to: tuple[str, ...]
+    v: Column
+    r: Column
+    w: Column
+
+
+class ComponentsResult(Strict):
+    """Variance components: factors on the standard deviations given."""
+
+    names: tuple[str, ...]
+    factors: tuple[float, ...]
+    sigma: tuple[float, ...]
+    redundancy: tuple[float, ...]
+
+
+class EliminatedParameter(Strict):
+    """A distortion parameter that was dropped, its test before, and sigma0 without it."""
+
+    camera: str
+    name: str
+    statistic: float | None
+    critical: float
+    p: float
+    sigma0: float | None
+
+
+class CrossValidation(Strict):
+    """Root mean square of predicted image coordinates, with all parameters and with those kept."""
+
+    all: float
+    kept: float
+
+
+class ResultDocument(Document):
+    """The result of a bundle adjustment, ``reseau-bundle/1``: everything in columns, null if not determined.
+
+    Keys after `warnings` are missing where they do not apply. Files written before they existed have neither
+    `warning_codes` nor `provenance`.
+
+    Examples
+    --------
+    >>> text = '{"schema": "reseau-bundle/1", "sigma0": null}'
+    >>> ResultDocument.parse(text, where="result.json")
+    Traceback (most recent call last):
+    reseau.core.errors.FormatError: result.json: missing key `observations` (and ... more)
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-bundle/1"
+    sigma0: float | None
+    observations: int
+    unknowns: int
+    constraints: int
+    redundancy: int
+    iterations: int
+    cameras: tuple[CameraResult, ...]
+    images: ImagesResult
+    points: PointsResult
+    image_points: ImagePointsResult
+    global_test: GlobalTestResult | None
+    warnings: tuple[str, ...]
+    warning_codes: tuple[str, ...] | None = None
+    left_out: LeftOut | None = None
+    distances: DistancesResult | None = None
+    variance_components: ComponentsResult | None = None
+    eliminated: tuple[EliminatedParameter, ...] | None = None
+    cross_validation: CrossValidation | None = None
+    provenance: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, result: Result, *, covariances: bool = False, provenance: Provenance | None = None) -> Self:
+        """Collect the numbers of a result.
+
+        Parameters
+        ----------
+        result : Result
+            Of a bundle adjustment.
+        covariances : bool
+            Whether points have their full covariances.
+        provenance : Provenance, optional
+            Inputs and options.
+        """
+        observations, unknowns, constraints = result.fit.counts
+        test = result.global_test()
+        more: dict[str, Any] = {}
+        if result.rejected.any():
+            more["left_out"] = _left_out(result)
+        if len(result.network.distance):
+            more["distances"] = _distances(result)
+        if provenance is not None:
+            more["provenance"] = provenance.to_dict()
+        return cls(
+            sigma0=_number(result.sigma0),
+            observations=observations,
+            unknowns=unknowns,
+            constraints=constraints,
+            redundancy=result.redundancy,
+            iterations=result.fit.iterations,
+            cameras=tuple(_camera(result, c) for c in range(len(result.network.cameras))),
+            images=_images(result),
+            points=_points(result, covariances),
+            image_points=_image_points(result),
+            global_test=None if test is None else GlobalTestResult(
+                statistic=test.statistic, redundancy=test.redundancy, lower=test.lower, upper=test.upper,
+                p=test.p, passed=test.passed,
+            ),
+            warnings=tuple(remark.text for remark in result.warnings),
+            warning_codes=tuple(remark.code.value for remark in result.warnings),
+            **more,
+            **_model_search(result),
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content as it stands in the file; keys that do not apply are left out."""
+        content = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+        return {"schema": self.SCHEMA} | content
+
+
+def model_search_entries(result: Result) -> dict[str, Any]:
+    """Return how the model of a result was found, as JSON values; empty where none was searched.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network, search_model
+    >>> entries = model_search_entries(search_model(example_network(), components="axes"))
+    >>> entries["variance_components"]["names"]
+    ['x', 'y']
+    """
+
+    def plain(entry: Any) -> Any:
+        if isinstance(entry, tuple):
+            return [plain(each) for each in entry]
+        return entry.model_dump(mode="json")
+
+    return {key: plain(entry) for key, entry in _model_search(result).items()}
+
+
+def _model_search(result: Result) -> dict[str, Any]:
+    """How the model was found; empty where none was searched."""
     found: dict[str, Any] = {}
-    components = searched.components
+    components = result.components
     if components is not None:
-        found["variance_components"] = {
-            "names": list(components.names),
-            "factors": components.factors.tolist(),
-            "sigma": components.sigma.tolist(),
-            "redundancy": components.redundancy.tolist(),
-        }
-    if searched.eliminated is not None:
-        found["eliminated"] = [
-            {"camera": step.camera, "name": step.test.name, "statistic": _number(step.test.statistic),
-             "critical": step.test.critical, "p": step.test.p, "sigma0": _number(step.sigma0)}
-            for step in searched.eliminated
-        ]  # fmt: skip
-    if searched.validation is not None:
-        found["cross_validation"] = {"all": searched.validation[0], "kept": searched.validation[1]}
+        found["variance_components"] = ComponentsResult(
+            names=tuple(components.names),
+            factors=tuple(components.factors.tolist()),
+            sigma=tuple(components.sigma.tolist()),
+            redundancy=tuple(components.redundancy.tolist()),
+        )
+    if result.eliminated is not None:
+        found["eliminated"] = tuple(
+            EliminatedParameter(
+                camera=step.camera, name=step.test.name, statistic=_number(step.test.statistic),
+                critical=step.test.critical, p=step.test.p, sigma0=_number(step.sigma0),
+            )
+            for step in result.eliminated
+        )  # fmt: skip
+    if result.validation is not None:
+        found["cross_validation"] = CrossValidation(all=result.validation[0], kept=result.validation[1])
     return found
 
 
-def _camera(result: Result, c: int) -> dict[str, Any]:
-    camera = result.network.cameras[c]
-    names, _, values = result.camera_columns(c)
-    covariance = result.camera_covariance(c)
-    sigma = np.sqrt(np.diag(covariance))
-    held = {name: {"value": value, "sigma": 0.0} for name, value in camera.parameters.items()}
-    found = {
-        name: {"value": float(value), "sigma": float(s)}
-        for name, value, s in zip(names, values, sigma, strict=True)
+def _camera(result: Result, c: int) -> CameraResult:
+    camera, found = result.network.cameras[c], result.camera(c)
+    held = {name: Estimate(value=value, sigma=0.0) for name, value in camera.parameters.items()}
+    estimated = {
+        name: Estimate(value=value, sigma=s)
+        for name, value, s in zip(found.parameters, found.values.tolist(), found.sigma.tolist(), strict=True)
     }
-    tests = {
-        test.name: {"statistic": _number(test.statistic), "critical": test.critical, "p": test.p,
-                    "significant": test.significant}
-        for test in result.camera_tests(c)
-    }  # fmt: skip
-    size = np.where(sigma > 0, sigma, 1.0)
-    correlation = covariance / np.outer(size, size)
-    np.fill_diagonal(correlation, 1.0)
-    return {
-        "id": camera.id,
-        "parameters": held | found,
-        # By the scatter between images; null where these are too few.
-        "sigma_between_images": dict(zip(names, _column(sigma_between_images(result, c)), strict=True)),
-        "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "tests": tests,
-    }
+    between = _column(sigma_between_images(result, c))
+    return CameraResult(
+        id=camera.id,
+        parameters=held | estimated,
+        sigma_between_images=dict(zip(found.parameters, between, strict=True)),
+        correlation=Correlation(names=found.parameters, matrix=_matrix(found.correlation)),
+        tests={test.name: _significance(test) for test in result.camera_tests(c)},
+    )
 
 
-def _images(result: Result) -> dict[str, Any]:
-    sigma = np.sqrt(np.maximum(np.diagonal(result.pose_covariance, axis1=1, axis2=2), 0.0))
-    network = result.network
-    return {
-        "id": list(network.images),
-        "camera": [network.cameras[c].id for c in network.camera_of],
-        "X0": _rows(result.fit.values.x0),
-        "rotation": _rows(result.rotation),
-        # Of X0, Y0, Z0 and the rotation vector.
-        "sigma": _rows(np.hstack([sigma[:, 3:], sigma[:, :3]])),
-        "angles_deg": _rows(np.degrees(result.angles)),
-        "angles_sigma_deg": _rows(np.degrees(result.angle_sigma)),
-        # Of the sigmas given, x and y: what they should have been multiplied with.
-        "factors": _rows(result.variance_factors),
-    }
+def _significance(test: CoefficientTest) -> Significance:
+    return Significance(
+        statistic=_number(test.statistic), critical=test.critical, p=test.p, significant=test.significant
+    )
 
 
-def _points(result: Result, covariances: bool) -> dict[str, Any]:
-    network = result.network
-    table: dict[str, Any] = {
-        "id": list(network.points),
-        "role": list(network.role),
-        "xyz": _rows(result.fit.values.xyz),
-        "sigma": _rows(result.point_sigma),
-        "rays": network.rays.tolist(),
-    }
+def _images(result: Result) -> ImagesResult:
+    images = result.images
+    return ImagesResult(
+        id=images.names,
+        camera=images.cameras,
+        X0=_rows(images.x0),
+        rotation=_rows(images.rotation),
+        sigma=_rows(images.sigma),
+        angles_deg=_rows(np.degrees(result.angles)),
+        angles_sigma_deg=_rows(np.degrees(result.angle_sigma)),
+        factors=_rows(result.variance_factors),
+    )
+
+
+def _points(result: Result, covariances: bool) -> PointsResult:
+    points, more = result.points, dict[str, Any]()
     if covariances:
-        determined = result.fit.usable.points
-        table["cov"] = [
-            block.tolist() if known else None
-            for block, known in zip(result.point_covariance, determined, strict=True)
-        ]
+        more["cov"] = tuple(
+            _matrix(block) if known else None
+            for block, known in zip(points.cov, result.fit.usable.points, strict=True)
+        )
     rows, difference = result.check_points
     if len(rows):
-        column: list[list[float] | None] = [None] * len(network.points)
+        column: list[tuple[float, ...] | None] = [None] * len(points)
         for row, off in zip(rows, difference, strict=True):
-            column[row] = off.tolist()
-        table["check"] = column
-    return table
+            column[row] = tuple(off.tolist())
+        more["check"] = tuple(column)
+    return PointsResult(
+        id=points.names,
+        role=points.roles,
+        xyz=_rows(points.xyz),
+        sigma=_rows(points.sigma),
+        rays=tuple(points.rays.tolist()),
+        **more,
+    )
 
 
-def _image_points(result: Result) -> dict[str, Any]:
+def _image_points(result: Result) -> ImagePointsResult:
     network = result.network
     v, r, w = result.residuals, result.redundancy_numbers, result.test_values
     least, effect = result.minimal_detectable_errors(), result.external_reliability()
-    return {
-        "image": [network.images[i] for i in network.image_of],
-        "point": [network.points[j] for j in network.point_of],
-        "vx": _column(v[:, 0]),
-        "vy": _column(v[:, 1]),
-        "rx": _column(r[:, 0]),
-        "ry": _column(r[:, 1]),
-        "wx": _column(w[:, 0]),
-        "wy": _column(w[:, 1]),
-        "rejected": result.rejected.tolist(),
-        # Minimal detectable errors (px), and what they do at most to any result (in its sigmas).
-        "mx": _column(least[:, 0]),
-        "my": _column(least[:, 1]),
-        "ex": _column(effect[:, 0]),
-        "ey": _column(effect[:, 1]),
-    }
+    return ImagePointsResult(
+        image=tuple(network.images[i] for i in network.image_of),
+        point=tuple(network.points[j] for j in network.point_of),
+        vx=_column(v[:, 0]),
+        vy=_column(v[:, 1]),
+        rx=_column(r[:, 0]),
+        ry=_column(r[:, 1]),
+        wx=_column(w[:, 0]),
+        wy=_column(w[:, 1]),
+        rejected=tuple(result.rejected.tolist()),
+        mx=_column(least[:, 0]),
+        my=_column(least[:, 1]),
+        ex=_column(effect[:, 0]),
+        ey=_column(effect[:, 1]),
+    )
 
 
-def _left_out(result: Result) -> dict[str, Any]:
-    """What data snooping left out, with the test values at which it did."""
+def _left_out(result: Result) -> LeftOut:
     rows, network = np.flatnonzero(result.rejected), result.network
     tests = result.rejected_tests[rows]
-    return {
-        "image": [network.images[i] for i in network.image_of[rows]],
-        "point": [network.points[j] for j in network.point_of[rows]],
-        "w": _column(tests[:, 0]),
-        "critical": _column(tests[:, 1]),
-    }
+    return LeftOut(
+        image=tuple(network.images[i] for i in network.image_of[rows]),
+        point=tuple(network.points[j] for j in network.point_of[rows]),
+        w=_column(tests[:, 0]),
+        critical=_column(tests[:, 1]),
+    )
 
 
-def _distances(result: Result) -> dict[str, Any]:
+def _distances(result: Result) -> DistancesResult:
     network, at = result.network, 2 * len(result.network.xy)
-    count = len(network.distance)
-    rows = slice(at, at + count)
+    rows = slice(at, at + len(network.distance))
     sigma0 = result.sigma0 if result.redundancy > 0 and result.sigma0 > 0 else 1.0
-    return {
-        "from": [network.points[j] for j in network.distance_of[:, 0]],
-        "to": [network.points[j] for j in network.distance_of[:, 1]],
-        "v": _column(result.fit.residuals[rows]),
-        "r": _column(result.fit.redundancy_numbers[rows]),
-        "w": _column(np.abs(result.fit.w[rows]) / sigma0),
-    }
+    return DistancesResult(
+        **{"from": tuple(network.points[j] for j in network.distance_of[:, 0])},
+        to=tuple(network.points[j] for j in network.distance_of[:, 1]),
+        v=_column(result.fit.residuals[rows]),
+        r=_column(result.fit.redundancy_numbers[rows]),
+        w=_column(np.abs(result.fit.w[rows]) / sigma0),
+    )
 
 
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _column(values: Array) -> list[float | None]:
-    return [_number(value) for value in values.tolist()]
+def _column(values: Array) -> Column:
+    return tuple(_number(value) for value in values.tolist())
 
 
-def _rows(values: NDArray[np.float64]) -> list[list[float] | None]:
+def _matrix(rows: Iterable[Array]) -> Matrix:
+    return tuple(tuple(row.tolist()) for row in rows)
+
+
+def _rows(values: Array) -> Rows:
     known = finite(values).tolist()
-    return [row if k else None for row, k in zip(values.tolist(), known, strict=True)]
+    return tuple(tuple(row) if k else None for row, k in zip(values.tolist(), known, strict=True))

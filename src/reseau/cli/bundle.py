@@ -19,11 +19,12 @@ from .bundle_options import (
     positive,
     say_left_out,
     say_model,
+    say_parameters,
 )
 from .common import AsJson, Out, progress, required, say
 
 if TYPE_CHECKING:
-    from ..bundle import Network, Searched
+    from ..bundle import Network, Result
 
 __all__ = ["bundle", "read_network"]
 
@@ -37,14 +38,16 @@ def bundle(
     alpha: Alpha = 0.001,
     components: ComponentsOf = None,
     eliminate: Eliminate = None,
-    cov: Annotated[bool, typer.Option("--cov", help="Full covariances of the points in the result.")] = False,
+    cov: Annotated[
+        bool, typer.Option("--cov", help="Include full covariances of the points in the result.")
+    ] = False,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,
     as_json: AsJson = False,
 ) -> None:
-    """Adjust a bundle: orientation, calibration and points from image coordinates, with all their quality."""
-    from ..bundle import Options, search_model, searched_document, to_document
-    from ..core.provenance import Provenance, canonical_json, sha256_of
+    """Adjust a network of images: orientation, calibration and object points, with their quality."""
+    from ..bundle import Options, ResultDocument, search_model
+    from ..core.provenance import Provenance
     from ..io import write_whole
 
     level_of(alpha, "--alpha")
@@ -56,24 +59,31 @@ def bundle(
             outliers="reject" if reject else "keep", alpha=alpha, watch=lambda k, cost: step(f"iteration {k}")
         )
         found = search_model(content, options, component_kind(components), level_of(eliminate, "--eliminate"))
-        searched = required(found, network)
-    document = to_document(searched.result, covariances=cov) | searched_document(searched)
+        result = required(found, network)
+    settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
+                "eliminate": eliminate}  # fmt: skip
+    provenance = Provenance(_hashes(network), settings)
+    document = ResultDocument.of(result, covariances=cov, provenance=provenance)
     if report is not None:
         from ..report.bundle import bundle_report
 
-        inputs = {network.name: sha256_of(network)} if network.is_file() else {}
-        settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
-                    "eliminate": eliminate}  # fmt: skip
-        page = bundle_report(
-            searched, title=network.name, provenance=Provenance(inputs, settings), distances=distance or ()
-        )
+        page = bundle_report(result, title=network.name, provenance=provenance, distances=distance or ())
         write_whole(report, page)
     if out is not None:
-        write_whole(out, canonical_json(document))
+        document.write(out)
     if as_json:
-        say(canonical_json(document))
+        say(document.to_json())
     else:
-        _say(network, searched)
+        _say(network, result)
+
+
+def _hashes(path: Path) -> dict[str, str]:
+    """SHA-256 of a file, or of the text files in a folder."""
+    from ..core.provenance import sha256_of
+
+    if path.is_file():
+        return {path.name: sha256_of(path)}
+    return {f"{path.name}/{file.name}": sha256_of(file) for file in sorted(path.glob("*.txt"))}
 
 
 def read_network(path: Path) -> Network:
@@ -87,24 +97,19 @@ def read_network(path: Path) -> Network:
     return Network.from_document(Network1.read(path))
 
 
-def _say(path: Path, searched: Searched) -> None:
-    result = searched.result
+def _say(path: Path, result: Result) -> None:
     observations, unknowns, constraints = result.fit.counts
+    left_out = f", {int(result.rejected.sum())} image points left out" if result.rejected.any() else ""
     say(
         f"{path.name}: {observations} observations, {unknowns} unknowns, {constraints} constraints, "
         f"redundancy {result.redundancy}\n"
-        f"sigma0 {result.sigma0:.6g} after {result.fit.iterations} iterations"
-        f"{f', {int(result.rejected.sum())} image points left out' if result.rejected.any() else ''}\n"
+        f"sigma0 {result.sigma0:.4g} after {result.fit.iterations} iterations{left_out}\n"
     )
-    for c, camera in enumerate(result.network.cameras):
-        names, _, values = result.camera_columns(c)
-        if not names:
-            continue
-        say(f"camera {camera.id}\n")
-        sigma = result.camera_covariance(c).diagonal() ** 0.5
-        for name, value, s in zip(names, values, sigma, strict=True):
-            say(f"  {name:<6} {value:14.7g} ± {s:.3g}\n")
-    say_model(searched)
+    for camera in result.cameras.values():
+        if camera.parameters:
+            say(f"camera {camera.id}\n")
+            say_parameters(camera)
+    say_model(result)
     say_left_out(result)
     for warning in result.warnings:
         say(f"warning: {warning}\n")

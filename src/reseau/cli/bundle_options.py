@@ -1,4 +1,4 @@
-"""What `reseau bundle` and `reseau calibrate` have in common: options, and what is said of a result."""
+"""Options and output shared by `reseau bundle` and `reseau calibrate`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import Kind, Result, Searched
+    from ..bundle import CameraEstimate, Kind, Result
     from ..calibration import FieldDifference
+    from ..core.data import Array
 
 __all__ = [
     "Alpha",
@@ -27,23 +28,24 @@ __all__ = [
     "say_difference",
     "say_left_out",
     "say_model",
+    "say_parameters",
 ]
 
 
 class Components(StrEnum):
-    """What gets a factor of its own on the standard deviations of its image coordinates."""
+    """Groups of image coordinates with a variance component of their own."""
 
     AXES = "axes"
     IMAGES = "images"
     CAMERAS = "cameras"
 
 
-Reject = Annotated[bool, typer.Option("--reject", help="Leave blunders out, by data snooping.")]
-Alpha = Annotated[float, typer.Option(help="Level of the single test of data snooping.")]
+Reject = Annotated[bool, typer.Option("--reject", help="Reject gross errors by data snooping.")]
+Alpha = Annotated[float, typer.Option(help="Significance level of each test of data snooping.")]
 ComponentsOf = Annotated[
     Components | None,
     typer.Option(
-        "--components", help="Variance components: x against y, image by image, or camera by camera."
+        "--components", help="Estimate variance components of x and y, of each image, or of each camera."
     ),
 ]
 Eliminate = Annotated[
@@ -53,18 +55,18 @@ Eliminate = Annotated[
 Distances = Annotated[
     list[float] | None,
     typer.Option(
-        "--distance", help="Distance at which the report maps how well the projection is known; repeatable."
+        "--distance", help="Distance at which to map the uncertainty of the projection; repeatable."
     ),
 ]
 
 
 def component_kind(chosen: Components | None) -> Kind | None:
-    """The kind of variance components asked for."""
+    """Return the kind of variance components."""
     return None if chosen is None else chosen.value
 
 
 def level_of(value: float | None, name: str) -> float | None:
-    """A level, where one is given.
+    """Check a significance level, if one is given.
 
     Raises
     ------
@@ -79,14 +81,14 @@ def level_of(value: float | None, name: str) -> float | None:
 
 
 def outputs(out: Path | None, report: Path | None) -> None:
-    """Ask before the work begins whether result and report can be written.
+    """Check before the computation that result and report can be written.
 
     Raises
     ------
     InputError
         When a folder does not exist.
     UsageError
-        When one has another suffix than it should.
+        When a suffix is wrong.
     """
     for path, suffixes in ((out, (".json",)), (report, (".html",))):
         if path is not None:
@@ -94,7 +96,7 @@ def outputs(out: Path | None, report: Path | None) -> None:
 
 
 def positive(distances: list[float] | None) -> list[float]:
-    """Distances, asked before the work begins.
+    """Check distances before the computation.
 
     Raises
     ------
@@ -109,8 +111,22 @@ def positive(distances: list[float] | None) -> list[float]:
     return distances or []
 
 
+def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None:
+    """Print the parameters of a camera, with sigmas from the scatter `between` images where given."""
+    import math
+
+    from ..core.numbers import measured
+
+    rows = zip(camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.units, strict=True)
+    for k, (name, value, sigma, unit) in enumerate(rows):
+        by_images = ""
+        if between is not None and math.isfinite(between[k]):
+            by_images = f" (from scatter between images: {between[k]:.2g})"
+        say(f"  {name:<6} {measured(value, sigma, unit)}{by_images}\n")
+
+
 def say_left_out(result: Result) -> None:
-    """What data snooping left out, with the test values."""
+    """Print the image points that data snooping rejected, with their test values."""
     import numpy as np
 
     tests = result.rejected_tests[np.flatnonzero(result.rejected)]
@@ -118,22 +134,22 @@ def say_left_out(result: Result) -> None:
         say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
 
 
-def say_model(searched: Searched) -> None:
-    """Variance components and parameters dropped."""
-    found = searched.components
+def say_model(result: Result) -> None:
+    """Print variance components and dropped parameters."""
+    found = result.components
     if found is not None:
         for name, factor, sigma in zip(found.names, found.factors, found.sigma, strict=True):
             say(f"sigmas of {name} times {factor:.3f} ± {sigma:.2g}\n")
-    for step in searched.eliminated or ():
-        said = f"|t| {step.test.statistic:.2f}, p = {step.test.p:.2g}, sigma0 without it {step.sigma0:.5g}"
-        say(f"dropped: {step.test.name} of camera {step.camera}: {said}\n")
-    if searched.eliminated == ():
-        say("all distortion parameters are significant: none was dropped\n")
-    if searched.validation is not None:
-        before, after = searched.validation
+    for step in result.eliminated or ():
+        test = f"|t| {step.test.statistic:.2f}, p = {step.test.p:.2g}, sigma0 without it {step.sigma0:.5g}"
+        say(f"dropped: {step.test.name} of camera {step.camera}: {test}\n")
+    if result.eliminated == ():
+        say("all distortion parameters are significant; none was dropped\n")
+    if result.validation is not None:
+        before, after = result.validation
         say(
-            f"cross-validation: points predicted without them are off by {before:.4g} sigmas with all "
-            f"parameters, by {after:.4g} with those that stayed\n"
+            f"cross-validation: predicted image coordinates differ by {before:.4g} sigmas rms with all "
+            f"parameters, by {after:.4g} with those kept\n"
         )
 
 

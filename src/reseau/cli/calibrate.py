@@ -21,6 +21,7 @@ from .bundle_options import (
     say_difference,
     say_left_out,
     say_model,
+    say_parameters,
 )
 from .common import (
     AsJson,
@@ -182,10 +183,10 @@ def _processes(images: list[Path], jobs: int | None) -> int:
 
 def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:
     """The calibration, with how its model was found."""
-    from ..bundle import calibration_of, searched_document
+    from ..bundle import calibration_of, model_search_entries
 
     calibration = calibration_of(done.result, "camera", name=name, provenance=provenance.to_dict())
-    more = searched_document(done.searched)
+    more = model_search_entries(done.result)
     return calibration.model_copy(update={"validity": calibration.validity | more}) if more else calibration
 
 
@@ -201,7 +202,7 @@ def _write_report(
     from ..report.bundle import bundle_report
 
     page = bundle_report(
-        done.searched, title=title, provenance=provenance, against=differences, distances=distances or ()
+        done.result, title=title, provenance=provenance, against=differences, distances=distances or ()
     )
     write_whole(path, page)
 
@@ -268,11 +269,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     v = result.residuals[~result.rejected]
     v = v[np.isfinite(v).all(axis=1)]
     say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
-    names, _, values = result.camera_columns(0)
-    sigmas, between = result.camera_covariance(0).diagonal() ** 0.5, sigma_between_images(result, 0)
-    for name, value, s, other in zip(names, values, sigmas, between, strict=True):
-        by_images = f" (by images {other:.3g})" if np.isfinite(other) else ""
-        say(f"  {name:<6} {value:14.7g} ± {s:.3g}{by_images}\n")
+    say_parameters(result.camera(0), sigma_between_images(result, 0))
     sigma = projection_field(camera_mapping(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
@@ -280,7 +277,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         sigma = projection_field_at(result, 0, away).sigma
         middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
         say(f"  of points at {away:g} {result.network.unit} to {middle:.2g} px, {worst:.2g} px at worst\n")
-    say_model(done.searched)
+    say_model(done.result)
     for name, found in differences.items():
         say_difference(name, found)
     say_left_out(result)

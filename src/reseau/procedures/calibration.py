@@ -15,10 +15,22 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from ..bundle import Camera, ControlPoints, Kind, Network, Options, Result, Searched, search_model
+from ..bundle import (
+    Camera,
+    CameraEstimate,
+    ControlPoints,
+    ImageEstimates,
+    Kind,
+    Network,
+    Options,
+    PointEstimates,
+    Result,
+    search_model,
+)
 from ..core.data import Array, Frame, ImagePoints
+from ..core.display import Display
 from ..core.errors import UsageError
-from ..core.failure import Code, Failure
+from ..core.failure import Code, Failure, Remark
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
 from .target_measurement import Measurer, measured_in_order, measurer_of
@@ -144,21 +156,21 @@ class CalibrationOptions:
     heights: Heights | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Calibrated:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibrated(Display):
     """A calibration with what it was made of; truthy.
 
     Parameters
     ----------
-    searched : Searched
-        The adjustment and how its model was found.
+    result : Result
+        The adjustment, and how its model was found; its network has one camera, `camera`.
     measured : dict
         What was measured, by image.
     declined : dict
         Why images do not take part.
     """
 
-    searched: Searched
+    result: Result
     measured: dict[str, ImagePoints]
     declined: dict[str, str]
 
@@ -170,9 +182,43 @@ class Calibrated:
         return self
 
     @property
-    def result(self) -> Result:
-        """The adjustment; its network has one camera, `camera`."""
-        return self.searched.result
+    def sigma0(self) -> float:
+        """Standard deviation of unit weight; NaN without redundancy."""
+        return self.result.sigma0
+
+    @property
+    def warnings(self) -> tuple[Remark, ...]:
+        """Warnings about the adjustment."""
+        return self.result.warnings
+
+    @property
+    def cameras(self) -> dict[str, CameraEstimate]:
+        """Estimated parameters of the camera, by its name ``camera``."""
+        return self.result.cameras
+
+    @property
+    def images(self) -> ImageEstimates:
+        """Exterior orientations."""
+        return self.result.images
+
+    @property
+    def points(self) -> PointEstimates:
+        """Points of the target."""
+        return self.result.points
+
+    def _facts(self) -> list[tuple[str, str]]:
+        camera = self.cameras["camera"]
+        count = sum(len(points) for points in self.measured.values())
+        return [
+            (f"{len(self.measured)} images", ""),
+            (f"{count} image points", ""),
+            (f"{len(self.declined)} declined", ""),
+            ("sigma0", f"{self.sigma0:.3f}"),
+            *camera._facts()[1:],
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        return self.cameras["camera"]._columns()
 
 
 def calibrate_camera(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import Result, Searched, camera_mapping, projection_field_at, sigma_between_images
+from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Rows
 from ..core.provenance import Provenance
@@ -26,7 +26,7 @@ _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
 
 
 def bundle_report(
-    searched: Searched,
+    result: Result,
     *,
     title: str,
     provenance: Provenance | None = None,
@@ -37,7 +37,7 @@ def bundle_report(
 
     Parameters
     ----------
-    searched : Searched
+    result : Result
         The adjustment.
     title : str
         Heading of the page.
@@ -54,7 +54,6 @@ def bundle_report(
     str
         An HTML page without any external resource and without clock times.
     """
-    result = searched.result
     cameras = [_camera(result, c, distances) for c in _shown(result)[:_CAMERAS]]
     return rendered(
         "bundle.html.j2",
@@ -62,8 +61,8 @@ def bundle_report(
         summary=_summary(result),
         warnings=result.warnings,
         network=Markup(network_figure(result)),
-        components=components_table(searched),
-        dropped=dropped_table(searched),
+        components=components_table(result),
+        dropped=dropped_table(result),
         cameras=cameras,
         more_cameras=max(0, len(_shown(result)) - _CAMERAS),
         images=images_table(result)[:_IMAGES],

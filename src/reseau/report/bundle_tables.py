@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bundle import Result, Searched
+from ..bundle import Result
 from ..core.data import Array
 
 __all__ = ["components_table", "dropped_table", "images_table", "left_out_table", "worst_points"]
@@ -78,25 +78,25 @@ def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def components_table(searched: Searched) -> list[tuple[str, str, str, str]]:
+def components_table(result: Result) -> list[tuple[str, str, str, str]]:
     """Return variance components: name, factor, its standard deviation, redundancy."""
-    found = searched.components
+    found = result.components
     if found is None:
         return []
     columns = zip(found.names, found.factors, found.sigma, found.redundancy, strict=True)
     return [(name, f"{factor:.3f}", f"{sigma:.2g}", f"{r:.1f}") for name, factor, sigma, r in columns]
 
 
-def dropped_table(searched: Searched) -> dict[str, Any] | None:
+def dropped_table(result: Result) -> dict[str, Any] | None:
     """Return dropped parameters and the errors of prediction before and after; None without elimination."""
-    if searched.eliminated is None:
+    if result.eliminated is None:
         return None
-    before, after = searched.validation or (np.nan, np.nan)
+    before, after = result.validation or (np.nan, np.nan)
     return {
         "steps": [
             (step.camera, step.test.name, f"{step.test.statistic:.2f}", f"{step.test.critical:.2f}",
              f"{step.test.p:.2g}", f"{step.sigma0:.5g}")
-            for step in searched.eliminated
+            for step in result.eliminated
         ],
         "before": f"{before:.4g}",
         "after": f"{after:.4g}",

@@ -2,13 +2,18 @@
 
 from .checks import checks, listed
 from .control_check import doubtful_control
+from .estimates import CameraEstimate, ImageEstimates, PointEstimates
 from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
-from .result import Result
+from .result import Eliminated, Result
 
 __all__ = [
+    "CameraEstimate",
     "CommonPattern",
+    "Eliminated",
+    "ImageEstimates",
+    "PointEstimates",
     "Result",
     "by_place",
     "by_point",

@@ -8,29 +8,51 @@ from functools import cached_property
 
 import numpy as np
 
+from ...adjust import VarianceComponents
 from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
+from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Remark
-from ...optics.cameras import distortion_names
+from ...optics.cameras import distortion_names, unit_of
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
 from ..solver import BundleFit
+from .estimates import CameraEstimate, ImageEstimates, PointEstimates
 
-__all__ = ["Result"]
+__all__ = ["Eliminated", "Result"]
 
 _STEP = 1e-6
 # Redundancy below which an image says nothing of its own scatter.
 _UNCONTROLLED = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """A bundle adjustment with everything known of its quality; truthy.
+@dataclass(frozen=True)
+class Eliminated:
+    """A parameter that was dropped because it was not significant.
 
-    Standard deviations and covariances are a posteriori, multiplied with the estimated variance factor;
-    without redundancy a priori. What was not determined is NaN.
+    Parameters
+    ----------
+    camera : str
+        Name of its camera.
+    test : CoefficientTest
+        Its test before it was dropped.
+    sigma0 : float
+        Standard deviation of unit weight without it.
+    """
+
+    camera: str
+    test: CoefficientTest
+    sigma0: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Display):
+    """A bundle adjustment with its quality; truthy.
+
+    Standard deviations and covariances are a posteriori, multiplied by the estimated variance factor; without
+    redundancy they are a priori. What was not determined is NaN.
 
     Parameters
     ----------
@@ -44,6 +66,24 @@ class Result:
         How that came about, by the numbers of :class:`~reseau.bundle.solver.problem.BundleProblem`.
     warnings : tuple of Remark
         What deserves attention; each names what it is about.
+    components : VarianceComponents, optional
+        Factors on the standard deviations given, where they were estimated.
+    eliminated : tuple of Eliminated, optional
+        Parameters that were dropped, in this order; None where no parameter was tested for it.
+    validation : (float, float), optional
+        Root mean square of image coordinates predicted without them, in their standard deviations: with all
+        parameters, and with those that were kept.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> result
+    <Result: 8 images, 20 points, sigma0 1.0..., redundancy 171, 0 image points left out, 0 warnings>
+    >>> result.points.xyz.shape, result.images.sigma.shape
+    ((20, 3), (8, 6))
+    >>> result.cameras["camera"]
+    <CameraEstimate: camera, c 8.00... mm, ...>
     """
 
     network: Network
@@ -51,6 +91,9 @@ class Result:
     rejected: Mask
     steps: tuple[SnoopingStep, ...] = ()
     warnings: tuple[Remark, ...] = ()
+    components: VarianceComponents[BundleFit] | None = None
+    eliminated: tuple[Eliminated, ...] | None = None
+    validation: tuple[float, float] | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -72,6 +115,69 @@ class Result:
     def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
         """Test of the variance factor against one; None without redundancy."""
         return self.fit.global_test(alpha) if self.redundancy > 0 else None
+
+    def _facts(self) -> list[tuple[str, str]]:
+        part = self.fit.usable
+        return [
+            (f"{int(part.images.sum())} images", ""),
+            (f"{int(part.points.sum())} points", ""),
+            ("sigma0", f"{self.sigma0:.3f}"),
+            ("redundancy", f"{self.redundancy}"),
+            (f"{int(self.rejected.sum())} image points left out", ""),
+            (f"{len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}", ""),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        network = self.network
+        columns: dict[str, list[object]] = {
+            "image": [network.images[i] for i in network.image_of],
+            "point": [network.points[j] for j in network.point_of],
+        }
+        for name, values in (("v", self.residuals), ("r", self.redundancy_numbers), ("w", self.test_values)):
+            unit = "_px" if name == "v" else ""
+            columns |= {f"{name}{axis}{unit}": values[:, k].tolist() for k, axis in enumerate("xy")}
+        return columns | {"rejected": self.rejected.tolist()}
+
+    # -- estimates in columns
+
+    def camera(self, c: int) -> CameraEstimate:
+        """Estimated parameters of the c-th camera of the network."""
+        names, _, values = self.camera_columns(c)
+        entry = self.network.cameras[c]
+        units = tuple(unit_of(name, entry.model) for name in names)
+        return CameraEstimate(entry.id, names, values, self.camera_covariance(c), units)
+
+    @cached_property
+    def cameras(self) -> dict[str, CameraEstimate]:
+        """Estimated parameters of each camera by its name."""
+        return {camera.id: self.camera(c) for c, camera in enumerate(self.network.cameras)}
+
+    @cached_property
+    def images(self) -> ImageEstimates:
+        """Exterior orientations."""
+        network = self.network
+        order = [3, 4, 5, 0, 1, 2]
+        return ImageEstimates(
+            network.images,
+            tuple(network.cameras[c].id for c in network.camera_of),
+            self.fit.values.x0,
+            self.rotation,
+            self.pose_covariance[:, order][:, :, order],
+            network.unit,
+        )
+
+    @cached_property
+    def points(self) -> PointEstimates:
+        """Object points."""
+        network = self.network
+        return PointEstimates(
+            network.points,
+            network.role,
+            self.fit.values.xyz,
+            self.point_covariance,
+            network.rays,
+            network.unit,
+        )
 
     # -- cameras
 
@@ -271,12 +377,6 @@ class Result:
         To first order: :func:`~reseau.bundle.modelling.components.estimate_components` iterates.
         """
         return _factors(*self.scatter)
-
-    @property
-    def axis_factors(self) -> Array:
-        """The same of all images together, x and y (2,)."""
-        squares, expected = self.scatter
-        return _factors(squares.sum(axis=0), expected.sum(axis=0))
 
     def rejected_names(self) -> tuple[list[str], list[str]]:
         """Images and points of the image points that data snooping left out."""

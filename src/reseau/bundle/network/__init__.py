@@ -1,5 +1,6 @@
 """What is adjusted: cameras, images, points and their observations, in columns."""
 
+from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network, Usable, finite, usable
 from .stage import Stage, StageValues, perpendicular
 
@@ -11,6 +12,7 @@ __all__ = [
     "Stage",
     "StageValues",
     "Usable",
+    "example_network",
     "finite",
     "perpendicular",
     "usable",

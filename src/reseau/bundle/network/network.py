@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.data import Array, Mask, Rows
+from ...core.display import Display
 from ...core.errors import UsageError
 from ...io.network import CameraEntry, Network1
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
@@ -251,9 +252,9 @@ class Camera:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Network:
-    """What goes into a bundle adjustment.
+@dataclass(frozen=True, eq=False, repr=False)
+class Network(Display):
+    """Input of a bundle adjustment: cameras, images, points and their observations, in columns.
 
     Parameters
     ----------
@@ -295,6 +296,15 @@ class Network:
         Of object space; a label.
     stage : Stage, optional
         That moved the field between images which share their exterior orientation; needs control.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> network = example_network()
+    >>> network
+    <Network: 1 camera, 8 images, 20 points, 160 image points, datum free>
+    >>> network.rays[:3], network.select(network.image_of > 0).seen[:3]
+    (array([8, 8, 8]), array([ 0, 20, 20]))
     """
 
     cameras: tuple[Camera, ...]
@@ -377,6 +387,13 @@ class Network:
             files=images.file or (None,) * len(images.id),
             unit=document.unit,
         )  # fmt: skip
+
+    def _facts(self) -> list[tuple[str, str]]:
+        counts = (
+            (len(self.cameras), "camera"), (len(self.images), "image"), (len(self.points), "point"),
+            (len(self.xy), "image point"),
+        )  # fmt: skip
+        return [*((f"{n} {what}{'s' * (n != 1)}", "") for n, what in counts), ("datum", self.datum)]
 
     @cached_property
     def rays(self) -> Rows:

@@ -1,0 +1,198 @@
+"""Estimates of an adjustment in columns, with their standard deviations: cameras, images, points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.data import Array, Rows
+from ...core.display import Display
+from ...core.numbers import measured
+
+__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CameraEstimate(Display):
+    """Estimated parameters of one camera.
+
+    Parameters
+    ----------
+    id : str
+        Name of the camera.
+    parameters : tuple of str (u,)
+        Names of the estimated parameters; those of additional sets per group or image carry its name.
+    values : ndarray (u,)
+        Estimates, in the units of `units`.
+    covariance : ndarray (u, u)
+        Their covariance.
+    units : tuple of str (u,)
+        Units; empty for numbers.
+
+    Examples
+    --------
+    >>> camera = CameraEstimate("front", ("c",), np.array([8.01234]), np.array([[4e-6]]), ("mm",))
+    >>> camera
+    <CameraEstimate: front, c 8.0123 ± 0.0020 mm>
+    >>> camera["c"], camera.sigma
+    (8.01234, array([0.002]))
+    """
+
+    id: str
+    parameters: tuple[str, ...]
+    values: Array
+    covariance: Array
+    units: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (u,)."""
+        sigma: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return sigma
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation matrix (u, u)."""
+        size = np.where(self.sigma > 0, self.sigma, 1.0)
+        correlation: Array = self.covariance / np.outer(size, size)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[self.parameters.index(name)])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        rows = zip(self.parameters, self.values.tolist(), self.sigma.tolist(), self.units, strict=True)
+        return [(self.id, ""), *((name, measured(value, s, unit)) for name, value, s, unit in rows)]
+
+    def _columns(self) -> dict[str, list[object]]:
+        return {
+            "parameter": list(self.parameters),
+            "value": self.values.tolist(),
+            "sigma": self.sigma.tolist(),
+            "unit": list(self.units),
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ImageEstimates(Display):
+    """Exterior orientations of all images; NaN where an image has none.
+
+    Parameters
+    ----------
+    names : tuple of str (m,)
+        Names of the images.
+    cameras : tuple of str (m,)
+        Name of the camera of each image.
+    x0 : ndarray (m, 3)
+        Projection centres, in the unit of object space.
+    rotation : ndarray (m, 3)
+        Rotation vectors, rad; x_c = R(X − X0).
+    cov : ndarray (m, 6, 6)
+        Covariances of X0, Y0, Z0 and of the rotation vector.
+    unit : str
+        Unit of object space.
+
+    Examples
+    --------
+    >>> images = ImageEstimates(("i1",), ("cam",), np.ones((1, 3)), np.zeros((1, 3)), np.eye(6)[None], "m")
+    >>> images
+    <ImageEstimates: 1 image, sigma of X0 1.7 m in the median>
+    >>> images.sigma.shape, len(images)
+    ((1, 6), 1)
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[str, ...]
+    x0: Array
+    rotation: Array
+    cov: Array
+    unit: str
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, 6) of X0, Y0, Z0 and of the rotation vector."""
+        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
+        return sigma
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{len(self)} image{'s' * (len(self) != 1)}", ""),
+            ("sigma of X0", _median(self.sigma[:, :3], self.unit)),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        found: dict[str, list[object]] = {"image": list(self.names), "camera": list(self.cameras)}
+        names = ("X0", "Y0", "Z0", "rx_rad", "ry_rad", "rz_rad")
+        for k, (name, value) in enumerate(zip(names, np.hstack([self.x0, self.rotation]).T, strict=True)):
+            found |= {name: value.tolist(), f"sigma_{name}": self.sigma[:, k].tolist()}
+        return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointEstimates(Display):
+    """Object points; NaN where a point is not determined, a covariance of zero where it is held.
+
+    Parameters
+    ----------
+    names : tuple of str (p,)
+        Names of the points.
+    roles : tuple of {"tie", "control", "check"} (p,)
+        What each point is for.
+    xyz : ndarray (p, 3)
+        Coordinates, in the unit of object space.
+    cov : ndarray (p, 3, 3)
+        Their covariances.
+    rays : ndarray of int (p,)
+        Number of images of each point.
+    unit : str
+        Unit of object space.
+
+    Examples
+    --------
+    >>> cov = 1e-6 * np.eye(3)[None]
+    >>> points = PointEstimates(("p1",), ("tie",), np.ones((1, 3)), cov, np.array([4]), "m")
+    >>> points
+    <PointEstimates: 1 point, sigma 0.0017 m in the median>
+    >>> points.sigma
+    array([[0.001, 0.001, 0.001]])
+    """
+
+    names: tuple[str, ...]
+    roles: tuple[str, ...]
+    xyz: Array
+    cov: Array
+    rays: Rows
+    unit: str
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (p, 3)."""
+        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
+        return sigma
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{len(self)} point{'s' * (len(self) != 1)}", ""),
+            ("sigma", _median(self.sigma, self.unit)),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        found: dict[str, list[object]] = {"point": list(self.names), "role": list(self.roles)}
+        for k, name in enumerate("XYZ"):
+            found |= {name: self.xyz[:, k].tolist(), f"sigma_{name}": self.sigma[:, k].tolist()}
+        return found | {"rays": self.rays.tolist()}
+
+
+def _median(sigma: Array, unit: str) -> str:
+    """Median standard deviation in space (k, 3), of those that are estimated."""
+    size = np.linalg.norm(sigma, axis=1)
+    known = size[np.isfinite(size) & (size > 0)]
+    return f"{np.median(known):.2g} {unit} in the median" if len(known) else "held"
