@@ -247,7 +247,7 @@ def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[
     results = procedure.finish()
     found = procedure.calibrated().required()
     title = f"Calibration, session {session.name}"
-    report = bundle_report(found.searched, title=title, provenance=procedure.provenance)
+    report = bundle_report(found.result, title=title, provenance=procedure.provenance)
     return results | {"report.html": report}
 
 

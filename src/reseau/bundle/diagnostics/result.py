@@ -79,7 +79,7 @@ class Result(Display):
     >>> from reseau.bundle import adjust_network, example_network
     >>> result = adjust_network(example_network())
     >>> result
-    <Result: 8 images, 20 points, sigma0 1.0..., redundancy 171, 0 image points left out, 0 warnings>
+    <Result: 8 images, 20 points, sigma0 1.005, redundancy 215, 0 image points left out, 1 warning>
     >>> result.points.xyz.shape, result.images.sigma.shape
     ((20, 3), (8, 6))
     >>> result.cameras["camera"]
