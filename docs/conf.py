@@ -1,7 +1,9 @@
 """Sphinx: the pages of this folder and the reference of the API, built without a network by `make docs`."""
 
 import sys
+import types
 from pathlib import Path
+from typing import Any
 
 _ROOT = Path(__file__).resolve().parents[1]
 for _folder in ("src", "drivers", "sims"):
@@ -53,3 +55,13 @@ html_static_path: list[str] = []
 html_show_sourcelink = False
 # Formulas are shown by the reader's browser; the build itself fetches nothing.
 mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@4/tex-mml-chtml.js"
+
+
+def _skip(app: Any, what: str, name: str, obj: object, skip: bool, options: Any) -> bool | None:
+    """Leave out aliases of generic types, whose signature autodoc cannot format."""
+    return True if isinstance(obj, types.GenericAlias) else None
+
+
+def setup(app: Any) -> None:
+    """Connect to Sphinx."""
+    app.connect("autodoc-skip-member", _skip)

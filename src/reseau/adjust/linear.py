@@ -106,7 +106,10 @@ class Linearised:
     scale: Array
 
     def step(self, damping: float) -> Array:
-        """The correction (f,) that minimises |r + A dx|² + damping · |D⁻¹ dx|²; least norm at no damping."""
+        """Return the correction (f,) that minimises ``|r + A dx|² + damping · |D⁻¹ dx|²``.
+
+        Without damping it is the one of least norm.
+        """
         s, g = self.singular[: self.rank], self.projected[: self.rank]
         return -self.basis[:, : self.rank] @ (s / (s**2 + damping) * g)
 
@@ -140,7 +143,7 @@ def linearise(
     tolerance: float,
     lengths: Array | None = None,
 ) -> Linearised:
-    """Factorise the linear problem |r + A dx| with constraints C dx = 0.
+    """Factorise the linear problem ``|r + A dx|`` with constraints C dx = 0.
 
     Parameters
     ----------

@@ -400,8 +400,8 @@ class FreeCurve:
 
         Notes
         -----
-        The modulus of an estimate with noise is too large: |Z|² by both variances. That along Z is the
-        modulus' own; of the one across it is freed, |Z|² − σ²₊, and is zero where that is negative.
+        The modulus of an estimate with noise is too large: ``|Z|²`` by both variances. That along Z is the
+        modulus' own; of the one across it is freed, ``|Z|² − σ²₊``, and is zero where that is negative.
         """
         z, cov = self.transfer(frequency)
         along = np.where(np.abs(z) > _SHORT, z / np.maximum(np.abs(z), _SHORT), 1.0)

@@ -340,7 +340,7 @@ class Result(Display):
 
     @cached_property
     def test_values(self) -> Array:
-        """w = |v|/(sigma0·σ·√r) of the image coordinates (n, 2); NaN for those left out."""
+        """``w = |v|/(sigma0·σ·√r)`` of the image coordinates (n, 2); NaN for those left out."""
         sigma0 = self.sigma0 if self.redundancy > 0 and self.sigma0 > 0 else 1.0
         return self._of_image_points(np.abs(self.fit.w)) / sigma0
 

@@ -11,9 +11,9 @@ What does is that both are smooth all along the edge. Sections of it, i = 1 … 
 1, are averaged and fitted as one,
 
 .. math::
-    g_i(d) = b_i + A_i\\,\\Phi\\Bigl(\frac{d - p(t_i)}{w}\\Bigr)
-             + B_i\\,\\Phi\\Bigl(\frac{d - q(t_i)}{w}\\Bigr)
-             + C_i\\,\\Phi\\Bigl(\frac{d - q(t_i) - h}{w}\\Bigr), \\qquad
+    g_i(d) = b_i + A_i\\,\\Phi\\Bigl(\\frac{d - p(t_i)}{w}\\Bigr)
+             + B_i\\,\\Phi\\Bigl(\\frac{d - q(t_i)}{w}\\Bigr)
+             + C_i\\,\\Phi\\Bigl(\\frac{d - q(t_i) - h}{w}\\Bigr), \\qquad
     p = p_0 + p_1 t + p_2 (t^2 - 1), \\quad q = q_0 + q_1 t + q_2 t^2,
 
 with the known width w of a blurred step: where the line leaves the edge, the edge is seen by itself.
