@@ -54,8 +54,9 @@ def test_m_and_n_define_the_system():
     np.testing.assert_allclose(ends, refined[[m, n]], atol=1e-9)
 
 
-def test_predicted_covariances_of_true_coordinates_cover():
-    rng, trials = np.random.default_rng(1), 80
+@pytest.mark.parametrize("trials", [20, pytest.param(80, marks=pytest.mark.slow)])
+def test_predicted_covariances_of_true_coordinates_cover(trials):
+    rng = np.random.default_rng(1)
     squares = []
     for _ in range(trials):
         camera = correct_camera(reseau_marks(rng), RESEAU, trials=0, alpha=_ALL).required()
