@@ -1,5 +1,6 @@
 """Sphinx: the pages of this folder and the reference of the API, built without a network by `make docs`."""
 
+import re
 import sys
 import types
 from pathlib import Path
@@ -62,6 +63,14 @@ def _skip(app: Any, what: str, name: str, obj: object, skip: bool, options: Any)
     return True if isinstance(obj, types.GenericAlias) else None
 
 
+def _magnitudes(app: Any, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
+    """Let |v| in a docstring be a magnitude; the project has no substitutions of reStructuredText."""
+    for i, line in enumerate(lines):
+        if "`" not in line and "\\" not in line:
+            lines[i] = re.sub(r"\|(\w)\|", r"\\|\1\\|", line)
+
+
 def setup(app: Any) -> None:
     """Connect to Sphinx."""
+    app.connect("autodoc-process-docstring", _magnitudes)
     app.connect("autodoc-skip-member", _skip)
