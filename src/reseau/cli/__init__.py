@@ -28,6 +28,7 @@ from . import (
     design,
     measure,
     orient,
+    perforations,
     refine,
 )
 
@@ -44,6 +45,7 @@ app = typer.Typer(
 app.command()(demo.demo)
 app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
+measure.app.command()(perforations.perforations)
 app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)

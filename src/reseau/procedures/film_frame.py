@@ -12,12 +12,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ..calibration.document import Quantity
+from ..core.data import Array
 from ..core.failure import Failure
 from ..io import FrameCorners, FrameOrientation
 from ..io.scans import Scan
-from ..measure.film import FrameOptions, FrameResult, Kind, Roll, orient_frames, roll_of, transformed
+from ..measure.film import (
+    FilmPlane,
+    FrameOptions,
+    FrameResult,
+    Kind,
+    Roll,
+    orient_frames,
+    roll_of,
+    transformed,
+)
 
-__all__ = ["FrameOptions", "FrameResult", "Roll", "orient_scan", "orientation_of", "reorient_scan", "roll_of"]
+__all__ = [
+    "FrameOptions",
+    "FrameResult",
+    "Roll",
+    "film_scale",
+    "orient_scan",
+    "orientation_of",
+    "reorient_scan",
+    "roll_of",
+]
 
 
 def orient_scan(scan: Scan, options: FrameOptions | None = None) -> list[FrameResult]:
@@ -81,3 +103,58 @@ def orientation_of(
         return document
     found = transformed(document, calibrated, kind)
     return found if isinstance(found, Failure) else document.model_copy(update={"transform": found})
+
+
+def film_scale(plane: FilmPlane) -> dict[str, Quantity]:
+    """Return the geometry of a scan from the perforations of its film, at the centre of the scan.
+
+    Parameters
+    ----------
+    plane : FilmPlane
+        The film plane; see :func:`reseau.measure.film.film_plane`.
+
+    Returns
+    -------
+    dict of str to Quantity
+        Scales across and along the film (px/mm), rotation of the film (deg), angle between its axes minus 90°
+        (deg), and relative change of the scale from edge to edge of the scan across and along the film (%).
+
+    Examples
+    --------
+    >>> values = np.array([25.0, 0, 0, 0, 25.0, 0, 0, 0, 0])
+    >>> plane = FilmPlane(values, 1e-4 * np.eye(9), np.zeros(2), 1000.0, np.zeros((0, 2)), 0.1)
+    >>> scale = film_scale(plane)["scale across"]
+    >>> round(scale.value, 3), round(scale.sigma, 3), scale.unit
+    (40.0, 0.016, 'px/mm')
+    """
+    units = ("px/mm", "px/mm", "deg", "deg", "%", "%")
+    names = ("scale across", "scale along", "rotation", "skew", "change across", "change along")
+
+    def quantities(values: Array) -> Array:
+        at = replace(plane, values=values)
+        across, along = _columns(at, np.zeros(2))
+        rotation = np.arctan2(across[1], across[0])
+        skew = np.arctan2(-along[0], along[1]) - rotation
+        sides = [(k, sign * plane.unit * np.eye(2)[k]) for k in (0, 1) for sign in (-1, 1)]
+        ends = [np.hypot(*_columns(at, offset)[k]) for k, offset in sides]
+        changes = 100 * (1 - np.array([ends[1] / ends[0], ends[3] / ends[2]]))
+        scales = 1 / np.hypot(*across), 1 / np.hypot(*along)
+        return np.array([*scales, -np.rad2deg(rotation), np.rad2deg(skew), *changes])
+
+    step = np.sqrt(np.diag(plane.covariance))
+    slope = np.array(
+        [quantities(plane.values + e) - quantities(plane.values - e) for e in np.diag(step)]
+    ).T / (2 * np.maximum(step, 1e-300))
+    found, sigma = quantities(plane.values), np.sqrt(np.diag(slope @ plane.covariance @ slope.T))
+    return {
+        name: Quantity(value=float(v), sigma=float(s), unit=unit)
+        for name, v, s, unit in zip(names, found, sigma, units, strict=True)
+    }
+
+
+def _columns(plane: FilmPlane, offset: Array) -> Array:
+    """Derivatives (2, 2) of film coordinates (mm) by pixel coordinates, at an offset from the centre."""
+    half = 0.5 * np.eye(2)
+    return np.array([plane.to_mm((plane.centre + offset + h)[None])[0] for h in half]) - np.array(
+        [plane.to_mm((plane.centre + offset - h)[None])[0] for h in half]
+    )

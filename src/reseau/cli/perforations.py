@@ -1,0 +1,68 @@
+"""`reseau measure perforations`: the scale of a scan from the perforations of its film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .common import AsJson, required, say
+
+__all__ = ["perforations"]
+
+Box = tuple[float, float, float, float]
+
+
+def perforations(
+    scan: Annotated[Path, typer.Argument(help="Scan of 35 mm film, film from top to bottom.")],
+    left: Annotated[
+        Box,
+        typer.Option(help="Left row, first perforation, approximately: left top right bottom (px)."),
+    ],
+    right: Annotated[Box, typer.Option(help="Right row, likewise.")],
+    pitch: Annotated[float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")],
+    count: Annotated[int, typer.Option(min=2, help="Number of perforations in a row.")],
+    channel: Annotated[
+        str, typer.Option(help="Channel with the darkest rims: red, green, blue. Default: the last.")
+    ] = "",
+    reach: Annotated[float, typer.Option(min=1.0, help="Search distance from the given edges (px).")] = 12.0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the perforations of 35 mm film: scale, rotation and perspective of the scan.
+
+    The scale follows from the pitch of 4.75 mm and the distance of the rows of 28.17 mm (ISO 2906).
+    """
+    import numpy as np
+
+    from ..core.errors import UsageError
+    from ..core.numbers import measured
+    from ..core.provenance import canonical_json
+    from ..io.images import open_scan
+    from ..measure.film import film_plane
+    from ..procedures.film_frame import film_scale
+
+    opened = open_scan(scan)
+    name = channel or opened.channels[-1]
+    if name not in opened.channels:
+        do = f"use {', '.join(opened.channels)}"
+        raise UsageError(f"the scan has no channel {name}", where="--channel", do=do)
+    rows = [np.array([*box, pitch]) for box in (left, right)]
+    plane = required(film_plane(opened, rows, count, channel=opened.channels.index(name), reach=reach), scan)
+    found = film_scale(plane)
+    if as_json:
+        document: dict[str, Any] = {
+            "schema": "reseau-film-plane/1",
+            "edges": plane.edges,
+            "rms_px": plane.rms_px,
+            "quantities": {name: each.model_dump() for name, each in found.items()},
+            "values": plane.values.tolist(),
+            "covariance": plane.covariance.tolist(),
+            "centre_px": plane.centre.tolist(),
+            "unit_px": plane.unit,
+        }
+        say(canonical_json(document))
+        return
+    say(f"{scan.name}: {plane.edges} edges of perforations, rms {plane.rms_px:.2g} px\n")
+    for name, each in found.items():
+        say(f"  {name:<14} {measured(each.value, each.sigma, each.unit)}\n")

@@ -1,0 +1,159 @@
+"""Sessions in a program: checked, carried out and rerun without the command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import pytest
+
+from reseau import sessions
+from reseau.archive import Archive
+from reseau.capture import Bench, BenchFile, BenchLock, InstrumentEntry
+from reseau.capture.bench import IN_PROCESS
+from reseau.core.errors import FormatError, ReseauError, StateError, UsageError
+
+from ..capture.fieldrig import DESIGN, FieldRig
+
+STEPS = [[f"tilt {tilt} roll {roll}", {"tilt": tilt, "roll": roll, "camera_roll": roll}]
+         for tilt, roll in ((0.0, 0.0), (30.0, 90.0), (30.0, 180.0), (30.0, 270.0))]  # fmt: skip
+TESTFIELD = {"steps": STEPS, "pitch": 0.027, "free": ["c", "x0", "y0"], "row_jitter": 0.0086, "fill": 0.8}
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    return Archive.open(tmp_path / "archive", create=True)
+
+
+def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
+    rig, given = FieldRig(), {"design.json": DESIGN.to_json()}
+    sessions.check("monday", "testfield", TESTFIELD, given, rig.bench)
+    session = sessions.begin(archive, "monday", "testfield", TESTFIELD, given)
+    assert session.parameters == TESTFIELD  # as given, without defaults
+    assert sessions.capture(session, rig.bench) is None
+    assert session.status == "done"
+    done = sessions.rerun(archive.session("monday"))
+    assert [each.result.name for each in done] == ["calibration.json", "report.html"]
+    assert all(each.same for each in done)
+    assert sessions.calibration_of(session).parameters["c"].unit == "mm"
+
+
+def test_a_rerun_does_not_import_the_command_line() -> None:
+    code = """
+        import sys
+        from reseau import sessions
+        assert not [name for name in sys.modules if name.startswith("reseau.cli") or name == "typer"]
+        """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("plan", "parameters", "text"),
+    [
+        ("sensor", {}, "mine: parameters of plan `sensor`: missing key `region`"),
+        ("testfield", {**TESTFIELD, "fill": "full"}, "mine: parameters of plan `testfield`: `fill`: "),
+        ("testfield", {**TESTFIELD, "pich": 1.0}, "mine: parameters of plan `testfield`: unknown key `pich`"),
+        ("frames", {"count": 0}, "mine: parameters of plan `frames`: `count`: "),
+        ("frames", {"camera": object()}, "mine: parameters of plan `frames`: not JSON ("),
+    ],
+)
+def test_wrong_parameters_are_refused_in_one_line_that_names_the_key(
+    archive: Archive, plan: str, parameters: dict[str, object], text: str
+) -> None:
+    with pytest.raises(FormatError) as error:
+        sessions.begin(archive, "mine", plan, parameters, {"design.json": DESIGN.to_json()})
+    assert str(error.value).startswith(text)
+    assert "\n" not in str(error.value)
+    assert not archive.sessions()
+
+
+def test_parameters_that_were_archived_unchecked_are_refused_by_a_rerun(archive: Archive) -> None:
+    with pytest.raises(FormatError, match="mine: parameters of plan `sensor`: missing key `region`"):
+        sessions.rerun(archive.begin("mine", "sensor", {}))
+    with pytest.raises(UsageError, match="mystery: unknown plan; use testfield, oscilloscope"):
+        sessions.rerun(archive.begin("other", "mystery", {}))
+
+
+def test_parameters_of_older_versions_are_read(archive: Archive) -> None:
+    """Version 0.1 had neither `sigmas` nor `retreat`, and no names of instruments."""
+    older = {**TESTFIELD, "until": "", "first": 5, "average": 1, "checks": 3, "retakes": 2, "home": False}
+    session = archive.begin(
+        "older", "testfield", {**older, "park": {}}, inputs={"design.json": DESIGN.to_json()}
+    )
+    found = sessions.parameters_of(session)
+    assert isinstance(found, sessions.TestfieldParameters)
+    assert (found.sigmas, found.retreat, found.expected) == (None, None, 4)
+    assert sessions.procedure_of(session) is not None
+
+
+def test_a_missing_input_is_named(archive: Archive) -> None:
+    with pytest.raises(UsageError, match=r"a: design\.json: missing input"):
+        sessions.begin(archive, "a", "testfield", TESTFIELD)
+
+
+def test_the_session_to_resume_is_found(archive: Archive) -> None:
+    with pytest.raises(UsageError, match="frames: no session can be resumed"):
+        sessions.resume(archive, "frames")
+    first = sessions.begin(archive, "a", "frames", {})
+    assert sessions.resume(archive, "frames").name == "a"
+    sessions.begin(archive, "b", "frames", {})
+    with pytest.raises(UsageError, match="a, b can be resumed; name one"):
+        sessions.resume(archive, "frames")
+    first.end("done")
+    assert sessions.resume(archive, "frames").name == "b"
+
+
+def _bench(*addresses: str) -> Bench:
+    entries = {f"i{k}": InstrumentEntry(driver="sim", address=a) for k, a in enumerate(addresses)}
+    rig = FieldRig()
+    return Bench(BenchFile(name="bench", instruments=entries), lambda name, entry: rig.camera)
+
+
+def test_two_benches_inside_processes_are_used_at_the_same_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    both = Barrier(2)
+
+    def use(owner: str) -> str:
+        with _bench(IN_PROCESS, f"sim-{owner}").lock(owner):
+            both.wait(20)  # each holds its bench now
+        return owner
+
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(use, ["the demo", "another demo"])) == ["the demo", "another demo"]
+
+
+def test_an_instrument_outside_the_process_is_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with (
+        BenchLock(["/dev/ttyUSB0"], "session monday"),
+        pytest.raises(StateError, match="/dev/ttyUSB0: is in use by session monday"),
+        _bench(IN_PROCESS, "/dev/ttyUSB0").lock("tuesday"),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_two_demos_run_at_the_same_time(tmp_path: Path) -> None:
+    """Each in its process, with the camera in that process, as on a machine without Aravis."""
+    code = """
+        import sys
+        from pathlib import Path
+        from reseau.sessions import demo
+        demo._gige_available = lambda: False
+        demo.run_demo(Path(sys.argv[1]))
+        """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    runs = [subprocess.Popen([*command, str(tmp_path / name)]) for name in ("one", "two")]
+    assert [run.wait(1200) for run in runs] == [0, 0]
+    assert (tmp_path / "one/true.csv").read_bytes() == (tmp_path / "two/true.csv").read_bytes()
+
+
+def test_errors_of_this_package_are_of_one_tree() -> None:
+    with pytest.raises(ReseauError, match="unknown plan"):
+        sessions.kind_of("mystery")
