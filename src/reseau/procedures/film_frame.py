@@ -155,6 +155,5 @@ def film_scale(plane: FilmPlane) -> dict[str, Quantity]:
 def _columns(plane: FilmPlane, offset: Array) -> Array:
     """Derivatives (2, 2) of film coordinates (mm) by pixel coordinates, at an offset from the centre."""
     half = 0.5 * np.eye(2)
-    return np.array([plane.to_mm((plane.centre + offset + h)[None])[0] for h in half]) - np.array(
-        [plane.to_mm((plane.centre + offset - h)[None])[0] for h in half]
-    )
+    centre = plane.centre + offset
+    return np.asarray(plane.to_mm(centre + half) - plane.to_mm(centre - half))
