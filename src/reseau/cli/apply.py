@@ -121,9 +121,7 @@ def _view(text: str) -> View:
     try:
         return float(text.removesuffix("°"))
     except ValueError:
-        raise UsageError(
-            f"is {text!r}", where="--fov", do="write keep, all, or an angle in degrees"
-        ) from None
+        raise UsageError(f"is {text!r}", where="--fov", do="write keep, all or degrees") from None
 
 
 def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
