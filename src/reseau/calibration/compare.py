@@ -1,11 +1,11 @@
-"""What a calibration is worth at each place of the image, and how two calibrations differ there.
+"""Uncertainty of a camera's calibration over the image, and differences of two calibrations.
 
-A shift of the principal point and a small tilt of the camera move an image alike, up to the squares of
-directions. The standard deviations of single parameters hold what is common to both, which no ray ever shows.
+A shift of the principal point and a small tilt of the camera move an image in the same way, up to the squares
+of directions. The standard deviations of single parameters contain this common part, which no ray shows.
 Fields are therefore referred to the rotation that fits best over the image: with the derivatives G by a
-rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ) J (an S-transformation, Baarda 1973);
-and two calibrations are compared after the rotation that brings the rays of the one nearest those of the
-other (Kogan, *mrcal*: differences with the implied transformation, for points at infinity).
+rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ) J (an S-transformation, Baarda 1973).
+Two calibrations are compared after the rotation that brings the rays of one nearest to those of the other
+(Kogan, *mrcal*: differences with the implied transformation, for points at infinity).
 """
 
 from __future__ import annotations
@@ -43,7 +43,13 @@ class ProjectionField:
     xy : ndarray (rows, columns, 2)
         Places, pixels.
     cov : ndarray (rows, columns, 2, 2)
-        Covariances (px²) of where the ray is imaged that is imaged there; NaN where no ray is.
+        Covariances (px²) of the image of the ray that is imaged there; NaN where there is no ray.
+
+    Examples
+    --------
+    >>> field = ProjectionField(np.zeros((1, 1, 2)), np.array([[[[0.04, 0.0], [0.0, 0.01]]]]))
+    >>> field.sigma
+    array([[0.2]])
     """
 
     xy: Array
@@ -64,13 +70,20 @@ class FieldDifference:
     xy : ndarray (rows, columns, 2)
         Places in the image of the first, pixels.
     difference : ndarray (rows, columns, 2)
-        Where the second images the ray, less where the first does, px.
+        Image of the ray by the second minus its image by the first, px.
     cov : ndarray (rows, columns, 2, 2)
         Covariances of the differences.
     rotation : ndarray (3,)
-        Rotation vector (rad) by which the rays of the second were turned.
+        Rotation vector (rad) by which the rays of the second were rotated.
     statistic, degrees : float, int
-        χ² of the field as a whole, and of how many degrees of freedom.
+        χ² of the whole field, and its degrees of freedom.
+
+    Examples
+    --------
+    >>> one = np.array([[[[0.04, 0.0], [0.0, 0.04]]]])
+    >>> found = FieldDifference(np.zeros((1, 1, 2)), np.full((1, 1, 2), 0.2), one, np.zeros(3), 2.0, 2)
+    >>> round(found.p, 3), found.p_at.round(3)
+    (0.368, array([[0.368]]))
     """
 
     xy: Array
@@ -87,12 +100,12 @@ class FieldDifference:
 
     @property
     def p(self) -> float:
-        """Probability of a field that differs as much, when the calibrations are of the same camera."""
+        """Probability of a difference at least as large when both are calibrations of the same camera."""
         return float(scipy.special.chdtrc(self.degrees, self.statistic)) if self.degrees else 1.0
 
     @property
     def p_at(self) -> Array:
-        """The same of each place by itself (rows, columns); NaN where no ray is imaged."""
+        """The same for each place alone (rows, columns); NaN where no ray is imaged."""
         known = np.isfinite(self.sigma) & (np.linalg.det(self.cov) > 0)
         p = np.full(known.shape, np.nan)
         d = self.difference[known]
@@ -113,8 +126,16 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
 
     Notes
     -----
-    It covers the noise of the observations alone, not what the model cannot follow; towards corners without
-    points it is what the model makes of the rest.
+    It covers the noise of the observations only, not what the model cannot follow. In corners without points
+    it is an extrapolation by the model.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
+    >>> projection_field(camera, 3).sigma.shape
+    (2, 3)
     """
     xy, shape = places(lens, across, down)
     uv = lens.mapping.inverse(xy)
@@ -134,7 +155,7 @@ def calibration_difference(
     Parameters
     ----------
     first, second : CameraMapping
-        Calibrations of images of the same size, not necessarily by the same model.
+        Calibrations of images of the same size; their models may differ.
     across, down : int
         Places along the axes, from edge to edge.
 
@@ -145,8 +166,17 @@ def calibration_difference(
 
     Notes
     -----
-    The test of the whole compares the part of the difference that the parameters' errors can make with their
-    covariances; what is beyond them, as between models of different kind, does not count in it.
+    The test of the whole field compares the part of the difference that errors of the parameters can cause
+    with their covariances. Other parts, as between different models, are not tested.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
+    >>> found = calibration_difference(camera, camera, 5)
+    >>> bool(abs(found.difference).max() < 1e-9), round(found.p, 3)
+    (True, 1.0)
     """
     if (first.width, first.height) != (second.width, second.height):
         raise UsageError(
@@ -173,7 +203,7 @@ def calibration_difference(
     statistic, degrees = _chi2(root.reshape(2 * len(root), root.shape[2]), off.ravel())
     difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
-    # The camera is turned against its rays.
+    # The camera is rotated in the opposite sense to its rays.
     angle = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     return FieldDifference(
         xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
@@ -184,7 +214,7 @@ def calibration_difference(
 def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by_second: Array) -> Array:
     """A root (g, 2, k) of the covariance of the differences."""
     if type(first.mapping) is type(second.mapping) and first.names == second.names:
-        # Derivatives at two estimates differ by their errors, and must not make up dimensions of their own.
+        # Derivatives at two estimates differ by their errors, which must not add dimensions of their own.
         mean: Array = (by_first + by_second) / 2 @ _root(first.covariance + second.covariance)
         return mean
     parts = [by_first @ _root(first.covariance), by_second @ _root(second.covariance)]
@@ -218,7 +248,7 @@ def _turned(turn: Array, uv: Array) -> tuple[Array, Array]:
 
 
 def _referred(by_rotation: Array, slope: Array) -> Array:
-    """Derivatives (g, 2, u) without the part that a rotation makes."""
+    """Derivatives (g, 2, u) without the part that a rotation explains."""
     g, flat = by_rotation.reshape(-1, 3), slope.reshape(2 * len(slope), slope.shape[2])
     part = np.linalg.lstsq(g, flat, rcond=None)[0]
     free: Array = (flat - g @ part).reshape(slope.shape)

@@ -16,7 +16,7 @@ __all__ = ["BEYOND", "CalibratedMapping", "Target", "beyond", "carried"]
 Target = Literal["points", "images", "scans", "frames"]
 
 BEYOND = 0.08
-"""Distance beyond the calibrated extent, in units of this, up to which a correction is still used."""
+"""Distance beyond the calibrated extent, in units of its sides, up to which a correction is still used."""
 
 
 def carried(mapping: PlaneMapping, points: ImagePoints) -> ImagePoints:
@@ -52,7 +52,18 @@ class CalibratedMapping(ABC):
     """A calibration in use.
 
     Points are given in pixels of the calibrated instrument. A subclass gives :meth:`derivatives`,
-    :meth:`to_pixels` and `covariance`; the propagation of covariances and the check of the validity follow.
+    :meth:`to_pixels` and `parameter_covariance`; the propagation of covariances and the check of the validity
+    follow.
+
+    Examples
+    --------
+    >>> from reseau.calibration import CameraMapping
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5})
+    >>> mapping: CalibratedMapping = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
+    >>> points = ImagePoints.with_sigma(["a"], [[719.5, 239.5]], 0.1)
+    >>> mapping.apply(points).xy, mapping.why_not(points)
+    (array([[0.5, 0. ]]), ('lies outside the image',))
     """
 
     applies_to: ClassVar[tuple[Target, ...]]

@@ -238,7 +238,13 @@ class ObjectPlane:
     scale : ndarray (2,)
         λ1 and λ2: of the photograph along that axis and across it.
     system : Similarity
-        The scaled system into the common one: M onto its image M', N onto N'.
+        The scaled system into the common one: M to its image M', N to N'.
+
+    Examples
+    --------
+    >>> plane = ObjectPlane(Similarity(), np.array([0.5, 0.4]), Similarity())
+    >>> plane.to_common(np.array([[10.0, 10.0]]))
+    array([[5., 4.]])
     """
 
     axes: Similarity
@@ -280,6 +286,14 @@ class LocalModel:
         Mapped minus target, over the targets.
     needed : (bool, bool)
         The axes in which it is subtracted.
+
+    Examples
+    --------
+    >>> at = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2)
+    >>> left = LocalModel.from_dict({"at": at.tolist(), "left": (0 * at + 0.1).tolist(), "degree": 0,
+    ...                              "needed": [True, False]})
+    >>> left.subtract(np.array([[2.0, 2.0]])).round(3)
+    array([[1.9, 2. ]])
     """
 
     field: SmoothField

@@ -345,6 +345,19 @@ def write_corrected(
         When the format cannot hold the grey values.
     InputError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 64, 48, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    >>> image = np.full((48, 64), 100, np.uint8)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "undistorted.png"
+    ...     write_corrected(path, [image], CorrectedImage.undistorted(camera))
+    ...     path.stat().st_size > 0
+    True
     """
     suffix, dtype = path.suffix.lower(), planes[0].dtype
     deepest = {".png": 2, ".jpg": 1, ".jpeg": 1}.get(suffix, 8)

@@ -1,9 +1,9 @@
-"""The physical causes behind the coefficients of the ultrasonic instrument (group B).
+"""The physical causes of the coefficients of the ultrasonic instrument (group B).
 
-Equations (7a, b) of Wishahy's paper have 16 coefficients, and its equations (6a, b) make them of 13 causes:
+Equations (7a, b) of Wishahy's paper have 16 coefficients; its equations (6a, b) derive them from 13 causes:
 orientation P0…P4, symmetric distortion k0, k1, asymmetric distortion h'1…h'4, and the ultrasonic beam m1, m2.
-The three conditions that this imposes, A6 = B6, A4 = B3 + A5 and B4 = A3 + B5, can be tested; where they
-hold, the causes follow by least squares.
+This implies three conditions, A6 = B6, A4 = B3 + A5 and B4 = A3 + B5, which can be tested; where they hold, the
+causes follow by least squares.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class ConditionTest:
     condition : str
         As in the paper's symbols.
     misclosure, sigma : float
-        What the coefficients leave of it, and its standard deviation.
+        Misclosure of the condition, and its standard deviation.
     statistic, critical, p : float
         χ² of one degree of freedom, the value it exceeds with probability alpha, and its probability.
     holds : bool
@@ -82,7 +82,7 @@ class ConditionTest:
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """Causes adjusted to coefficients.
+    """Causes estimated from the coefficients.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def physical_causes(
     Parameters
     ----------
     names : sequence of str (16)
-        The coefficients A0…A7, B0…B7 in any order. None may have been dropped: a coefficient held at nought
+        The coefficients A0…A7, B0…B7 in any order. None may have been dropped: a coefficient held at zero
         has no variance.
     values : ndarray (16,)
         Their values.
@@ -123,6 +123,14 @@ def physical_causes(
     ------
     UsageError
         When a coefficient is missing.
+
+    Examples
+    --------
+    >>> values = np.zeros(16)
+    >>> values[[COEFFICIENTS.index("A1"), COEFFICIENTS.index("B1")]] = 1.02, 1.01
+    >>> found = physical_causes(COEFFICIENTS, values, 1e-6 * np.eye(16))
+    >>> [test.holds for test in found.conditions], round(found.adjustment["m1"], 3)
+    ([True, True, True], 0.01)
     """
     missing = [name for name in COEFFICIENTS if name not in names]
     if missing:
@@ -145,7 +153,31 @@ def physical_causes(
 
 
 def causes_of(fit: Adjustment, alpha: float = 0.05) -> Causes | None:
-    """The causes behind an adjustment of group B; None where it lacks one of the 16 coefficients."""
+    """The causes of the coefficients of an adjustment of group B.
+
+    Parameters
+    ----------
+    fit : Adjustment
+        With all 16 coefficients.
+    alpha : float
+        Level of the tests.
+
+    Returns
+    -------
+    Causes or None
+        None where a coefficient is missing, or the adjustment fails.
+
+    Examples
+    --------
+    >>> from reseau.core.data import ImagePoints
+    >>> from reseau.measure.fitting import fit_mapping
+    >>> from reseau.optics import RationalPolynomial
+    >>> xy = np.stack(np.meshgrid(np.linspace(-50, 50, 5), np.linspace(-40, 40, 5)), axis=-1).reshape(-1, 2)
+    >>> points = ImagePoints.with_sigma(map(str, range(25)), xy, 0.01)
+    >>> causes = causes_of(fit_mapping(RationalPolynomial.ultrasonic(), points, 1.01 * xy).required())
+    >>> round(causes.adjustment["k0"], 4)
+    0.01
+    """
     if any(name not in fit.names for name in COEFFICIENTS):
         return None
     causes = physical_causes(fit.names, fit.values, fit.cofactor, alpha)

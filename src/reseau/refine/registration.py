@@ -1,10 +1,10 @@
 """Refer a photograph to PHOTO I by the reseau that both show.
 
-The camera's correction says where in the image every mark of the reseau should appear. A similarity from
-where the marks are to where they should be carries any other measurement in the photograph to PHOTO I;
-whether it differs from doing nothing tells if the camera has moved in between. A camera that was pushed far,
-or turned, sees the reseau in another perspective and through other parts of its lens: where the similarity
-leaves more than the marks' errors, a smooth field through the marks takes its place.
+The correction of the camera predicts the image position of every mark of the reseau. A similarity from the
+measured to the predicted positions transforms any other measurement in the photograph to PHOTO I. If it differs
+from the identity, the camera has moved. After a large shift or a rotation the camera sees the reseau in another
+perspective and through other parts of its lens: where the similarity leaves more than the errors of the marks, a
+smooth field through the marks replaces it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from ..optics.field import SmoothField
 __all__ = ["Registration", "register"]
 
 _LEAST_PX = 0.05
-"""A displacement smaller than this is nobody's concern, however significant."""
+"""Smaller displacements are ignored, even where they are significant."""
 _UNLIKE = 2.0
-"""Standard deviation of unit weight from which a similarity does not do."""
+"""Standard deviation of unit weight above which a similarity is not sufficient."""
 _FIELD_FROM = 20
-"""Marks that a smooth field needs."""
+"""Least number of marks for a smooth field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +42,16 @@ class Registration:
     system : Similarity or SmoothField
         Pixels of this photograph to pixels of PHOTO I.
     marks : int
-        Marks it was made from.
+        Number of marks that it was fitted to.
     sigma0 : float
         Standard deviation of unit weight of a similarity; far above one where the photographs differ by more.
     left_px : float
-        How far marks lie from where the others carry them, root mean square per axis; of a similarity, from
-        where they should be.
+        Residuals of the marks, root mean square per axis; of a smooth field, those of the prediction of each
+        mark from the others.
     displacement_px : float
         Largest displacement of a mark.
     p : float
-        Probability of as large a difference from the identity when nothing has moved.
+        Probability of a difference from the identity at least as large when nothing has moved.
     moved : bool
         Whether the camera has moved: significantly at 0.001, and by more than 0.05 px.
     """
@@ -66,11 +66,11 @@ class Registration:
 
     @property
     def similar(self) -> bool:
-        """Whether a similarity does; else the camera was turned or pushed so far that it does not."""
+        """Whether a similarity is sufficient; not after a large shift or a rotation of the camera."""
         return isinstance(self.system, Similarity)
 
     def apply(self, points: ImagePoints) -> ImagePoints:
-        """Points of this photograph as they would be in PHOTO I; the errors of its many marks left out."""
+        """Transform points of this photograph to PHOTO I; the errors of the marks are neglected."""
         if isinstance(self.system, Similarity):
             return carried(self.system, points)
         slope = self.system.jacobian(points.xy)
@@ -94,6 +94,17 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     -------
     Registration or Failure
         A failure with fewer than four marks.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> from reseau.refine import correct_camera
+    >>> reseau = standard_reseau()
+    >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> camera = correct_camera(seen, reseau, trials=0).required()
+    >>> moved = register(ImagePoints(seen.names, seen.xy + [0.8, -0.5], seen.cov), reseau, camera)
+    >>> moved.moved, round(moved.displacement_px, 2)
+    (True, 0.94)
     """
     row_of = {name: i for i, name in enumerate(design.ids)}
     known = [name for name in points.names if name in row_of]

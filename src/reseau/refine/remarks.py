@@ -1,4 +1,4 @@
-"""What is odd about a photograph of the oscilloscope procedure, in words for those who took it."""
+"""Remarks on photographs of the oscilloscope procedure, for those who took them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .standard import StandardTest
 __all__ = ["of_the_camera", "of_the_change", "of_the_object"]
 
 _UPRIGHT = np.deg2rad(20.0)
-"""Rotation of the test object against the reseau, or of the reseau in the image, that is still meant."""
+"""Rotation of the test object against the reseau, or of the reseau in the image, that is accepted as intended."""
 _ANOTHER_SHAPE_PX = 0.3
-"""What may remain at the marks of a photograph referred to PHOTO I."""
+"""Residuals (px) of the marks of a photograph referred to PHOTO I up to which it has the same shape."""
 
 
 def of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[Remark, ...]:
-    """What is odd about the camera's side."""
+    """Remarks on the camera."""
     notes = []
     angle = camera.photo_system.angle
     if abs(angle) > np.pi - _UPRIGHT:
@@ -41,15 +41,15 @@ def of_the_camera(camera: CameraCorrection, registration: Registration | None) -
         notes.append(
             Remark(
                 f"the camera has moved since PHOTO I, by up to {registration.displacement_px:.2f} px; "
-                "the photograph was carried back",
+                "the photograph was transformed back",
                 Code.CAMERA_MOVED,
             )
         )
     if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
         notes.append(
             Remark(
-                f"the marks of the reseau lie by {registration.left_px:.2f} px (rms) otherwise than in "
-                "PHOTO I: take PHOTO I anew",
+                f"the marks of the reseau differ from PHOTO I by {registration.left_px:.2f} px (rms): "
+                "take PHOTO I again",
                 Code.INCONSISTENT,
             )
         )
@@ -57,7 +57,7 @@ def of_the_camera(camera: CameraCorrection, registration: Registration | None) -
 
 
 def of_the_change(test: StandardTest, registration: Registration | None, unit: str) -> tuple[Remark, ...]:
-    """What has changed since a calibration, and what it points to."""
+    """Remarks on changes since a calibration, and their likely causes."""
     if test.holds:
         return ()
     notes, shift = [], float(np.hypot(*test.shift))
@@ -72,13 +72,13 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
                 )
             )
         else:
-            notes.append(Remark(f"{said}: was it centred anew?", Code.DISPLAY_SHIFTED))
+            notes.append(Remark(f"{said}: was it centred again?", Code.DISPLAY_SHIFTED))
     if test.p_rest < test.alpha:
         rod, length = test.largest
         notes.append(
             Remark(
-                f"the instrument draws otherwise than it did, by up to {length:.3g} {unit} at rod {rod}: "
-                "make its calibration anew",
+                f"the display of the instrument has changed, by up to {length:.3g} {unit} at rod {rod}: "
+                "calibrate it again",
                 Code.INSTRUMENT_CHANGED,
             )
         )
@@ -88,10 +88,10 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
 def of_the_object(
     instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
 ) -> tuple[Remark, ...]:
-    """What is odd about the test object's side."""
+    """Remarks on the test object."""
     notes, plane = [], instrument.plane
     if abs(plane.rotation) > np.pi - _UPRIGHT:
-        notes.append(Remark("the test object stands on its head or M and N are swapped", Code.TARGET_ROTATED))
+        notes.append(Remark("the test object is upside down, or M and N are swapped", Code.TARGET_ROTATED))
     elif abs(plane.rotation) > np.deg2rad(2.0):
         notes.append(
             Remark(

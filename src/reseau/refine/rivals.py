@@ -1,8 +1,8 @@
 """Which of two models explains the same points better, when neither contains the other.
 
-An F-test asks for nested models. Here every point is predicted from all the others by both models, and the
-weighted squares of the two predictions' errors are compared point by point (Wilcoxon's signed ranks): more
-parameters are no advantage, for what they fit of the noise they pay in the prediction.
+An F-test needs nested models. Here every point is predicted from all others by both models, and the weighted
+squares of the errors of prediction are compared point by point (Wilcoxon's signed ranks). More parameters are no
+advantage: fitting the noise makes the prediction worse.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["Rivalry", "leave_one_out", "rivals"]
 
 @dataclass(frozen=True, eq=False)
 class Rivalry:
-    """Two models of the same points.
+    """Comparison of two models of the same points.
 
     Parameters
     ----------
@@ -33,9 +33,19 @@ class Rivalry:
     rms : ndarray (2, 2)
         Root mean square of the prediction of a point from the others; a row for each model, x and y.
     p : float
-        Probability of as different predictions when the models are as good as one another.
+        Probability of a difference at least as large when both models are equally good.
     verdict : {"first", "second", "undecided"}
-        Which one explains the points better, at the level asked for.
+        Which model explains the points better, at the level of the test.
+
+    Examples
+    --------
+    >>> from reseau.optics import RationalPolynomial
+    >>> xy = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    >>> points = ImagePoints.with_sigma(map(str, range(20)), xy, 0.01)
+    >>> target = xy * 1.1 + [0.0, 0.02] * xy[:, :1]  # sheared: no similarity
+    >>> found = rivals(RationalPolynomial.affine(), RationalPolynomial.similarity(), points, target)
+    >>> found.verdict
+    'first'
     """
 
     first: Adjustment
@@ -53,7 +63,7 @@ def rivals(
     target_sigma: ArrayLike = 0.0,
     alpha: float = 0.05,
 ) -> Rivalry | Failure:
-    """Fit two models to the same points and tell which one explains them better.
+    """Fit two models to the same points and decide which one explains them better.
 
     Parameters
     ----------
@@ -67,7 +77,16 @@ def rivals(
     Returns
     -------
     Rivalry or Failure
-        A failure when one of the two cannot be adjusted, or has no point to spare.
+        A failure when one of the two cannot be adjusted, or has no redundant point.
+
+    Examples
+    --------
+    See :class:`Rivalry`.
+
+    >>> from reseau.optics import RationalPolynomial
+    >>> few = ImagePoints.with_sigma(["a"], [[0.0, 0.0]], 0.01)
+    >>> bool(rivals(RationalPolynomial.affine(), RationalPolynomial.similarity(), few, few.xy))
+    False
     """
     fits, errors, squares = [], [], []
     for model in (first, second):
@@ -95,7 +114,7 @@ def rivals(
 def leave_one_out(
     model: PlaneMapping, fit: Adjustment, points: ImagePoints, target: Array
 ) -> tuple[Array, Array]:
-    """Predict every point from the others.
+    """Predict every point from all others.
 
     Parameters
     ----------
@@ -109,14 +128,24 @@ def leave_one_out(
     Returns
     -------
     error : ndarray (n, 2)
-        Mapped minus target for each point by the model without it; NaN where it cannot be spared.
+        Mapped minus target for each point by the model fitted without it; NaN where that is not determined.
     squares : ndarray (n,)
-        The errors' weighted squares, with the weights of the fit.
+        Weighted squares of the errors, with the weights of the fit.
 
     Notes
     -----
-    For a model linear in its parameters exactly (I − A_i Q A_iᵀ W_i)⁻¹ r_i (Cook & Weisberg 1982, ch. 2);
-    nothing is fitted anew.
+    For a model linear in its parameters this is exactly (I − A_i Q A_iᵀ W_i)⁻¹ r_i (Cook & Weisberg 1982,
+    ch. 2); no model is fitted again.
+
+    Examples
+    --------
+    >>> from reseau.optics import RationalPolynomial
+    >>> xy = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.5, 0.4]])
+    >>> points, model = ImagePoints.with_sigma("abcde", xy, 0.01), RationalPolynomial.affine()
+    >>> fit = fit_mapping(model, points, 2 * xy).required()
+    >>> error, _ = leave_one_out(model.with_values(fit.values), fit, points, 2 * xy)
+    >>> bool(abs(error).max() < 1e-9)
+    True
     """
     value, slope, by_parameter = model.derivatives(points.xy)
     weights = np.linalg.inv(slope @ np.asarray(fit.problem.covariance) @ np.swapaxes(slope, 1, 2))

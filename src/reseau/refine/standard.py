@@ -1,8 +1,8 @@
-r"""Whether stored coefficients still hold for a new photograph of the test object.
+r"""Test whether stored coefficients still hold for a new photograph of the test object.
 
-Wishahy calls the coefficients of an instrument "theoretically standard": found once, they serve for every
-further photograph. Each new image of the test object can contradict that. With the same rods as before their
-errors are the same, and every rod is held against where it was seen then:
+Wishahy calls the coefficients of an instrument "theoretically standard": determined once, they serve for every
+later photograph. A new image of the test object tests that. With the same rods as before, their errors are the
+same, and every rod is compared with its earlier image:
 
 .. math:: d_i = f(x_i^{new}) - f(x_i^{old}), \qquad \chi^2 = \sum_i d_i^T \Sigma_i^{-1} d_i ,
 
@@ -28,22 +28,23 @@ __all__ = ["StandardTest", "still_standard"]
 
 @dataclass(frozen=True, eq=False)
 class StandardTest:
-    """Stored coefficients against a new photograph; object coordinates in the unit of the instrument.
+    """Test of stored coefficients by a new photograph; object coordinates in the unit of the instrument.
 
     Parameters
     ----------
     names : tuple of str (n,)
         The rods compared.
     change : ndarray (n, 2)
-        By how much the stored correction now has each elsewhere.
+        Change of the position of each rod under the stored correction.
     sigma : ndarray (n, 2)
-        Standard deviations of that when nothing has changed.
+        Standard deviations of the changes when nothing has changed.
     statistic, degrees, critical, p : float, int, float, float
         χ² of all changes together, the value it exceeds with probability alpha, and its probability.
     shift, shift_sigma : ndarray (2,)
-        What the changes have in common, and its standard deviations.
+        Common part of the changes, and its standard deviations.
     p_shift, p_rest : float
-        Probability of as large a common shift, and of as large changes beside it, when nothing has changed.
+        Probability of a common shift at least as large, and of other changes at least as large, when nothing
+        has changed.
     same_object : bool
         Whether the rods were taken to be those of the stored calibration.
     alpha : float
@@ -74,7 +75,7 @@ class StandardTest:
 
     @property
     def largest(self) -> tuple[str, float]:
-        """The rod that has changed most, and by how much."""
+        """The rod with the largest change, and its length."""
         length = np.hypot(*self.change.T)
         worst = int(length.argmax())
         return self.names[worst], float(length[worst])
@@ -99,7 +100,7 @@ def still_standard(
     rods : ReseauDesign
         The rods.
     same_object : bool
-        Whether they are those that the calibration was made with, their errors therefore the same.
+        Whether they are the rods of the calibration, so that their errors are the same.
     alpha : float
         Level of the tests.
 
@@ -111,7 +112,23 @@ def still_standard(
     Raises
     ------
     UsageError
-        When the level is none.
+        When the level is not between 0 and 1.
+
+    Examples
+    --------
+    >>> from reseau.calibration import CameraCorrection, ObjectPlane
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.optics import RationalPolynomial, Similarity
+    >>> rods = regular_reseau(3, 3, 20.0, Mark(shape="disk", size=0.75))
+    >>> model, plane = RationalPolynomial.camera(), ObjectPlane(Similarity(), np.ones(2), Similarity())
+    >>> camera = CameraCorrection(model, np.zeros((13, 13)), Similarity(), Similarity(), "mm")
+    >>> pins = ImagePoints.with_sigma(rods.ids, rods.xy, 0.01)
+    >>> group_b = RationalPolynomial.ultrasonic()
+    >>> stored = InstrumentCorrection(camera, group_b, plane, np.zeros((29, 29)), "mm", pins)
+    >>> moved = ImagePoints(pins.names, pins.xy + [0.1, 0.0], pins.cov)
+    >>> still_standard(stored, pins, rods).holds, still_standard(stored, moved, rods).holds
+    (True, False)
     """
     if not 0 < alpha < 1:
         raise UsageError(f"{alpha:g} is not between 0 and 1", where="alpha")
