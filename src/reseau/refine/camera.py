@@ -129,7 +129,8 @@ def correct_camera(
     --------
     >>> from reseau.designs import standard_reseau
     >>> reseau = standard_reseau()
-    >>> seen = reseau.xy * [9.0, -9.0] + [800.0, 600.0] + 1e-5 * reseau.xy**3
+    >>> bent = reseau.xy * (1 + 1e-6 * (reseau.xy**2).sum(axis=1, keepdims=True))
+    >>> seen = bent * [9.0, -9.0] + [800.0, 600.0]
     >>> camera = correct_camera(ImagePoints.with_sigma(reseau.ids, seen, 0.01), reseau, trials=0).required()
     >>> bool(abs(camera.fit.residuals).max() < 0.02)
     True

@@ -2,8 +2,8 @@
 
 Equations (7a, b) of Wishahy's paper have 16 coefficients; its equations (6a, b) derive them from 13 causes:
 orientation P0…P4, symmetric distortion k0, k1, asymmetric distortion h'1…h'4, and the ultrasonic beam m1, m2.
-This implies three conditions, A6 = B6, A4 = B3 + A5 and B4 = A3 + B5, which can be tested; where they hold, the
-causes follow by least squares.
+This implies three conditions, A6 = B6, A4 = B3 + A5 and B4 = A3 + B5, which can be tested; where they hold,
+the causes follow by least squares.
 """
 
 from __future__ import annotations

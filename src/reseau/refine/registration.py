@@ -1,10 +1,10 @@
 """Refer a photograph to PHOTO I by the reseau that both show.
 
 The correction of the camera predicts the image position of every mark of the reseau. A similarity from the
-measured to the predicted positions transforms any other measurement in the photograph to PHOTO I. If it differs
-from the identity, the camera has moved. After a large shift or a rotation the camera sees the reseau in another
-perspective and through other parts of its lens: where the similarity leaves more than the errors of the marks, a
-smooth field through the marks replaces it.
+measured to the predicted positions transforms any other measurement in the photograph to PHOTO I. If it
+differs from the identity, the camera has moved. After a large shift or a rotation the camera sees the reseau
+in another perspective and through other parts of its lens: where the similarity leaves more than the errors
+of the marks, a smooth field through the marks replaces it.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from .standard import StandardTest
 __all__ = ["of_the_camera", "of_the_change", "of_the_object"]
 
 _UPRIGHT = np.deg2rad(20.0)
-"""Rotation of the test object against the reseau, or of the reseau in the image, that is accepted as intended."""
+"""Rotation of the test object against the reseau, or of the reseau in the image, that is accepted."""
 _ANOTHER_SHAPE_PX = 0.3
 """Residuals (px) of the marks of a photograph referred to PHOTO I up to which it has the same shape."""
 

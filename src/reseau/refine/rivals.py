@@ -1,8 +1,8 @@
 """Which of two models explains the same points better, when neither contains the other.
 
 An F-test needs nested models. Here every point is predicted from all others by both models, and the weighted
-squares of the errors of prediction are compared point by point (Wilcoxon's signed ranks). More parameters are no
-advantage: fitting the noise makes the prediction worse.
+squares of the errors of prediction are compared point by point (Wilcoxon's signed ranks). More parameters are
+no advantage: fitting the noise makes the prediction worse.
 """
 
 from __future__ import annotations

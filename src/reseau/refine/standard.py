@@ -1,8 +1,8 @@
 r"""Test whether stored coefficients still hold for a new photograph of the test object.
 
-Wishahy calls the coefficients of an instrument "theoretically standard": determined once, they serve for every
-later photograph. A new image of the test object tests that. With the same rods as before, their errors are the
-same, and every rod is compared with its earlier image:
+Wishahy calls the coefficients of an instrument "theoretically standard": determined once, they serve for
+every later photograph. A new image of the test object tests that. With the same rods as before, their errors
+are the same, and every rod is compared with its earlier image:
 
 .. math:: d_i = f(x_i^{new}) - f(x_i^{old}), \qquad \chi^2 = \sum_i d_i^T \Sigma_i^{-1} d_i ,
 
