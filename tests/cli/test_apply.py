@@ -202,7 +202,7 @@ def test_a_film_frame_is_resampled_to_millimetres_in_its_colours(
         window = found[row - 12 : row + 13, column - 12 : column + 13, 0].astype(float)
         offset = np.arange(-12.0, 13.0)
         centroid = np.array([(window * offset).sum(), (window * offset[:, None]).sum()]) / window.sum()
-        np.testing.assert_allclose(centroid + [column, row], at, atol=0.02)
+        np.testing.assert_allclose(centroid + np.array([column, row]), at, atol=0.02)
     with tifffile.TiffFile(out) as tiff:
         numerator, denominator = tiff.pages.first.tags["XResolution"].value
     assert numerator / denominator == pytest.approx(80.0)  # pixels per centimetre
@@ -210,10 +210,11 @@ def test_a_film_frame_is_resampled_to_millimetres_in_its_colours(
 
 def test_points_of_a_scan_become_photo_coordinates(orientation: Path, tmp_path: Path, reseau: Run) -> None:
     lines = [f"{k},{x:.6f},{y:.6f},0.1,0.1" for k, (x, y) in enumerate(to_scan(SPOTS))]
-    (tmp_path / "p.csv").write_text("\n".join(["id,x,y,sx,sy", *lines, "out,5,5,0.1,0.1"]) + "\n")
+    (tmp_path / "p.csv").write_text("\n".join(["id,x,y,sx,sy", *lines, "out,-40,-40,0.1,0.1"]) + "\n")
     status, out, err = reseau("apply", orientation, tmp_path / "p.csv", "--json")
     assert status == 0
-    assert "beyond the frame" in err or err == ""
+    assert "point out lies" in err
+    assert "beyond the frame: the correction is unreliable there" in err
     found = json.loads(out)
     assert (found["unit"], found["system"]) == ("mm", "photo")
     table = found["points"]
