@@ -123,7 +123,7 @@ def one_bad(name: str, path: Path) -> None:
     ("name", "status", "wrong", "helps"),
     [
         ("without borders", 1, "no frame of the format", "scan it with a margin of film around"),
-        ("overlapping", 1, "no frame of the format", "frames that overlap cannot be told apart"),
+        ("overlapping", 1, "no frame of the format", "overlapping frames cannot be separated"),
         ("blank", 1, "of one tone", "scan it with more exposure"),
         ("truncated", 2, "is a truncated TIFF", "copy or scan it anew"),
         ("CMYK", 2, "colour CMYK", "convert it to grey or RGB of 8 or 16 bit"),

@@ -42,7 +42,7 @@ def test_rods_are_measured_and_the_missing_one_is_named(
     status, out, _ = reseau("measure", "pins", image, "-d", design, "-o", tmp_path / "m.json")
     assert status == 0
     assert "6 of 7 rods measured" in out
-    assert "R6: no echo where the others have it" in out
+    assert "R6: no echo at the predicted position" in out
     points = ReseauMeasurement.read(tmp_path / "m.json").image_points()
     assert points.names == tuple(f"R{k}" for k in range(6))
     assert np.abs(points.xy - TRUTH[:6]).max() < 0.2
@@ -68,7 +68,7 @@ def test_what_cannot_be_measured_is_one_line(reseau: Run, bench: tuple[Path, Pat
     for arguments, expected, reason in (
         ((image, "-d", tmp_path / "disks.json"), 2, "disk"),
         ((tmp_path / "dark.png", "-d", design), 2, "is all black"),
-        ((tmp_path / "blank.png", "-d", design), 1, "not to be found"),
+        ((tmp_path / "blank.png", "-d", design), 1, "not found"),
         ((image, "-d", tmp_path / "none.json"), 2, "none.json"),
     ):
         status, out, err = reseau("measure", "pins", *arguments, "-o", tmp_path / "never.json")

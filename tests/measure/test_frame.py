@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
+from reseau.core.failure import Code
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
 from reseau.procedures.film_frame import reorient_scan
@@ -83,6 +84,7 @@ def test_a_line_that_nothing_parts_from_an_edge_is_not_taken_for_it() -> None:
     # A bright line within half a pixel of the upper edge at one end: told by the width of its steps alone.
     result = oriented(FilmFrame(320035, beside=Beside(lines=1)))
     assert result.status == "declined"
+    assert result.code is Code.UNCERTAIN
     assert "standard deviation" in result.why
 
 
@@ -189,12 +191,13 @@ def moved_at_its_corners(frame: FilmFrame, by: Array) -> tuple[FrameResult, Arra
     return result, cv2.perspectiveTransform(frame.truth.corners[None], moved)[0]
 
 
-def test_a_frame_seen_at_a_slant_is_oriented_and_said_to_be_so() -> None:
+def test_a_frame_seen_at_an_angle_is_oriented_with_a_remark() -> None:
     # Left and right edge converge by two degrees.
     by = np.array([[-14.0, 0.0], [14.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     result, corners = moved_at_its_corners(FilmFrame(51), by)
     assert result.status == "oriented", result.why
-    assert "seen at a slant" in result.why
+    assert result.code is Code.TILTED
+    assert "opposite edges converge by" in result.why
     assert result.lines is not None
     np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=0.3)
 
@@ -204,7 +207,8 @@ def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
     by = np.array([[24.0, 16.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     result, _ = moved_at_its_corners(FilmFrame(52), by)
     assert result.status == "declined"
-    assert "do not make a frame" in result.why
+    assert result.code is Code.INCONSISTENT
+    assert "do not form a frame" in result.why
 
 
 def test_what_is_no_frame_is_declined_with_what_would_help() -> None:
@@ -212,10 +216,10 @@ def test_what_is_no_frame_is_declined_with_what_would_help() -> None:
     blank = np.full((500, 700), 12, dtype=np.uint8)
     noise = rng.integers(0, 255, (500, 700)).astype(np.uint8)
     inner = FilmFrame(1, margin_mm=-1.0).scan()
-    for pixels, words in ((blank, "of one tone"), (noise, "no frame"), (inner, "no frame")):
+    for pixels, code in ((blank, Code.LOW_CONTRAST), (noise, Code.NOT_FOUND), (inner, Code.NOT_FOUND)):
         (result,) = orient_frames(scan_of(pixels))
         assert not result
-        assert words in result.why
+        assert result.code is code
         assert ";" in result.why
         document = result.document()
         assert document.status == "declined"

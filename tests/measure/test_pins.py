@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from reseau.core.data import Array, Frame
 from reseau.core.errors import ImageError, UsageError
+from reseau.core.failure import Code
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image
 from reseau.measure import PinOptions, Wires, find_pins, lay_wires, measure_pins
@@ -140,7 +141,7 @@ def test_neighbours_that_touch_are_measured_as_well_as_they_say_or_declined(apar
     rows = nearest(found.xy, truth)
     assert len(set(rows)) == 2
     if apart < 25:
-        assert [found.why[k] for k in rows] == ["too uncertain"] * 2
+        assert [found.codes[k] for k in rows] == [Code.UNCERTAIN] * 2
     else:
         sigma = np.sqrt(np.diagonal(found.cov[rows], axis1=1, axis2=2))
         assert found.ok[rows].all()
@@ -156,7 +157,7 @@ def test_what_is_too_faint_is_declined_and_the_rest_measured_where_it_is():
     assert found.ok[rows[:6]].all()
     assert found.ok.sum() == 6
     assert np.abs(found.xy[rows[:6]] - truth[:6]).max() < 0.4
-    assert found.why[rows[6]] == "too faint beside the others"
+    assert found.codes[rows[6]] is Code.LOW_CONTRAST
 
 
 @pytest.mark.parametrize("wire", [148, 151, 154])
@@ -196,7 +197,7 @@ def test_at_the_edge_of_the_screen_measured_rightly_or_declined(x: float):
         assert (np.abs(found.xy[k] - truth[0]) < 5 * np.sqrt(np.diagonal(found.cov[k]))).all()
     elif near:
         assert not found.ok[k]
-        assert found.why[k] == "cut off by the edge of the frame"
+        assert found.codes[k] is Code.OUTSIDE
 
 
 def test_nothing_is_found_in_noise():
@@ -317,11 +318,11 @@ def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():
     shown = picture(truth, arcs(len(truth), 6.0), (600, 800), light)
     result = measure_pins(frame(shown), rods(close, unknown=len(close) - 1))
     assert result
-    assert result.why[3] == "no echo where the others have it"
+    assert result.codes[3] is Code.NOT_FOUND
     pair = [len(close) - 3, len(close) - 2]
     assert [result.ok[k] for k in pair] == [False, False]
-    assert all("touches" in result.why[k] for k in pair)
-    assert result.why[-1] == "the design does not say where"
+    assert all(result.codes[k] is Code.OVERLAPPING for k in pair)
+    assert result.codes[-1] is Code.NO_COORDINATES
     assert result.found == len(close) - 4
     assert result.notes == ()
 
@@ -330,7 +331,7 @@ def test_a_pattern_that_is_not_there_is_a_failure_with_the_reason():
     truth = np.random.default_rng(4).uniform([40, 40], [600, 440], (5, 2))
     result = measure_pins(frame(picture(truth, arcs(5), (480, 640))), rods())
     assert not result
-    assert "not to be found" in result.reason
+    assert result.code is Code.TOO_FEW_POINTS, result.reason
     blank = measure_pins(frame(GROUND + NOISE * np.random.default_rng(0).standard_normal((200, 300))), rods())
     assert not blank
     assert "0 echoes" in blank.reason

@@ -158,7 +158,7 @@ def test_a_design_of_unknown_size_and_unknown_coordinates_of_some_marks():
     design = formed.design.model_copy(update={"points": points, "mark": mark})
     result = measure_reseau(formed.frame, design, ReseauOptions(nominal=False))
     assert result.found == 46
-    assert {result.why[0], result.why[20]} == {"the design does not say where"}
+    assert {result.codes[0], result.codes[20]} == {Code.NO_COORDINATES}
     error = (result.xy - formed.xy)[result.ok]
     assert np.abs(error).max() < 0.08
 

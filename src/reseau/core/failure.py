@@ -21,15 +21,21 @@ class Code(StrEnum):
     """
 
     AMBIGUOUS = "ambiguous"  # several solutions fit equally well: add something that distinguishes them
+    BLURRED = "blurred"  # less sharp than the other marks: another object, or out of focus
     CAMERA_MOVED = "camera-moved"  # the camera has moved between photographs
     CAMERA_UNSTABLE = "camera-unstable"  # the camera's parameters differ between images
     COLLINEAR = "collinear"  # all points lie on one line
     CORRELATED = "correlated"  # unknowns that the observations can hardly separate
     COVERAGE = "coverage"  # parts of the images have no points
     DECLINED = "declined"  # an earlier step declined the image
+    DEVIATES = "deviates"  # far from the position predicted by the other points
     DISPLAY_SHIFTED = "display-shifted"  # the display has shifted against the reseau
+    DISTURBED = "disturbed"  # bit errors, dust or another object cross the mark
     DOUBTFUL_CONTROL = "doubtful-control"  # control points or distances contradict the images
+    DRAWN = "drawn"  # graphics of the instrument, not part of the image
+    EDGE_MISSING = "edge-missing"  # one edge of a frame was not found; the format determines it
     GROSS_ERRORS = "gross-errors"  # single observations are probably wrong: check or leave them out
+    HIDDEN = "hidden"  # covered, saturated or on lost pixels
     INCONSISTENT = "inconsistent"  # the observations contradict the model or each other
     INSTRUMENT_CHANGED = "instrument-changed"  # the instrument has changed since its calibration
     LOW_CONTRAST = "low-contrast"  # nothing stands out from the noise
@@ -38,9 +44,12 @@ class Code(StrEnum):
     NOT_FINITE = "not-finite"  # the model has no finite value at the approximate values
     NOT_FOUND = "not-found"  # the target or the feature is not in the image
     NOT_IDENTIFIED = "not-identified"  # the observations do not determine a point or a parameter
+    NO_COORDINATES = "no-coordinates"  # the design does not define the position
     NO_DATUM = "no-datum"  # nothing defines the coordinate system
     NO_REDUNDANCY = "no-redundancy"  # too few observations for the unknowns, or for a test
     OTHER_DESIGN = "other-design"  # a target of another design is in the image
+    OUTSIDE = "outside"  # beyond the edge of the frame
+    OVERLAPPING = "overlapping"  # the image touches that of another mark
     PARALLAX = "parallax"  # a gap between reseau and screen shows after the camera moved
     PREREQUISITE_MISSING = "prerequisite-missing"  # an earlier step has no result
     RANK_DEFECT = "rank-defect"  # the observations do not determine a combination of the unknowns
@@ -50,13 +59,16 @@ class Code(StrEnum):
     SINGULAR = "singular"  # the normal equations are singular to rounding
     SLANT = "slant"  # an edge is slanted too little or too much
     TARGET_ROTATED = "target-rotated"  # the target is rotated, or named points are exchanged
+    TILTED = "tilted"  # the perspective of a tilted copying camera was found
     TOO_FEW_IMAGES = "too-few-images"
     TOO_FEW_LEVELS = "too-few-levels"  # exposures at too few levels of light
     TOO_FEW_POINTS = "too-few-points"
     TOO_MANY_OUTLIERS = "too-many-outliers"  # the model is probably wrong, not the observations
     TOO_SMALL = "too-small"  # the region or the target covers too few pixels
+    UNCERTAIN = "uncertain"  # the standard deviation is larger than allowed
     UNEQUAL_SCALES = "unequal-scales"  # the scales along the two axes differ
     UNKNOWN_STEP = "unknown-step"  # the procedure has no step of this name
+    UNLIKE = "unlike"  # the image is not that of the mark
     UNMODELLED = "unmodelled"  # the residuals show a pattern that the model does not describe
     WEAK_GEOMETRY = "weak-geometry"  # points, images or parameters with very large uncertainty
 

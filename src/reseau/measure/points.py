@@ -3,13 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from ..core.data import Array, ImagePoints, Mask
+from ..core.failure import Code
 from ..io import ReseauMeasurement
 
-__all__ = ["Measured"]
+__all__ = ["Measured", "Reason"]
+
+
+class Reason(str):
+    """Why a point was not measured: a text with a code.
+
+    Parameters
+    ----------
+    text : str
+        The reason for the user.
+    code : Code
+        The same for programs.
+
+    Examples
+    --------
+    >>> why = Reason("outside the frame", Code.OUTSIDE)
+    >>> why, why.code == "outside"
+    ('outside the frame', True)
+    """
+
+    code: Code
+
+    def __new__(cls, text: str, code: Code) -> Self:
+        """The text, which carries its code."""
+        reason = super().__new__(cls, text)
+        reason.code = code
+        return reason
+
+    def repeated(self, count: int) -> Array:
+        """An array (count,) of this reason."""
+        reasons = np.empty(count, dtype=object)
+        reasons[:] = self  # np.full would convert it to a plain str
+        return reasons
+
+    def __getnewargs__(self) -> tuple[str, Code]:  # type: ignore[override]
+        return str(self), self.code
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +94,11 @@ class Measured:
         return int(self.ok.sum())
 
     @property
+    def codes(self) -> tuple[Code | None, ...]:
+        """Codes (n,) of the reasons; None where a point was measured."""
+        return tuple(why.code if isinstance(why, Reason) else None for why in self.why)
+
+    @property
     def points(self) -> ImagePoints:
         """The points that were measured."""
         names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
@@ -70,5 +112,5 @@ class Measured:
     def measurement(self) -> ReseauMeasurement:
         """The result as a document."""
         return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, self.why
+            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, tuple(map(str, self.why))
         )

@@ -1,4 +1,4 @@
-"""The inner orientation of scanned film frames from their four edges."""
+"""Interior orientation of scanned film frames from their four edges."""
 
 from .orientation import FrameOptions, FrameResult, orient_frames
 from .perforations import PITCH_MM, FilmPlane, edge_of, film_plane

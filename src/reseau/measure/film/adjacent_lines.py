@@ -1,22 +1,20 @@
-"""How sharp the steps of a frame's edges are, and by how much what lies beside an edge may have drawn them.
+r"""Lines of the picture beside an edge of the frame: detection, and adjustment together with the edge.
 
-A line of the picture close behind an edge (Cruz et al., fig. 7B) cannot be told from it by a profile alone.
-But it widens the step that is seen, and neighbours alike; a picture's forms do so at random, here and there.
+A line of the picture close behind an edge (Cruz et al., fig. 7B) cannot be separated from it in a single
+profile. But it widens the visible step consistently over neighbouring profiles, whereas picture content does
+so at random. The widths of the steps therefore show which edges are affected, and by how much.
 
-An edge and a line of the picture close behind it, fitted together (Cruz et al., fig. 7B).
-
-Where a bright line of the picture runs within some pixels of an edge, the larger step from the dark ground
-to the line draws the smaller one from film to ground towards it; a profile alone does not tell the two apart.
-What does is that both are smooth all along the edge. Sections of it, i = 1 … s, at the places t_i from −1 to
-1, are averaged and fitted as one,
+If a bright line runs within a few pixels of an edge, the larger step from the dark background to the line
+displaces the smaller one from film to background towards it. Both are smooth along the edge: sections of it,
+i = 1 … s, at the positions t_i from −1 to 1, are averaged and fitted together,
 
 .. math::
-    g_i(d) = b_i + A_i\\,\\Phi\\Bigl(\\frac{d - p(t_i)}{w}\\Bigr)
-             + B_i\\,\\Phi\\Bigl(\\frac{d - q(t_i)}{w}\\Bigr)
-             + C_i\\,\\Phi\\Bigl(\\frac{d - q(t_i) - h}{w}\\Bigr), \\qquad
-    p = p_0 + p_1 t + p_2 (t^2 - 1), \\quad q = q_0 + q_1 t + q_2 t^2,
+    g_i(d) = b_i + A_i\,\Phi\Bigl(\frac{d - p(t_i)}{w}\Bigr)
+             + B_i\,\Phi\Bigl(\frac{d - q(t_i)}{w}\Bigr)
+             + C_i\,\Phi\Bigl(\frac{d - q(t_i) - h}{w}\Bigr), \qquad
+    p = p_0 + p_1 t + p_2 (t^2 - 1), \quad q = q_0 + q_1 t + q_2 t^2,
 
-with the known width w of a blurred step: where the line leaves the edge, the edge is seen by itself.
+with the known width w of a blurred step. Where the line departs from the edge, the edge is visible by itself.
 """
 
 from __future__ import annotations
@@ -45,31 +43,31 @@ __all__ = [
 ]
 
 _QUANTILES, _EVEN = (0.1, 0.3), 0.015
-"""Of the widths of profiles: the greater is that of a sharp step, their difference tells how they differ from
-place to place, logarithm, at least so much."""
+"""Quantiles of the widths of profiles: the larger is the width of a sharp step; their difference is the
+scatter of its logarithm, with a minimum."""
 _UNEVEN, _SCRATCHED = 0.2, 0.5
-"""Logarithms by which widths of three edges differ if the scan is sharper at one side than at another, and
-that of the sharpest from the next if it is no edge's."""
+"""Differences of logarithmic widths: of three edges if the scan is sharper on one side, and of the sharpest
+from the next if it is no edge."""
 _TOO_SHARP = 0.3
-"""Logarithm by which steps are too sharp for those of an edge."""
+"""Difference of logarithmic width from which steps are too sharp for an edge."""
 _FARTHEST_DRAWN = 1.5
-"""Widths by which a line may draw a step at most; one that is farther away is seen by itself."""
+"""Largest displacement of a step by a line, in widths; a more distant line is visible by itself."""
 _RATIO, FEW_DRAWN = 4.0, 0.22
-"""Of the second step to the first, where a line of the picture draws an edge; and part of its profiles that
-show it by chance."""
+"""Ratio of the second step to the first where a line displaces an edge, and share of profiles that show this
+by chance."""
 _NEIGHBOURHOODS, _INDEPENDENT = 5, 2.5
-"""Neighbourhoods of profiles that a line widens alike; as how many their mean tells in a picture's forms."""
+"""Neighbourhoods of profiles that a line widens consistently; their effective number in picture content."""
 
 
 class Sharp(NamedTuple):
-    """Sharp steps of an edge.
+    """Widths of sharp steps of an edge.
 
     Parameters
     ----------
     log_width : float
-        Logarithm of their width.
+        Logarithm of the width.
     scatter, texture : float
-        By how much it differs from place to place at least; and at random, by the picture's forms.
+        Scatter of the logarithm along the edge (minimum), and its random part from picture content.
     """
 
     log_width: float
@@ -78,16 +76,16 @@ class Sharp(NamedTuple):
 
     @property
     def width(self) -> float:
-        """One sigma, pixels."""
+        """Width, one sigma, pixels."""
         return float(np.exp(self.log_width))
 
     def beyond(self, found: EdgeProfiles) -> bool:
-        """Whether most steps are sharper than those of an edge can be: a scratch's."""
+        """Whether most steps are sharper than those of an edge can be, as at a scratch."""
         return bool(np.median(found.blur[0][found.good]) < self.log_width - _TOO_SHARP)
 
 
 def common_widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
-    """Width of the blurred step for each edge: one for all, unless they are focused differently."""
+    """Width of the blurred step for each edge: common to all, unless their sharpness differs."""
     told = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
     if not told:
         return [None] * len(profiles)
@@ -97,13 +95,13 @@ def common_widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]
 
 
 def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Sharp]:
-    """Sharp steps of each edge: of all together, unless they are focused differently."""
+    """Widths of sharp steps for each edge: common to all, unless their sharpness differs."""
     own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
     sharp = [_sharp(widths) for widths in own]
     seen = [each for each, widths in zip(sharp, own, strict=True) if len(widths)]
     if not seen:
         return sharp
-    # A line beside one of the edges scatters its widths, not those of the others.
+    # A line beside one of the edges scatters the widths of that edge only.
     second = min(1, len(seen) - 1)
     texture = sorted(each.texture for each in seen)[second]
     if _uneven(sorted(each.width for each in seen)):
@@ -113,24 +111,24 @@ def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Sharp]:
 
 
 def drawn_by_lines(found: EdgeProfiles, sharp: Sharp) -> tuple[Array, float]:
-    """By how much lines of the picture beside an edge may draw its steps to them, pixels (n,); how many do.
+    """Possible displacement of steps by lines beside the edge, pixels (n,); share of affected profiles.
 
-    A second step of a part r of the contrast, s behind the first, is seen as one that is moved by r·s and has
-    the variance w² + r(1 − r)·s². One that is too sharp is a line by itself.
+    A second step with a share r of the contrast, at a distance s behind the first, appears as one step that
+    is displaced by r·s and has the variance w² + r(1 − r)·s². A step that is too sharp is itself a line.
     """
     sure = _unlike(found, sharp, 2.0)
     part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
     if part > FEW_DRAWN:
-        # There is such a line: what is no proof is a sign now.
+        # There is such a line; use a lower level of significance for the other profiles.
         sure = _unlike(found, sharp, 1.0)
     moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _FARTHEST_DRAWN)
     if part > FEW_DRAWN:
-        moved = moved * np.sqrt(NEIGHBOURS)  # which are drawn alike
+        moved = moved * np.sqrt(NEIGHBOURS)  # neighbours are displaced alike
     return np.asarray(sharp.width * moved), part
 
 
 def _unlike(found: EdgeProfiles, sharp: Sharp, sigmas: float) -> Array:
-    """By how much widths surely differ from a sharp step's, logarithm (n,): alone, or with those around."""
+    """Significant differences from the width of a sharp step, logarithm (n,): of profiles or groups."""
     other, variance = found.blur[0] - sharp.log_width, found.blur[1] + sharp.texture**2
     size = min(_NEIGHBOURHOODS * NEIGHBOURS, len(other))
     mean, own = (uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
@@ -143,44 +141,44 @@ def _sharp(widths: Array) -> Sharp:
     if not len(widths):
         return Sharp(0.0, _EVEN, 0.0)
     low, high = np.quantile(widths, _QUANTILES)
-    # A picture's forms move the steps, too, where it shows; a line along the edge widens neighbours alike.
+    # Picture content changes widths at random; a line along the edge widens neighbours alike.
     apart = np.abs(np.diff(widths[::NEIGHBOURS]))
     texture = 1.4826 * float(np.median(apart)) / np.sqrt(2) if len(apart) > 3 else 0.0
     return Sharp(float(high), max(float(high - low), _EVEN), texture)
 
 
 def _uneven(widths: Sequence[float]) -> bool:
-    """Whether sorted widths differ by more than what a picture beside one of the edges does to it."""
+    """Whether sorted widths differ by more than a picture structure at one of the edges can cause."""
     if len(widths) > 3 and np.log(widths[1] / widths[0]) > _SCRATCHED:
-        widths = widths[1:]  # no lens is that sharp at one edge alone
+        widths = widths[1:]  # a lens cannot be that sharp at a single edge
     return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN)
 
 
 _SECTIONS = 20
-"""Sections of an edge."""
+"""Number of sections of an edge."""
 _REACH, _BIN = 7.0, 0.6
-"""How far to both sides pixels are used, and in what steps they are averaged, widths of the blurred step."""
+"""Range of pixels on both sides, and size of the bins, in widths of the blurred step."""
 _MODEL = 0.012
-"""Part of a section's contrast to which the model describes it."""
+"""Accuracy of the model relative to the contrast of a section."""
 _OUT, _BEHIND, _SLOPES = -0.5, 2.5, (0.0, -2.0, 2.0)
-"""Approximate values, widths: of the edge from the line that was fitted, of the line behind it from the edge,
-and by how much that leaves it from the middle to an end."""
+"""Approximate values in widths: distance of the edge from the fitted line, of the line behind it from the
+edge, and change of the latter from the centre to an end."""
 _MOST_MISFIT, _LEAST_GAIN, _CLEAR_GAIN = 1.0, 3.0, 20.0
-"""χ² over the redundancy with which two lines describe an edge, and how often as large it is with one: at
-least, and where nothing else can be there."""
+"""Largest χ² over redundancy with two lines; minimum ratio of χ² with one line to that with two; and the same
+if nothing else can be there."""
 _TOGETHER = 1.7
-"""By how much more the edge varies than from bins whose errors were independent: grain is wider."""
+"""Factor on the standard deviation of the edge, because errors of bins are correlated by grain."""
 _BOW = 0.3
-"""Widths by which the edge itself may be bowed, one sigma."""
+"""Standard deviation of the bow of the edge, in widths."""
 _FARTHEST, _WELL = (2.0, 3.2), 0.6
-"""Widths by which a line draws the edge's steps at most, where two lines describe it less well and well; and
-the χ² over the redundancy that parts these."""
+"""Largest displacement of the edge's steps by a line, in widths, for a moderate and for a good fit of two
+lines; and the χ² over redundancy that separates these."""
 _SHARED = 7
-"""Parameters of all sections: p0, p1, p2, q0, q1, q2, h."""
+"""Number of parameters common to all sections: p0, p1, p2, q0, q1, q2, h."""
 
 
 class Companion(NamedTuple):
-    """Offsets (2,) of the edge at the places −1 and 1, inwards, with their covariance (2, 2), and its bow."""
+    """Offsets (2,) of the edge at the positions −1 and 1, inwards, their covariance (2, 2), and its bow."""
 
     ends: Array
     covariance: Array
@@ -190,26 +188,26 @@ class Companion(NamedTuple):
 def edge_beside_line(
     grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
 ) -> tuple[Companion | None, bool]:
-    """The edge where a line of the picture runs beside it, if two lines describe it; if one does as well.
+    """Adjust an edge together with a line beside it; test against a model without the line.
 
     Parameters
     ----------
     grey : ndarray (n, s)
         Pixels of the profiles, film darker than the picture.
     band : Band
-        Where they are.
+        Distances of the pixels.
     line : ndarray (n,)
-        Offset of the line that was fitted, at each profile.
+        Offset of the line fitted before, at each profile.
     level : ndarray (n,)
-        Tone of film beside each profile.
+        Tone of the film beside each profile.
     noise, width : float
-        Of a pixel; of the blurred step, one sigma, pixels.
+        Noise of a pixel; width of the blurred step, one sigma, pixels.
 
     Returns
     -------
     (Companion or None, bool)
-        The second tells whether a line could run so close to the edge all along that nothing parts the two:
-        all sections are described by straight steps. With other things beside the edge they are not.
+        The edge, if two lines describe it; and whether a line may run so close to the edge all along that the
+        two cannot be separated: then straight steps describe all sections, which other structures would not.
     """
     two = _two_lines(grey, band, line, level, noise, width)
     if two is None:
@@ -221,7 +219,7 @@ def edge_beside_line(
     there &= (behind > -0.3 * width).mean() > 0.9
     farthest = _FARTHEST[int(two.chi < _WELL)] * width
     there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest
-    # What lies behind the edge at one distance all along may be the scanner's own glare, which is less clear.
+    # A structure behind the edge at constant distance may be glare of the scanner, which is less distinct.
     there &= np.ptp(behind) > width or (two.chi < _WELL and two.without > _CLEAR_GAIN * two.chi)
     if two.chi > _MOST_MISFIT or two.without < _LEAST_GAIN * two.chi or not there:
         return None, min(two.without, two.chi) < _MOST_MISFIT
@@ -231,18 +229,18 @@ def edge_beside_line(
 def ends_with_line(
     grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
 ) -> Companion | None:
-    """The edge with a line behind it, whether or not that describes it; as :func:`edge_beside_line`.
+    """The edge with a line behind it, without a test of the model; arguments as in :func:`edge_beside_line`.
 
-    Its covariance is what the pixels tell of the edge if that is what is there.
+    Its covariance assumes that the model is correct.
     """
     two = _two_lines(grey, band, line, level, noise, width)
     return None if two is None else two.companion(band, line)
 
 
 class _TwoLines(NamedTuple):
-    """An edge and a line fitted: parameters (u,), cofactors (u, u), places and contrasts of sections (s,).
+    """Adjusted edge and line: parameters (u,), cofactors (u, u), positions and contrasts of sections (s,).
 
-    Besides χ² over the redundancy with the line, and without.
+    Also χ² over the redundancy, with the line and without.
     """
 
     x: Array
@@ -253,7 +251,7 @@ class _TwoLines(NamedTuple):
     without: float
 
     def companion(self, band: Band, line: Array) -> Companion:
-        """The edge of it."""
+        """Its edge."""
         ends = np.array([[1.0, -1.0], [1.0, 1.0]])
         covariance = ends @ self.cofactor[:2, :2] @ ends.T * _TOGETHER**2
         fitted = np.interp([-1.0, 1.0], band.place, line)
@@ -283,7 +281,7 @@ def _two_lines(
 def _sections(
     rest: Array, band: Band, line: Array, noise: float, width: float
 ) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Of each section its place, and of its bins: distances, tones, weights; and the contrast (s,)."""
+    """Position of each section; distances, tones and weights of its bins; contrast (s,)."""
     distance = band.distance - line[:, None]
     low, count = -_REACH * width, int(2 * _REACH / _BIN)
     step = _BIN * width
@@ -307,7 +305,7 @@ def _sections(
 
 
 def _of_steps(film: Array, first: Array, second: Array, change: Array) -> Array:
-    """Parameters of the sections in their order."""
+    """Parameters of the sections in the order of the model."""
     return np.stack([film, first, second, change], axis=1).ravel()
 
 
@@ -318,7 +316,7 @@ class _Model:
         self.place, self.at, self.width = place, at, width
 
     def start(self, slope: float, top: Array) -> Array:
-        """Approximate parameters, with the line behind the edge leaving it by so many widths."""
+        """Approximate parameters, with the line departing from the edge by `slope` widths."""
         shared = np.array([_OUT, 0.0, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
         return np.concatenate([shared, _of_steps(0 * top, 0.2 * top, 0.8 * top, -0.3 * top)])
 

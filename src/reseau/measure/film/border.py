@@ -1,15 +1,13 @@
-"""The pixels along an approximate edge, each with its exact distance from it, in profiles across.
+"""The border between unexposed film and picture along an edge, from profiles of pixels across it.
 
-All four edges are one case (Cruz et al., sect. 2.2): distances are positive towards the picture. Nothing is
-rotated or resampled for it.
+All four edges are treated alike (Cruz et al., sect. 2.2): each pixel has its exact distance from an
+approximate line, positive towards the picture. Nothing is rotated or resampled.
 
-Where unexposed film ends: the straight line beyond which there is film alone, and within it a picture.
-
-The strongest gradient is not the edge of a frame where something bright runs along it within the picture
-(Cruz et al., fig. 7B). What tells the edge is what is *beyond* it: film of one tone. Each place along and
-across gets the logarithm of how much more likely it belongs to a picture than to unexposed film; the edge is
-the line for which their sum within it is greatest. Both likelihoods have broad tails: dust and scratches on
-the film cost little, and so do dark parts of the picture.
+The strongest gradient is not the edge of a frame if a bright structure runs along it within the picture (Cruz
+et al., fig. 7B). The edge is identified by what lies *beyond* it: film of uniform tone. Each place along and
+across gets its log-likelihood ratio of picture against unexposed film; the edge is the straight line with the
+largest sum of these on its inside. Both likelihoods have heavy tails: dust and scratches on the film and dark
+parts of the picture have little weight.
 """
 
 from __future__ import annotations
@@ -38,11 +36,12 @@ __all__ = [
 ]
 
 _PROFILES = 400
-"""Profiles of an edge, where it is long enough for as many."""
+"""Maximum number of profiles of an edge."""
 _COLUMNS, _MANY = 4, 12
-"""Neighbouring columns of pixels that make a profile, at most; and where so few show no step."""
+"""Maximum number of neighbouring pixel columns in a profile; the second where narrow profiles show no
+step."""
 _ENDS = 0.03
-"""Part of an edge at either end that is left out: corners are rounded."""
+"""Share of an edge at either end that is left out: corners are rounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +53,13 @@ class Band:
     start, stop : ndarray (2,)
         Ends of the approximate edge, pixels.
     place : ndarray (n,)
-        Of the profiles along it, −1 at its start and 1 at its end.
+        Position of each profile along the edge, −1 at its start and 1 at its end.
     distance : ndarray (n, s)
-        Of the pixels from it, positive inwards.
+        Distance of each pixel from the edge, positive inwards.
     grey : ndarray (n, s, channels)
-        Their values; NaN outside the scan.
+        Grey values; NaN outside the scan.
     columns : int
-        Neighbouring columns of pixels in a profile.
+        Number of neighbouring pixel columns in a profile.
     """
 
     start: Array
@@ -72,7 +71,7 @@ class Band:
 
     @property
     def normal(self) -> Array:
-        """Unit vector inwards."""
+        """Unit vector pointing inwards."""
         along = self.stop - self.start
         return np.asarray(np.array([-along[1], along[0]]) / np.hypot(*along))
 
@@ -80,9 +79,9 @@ class Band:
 def read_band(
     scan: Scan, start: Array, stop: Array, outward: float, inward: float, *, wide: bool = False
 ) -> Band:
-    """Read the pixels along an approximate edge, `outward` and `inward` pixels to its sides.
+    """Read the pixels along an approximate edge, from `outward` to `inward` pixels on its sides.
 
-    `wide` profiles are of more columns each, for weak contrast.
+    With `wide`, each profile averages more columns, for weak contrast.
     """
     along = stop - start
     length = float(np.hypot(*along))
@@ -122,34 +121,34 @@ def read_band(
 
 
 _PICTURE, _FILM = 2.3, 0.65
-"""Log-likelihood of a place that differs from film, and the loss by one that does not: half of a picture's
-edge may be as dark as film, one place in twenty of film may be dust."""
+"""Log-likelihood gain of a place that differs from film, and loss of one that does not: half of a picture's
+edge may be as dark as film, and one place in twenty of film may be dust."""
 _BINS = 72
-"""Places across at which the search for the border looks, at most."""
+"""Maximum number of bins across the edge in the search for the border."""
 _ALONG = 24
-"""Columns over which tones are smoothed before they are compared with film."""
+"""Number of columns over which tones are smoothed before comparison with film."""
 _SIGNIFICANT, _LEAST_CONTRAST = 4.0, 0.12
-"""In noise, and of the contrast along the edge: what differs from film by less is film."""
+"""Places count as film if they differ by less than this multiple of the noise or share of the contrast."""
 _STRIPE, _LIT, _DETACHED = 8, 0.06, 3
-"""Places within a line at which film may part it from the picture, the part of an edge that differs from film
-at least where there is a picture, and how often such a thing is passed."""
+"""Bins within a line in which film may separate it from the picture, minimum share of an edge that differs
+from film where there is a picture, and maximum number of such lines that are skipped."""
 _RUNNING = 101
-"""Profiles over which the tone of film along an edge is taken."""
+"""Number of profiles over which the tone of film along an edge is taken."""
 _SHALLOW = 0.2
-"""Part of the picture's contrast by which the middle of a narrow strip may differ from film: what differs by
-more is none, or so narrow that blur has filled it."""
+"""Largest difference of the centre of a narrow strip of film from film, as a share of the picture's contrast;
+a strip that differs more is no film, or so narrow that blur has filled it."""
 _NARROW = 0.25
-"""Part of the usual gap that film has at least where it is known by its tone."""
+"""Minimum width of a strip of film of known tone, as a share of the usual gap."""
 
 
 @dataclass(frozen=True)
 class Film:
-    """Unexposed film as other edges of the frame show it, where there is little of it beyond an edge.
+    """Tone of unexposed film from other edges of the frame, for an edge with little film beyond it.
 
     Parameters
     ----------
     tone, noise : float
-        Grey value, times the polarity, and the scatter of smoothed ones.
+        Grey value times the polarity, and the scatter of smoothed values.
     """
 
     tone: float
@@ -163,17 +162,17 @@ class Border:
     Parameters
     ----------
     level : ndarray (n,)
-        Tone of film beside each profile.
+        Tone of the film beside each profile.
     noise, spread : float
-        Of a pixel of film; of film smoothed along the edge.
+        Noise of a pixel of film; scatter of film smoothed along the edge.
     contrast : float
-        Of the picture against film.
+        Contrast of the picture against film.
     start : ndarray (n,)
         Approximate distance of the step.
     outermost : ndarray (n,)
-        Distance to which film reaches outwards at least.
+        Minimum distance to which film extends outwards.
     clean : float
-        Part of the places beyond the edge that are film.
+        Share of the places beyond the edge that are film.
     """
 
     level: Array
@@ -186,23 +185,23 @@ class Border:
 
     @property
     def film(self) -> Film:
-        """What lies beyond the edge."""
+        """The film beyond the edge."""
         return Film(float(np.median(self.level)), self.spread)
 
 
 def likelihood(departure: Array, known: Array, start: int, gap: int) -> Array:
-    """How much more likely places belong to the picture than to film.
+    """Log-likelihood ratio of places: picture against film.
 
     Parameters
     ----------
     departure : ndarray (n, s)
-        By how much n profiles differ from film, in the sense of the picture, over the least difference that
-        is significant; s places from the outside to the inside.
+        Difference of n profiles from film, positive towards the picture, over the smallest significant
+        difference; s places from outside to inside.
     known : ndarray of bool (n, s)
-        Which places are in the scan at all.
+        Which places are in the scan.
     start : int
-        A column that is surely not far outside the edge. What lies further out behind `gap` columns of film,
-        as perforations and neighbours do, counts as film.
+        A column that is not far outside the edge. Places further outwards behind `gap` columns of film, such
+        as perforations and neighbouring frames, count as film.
     """
     ratio = np.clip((departure - 0.5) / 0.5, 0.0, 1.0) * known
     differs = ratio > 0.5
@@ -212,29 +211,29 @@ def likelihood(departure: Array, known: Array, start: int, gap: int) -> Array:
         ratio[beyond, column] = 0.0
         beyond |= run >= gap
     found = np.where(known, -_FILM + (_PICTURE + _FILM) * ratio, 0.0)
-    # A profile that differs nowhere tells nothing about where its picture begins.
+    # A profile that differs nowhere gives no information about the border.
     lit = (ratio > 0.5).any(axis=1, keepdims=True)
     return np.asarray(np.where(lit, found, 0.0))
 
 
 def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> tuple[float, float]:
-    """Straight line of the greatest sum within it.
+    """Straight line with the largest sum on its inside.
 
     Parameters
     ----------
     found : ndarray (n, s)
-        As from :func:`likelihood`.
+        Result of :func:`likelihood`.
     along : ndarray (n,)
-        Places of the profiles, −1 to 1.
+        Positions of the profiles, −1 to 1.
     first, last : int
-        Range of the column at which the line may stand at either end.
+        Range of columns for both ends of the line.
     tilt : int
-        Columns by which its ends may differ at most.
+        Largest difference between the columns of its ends.
 
     Returns
     -------
     (float, float)
-        Columns before which the inside begins at the places −1 and 1; the line is half a column before.
+        First inside columns at the positions −1 and 1; the line is half a column before.
     """
     within = np.cumsum(found[:, ::-1], axis=1)[:, ::-1]
     within = np.concatenate([within, np.zeros((len(found), 1))], axis=1)
@@ -246,16 +245,17 @@ def best_line(found: Array, along: Array, first: int, last: int, tilt: int) -> t
     column = np.rint(start[:, None] * (1 - share) + stop[:, None] * share).astype(np.intp)
     total = within[np.arange(len(found)), np.clip(column, 0, found.shape[1])].sum(axis=1)
     best = int(np.argmax(total))
-    # Lines as good as the best are one with it: take their middle.
+    # Average over neighbouring lines that are equally good.
     alike = total > total[best] - 0.5
     alike &= (np.abs(start - start[best]) <= 1) & (np.abs(stop - stop[best]) <= 1)
     return float(start[alike].mean()), float(stop[alike].mean())
 
 
 def _detached(found: Array, line: Array) -> bool:
-    """Whether film all along parts what a line begins with from the picture: then that counts as film, too.
+    """Whether film separates the outermost structure along the whole edge from the picture.
 
-    It is a scratch beside the edge, or print: of a picture's edge some part is always brighter than film.
+    Then it is a scratch beside the edge, or print, and is set to film in `found`: at a picture's edge some
+    part is always brighter than film.
     """
     column = np.rint(line).astype(np.intp)[:, None] + np.arange(_STRIPE)
     seen = np.take_along_axis(found, np.clip(column, 0, found.shape[1] - 1), axis=1) > 0
@@ -268,7 +268,7 @@ def _detached(found: Array, line: Array) -> bool:
 
 
 def first_departure(found: Array, middle: Array, reach: int) -> Array:
-    """For each profile the column at which its inside begins, within `reach` of the given columns (n,)."""
+    """First inside column of each profile, within `reach` of the given columns (n,)."""
     within = np.cumsum(found[:, ::-1], axis=1)[:, ::-1]
     columns = np.rint(middle).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
     columns = np.clip(columns, 0, found.shape[1] - 1)
@@ -288,14 +288,14 @@ def binned(grey: Array, distance: Array, low: float, size: float, count: int) ->
 
 
 def row_median(values: Array) -> Array:
-    """Medians of rows, NaN left out; NaN for a row that has nothing else."""
+    """Medians of rows without NaN; NaN for an empty row."""
     empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
     filled = np.where(empty[:, None], 0.0, values)
     return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
 
 
 def _running(values: Array) -> Array:
-    """Median along the edge: dust, print and scratches do not move it. NaN where there is nothing at all."""
+    """Median along the edge, robust against dust, print and scratches. NaN if all values are missing."""
     if not np.isfinite(values).any():
         return values
     filled = np.where(np.isfinite(values), values, np.nanmedian(values))
@@ -303,20 +303,20 @@ def _running(values: Array) -> Array:
 
 
 def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | None = None) -> Border | None:
-    """Tone of film along an edge, and the line where film ends; None where nothing differs from film.
+    """Tone of film along an edge, and the line where film ends; None if nothing differs from film.
 
     Parameters
     ----------
     grey : ndarray (n, s)
         Pixels of one channel, times the polarity, so that film is darker.
     band : Band
-        Where they are.
+        Distances of the pixels.
     reach : float
-        How far the edge may be from the approximate one, pixels.
+        Largest distance of the edge from the approximate one, pixels.
     gap : float
-        Width of film, pixels, beyond which things have nothing to do with the edge.
+        Width of film in pixels beyond which structures do not belong to the frame.
     film : Film, optional
-        Film as other edges show it; else it is what lies beyond the reach.
+        Film as shown by other edges; by default the film beyond `reach` is used.
     """
     low, high = float(band.distance.min(axis=1).max()), float(band.distance.max(axis=1).min())
     size = max(1.0, (high - low) / _BINS)
@@ -360,8 +360,8 @@ def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | No
 
 
 class _Ground(NamedTuple):
-    """Tone of film beside each profile (n,), smoothed departures from it (n, s), their scatter in film; and
-    which places lie beyond a strip of film, and are none of the frame's."""
+    """Tone of film beside each profile (n,), smoothed departures from it (n, s), their scatter in film, and
+    a mask of places beyond a strip of film that do not belong to the frame."""
 
     level: Array
     smooth: Array
@@ -370,50 +370,50 @@ class _Ground(NamedTuple):
 
 
 def _ground(tones: Array, outer: Mask, band: Band, film: Film | None, between: tuple[int, int]) -> _Ground:
-    """Film beyond an edge: what lies beyond the reach, or a strip as dark as that of other edges."""
+    """Film beyond an edge: outside the reach, or a strip as dark as the film at other edges."""
     foreign = np.zeros(tones.shape, dtype=bool)
     if film is None:
         level = _running(row_median(np.where(outer, tones, np.nan)))
     else:
         level = np.full(len(tones), film.tone)
-        # Perforations of a negative differ from film in the other sense: they are none either.
+        # Perforations of a negative differ from film in the opposite direction; they do not belong to it.
         strip = _alike(np.abs(tones - film.tone) / max(film.noise, 1e-6), band.place, *between)
         darkest = _running(row_median(_beside(tones, strip, [-1, 0, 1])))
         bright = float(np.nanquantile(tones, 0.85)) - film.tone
         if abs(np.median(darkest) - film.tone) < _SHALLOW * bright:
             level, foreign = darkest, np.asarray(np.arange(tones.shape[1]) <= strip[:, None])
     over = max(1, round(_ALONG / band.columns))
-    # Medians: a scratch that crosses the edge is a few columns wide.
+    # Medians, because a scratch that crosses the edge is a few columns wide.
     rest = np.where(np.isfinite(tones), tones - level[:, None], 0.0)
     smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
     return _Ground(level, smooth, _spread(smooth, outer) if film is None else film.noise, foreign)
 
 
 def _spread(smooth: Array, outer: Mask) -> float:
-    """Scatter of film, within each profile: perforations and the scanner's light change between profiles."""
+    """Scatter of film within profiles; perforations and the scanner's light vary between profiles."""
     own = row_median(np.where(outer, smooth, np.nan))
     return 1.4826 * float(np.nanmedian(np.abs(smooth - own[:, None])[outer]))
 
 
 def _alike(departure: Array, along: Array, first: int, last: int) -> Array:
-    """Columns (n,) of the straight line of a narrow strip of film: what departs least from its tone."""
+    """Columns (n,) of the straight line along a narrow strip of film, where tones depart least from it."""
     step = np.diff(np.where(np.isfinite(departure), departure, np.nanmax(departure)), axis=1, append=0.0)
     step[:, -1] = 0.0
-    # The sum of these steps from a column on is the last departure less that of the column.
+    # The sum of these steps from a column on is the last departure minus that of the column.
     begin, end = best_line(step, along, first, last, max(2, (last - first) // 4))
     return np.asarray(begin * (1 - along) / 2 + end * (1 + along) / 2)
 
 
 def _beside(tones: Array, line: Array, away: Sequence[int] | Rows) -> Array:
-    """Tones (n, m) of the columns so far inside a line."""
+    """Tones (n, m) of the columns at given distances inside a line."""
     column = np.clip(np.rint(line[:, None] + np.asarray(away)).astype(np.intp), 0, tones.shape[1] - 1)
     return np.take_along_axis(tones, column, axis=1)
 
 
 def _strip(tones: Array, line: Array, width: float) -> tuple[Array, Array]:
-    """Tone of a narrow strip of film beyond a line, and the column in its middle: the darkest one.
+    """Tone of a narrow strip of film beyond a line, and the column of its centre, the darkest one.
 
-    Blur fills the strip from both sides; only its middle is film.
+    Blur fills the strip from both sides, so only its centre shows film.
     """
     away = np.arange(1, max(3, round(2.5 * width)) + 1)
     values = _beside(tones, line, -away)

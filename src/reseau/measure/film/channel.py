@@ -1,4 +1,5 @@
-"""The four edges of a frame in one channel of a scan: which profiles agree, or why it is not found."""
+"""The four edges of a frame in one channel of a scan: consistent profiles, or the reason for a missing
+edge."""
 
 from __future__ import annotations
 
@@ -25,38 +26,40 @@ from .lines import EdgeData, robust_line, shared_error
 __all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
 
 _NEIGHBOURHOOD_PX = 0.05
-"""What unevenness of the gate and the picture's own forms add to a profile's standard deviation at least."""
+"""Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
 _TONE = 0.12
-"""Standard deviation of the tone of film along an edge, over that of the noise of a pixel."""
+"""Standard deviation of the tone of film along an edge relative to the noise of a pixel."""
 _FEW_GOOD, FAR = 0.2, 2.5
-"""Part of an edge's profiles that show a step, below which the edge is looked for so much further away."""
+"""Minimum share of profiles that show a step; otherwise the edge is searched in a wider range, by this
+factor."""
 _FOREIGN = 0.25
-"""Part of the picture's contrast by which what lies beyond an edge differs from film beyond the others."""
+"""Difference of the tone beyond an edge from film beyond the others, as a share of the picture's contrast,
+from which it is no film."""
 _UNEVEN = 0.45
-"""Part of its own tone by which film may differ between edges: the scanner's light is uneven."""
+"""Share of its own tone by which film may differ between edges, because the scanner's light is uneven."""
 _CLEAR = 0.6
-"""Part of its profiles that show a step where nothing disturbs."""
+"""Usual share of profiles that show a step on an undisturbed edge."""
 _ENDS = 2.0
-"""Standard deviation of an end of an edge that a line draws wholly and cannot be told from, widths."""
+"""Standard deviation, in widths of the step, of an end of an edge that is completely displaced by a line."""
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
-"""Sigmas by which neighbouring profiles lie inwards at a rounded corner, the part of half an edge that it may
-take, and that which is left out besides."""
+"""Sigmas by which neighbouring profiles lie inwards at a rounded corner, share of half an edge that the
+corner may take, and additional margin."""
 _LEAST_AGREE = 0.45
-"""Part of an edge's profiles that agree with a line at least."""
+"""Minimum share of an edge's profiles that agree with a line."""
 _BOWED, _OUTWARDS = 0.6, 0.1
-"""Bow inwards, pixels, of which a thing in the picture may be the cause; part of the profiles off a straight
-edge that lie outwards at most then."""
+"""Inward bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
+outwards of a straight edge."""
 _CHORD = 30
-"""Points by which an edge is given that is known by its ends."""
+"""Number of points that represent an edge known by its two ends."""
 _OTHER_WIDTH = 0.12
-"""Logarithm by which an edge's width of the step differs from that of all, to be measured with theirs."""
+"""Largest difference in the logarithm of the width at which an edge is measured with the common width."""
 _MOST_GOOD = 0.85
-"""Part of an edge's profiles that show a step, from which no wide ones are needed."""
+"""Share of profiles that show a step, from which wide profiles are not needed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One channel measured: of each edge the profiles kept, how many were not, why it was not found."""
+    """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge."""
 
     name: str
     data: list[EdgeData | None]
@@ -65,7 +68,7 @@ class Channel:
 
 
 def channels_by_contrast(bands: Sequence[Band | None], count: int, reach: float) -> list[int]:
-    """Channels by the contrast of the picture along the edges against the noise of film, the best first."""
+    """Channels in order of the contrast of the picture along the edges relative to the noise of film."""
     total = np.zeros(count)
     for band in bands:
         if band is None or count == 1:
@@ -89,7 +92,7 @@ def measure_channel(
     reach: float,
     gap: float,
 ) -> Channel:
-    """Profiles of the four edges in one channel, each edge's own line, and what agrees with it."""
+    """Profiles of the four edges in one channel that agree with a line through each edge."""
 
     far: list[bool] = [False] * 4
     films: list[Film | None] = [None] * 4
@@ -103,7 +106,7 @@ def measure_channel(
     profiles = [measured(k, False) for k in range(4)]
     for k, found in enumerate(profiles):
         if found is None or found.good.mean() < _FEW_GOOD:
-            # What voted may have been a scratch beside the edge.
+            # The line that got the votes may have been a scratch beside the edge.
             far[k] = True
             again = measured(k, False)
             if again is not None and (found is None or again.good.mean() > found.good.mean()):
@@ -132,11 +135,11 @@ def measure_channel(
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
-    """The film of the other edges, for those beyond which there is something else."""
+    """Film of the other edges, for edges beyond which there is something else."""
     seen = [p for p in profiles if p is not None]
     if len(seen) < 2:
         return [None] * len(profiles)
-    # Film is darker than anything: the second darkest of the edges is not by chance.
+    # Film is darker than anything else; the second darkest of the edges is robust.
     film = sorted((p.border.film for p in seen), key=lambda f: f.tone)[1]
     contrast = max(p.border.contrast for p in seen if p.border.film.tone <= film.tone)
     most = _FOREIGN * contrast + _UNEVEN * abs(film.tone)
@@ -146,9 +149,9 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
 def _edge(
     band: Band | None, found: EdgeProfiles | None, sharp: Sharp, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
-    """The profiles of an edge that agree with its line; or why it is not found."""
+    """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
-        return None, 0, "is not in the scan, or nothing parts it from the picture"
+        return None, 0, "is not in the scan, or nothing separates it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
     drawn, part = drawn_by_lines(found, sharp)
@@ -157,19 +160,20 @@ def _edge(
     sigma = np.hypot(sigma, drawn[found.good])
     rejected = int((~found.good).sum())
     if line is None:
-        return None, rejected, f"no line through {len(place)} of {len(found.place)} profiles show a step"
+        return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
     (start, stop, bow), agree = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
     if border.clean < 0.6:
-        return None, rejected, "there is no unexposed film beyond it; do frames overlap?"
-    # An error of the film's tone moves a step by √(2π) of its width for each part of the contrast.
+        return None, rejected, "there is no unexposed film beyond it; frames may overlap"
+    # An error of the film's tone moves a step by √(2π) of its width, times the error relative to the
+    # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
     hidden = False
     if part > (FEW_DRAWN if found.good.mean() > _CLEAR else FEW_DRAWN / 5):
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
-        # A line draws an edge by its width at most: a greater bow is the edge's own.
+        # A line displaces an edge by at most its width; a larger bow is real.
         own = bow if abs(bow) > 2 * found.width else 0.0
         fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
         two, hidden = edge_beside_line(grey, band, fitted, border.level, border.noise, sharp.width)
@@ -179,7 +183,7 @@ def _edge(
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
-    # Steps sharper than any are those of a scratch, and tell as little.
+    # Steps that are too sharp belong to a scratch and are equally uninformative.
     hidden |= sharp.beyond(found)
     ends = _ENDS * sharp.width * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
@@ -187,10 +191,10 @@ def _edge(
 
 
 def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
-    """Chord and bow of an edge, and which profiles agree; `own` sigmas are without what may draw the steps.
+    """Chord and bow of an edge, and the profiles that agree; `own` sigmas exclude displacement by lines.
 
-    A thing in the picture that bends away from a dark edge is no bow of it: those profiles that do not agree
-    with a straight one all lie inwards.
+    A structure in the picture that bends away from a dark edge must not appear as a bow: in that case the
+    profiles that disagree with a straight edge all lie inwards.
     """
     found = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
     if found is None or found[0][2] > -_BOWED:
@@ -206,7 +210,7 @@ def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array,
 
 
 def _straight(place: Array, inward: Array) -> Mask:
-    """Which profiles are not where corners are rounded: there an edge turns inwards, by so many sigmas."""
+    """Mask of profiles outside rounded corners, where the edge turns inwards significantly."""
     turned = median_filter(inward, size=min(9, len(inward)), mode="nearest") > _TURNED
     keep = np.ones(len(place), dtype=bool)
     for order in (np.arange(len(place)), np.arange(len(place))[::-1]):
@@ -223,11 +227,11 @@ def _points(band: Band, place: Array, offset: Array) -> Array:
 
 
 def _along_chord(band: Band, found: Companion, bow: float, common: float) -> EdgeData:
-    """An edge that is known by its two ends, as points of a line as precise in its middle and at the ends."""
+    """An edge known by its two ends, as points of a line with the same precision."""
     middle = float(found.covariance.sum() / 4)
     slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
     place = np.linspace(-1, 1, _CHORD)
-    # The line through n points of sigma s has the variance s²/n in its middle, s²/Σt² of its slope.
+    # A line through n points of sigma s has the variance s²/n at its centre, and s²/Σt² of its slope.
     place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
     offset = (found.ends[0] * (1 - place) + found.ends[1] * (1 + place)) / 2 - bow * (1 - place**2)
     return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

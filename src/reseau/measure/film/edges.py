@@ -1,8 +1,9 @@
-"""One edge of a frame at full resolution: profiles across it, and where each steps from film to picture.
+"""One edge of a frame at full resolution: location of the step from film to picture in profiles across it.
 
-All four edges are one case (Cruz et al., sect. 2.2): places are distances from an approximate line, positive
-towards the picture. Nothing is rotated or resampled for it; pixels keep their exact distances. A profile is
-film, a step blurred by a Gaussian, and a picture whose tone may change once more close behind it:
+All four edges are treated alike (Cruz et al., sect. 2.2): positions are distances from an approximate line,
+positive towards the picture. Nothing is rotated or resampled; pixels keep their exact distances. The model of
+a profile is film, a step blurred by a Gaussian, and a picture whose tone may change once more close behind
+it:
 
 .. math:: g(d) = b + A\\,\\Phi(u) + c\\,\\Phi(u - 3), \\qquad u = (d - p)/w .
 """
@@ -24,40 +25,39 @@ from .border import Band, Border, Film, binned, border_of, row_median
 __all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_function"]
 
 _SHIFTS, _CHANGE = (3.0,), 0.15
-"""Where behind its edge, in widths of the step, a picture may change its tone, and by how much of the
-contrast, one sigma."""
+"""Distance behind the edge, in widths of the step, at which the tone of the picture may change, and the
+standard deviation of this change relative to the contrast."""
 _INWARD, _OUTWARD = 2.0, 4.0
-"""How far behind the edge, in widths of the step, its picture is looked at, no further than it takes; and how
-far beyond it film."""
+"""Extent of the profile behind the edge and beyond it, in widths of the step."""
 NEIGHBOURS = 15
-"""Profiles that tell one another how well a step is determined."""
+"""Number of neighbouring profiles used to estimate how well a step is determined."""
 _BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("danish", 2.5))
 _FREE, _HELD = 0.5, (0.02, 0.12)
-"""Logarithms by which the width of a step may differ from the expected one: at first; then, where that is of
-other edges, and where it is of this one."""
+"""Standard deviation of the logarithm of the width: at first; then for a width from other edges, and for one
+from this edge."""
 _MODEL = 0.012, 0.05
-"""Part of the picture's contrast to which the model describes a profile: more where the width is yet unknown,
-lest what it does not describe be taken for blunders."""
+"""Accuracy of the model relative to the contrast, for a known and for an unknown width; larger for the
+latter, so that model errors are not treated as blunders."""
 _ROUNDS, _LEAST_PIXELS = 2, 100
-"""How often the common width is looked for, and pixels of a section that tells it."""
+"""Rounds of estimating the common width, and minimum number of pixels of a section used for it."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeProfiles:
-    """What the profiles of an edge in one channel tell, in columns over the n profiles.
+    """Profiles of an edge in one channel, in columns over the n profiles.
 
     Parameters
     ----------
     place : ndarray (n,)
-        Along the approximate edge, −1 to 1.
+        Position along the approximate edge, −1 to 1.
     offset, sigma : ndarray (n,)
-        Of the step, inwards from the approximate edge, and its standard deviation, pixels.
+        Position of the step, inwards from the approximate edge, and its standard deviation, pixels.
     good : ndarray of bool (n,)
-        Which show a step that can be located.
+        Which profiles show a step that can be located.
     blur : ndarray (2, n)
-        Logarithm of the width that a profile and its neighbours show by themselves, and its variance.
+        Logarithm of the width estimated from a profile and its neighbours alone, and its variance.
     width : float
-        Of the blurred step, one sigma, pixels.
+        Width of the blurred step, one sigma, pixels.
     border : Border
         Film and picture along the edge.
     """
@@ -85,25 +85,25 @@ def measure_profiles(
     Parameters
     ----------
     band : Band
-        The pixels.
+        Pixels along the edge.
     channel : int
-        Which of its channels.
+        Index of the channel.
     polarity : int
-        1 where film is darker than the picture.
+        1 if film is darker than the picture, −1 if brighter.
     reach : float
-        How far the edge may be from the approximate one, pixels.
+        Largest distance of the edge from the approximate one, pixels.
     gap : float
-        Width of film, pixels, beyond which things have nothing to do with the edge.
+        Width of film in pixels beyond which structures do not belong to the frame.
     width : float, optional
-        Of the blurred step, one sigma, where it is known from other edges; then the picture may have a step
-        of its own near the edge.
+        Width of the blurred step, one sigma, if known from other edges; then the model allows a second step
+        of the picture near the edge.
     film : Film, optional
-        Film as other edges show it, where little of it lies beyond this one.
+        Film as shown by other edges, if little film lies beyond this one.
 
     Returns
     -------
     EdgeProfiles or None
-        None where nothing differs from film.
+        None if nothing differs from film.
     """
     grey = band.grey[:, :, channel].astype(np.float64) * polarity
     border = border_of(grey, band, reach, gap, film)
@@ -118,7 +118,7 @@ def measure_profiles(
 
 
 def _width(grey: Array, band: Band, border: Border) -> float:
-    """Width of the blurred step from the mean of all profiles, each over its own contrast."""
+    """Width of the blurred step from the mean of all profiles, each divided by its contrast."""
     at = band.distance - border.start[:, None]
     rest = grey - border.level[:, None]
     place = np.arange(-12.0, 12.0, 0.5)
@@ -128,7 +128,7 @@ def _width(grey: Array, band: Band, border: Border) -> float:
     if not len(lit):
         return 1.0
     strong = np.asarray(inside > 0.5 * float(np.median(lit)))
-    with warnings.catch_warnings():  # where no profile has a pixel there is no mean, and none is needed
+    with warnings.catch_warnings():  # bins without pixels in any profile have no mean
         warnings.simplefilter("ignore", RuntimeWarning)
         mean = np.nanmedian(tones[strong] / inside[strong][:, None], axis=0)
     top = max(float(np.nanmax(mean[(place > 0) & (place < 6)])), 0.1)
@@ -140,8 +140,8 @@ def _width(grey: Array, band: Band, border: Border) -> float:
 
 
 class _Steps(NamedTuple):
-    """Steps of n profiles: distances, contrasts, standard deviations of the distances, which are good, and as
-    in :class:`EdgeProfiles` their own widths.
+    """Steps of n profiles: distances, contrasts, standard deviations of the distances, mask of good ones, and
+    widths as in :class:`EdgeProfiles`.
     """
 
     place: Array
@@ -154,7 +154,7 @@ class _Steps(NamedTuple):
 def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tuple[_Steps, float] | None:
     """Step of every profile, and the common width."""
     width = _width(grey, band, border) if known is None else known
-    # Where the border puts them is good to a pixel or two, too little for a narrow window.
+    # The border is accurate to one or two pixels, not enough for a narrow window.
     first = _one_by_one(grey, band, border, border.start, width, _FREE)
     if first is None:
         return None
@@ -170,7 +170,7 @@ def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tup
 def _one_by_one(
     grey: Array, band: Band, border: Border, start: Array, width: float, spread: float
 ) -> _Steps | None:
-    """Step of every profile, its width held to the common one by so much; None where none is good."""
+    """Step of every profile, with a prior on the common width; None if none is good."""
     near = _OUTWARD * width + 2.0 if spread == _FREE else _INWARD * width
     window = _window(grey, band, border, start, width, near)
     if window is None:
@@ -181,7 +181,8 @@ def _one_by_one(
     scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
     own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
     told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
-    # By neighbours: a profile with a step too high by chance lies too far in, and would weigh more.
+    # From neighbours: a profile whose step is too high by chance is located too far inwards and would get a
+    # larger weight.
     sigma = _along(np.where(told, own, np.inf))
     ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
     good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
@@ -202,11 +203,11 @@ def _fit(
     width: float,
     spread: float,
 ) -> BatchAdjustment:
-    """Profiles adjusted, from the parameters that they are expected to have."""
+    """Adjust profiles, starting from expected parameters."""
     one = np.ones(len(value))
     none = [0 * one] * len(_SHIFTS)
     initial = np.stack([start, level, np.log(width) * one, border.contrast * one, *none], axis=1)
-    # Film is known from its surroundings; that the picture changes at once is an exception.
+    # Film is known from its surroundings; an immediate change of tone in the picture is an exception.
     changes = [_CHANGE * border.contrast] * len(_SHIFTS)
     prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
     return adjust_batch(
@@ -220,7 +221,7 @@ def _fit(
 
 
 def _smoothed(place: Array, good: Mask) -> Array:
-    """Steps of profiles by those of their neighbours: whose noise is not that of a profile's own pixels."""
+    """Steps smoothed over neighbouring profiles, independent of the noise of a profile's own pixels."""
     index = np.arange(len(place))
     return _along(np.interp(index, index[good], place[good]))
 
@@ -228,10 +229,10 @@ def _smoothed(place: Array, good: Mask) -> Array:
 def _common_width(
     grey: Array, band: Band, border: Border, start: Array, steps: _Steps, width: float
 ) -> float:
-    """Width of the step by sections of neighbouring profiles, each fitted as one profile: their median.
+    """Width of the step: median over sections of neighbouring profiles, each fitted as one profile.
 
-    Of single profiles in noise it comes out too small, since each has unknowns of its own (Neyman and Scott
-    1948), and with a step too wide or too sharp all places lie to one side.
+    From single noisy profiles it would be too small, as each has unknowns of its own (Neyman and Scott 1948),
+    and with a wrong width all positions are biased to one side.
     """
     contrast = _along(np.where(steps.good, steps.contrast, np.inf))
     lit = steps.good & np.isfinite(contrast) & (contrast > 0)
@@ -253,12 +254,12 @@ def _common_width(
     none = np.zeros(int(told.sum()))
     fit = _fit(value[told], distance[told], weight[told], border, none, none, width, _FREE)
     found = fit.estimates[fit.converged, 2]
-    # Where something else runs along the edge few sections come to an end.
+    # If another structure runs along the edge, few sections converge.
     return float(np.clip(np.exp(np.median(found)), 0.4, 6.0)) if len(found) > 0.5 * sections else width
 
 
 def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
-    """Logarithm of the width without the prior that held it, mean over neighbours, and variance (2, n)."""
+    """Logarithm of the width without its prior, averaged over neighbours, and its variance (2, n)."""
     share = np.clip(1 - cofactor / spread**2, 1e-3, 1.0)
     weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
     alone = np.where(good, np.clip((found - known) / share, -1.0, 1.0), 0.0)
@@ -274,7 +275,7 @@ def _along(values: Array) -> Array:
 
 
 def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
-    """The profiles of an edge, and wide ones where no other near them shows a step."""
+    """Profiles of an edge, with wide ones where no narrow one nearby shows a step."""
     half = 0.5 * float(np.median(np.diff(wide.place))) if len(wide.place) > 1 else 1.0
     at = fine.place[fine.good]
     if len(at):
@@ -298,14 +299,14 @@ def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
 def _window(
     grey: Array, band: Band, border: Border, start: Array, width: float, high: float
 ) -> tuple[Array, Array, Array] | None:
-    """Pixels of profiles from film to so far inwards of their starts: values, distances, weights (n, s)."""
+    """Pixels of profiles from film to a distance inside their starts: values, distances, weights (n, s)."""
     low = np.maximum(-_OUTWARD * width - 2.0, border.outermost - start)
     at = band.distance - start[:, None]
     used = (at > low[:, None]) & (at < high) & np.isfinite(grey)
     size = int(used.sum(axis=1).max(initial=0))
     if size < 8:
         return None
-    # Those used first, in their order; the rest have no weight.
+        # Used pixels come first, in their order; the rest have zero weight.
     order: Rows = np.argsort(~used, axis=1, kind="stable")[:, :size]
     value, place, weight = (
         np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used.astype(np.float64))
@@ -314,7 +315,7 @@ def _window(
 
 
 def profile_function(distance: Array) -> Any:
-    """The model of a profile and its derivatives by p, b, log w, A and the c, for :func:`adjust_batch`."""
+    """Model of a profile and its derivatives by p, b, log w, A and the c, for :func:`adjust_batch`."""
     shifts = np.array([0.0, *_SHIFTS])
 
     def function(x: Array, rows: Rows) -> tuple[Array, Array]:
@@ -324,7 +325,7 @@ def profile_function(distance: Array) -> Any:
         jacobian = np.empty((*u.shape[:2], 3 + len(shifts)))
         jacobian[..., 0] = -(steps * bell).sum(axis=2) / w
         jacobian[..., 1] = 1.0
-        # The steps behind the first move with the width; u + shift is where they were without it.
+        # The further steps move with the width; u + shift is their position without it.
         jacobian[..., 2] = -(steps * bell * (u + shifts)).sum(axis=2)
         jacobian[..., 3:] = phi
         return b + (steps * phi).sum(axis=2), jacobian

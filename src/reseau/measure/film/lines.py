@@ -1,9 +1,9 @@
-"""The four edges of a frame in one adjustment: corners, indicated principal point and axes with covariance.
+"""Adjustment of the four edges of a frame: corners, indicated principal point and axes with covariance.
 
-Each edge is a chord between its two corners and a bow above it that vanishes at both (film unflatness, the
-scanner's lens). Its profiles are observations of it; the frame's shape (right angles, proportions of the
-format) observes all four together, so weakly that well measured edges do not feel it and one that is lost is
-still determined, as well as gates are made.
+Each edge is a chord between its two corners with a bow that vanishes at both (film unflatness, the scanner's
+lens). Its profiles are observations. The frame's shape (right angles, proportions of the format) is observed,
+too, with the accuracy of camera gates: well measured edges are hardly affected, and a missing edge is still
+determined.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ __all__ = [
 ]
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
-"""Standard deviation of the bow of an edge before any is measured, and the least after that, pixels."""
+"""Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""
 _SECTIONS = 24
-"""Sections of an edge whose means tell what neighbouring profiles share."""
+"""Number of sections of an edge whose means show the errors common to neighbouring profiles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class EdgeData:
     Parameters
     ----------
     xy : ndarray (n, 2)
-        Places of the steps, pixels.
+        Positions of the steps, pixels.
     sigma : ndarray (n,)
         Standard deviations across the edge.
     common : float
-        Standard deviation of an error that all of them share, pixels.
+        Standard deviation of an error common to all profiles, pixels.
     ends : float
-        Standard deviation of an error that the edge may have at either end by itself, pixels.
+        Standard deviation of an independent error of either end of the edge, pixels.
     """
 
     xy: Array
@@ -59,19 +59,19 @@ class EdgeData:
 
 @dataclass(frozen=True)
 class FrameShape:
-    """What is known of a frame's shape beforehand.
+    """Prior knowledge of a frame's shape.
 
     Parameters
     ----------
     width, height : float
-        Of the format as it lies in the scan, mm.
+        Width and height of the format as it lies in the scan, mm.
     aspect_sigma : float
-        Relative standard deviation of its proportions: of the gate, and of the scanner's two scales.
+        Relative standard deviation of the proportions, from the gate and the scanner's two scales.
     angle_sigma : float
-        Standard deviation of its right angles, radians.
+        Standard deviation of the right angles, radians.
     deviation : tuple of float (4,)
-        What is known of its angles at ur, lr, ll less right ones and of the logarithm of its proportions over
-        the format's: nought, or the gate of the camera as its other frames show it.
+        Known deviations: of the angles at ur, lr, ll from right angles, and of the logarithm of the
+        proportions from the format's; zero, or as shown by other frames of the camera.
     """
 
     width: float
@@ -83,28 +83,28 @@ class FrameShape:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """The four edges adjusted.
+    """The adjusted edges of a frame.
 
     Parameters
     ----------
     corners : ndarray (4, 2)
-        ul, ur, lr, ll, pixels.
+        Corners ul, ur, lr, ll, pixels.
     covariance : ndarray (8, 8)
-        Of their coordinates.
+        Covariance of their coordinates.
     bow, bow_sigma : ndarray (4,)
         Sagittas of the edges, positive outwards, pixels.
     used, rejected : ndarray of int (4,)
-        Profiles.
+        Number of profiles.
     rms : ndarray (4,)
-        Of the residuals of those used, pixels; NaN where there are none.
+        Rms of the residuals of the profiles used, pixels; NaN if there are none.
     coverage : ndarray (4,)
-        Part of each edge's length that its profiles control.
+        Share of each edge's length that is controlled by profiles.
     shape_w : ndarray (4,)
         Test values of the shape: three angles (at ur, lr, ll) and the proportions, N(0, 1).
     sigma0 : float
         Standard deviation of unit weight.
     redundancy : int
-        Of the adjustment.
+        Redundancy of the adjustment.
     """
 
     corners: Array
@@ -123,16 +123,16 @@ class Lines:
 def robust_line(
     place: Array, offset: Array, sigma: Array, unit: float, bow: float = _BOW_PX
 ) -> tuple[Array, Mask] | None:
-    """Chord and bow of one edge, and which profiles agree: [at −1, at 1, bow] and a mask.
+    """Chord and bow of one edge as [at −1, at 1, bow], and a mask of the profiles that agree.
 
     Parameters
     ----------
     place, offset, sigma : ndarray (n,)
-        Along the edge (−1 to 1), inwards, and the standard deviation.
+        Positions along the edge (−1 to 1), offsets inwards, and standard deviations.
     unit : float
-        What a profile's neighbourhood adds to its standard deviation at least.
+        Minimum contribution of a profile's neighbourhood to its standard deviation.
     bow : float
-        Standard deviation of the bow.
+        Prior standard deviation of the bow.
     """
     if len(place) < 12:
         return None
@@ -162,14 +162,14 @@ def adjust_lines(
 
     Parameters
     ----------
-    corners : ndarray (4, 2)
+        Approximate corners, accurate to a few pixels.
         Approximate corners, good to some pixels.
     edges : sequence of EdgeData or None
-        Upper, right, lower, left; None for an edge that is not seen, which takes the shape to determine.
+        Upper, right, lower, left; None for a missing edge, which is then determined by the shape.
     shape : FrameShape or None
-        What is known of the shape.
+        Prior knowledge of the shape.
     rejected : sequence of int
-        Profiles left out of each edge before; reported with the others.
+        Profiles of each edge that were rejected before; included in the reported numbers.
     """
     if sum(edge is None for edge in edges) > (shape is not None):
         return Failure(
@@ -183,7 +183,7 @@ def adjust_lines(
             return found
         corners = _corners(found.adjustment.values, corners)
         bow = _bow_of(found.adjustment.values[2:12:3], found.adjustment.sigma[2:12:3])
-        # Whatever is far from the lines of all is left out for good.
+        # Profiles far from the adjusted lines are rejected permanently.
         keep = (np.abs(found.adjustment.w) < 4.0) | ~np.isfinite(found.adjustment.w)
     keep[bounds[-1] :] = True
     problem, bounds = _problem(corners, edges, shape, bow)
@@ -198,9 +198,9 @@ _NAMES = tuple(f"{edge}.{what}" for edge in ("upper", "right", "lower", "left") 
 
 
 def _bow_of(bow: Array, sigma: Array) -> float:
-    """Standard deviation of the four edges' bows, from what they were found to be.
+    """Prior standard deviation of the bows, from the estimated bows.
 
-    An edge that is seen in part alone is hardly bowed more than the others, which are seen well.
+    A partly visible edge is assumed to be bowed about as much as the others, which are determined well.
     """
     known = sigma < 0.5 * _BOW_PX
     if not known.any():
@@ -211,7 +211,7 @@ def _bow_of(bow: Array, sigma: Array) -> float:
 
 
 def _frame_axes(corners: Array) -> tuple[Array, Array, Array]:
-    """Ends of the approximate edges and their inward normals, each (4, 2)."""
+    """Start and end of the approximate edges and their inward normals, each (4, 2)."""
     following = np.roll(corners, -1, axis=0)
     along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
     return corners, following, np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -225,7 +225,7 @@ def _corners(values: Array, corners: Array) -> Array:
 
 
 def shape_of(corners: Array, shape: FrameShape) -> Array:
-    """Of corners (4, 2): three angles less right ones, the logarithm of the proportions over the format's."""
+    """Shape of corners (4, 2): three angles minus right angles, log of proportions over the format's."""
     side = np.roll(corners, -1, axis=0) - corners
     before = np.roll(side, 1, axis=0)
     turn = np.arctan2(before[:, 0] * side[:, 1] - before[:, 1] * side[:, 0], (before * side).sum(axis=1))
@@ -237,10 +237,10 @@ def shape_of(corners: Array, shape: FrameShape) -> Array:
 def _problem(
     corners: Array, edges: Sequence[EdgeData | None], shape: FrameShape | None, bow: float
 ) -> tuple[GaussMarkov, list[int]]:
-    """Observations of the profiles, then of the shape; and where each edge's begin."""
+    """Observations of the profiles, followed by those of the shape; and the first index of each edge."""
     a, b, normal = _frame_axes(corners)
     rows, observed, sigma, bounds = [], [], [], [0]
-    # What an edge's ends may err by themselves are unknowns, so that the shape tells something of them.
+    # Independent errors of an edge's ends are unknowns, so that the shape helps to determine them.
     drawn = [k for k, edge in enumerate(edges) if edge is not None and edge.ends > 0]
     names = [*_NAMES, *(f"{k}.{end}" for k in drawn for end in ("start", "stop"))]
     for k, edge in enumerate(edges):
@@ -292,7 +292,7 @@ def _lines(
     keep: Mask,
     rejected: Sequence[int],
 ) -> Lines:
-    """Everything that follows from the adjusted chords and bows."""
+    """Results derived from the adjusted chords and bows."""
     values = fit.values[:12]
     step = 1e-3
     slope = np.stack(
@@ -318,7 +318,7 @@ def _lines(
         if edge is not None and kept.any():
             along = b[k] - a[k]
             place = ((edge.xy[kept] - a[k]) @ along) / (along @ along)
-            # Of thirty sections, those in which a profile was used.
+            # Share of thirty sections that contain a profile in use.
             coverage[k] = len(np.unique(np.floor(place * 30))) / 28
     sigma = fit.sigma[:12]
     return Lines(
@@ -337,19 +337,19 @@ def _lines(
 
 
 def shared_error(place: Array, residuals: Array, sigma: Array) -> float:
-    """By how much standard deviations must grow so that means over sections of an edge scatter as they do.
+    """Factor on standard deviations so that they agree with the scatter of means over sections of an edge.
 
     Parameters
     ----------
     place : ndarray (n,)
-        Of the profiles, −1 to 1.
+        Positions of the profiles, −1 to 1.
     residuals, sigma : ndarray (n,)
-        From the edge's own line, and what was expected.
+        Residuals from the edge's own line, and their expected standard deviations.
 
     Returns
     -------
     float
-        Factor, at least 1: of single profiles, or of means over sections, where neighbours err alike.
+        Factor, at least 1: the larger of that of single profiles and that of means over sections.
     """
     single = float(np.mean((residuals / sigma) ** 2))
     section = np.clip(((place + 1) / 2 * _SECTIONS).astype(np.intp), 0, _SECTIONS - 1)
@@ -366,9 +366,9 @@ def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, flo
     Parameters
     ----------
     corners : ndarray (4, 2)
-        ul, ur, lr, ll, pixels.
+        Corners ul, ur, lr, ll, pixels.
     covariance : ndarray (8, 8)
-        Of their coordinates.
+        Covariance of their coordinates.
 
     Returns
     -------

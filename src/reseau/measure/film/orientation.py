@@ -1,4 +1,5 @@
-"""The inner orientation of scanned film frames from their four edges, with an uncertainty, or declined."""
+"""Interior orientation of scanned film frames from their four edges, with uncertainty, or declined with a
+reason."""
 
 from __future__ import annotations
 
@@ -20,39 +21,39 @@ from .search import FrameGuess, search_frames
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
 
 FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
-"""Formats that are tried where none is given: 35 mm, 6×6, 6×4.5, 6×7."""
+"""Formats tried by default: 35 mm, 6×6, 6×4.5, 6×7."""
 
 _OVERVIEWS = ((500, 60), (1000, 300))
-"""Longer side of the overviews, pixels, and how many combinations of lines are looked at in each."""
+"""Longer side of the overviews in pixels, and number of combinations of lines tested in each."""
 _SURE = 3.0
-"""Score of a frame from which no finer overview is looked at."""
+"""Score of a frame from which no finer overview is needed."""
 _REACH = 4.0
-"""Pixels of the overview by which an approximate edge may be off."""
+"""Largest error of an approximate edge, in pixels of the overview."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
-"""Width of film that is looked at beyond an edge, and that which parts the frame from anything else."""
+"""Width of film examined beyond an edge, and width that separates the frame from other structures."""
 _MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
-"""Standard deviation of a corner's coordinate from which on a frame is not called oriented: what is greater,
-so that a scan finer than its film is not asked for more than the film shows."""
+"""Largest standard deviation of a corner's coordinate of an oriented frame: the larger of the two applies, so
+that a scan finer than its film is not required to be better than the film."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
-"""Order of what a frame may be."""
+"""Rank of each status."""
 _SLANT = float(np.deg2rad(0.7))
-"""Standard deviation of an angle that a copying camera may have turned, radians."""
+"""Standard deviation of the rotation angle of a tilted copying camera, radians."""
 _MOST_W = 4.0
-"""Test value from which on the shape of a frame contradicts its format."""
+"""Test value from which the shape of a frame contradicts its format."""
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """What is known of the frames beforehand.
+    """Prior knowledge of the frames.
 
     Parameters
     ----------
     formats : tuple of (width, height)
-        Formats that may be, mm, each tried upright and lying.
+        Possible formats in mm, each tried in both orientations.
     dpi : float, optional
-        Resolution of the scan, where the file does not say it or says it wrongly.
+        Resolution of the scan, if it is missing or wrong in the file.
     near : ndarray (4, 2), optional
-        Approximate corners ul, ur, lr, ll in pixels: where to search.
+        Approximate corners ul, ur, lr, ll in pixels, near which to search.
     aspect_sigma : float
         Relative standard deviation of a frame's proportions.
     angle_sigma_deg : float
@@ -60,7 +61,12 @@ class FrameOptions:
     max_tilt_deg : float
         Largest tilt.
     shape : FrameShape, optional
-        Format and shape of the camera's frame as others of its roll show them; instead of the formats.
+        Format and shape of the camera's frame from other frames of its roll; replaces the formats.
+
+    Examples
+    --------
+    >>> FrameOptions(formats=((36.0, 24.0),), dpi=2400).max_tilt_deg
+    8.0
     """
 
     formats: tuple[tuple[float, float], ...] = FORMATS
@@ -74,24 +80,26 @@ class FrameOptions:
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """One frame oriented, or the reason why not; falsy when declined.
+    """One oriented frame, or the reason for declining it; falsy if declined.
 
     Parameters
     ----------
     image : str
         Name of the scan.
     status : {"oriented", "three-edges", "declined"}
-        With three edges the fourth is where the format says, and the covariance says how uncertain that is.
+        With three edges the position of the fourth follows from the format, with the resulting covariance.
     why : str
         What was wrong, and what would help.
     format_mm : (float, float) or None
         Width and height as they lie in the scan.
     channel : str or None
-        The channel that was kept.
+        The channel with the best result.
     lines : Lines or None
         The adjusted edges.
     edges : dict
-        How each edge was found.
+        Result for each edge.
+    code : Code or None
+        Reason for a declined or incomplete frame, or a remark on it, for programs.
     """
 
     image: str
@@ -101,13 +109,14 @@ class FrameResult:
     channel: str | None
     lines: Lines | None
     edges: dict[str, MeasuredEdge]
+    code: Code | None = None
 
     def __bool__(self) -> bool:
         return self.status != "declined"
 
     @property
     def px_per_mm(self) -> tuple[float, float] | None:
-        """Pixels in a millimetre along x and y, by the mean sides of the frame and its format."""
+        """Pixels per millimetre along x and y, from the mean sides of the frame and its format."""
         if self.lines is None or self.format_mm is None:
             return None
         side = np.roll(self.lines.corners, -1, axis=0) - self.lines.corners
@@ -116,7 +125,7 @@ class FrameResult:
         return float((length[0] + length[2]) / (2 * w)), float((length[1] + length[3]) / (2 * h))
 
     def document(self) -> FrameOrientation:
-        """As ``reseau-orientation/1``, without a transformation."""
+        """The document ``reseau-orientation/1``, without a transformation."""
         common = {
             "image": self.image,
             "status": self.status,
@@ -152,19 +161,19 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     Parameters
     ----------
     scan : Scan
-        The scan, opened; only an overview and the bands along the edges are read.
+        The open scan; only an overview and the bands along the edges are read.
     options : FrameOptions, optional
-        What is known beforehand.
+        Prior knowledge of the frames.
 
     Returns
     -------
     list of FrameResult
-        One for each frame, in the order of reading; one that is declined where none was found.
+        One result for each frame, in reading order; a declined one if no frame was found.
     """
     options = options or FrameOptions()
     guesses, reduction = _found(scan, options)
     if isinstance(guesses, Failure):
-        return [_declined(scan, guesses.reason)]
+        return [_declined(scan, guesses)]
     results = [_oriented(scan, guess, reduction, options) for guess in guesses]
     good = [result for result in results if result]
     return sorted(good or results[:1], key=_reading)
@@ -178,16 +187,16 @@ def _reading(result: FrameResult) -> tuple[float, float]:
     return float(np.rint(y / size)), float(x)
 
 
-def _declined(scan: Scan, why: str, edges: dict[str, MeasuredEdge] | None = None) -> FrameResult:
+def _declined(scan: Scan, failure: Failure) -> FrameResult:
     lost = {
         name: MeasuredEdge(found=False, points=0, rejected=0, rms_px=None, curvature_px=None)
         for name in EDGES
     }
-    return FrameResult(scan.name, "declined", why, None, None, None, edges or lost)
+    return FrameResult(scan.name, "declined", failure.reason, None, None, None, lost, failure.code)
 
 
 def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failure, float]:
-    """Frames in an overview; a finer one is looked at where the first is not sure of any."""
+    """Frames in an overview; a finer overview is used if the first gives no reliable frame."""
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
     for longest, tried in _OVERVIEWS:
@@ -215,14 +224,12 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
     if best:
         return best, reduction
     if dark:
-        return Failure(
-            "shows nothing: it is of one tone; scan it with more exposure", Code.LOW_CONTRAST
-        ), reduction
+        return Failure("is of one tone; scan it with more exposure", Code.LOW_CONTRAST), reduction
     formats = ", ".join(f"{w:g}x{h:g}" for w, h in options.formats)
     return Failure(
         f"no frame of the format {formats} stands out from unexposed film on at least three sides; scan it "
-        "with a margin of film around, or say its --frame, --dpi or where it is (frames that overlap cannot "
-        "be told apart)",
+        "with a margin of film around, or give --frame, --dpi or the approximate corners (overlapping frames "
+        "cannot be separated)",
         Code.NOT_FOUND,
     ), reduction
 
@@ -232,7 +239,7 @@ def _rank(found: list[FrameGuess]) -> float:
 
 
 def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions) -> FrameResult:
-    """Measure the edges of one frame in all channels, adjust, and keep the best."""
+    """Measure the edges of one frame in all channels, adjust, and keep the best channel."""
     corners = (guess.corners + 0.5) * reduction - 0.5
     side = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
     scale = float((side[0] + side[2]) / (2 * guess.format_mm[0]))
@@ -252,17 +259,17 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
         result = _judged(scan, guess, measured, corners, shape)
-        # Channels come by their contrast: a later one has to see more, or better.
+        # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
             best = result
-        if best.status == "oriented":  # the others show the same edges with less contrast
+        if best.status == "oriented":  # other channels show the same edges with less contrast
             break
     assert best is not None
     return best
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:
-    """How many edges, and how well."""
+    """Rank of a result: status, then accuracy."""
     return _STATUS[result.status], -np.inf if result.lines is None else -float(
         np.trace(result.lines.covariance)
     )
@@ -271,45 +278,47 @@ def _seen(result: FrameResult) -> tuple[int, float]:
 def _judged(
     scan: Scan, guess: FrameGuess, measured: Channel, corners: Array, shape: FrameShape
 ) -> FrameResult:
-    """Adjust the edges that were found; what contradicts the format is declined."""
+    """Adjust the edges found; decline the frame if they contradict the format."""
     missing = [EDGES[k] for k in range(4) if measured.data[k] is None]
     base = FrameResult(scan.name, "declined", "", guess.format_mm, measured.name, None, {})
     if len(missing) > 1:
         why = "; ".join(f"{EDGES[k]} edge: {measured.why[k]}" for k in range(4) if measured.why[k])
-        return replace(base, why=why, edges=_reports(measured, None))
+        return replace(base, why=why, edges=_reports(measured, None), code=Code.NOT_FOUND)
     lines = adjust_lines(corners, measured.data, shape, measured.rejected)
     if isinstance(lines, Failure):
-        return replace(base, why=lines.reason, edges=_reports(measured, None))
-    worst, slant = np.abs(np.nan_to_num(lines.shape_w)).max(), ""
+        return replace(base, why=lines.reason, edges=_reports(measured, None), code=lines.code)
+    worst, slant, code = np.abs(np.nan_to_num(lines.shape_w)).max(), "", None
     if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
         lines, converging = seen
-        worst, slant = 0.0, f"seen at a slant: opposite edges converge by {np.rad2deg(converging):.1f}°"
-    base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant)
+        worst, code = 0.0, Code.TILTED
+        slant = f"seen at an angle: opposite edges converge by {np.rad2deg(converging):.1f}°"
+    base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant, code=code)
     if worst > _MOST_W:
         w, h = guess.format_mm
         return replace(
             base,
             lines=None,
-            why=f"the four edges do not make a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
-            "may be a line of the picture: say where the edges are, or the right --frame",
+            why=f"the four edges do not form a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
+            "may be a line of the picture: give the approximate corners, or the correct --frame",
+            code=Code.INCONSISTENT,
         )
     sigma = np.sqrt(np.diag(lines.covariance))
     if missing:
         reason = measured.why[EDGES.index(missing[0])]
-        why = f"{missing[0]} edge: {reason}; it is where the format has it"
-        return replace(base, status="three-edges", why=why)
+        why = f"{missing[0]} edge: {reason}; its position follows from the format"
+        return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
     scale = max(base.px_per_mm or (0.0, 0.0))
     if (most := float(sigma.max())) > max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale):
         why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
-        return replace(base, lines=None, why=why)
+        return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
     return replace(base, status="oriented")
 
 
 def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
-    """Four edges as a tilted copying camera sees them, and by how much opposite ones converge, radians.
+    """Four edges as seen by a tilted copying camera, and the convergence of opposite edges, radians.
 
-    A perspective turns opposite edges towards one another; a single edge that is wrong makes opposite angles
-    both greater or both smaller, too.
+    Perspective makes opposite edges converge; a single wrong edge would also make opposite angles both larger
+    or both smaller.
     """
     free = replace(shape, angle_sigma=_SLANT, aspect_sigma=3 * shape.aspect_sigma)
     lines = adjust_lines(corners, measured.data, free, measured.rejected)
@@ -326,7 +335,7 @@ def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
     reports = {}
     for k, name in enumerate(EDGES):
         found = measured.data[k] is not None
-        # A bow that is not significant is none.
+        # An insignificant bow is reported as zero.
         bow = 0.0
         if lines is not None and found and abs(lines.bow[k]) > 3 * lines.bow_sigma[k]:
             bow = float(lines.bow[k])

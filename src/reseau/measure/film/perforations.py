@@ -1,9 +1,9 @@
-"""The perforations of 35 mm film as a measure in the scan: the film's own plane from their pitch.
+"""The plane of 35 mm film in a scan, from its perforations.
 
-Perforations are punched every 4.75 mm on both sides of the film, so exactly that film carries its own scale
-(ISO 2906, SMPTE 139: pitch 4.75 mm, rows 28.17 mm apart). Their edges are steps as those of a frame are, and
-measured in the same way; a tilted camera that copied the film and the distortion of its lens are estimated
-from where they lie.
+Perforations are punched every 4.75 mm on both sides of the film, so accurately that they define its scale
+(ISO 2906, SMPTE 139: pitch 4.75 mm, rows 28.17 mm apart). Their edges are measured like those of a frame.
+From their positions a projective transformation (tilted copying camera) and the radial distortion of the lens
+are estimated.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from .lines import robust_line
 __all__ = ["PITCH_MM", "FilmPlane", "edge_of", "film_plane"]
 
 PITCH_MM = 4.75
-"""From one perforation to the next."""
+"""Distance between perforations."""
 _ROWS_MM = 28.17
-"""From the middle of one row of perforations to that of the other."""
+"""Distance between the centre lines of the two rows of perforations."""
 _SIZE_MM = 1.98, 2.79
-"""Height and width of a perforation, approximate: both are estimated."""
+"""Approximate height and width of a perforation; both are estimated."""
 _STRAIGHT = 0.45
-"""Part of a perforation's side between its rounded corners."""
+"""Share of a perforation's side between its rounded corners."""
 _LEAST = 20
-"""Edges from which the plane is determined well."""
+"""Minimum number of edges for the plane."""
 _RIM_PX = 10.0
-"""Width of what is looked at outside a perforation: its rim is a dark line some pixels wide."""
+"""Width examined outside a perforation; its rim is a dark line a few pixels wide."""
 _ASIDE, _BLUR_PX = 4.0, 2.0
-"""How far from the steepest place a step is looked at, and its width to begin with."""
+"""Range of the fit around the steepest place of a step, and approximate width of the step."""
 _LEAST_CONTRAST = 8.0
-"""Grey values by which the light in a perforation is brighter than its rim at least."""
+"""Minimum difference in grey values between a perforation and its rim."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilmPlane:
-    """From pixels of a scan to millimetres on the film.
+    """Transformation from pixels of a scan to millimetres on the film.
 
     Parameters
     ----------
     values, covariance : ndarray (9,), (9, 9)
-        Eight of a projective transformation, and the radial distortion at half the scan's longer side.
+        Eight parameters of a projectivity, and the radial distortion at half the scan's longer side.
     centre, unit : ndarray (2,), float
-        Of the pixel coordinates: the scan's middle, half its longer side.
+        Normalization of the pixel coordinates: centre of the scan, half its longer side.
     at : ndarray (n, 2)
-        Where edges of perforations were found, pixels.
+        Positions of the edges of perforations, pixels.
     rms_px : float
-        What they differ from the plane.
+        Rms of the residuals.
     """
 
     values: Array
@@ -66,17 +66,17 @@ class FilmPlane:
 
     @property
     def edges(self) -> int:
-        """How many edges were found."""
+        """Number of edges found."""
         return len(self.at)
 
     def to_mm(self, xy: Array) -> Array:
-        """Places on the film (n, 2), mm, of pixels (n, 2)."""
+        """Film coordinates (n, 2) in mm of pixels (n, 2)."""
         return _plane(self.values, (xy - self.centre) / self.unit)
 
     def apart(self, first: Array, second: Array) -> tuple[float, float]:
-        """Mean distance along the film of two edges, mm, and its standard deviation by the plane alone.
+        """Mean distance of two edges along the film in mm, and its standard deviation from the plane alone.
 
-        Both are points (n, 2), pixels; they are compared where they have the same places across the film.
+        Both edges are points (n, 2) in pixels; they are compared at the same positions across the film.
         """
 
         def distance(values: Array) -> float:
@@ -100,7 +100,7 @@ def _plane(x: Array, place: Array) -> Array:
 def film_plane(
     scan: Scan, rows: Sequence[Array], count: int, *, channel: int = 2, reach: float = 12.0
 ) -> FilmPlane | Failure:
-    """Measure two rows of perforations and the plane in which they lie.
+    """Measure two rows of perforations and the film plane.
 
     Parameters
     ----------
@@ -108,13 +108,18 @@ def film_plane(
         The scan; perforations brighter than their rims, film from top to bottom.
     rows : sequence of two ndarray (4,)
         Left, top, right and bottom of the first perforation of the left and of the right row, then the
-        approximate pitch, pixels: (5,).
+        approximate pitch, all in pixels: (5,).
     count : int
-        Perforations in a row.
+        Number of perforations in a row.
     channel : int
-        Which channel; that in which rims are darkest is the blue one.
+        Index of the channel; rims are usually darkest in the blue one.
     reach : float
-        Pixels by which their approximate edges may be off.
+        Largest error of the approximate edges, pixels.
+
+    Returns
+    -------
+    FilmPlane or Failure
+        A failure if too few edges of perforations are found.
     """
     places, axes, targets, signs = [], [], [], []
     for side, (left, top, right, bottom, pitch) in zip((-1, 1), rows, strict=True):
@@ -127,7 +132,7 @@ def film_plane(
                 signs.append((-1, 1, 1, -1)[k])
     if len(places) < _LEAST:
         return Failure(
-            f"{len(places)} edges of perforations are seen, and {_LEAST} are needed", Code.NOT_FOUND
+            f"{len(places)} edges of perforations were found, and {_LEAST} are needed", Code.NOT_FOUND
         )
     centre = (np.array([scan.width, scan.height]) - 1) / 2
     unit = max(scan.width, scan.height) / 2
@@ -154,9 +159,9 @@ def film_plane(
 
 
 def edge_of(scan: Scan, start: Array, stop: Array, channel: int, reach: float = 24.0) -> Array | None:
-    """Points (50, 2) of the line along which film ends near another one, the picture at its right as seen.
+    """Points (50, 2) of an edge of a frame near another one, with the picture on its right as seen.
 
-    `start` and `stop` are pixels (2,); film is darker, and is looked at for twice the `reach` beyond.
+    `start` and `stop` are pixels (2,); film is darker, and is searched up to twice the `reach` beyond.
     """
     band = read_band(scan, start, stop, 3 * reach, 3 * reach)
     found = measure_profiles(band, channel, 1, reach, reach)
@@ -173,7 +178,7 @@ def edge_of(scan: Scan, start: Array, stop: Array, channel: int, reach: float = 
 
 
 def _sides_of(scan: Scan, box: Array, channel: int, reach: float) -> list[tuple[int, Array]]:
-    """Middles of the straight parts of a perforation's sides: upper, right, lower, left; those seen."""
+    """Centres of the straight parts of a perforation's sides that are visible: upper, right, lower, left."""
     corners = box[[[0, 1], [2, 1], [2, 3], [0, 3]]].astype(np.float64)
     found = []
     for k in range(4):
@@ -187,7 +192,7 @@ def _sides_of(scan: Scan, box: Array, channel: int, reach: float) -> list[tuple[
 
 
 def _step(grey: Array, distance: Array, reach: float) -> float | None:
-    """Where the rim of a perforation steps to the light in it: one profile of a side's many columns."""
+    """Position of the step from the rim of a perforation to its light, in the mean profile of a side."""
     if not np.isfinite(grey).all():
         return None
     low, count = -reach - _RIM_PX, 2 * int(reach + _RIM_PX)

@@ -1,4 +1,5 @@
-"""From the corners of frames to the camera: photo-coordinates, transformations, calibrated corners, rolls."""
+"""The camera of a roll of film from the corners of its frames: photo-coordinates, calibrated corners,
+transforms."""
 
 from __future__ import annotations
 
@@ -22,25 +23,25 @@ Kind = Literal["similarity", "affine", "projective", "bilinear"]
 
 KINDS: tuple[Kind, ...] = ("similarity", "affine", "projective", "bilinear")
 _LEAST_FRAMES = 4
-"""Frames from which a roll knows its camera."""
+"""Minimum number of frames for the calibrated corners of a camera."""
 _LEAST_ASPECT, _LEAST_ANGLE = 2e-4, 2e-4
-"""What film and scanner change from frame to frame at least: relative, and radians."""
+"""Minimum scatter of the shape from frame to frame by film and scanner: relative, and radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class Roll:
-    """What the frames of one roll have in common.
+    """Common properties of the frames of one roll.
 
     Parameters
     ----------
     corners : FrameCorners
-        Calibrated corners of the camera: means over the frames with their standard deviations.
+        Calibrated corners of the camera: means over the frames with standard deviations.
     shape : FrameShape
-        The frame's shape with the scatter from frame to frame, for a doubtful frame of the same roll.
+        Shape of the frame with its scatter from frame to frame, as prior knowledge for other frames.
     px_per_mm : float
         Mean scale of the scans.
     frames : int
-        How many took part.
+        Number of frames used.
     scatter_mm : (float, float)
         Standard deviation of one frame's corners about the mean.
     """
@@ -52,7 +53,7 @@ class Roll:
     scatter_mm: tuple[float, float]
 
     def options(self, before: FrameOptions) -> FrameOptions:
-        """How to orient a doubtful frame of this roll."""
+        """Options for orienting other frames of this roll."""
         dpi = self.px_per_mm * 25.4
         return FrameOptions((), dpi, before.near, max_tilt_deg=before.max_tilt_deg, shape=self.shape)
 
@@ -60,14 +61,14 @@ class Roll:
 def photo_coordinates(corners: Array, px_per_mm: tuple[float, float]) -> Array:
     """Corners (4, 2) in millimetres: origin at the intersection of the diagonals, x along the lower edge.
 
-    The y-axis points to the upper edge, also of a scan from the wrong side (Cruz et al., fig. 1).
+    The y-axis points to the upper edge, also for a scan from the wrong side (Cruz et al., fig. 1).
 
     Parameters
     ----------
     corners : ndarray (4, 2)
         ul, ur, lr, ll in pixels.
     px_per_mm : (float, float)
-        Along x and along y of the frame.
+        Scale along x and along y of the frame.
     """
     ul, ur, lr, ll = corners
     crossing = np.cross(np.cross([*ul, 1.0], [*lr, 1.0]), np.cross([*ur, 1.0], [*ll, 1.0]))
@@ -82,20 +83,25 @@ def photo_coordinates(corners: Array, px_per_mm: tuple[float, float]) -> Array:
 def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -> FrameTransform | Failure:
     """Transform the photo-coordinates of a frame's corners to the calibrated ones.
 
-    All corners count alike: what parts them is film, scanner and gate, not the measurement.
+    All corners have equal weight: they differ by film, scanner and gate, not by errors of the measurement.
 
     Parameters
     ----------
     found : FrameOrientation
-        A frame that was oriented.
+        An oriented frame.
     calibrated : FrameCorners
-        Corners of the camera.
+        Calibrated corners of the camera.
     kind : {"similarity", "affine", "projective", "bilinear"}
-        With 4, 6, 8 and 8 parameters; the last two fit four corners without redundancy.
+        Kinds with 4, 6, 8 and 8 parameters; the last two fit four corners without redundancy.
+
+    Returns
+    -------
+    FrameTransform or Failure
+        A failure if the frame was declined.
     """
     points = found.image_points()
     if not len(points) or found.px_per_mm is None:
-        return Failure("a frame that was declined has no corners to transform", Code.DECLINED)
+        return Failure("a declined frame has no corners to transform", Code.DECLINED)
     xy = photo_coordinates(points.xy, found.px_per_mm)
     model = {
         "similarity": RationalPolynomial.similarity,
@@ -103,7 +109,7 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
         "projective": RationalPolynomial.projective,
         "bilinear": RationalPolynomial.bilinear,
     }[kind]()
-    # A hundredth of a millimetre: only its being alike for all counts.
+    # Sigmas of 0.01 mm; only their equality matters.
     fit = fit_mapping(model, ImagePoints.with_sigma(CORNERS, xy, 0.01), calibrated.xy())
     if isinstance(fit, Failure):
         return fit
@@ -123,20 +129,20 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
 
 
 def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | Failure:
-    """What the frames of one roll, taken by one camera and scanned alike, have in common.
+    """Determine the common properties of frames of one roll, taken by one camera and scanned alike.
 
     Parameters
     ----------
     results : sequence of FrameResult
-        Frames of the roll; those that were oriented and lie like most of them take part.
+        Frames of the roll; those that are oriented and agree with the majority are used.
     dpi : float, optional
-        Resolution, where it is known better than the format: then the camera's corners have its scale, else
-        the mean sides of the frame are those of the format.
+        Resolution, if it is known better than the format: it then defines the scale of the camera's corners.
+        By default the mean sides of the frame are those of the format.
 
     Returns
     -------
     Roll or Failure
-        A failure with fewer than four frames.
+        A failure if fewer than four frames are oriented.
     """
     sure = [r for r in results if r.status == "oriented" and r.lines is not None]
     lying = [r.format_mm for r in sure]
@@ -144,7 +150,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     sure = [r for r in sure if r.format_mm == most]
     if len(sure) < _LEAST_FRAMES or most is None:
         return Failure(
-            f"{len(sure)} oriented frames do not make a roll; it takes {_LEAST_FRAMES}", Code.TOO_FEW_IMAGES
+            f"{len(sure)} oriented frames do not make a roll; {_LEAST_FRAMES} are needed", Code.TOO_FEW_IMAGES
         )
     nominal = FrameShape(*most)
     corners = np.array([r.lines.corners for r in sure if r.lines is not None])
@@ -156,7 +162,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
         placed = _turned(placed, placed[keep].mean(axis=0))
         left = placed - placed[keep].mean(axis=0)
         spread = np.sqrt(np.mean(left[keep] ** 2))
-        # A frame unlike the others is not left to move their mean.
+        # A deviating frame must not influence the mean.
         keep = np.abs(left).max(axis=(1, 2)) < max(5 * spread, 1e-6)
     n = int(keep.sum())
     mean, scatter = placed[keep].mean(axis=0), np.sqrt((left[keep] ** 2).sum(axis=(0, 1)) / (4 * (n - 1)))
@@ -181,7 +187,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
 
 
 def _turned(placed: Array, mean: Array) -> Array:
-    """Frames (n, 4, 2) shifted and turned onto their mean, without a change of size (Procrustes)."""
+    """Frames (n, 4, 2) shifted and rotated onto their mean, without a change of size (Procrustes)."""
     centred = placed - placed.mean(axis=1, keepdims=True)
     goal = mean - mean.mean(axis=0)
     dot = (centred * goal).sum(axis=(1, 2))

@@ -1,11 +1,10 @@
-"""What is on both sides of a frame's edges in an overview: whether it is one, and where its film ends.
+"""Search for frames in an overview of a scan: four straight edges of one polarity with known proportions.
 
-Where a scan shows frames: four straight edges of one polarity around a rectangle of known proportions.
-
-Gradients of a small overview vote for directed lines (Hough 1962; Ballard 1981): each edge of a frame on dark
-film has its normal towards the inside, on bright film towards the outside, so that four edges once around
-differ in direction from two lines of the picture, and from the edges of a neighbour. Proportions choose among
-the combinations; what is beyond the edges, unexposed film of one tone, decides.
+Gradients of a small overview vote for directed lines (Hough 1962; Ballard 1981). Each edge of a frame on dark
+film has its normal inwards, on bright film outwards; therefore the four edges in turn differ in direction
+from two lines of the picture and from the edges of a neighbouring frame. Combinations are selected by their
+proportions, and tested by what lies on both sides of the edges: unexposed film of uniform tone outside,
+picture inside. Finally each edge is moved to the end of the unexposed film.
 """
 
 from __future__ import annotations
@@ -28,32 +27,31 @@ __all__ = ["FrameGuess", "crossings_of", "judged", "lies_in", "search_frames", "
 Plane = NDArray[np.float32]
 
 _OUTWARD_MM = 0.8
-"""How far beyond a line that voted the edge is looked for; perforations are hardly nearer to it."""
+"""Distance beyond a detected line within which the edge is searched; perforations are hardly closer."""
 _OUTSIDE, _INSIDE = (-3.5, -2.5, -1.5), (2.0, 3.0)
-"""Distances inwards at which film, wherever there is some, and picture are looked at, pixels of the overview.
-"""
+"""Distances inwards, in pixels of the overview, at which film and picture are sampled."""
 _GAP_MM = 0.15
-"""Width of film beyond which something else begins, as perforations do."""
+"""Minimum width of film that separates the frame from other structures."""
 _ALONG = np.linspace(-0.92, 0.92, 80)
-"""Where along an edge its surroundings are looked at, −1 to 1."""
+"""Positions along an edge at which its surroundings are sampled, −1 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameGuess:
-    """A frame as the overview shows it.
+    """A candidate for a frame in the overview.
 
     Parameters
     ----------
     corners : ndarray (4, 2)
-        ul, ur, lr, ll in pixels of the overview.
+        Corners ul, ur, lr, ll in pixels of the overview.
     polarity : int
-        1 where the film around is darker than the picture, −1 where it is brighter.
+        1 if the film around is darker than the picture, −1 if it is brighter.
     format_mm : (float, float)
-        Width and height as they lie in the scan.
+        Width and height of the format as it lies in the scan.
     supported : tuple of bool
-        Which edges were seen: upper, right, lower, left. Where one was not, the format gives it.
+        Which edges were detected: upper, right, lower, left. A missing one follows from the format.
     score : float
-        How much of its outline separates unexposed film from picture, less what contradicts, 0 to 4.
+        Amount of outline that separates unexposed film from picture, minus contradictions, 0 to 4.
     """
 
     corners: Array
@@ -64,7 +62,7 @@ class FrameGuess:
 
 
 def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
-    """The guess with its score by what is on both sides of its edges; None where that is no frame."""
+    """The guess with its score from both sides of its edges; None if it is no frame."""
     outside, inside = _sides(guess, grey)
     known, seen = np.isfinite(outside) & np.isfinite(inside), np.array(guess.supported)
     if (known.mean(axis=1)[seen] < 0.5).any() or (seen.all() and not _within(guess.corners, grey.shape)):
@@ -77,7 +75,7 @@ def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
     least = max(4 * spread, 0.08 * strong)
     film = np.abs(outside - own[:, None]) < max(least, 0.15 * strong)
     step, against = (film & (contrast > least)).mean(axis=1), (~film & known).mean(axis=1)
-    # A picture's own rectangle has other tones around it, from side to side.
+    # A rectangle within the picture is surrounded by different tones on its sides.
     excess = guess.polarity * (own - level) / strong
     if (excess[seen] > 0.6).any() or (step[seen] < 0.12).any() or (against[seen] > 0.5).any():
         return None
@@ -88,7 +86,7 @@ def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
 
 
 def lies_in(xy: Array, shape: tuple[int, ...]) -> bool:
-    """Whether a point is within an image of a shape."""
+    """Whether a point lies within an image of this shape."""
     return bool((xy > 0).all() and (xy < np.array(shape[::-1]) - 1).all())
 
 
@@ -97,9 +95,9 @@ def _within(corners: Array, shape: tuple[int, ...]) -> bool:
 
 
 def _film(guess: FrameGuess, outside: Array, inside: Array) -> tuple[float, float, float]:
-    """Tone of unexposed film, how it scatters, and the contrast of a bright picture against it."""
+    """Tone of unexposed film, its scatter, and the contrast of a bright picture against it."""
     own = np.nanmedian(outside, axis=1)
-    # Film is darker than any picture (polarity 1): the second darkest of the edges is not by chance.
+    # Film is darker than any picture (polarity 1); the second darkest of the edges is robust.
     level = float(guess.polarity * np.sort(guess.polarity * own)[min(1, len(own) - 1)])
     spread = float(np.nanmedian(np.abs(outside - own[:, None])))
     strong = float(np.nanquantile(guess.polarity * (inside - level), 0.8))
@@ -107,7 +105,7 @@ def _film(guess: FrameGuess, outside: Array, inside: Array) -> tuple[float, floa
 
 
 def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
-    """Each edge moved to where unexposed film ends; the lines that voted may run within the picture."""
+    """Move each edge to where unexposed film ends; the lines that got votes may lie within the picture."""
     scale = float(np.mean(size_of(guess.corners) / guess.format_mm))
     seen = np.array(guess.supported)
     outside, inside = _sides(guess, grey)
@@ -121,11 +119,11 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
     for k in np.flatnonzero(seen):
         near = _running(outside[k], level)
         far = _running(np.nanmean(np.where(known[k], profiles[k], level)[:, : out // 2], axis=1), level)
-        # Where the line that voted has other tones before it than film, film is looked for further out.
+        # If tones beyond the detected line differ from film, search for film further outside.
         further = guess.polarity * (np.median(far) - np.median(near)) / strong
         raised = guess.polarity * (np.median(near) - level) > 0.1 * strong
         film = (far if raised and further < 0 else near)[:, None]
-        # Where film is a narrow strip, blurred with something else beyond it, one place of it must do.
+        # Where film is a narrow strip, blurred with other structures, a single place must be sufficient.
         narrow = further > 0.1
         gap = 1 if narrow else max(2, round(_GAP_MM * scale))
         significant = max(least, 0.4 * further * strong) if narrow else least
@@ -139,13 +137,13 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
 
 
 def _running(values: Array, level: float) -> Array:
-    """Running median of values (n,) along an edge: the scanner's light may be uneven."""
+    """Running median of values (n,) along an edge, because the scanner's light may be uneven."""
     filled = np.where(np.isfinite(values), values, level)
     return np.asarray(median_filter(filled, size=31, mode="nearest"))
 
 
 def _moved(corners: Array, ends: Array) -> Array:
-    """Corners of a frame whose edges were moved inwards by `ends` (4, 2) at their beginning and end."""
+    """Corners of a frame whose edges are moved inwards by `ends` (4, 2) at their start and end."""
     following = np.roll(corners, -1, axis=0)
     along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -154,20 +152,20 @@ def _moved(corners: Array, ends: Array) -> Array:
 
 
 def crossings_of(a: Array, b: Array) -> Array:
-    """Corners (4, 2) of lines through a and b, both (4, 2): corner k is where line k meets the one before."""
+    """Corners (4, 2) of lines through a and b, both (4, 2); corner k is where line k meets line k − 1."""
     line = np.cross(np.column_stack([a, np.ones(4)]), np.column_stack([b, np.ones(4)]))
     corner = np.cross(np.roll(line, 1, axis=0), line)
     return np.asarray(corner[:, :2] / corner[:, 2:])
 
 
 def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
-    """Grey values (4, 80) along the edges outside, where they are most like film, and inside."""
+    """Grey values (4, 80) along the edges: outside, where they are most similar to film, and inside."""
     outside = [guess.polarity * _beside(guess.corners, grey, (offset,)) for offset in _OUTSIDE]
     return guess.polarity * np.fmin.reduce(outside), _beside(guess.corners, grey, _INSIDE)
 
 
 def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
-    """Mean grey values (4, 80) along the edges at distances inwards; NaN outside the overview."""
+    """Mean grey values (4, 80) along the edges at given distances inwards; NaN outside the overview."""
     t = (_ALONG + 1) / 2
     a, b = corners, np.roll(corners, -1, axis=0)
     along = (b - a) / np.hypot(*(b - a).T)[:, None]
@@ -176,7 +174,7 @@ def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
     total = np.zeros(at.shape[:2])
     for offset in offsets:
         xy = (at + offset * normal[:, None]).astype(np.float32)
-        # Beyond the border of the scan there is nothing.
+        # No values beyond the border of the scan.
         total += cv2.remap(
             grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
         )
@@ -184,23 +182,23 @@ def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
 
 
 def size_of(corners: Array) -> Array:
-    """Width and height of a frame, means of its sides."""
+    """Width and height of a frame, as means of opposite sides."""
     ul, ur, lr, ll = corners
     return np.array([np.hypot(*(ur + lr - ul - ll)), np.hypot(*(ll + lr - ul - ur))]) / 2
 
 
 _BIN = np.deg2rad(0.5)
-"""Step of the directions; that of the distances is a pixel of the overview."""
+"""Step of the directions; the step of the distances is one pixel of the overview."""
 _SPREAD = 16
-"""Steps to either side of a gradient's own direction for which it votes: texture at an edge turns it."""
+"""A gradient votes for this many directions on either side of its own; texture at an edge rotates it."""
 _PEAKS = 8
-"""Lines of each direction that are combined with those of the others."""
+"""Maximum number of lines of each direction that are combined with others."""
 _LEAST_SIDE = 0.15
-"""Part of the overview's longer side that a frame's side takes at least."""
+"""Minimum side of a frame, relative to the longer side of the overview."""
 
 
 class _Lines(NamedTuple):
-    """Peaks of the votes of one direction: distances from the centre and shares of votes."""
+    """Peaks of the votes for one direction: distances from the centre, and votes."""
 
     at: Array
     votes: Array
@@ -217,26 +215,26 @@ def search_frames(
     tried: int = 60,
     near: Array | None = None,
 ) -> list[FrameGuess]:
-    """Find frames in an overview; the best first, and none that overlap.
+    """Find frames in an overview; the best first, without overlap.
 
     Parameters
     ----------
     overview : ndarray (h, w, c)
-        The scan, its longer side some hundred pixels.
+        The scan, reduced to some hundred pixels on its longer side.
     formats : sequence of (width, height)
-        Formats that may be, in mm, each tried upright and lying.
+        Possible formats in mm, each tried in both orientations.
     max_tilt_deg : float
         Largest tilt.
     tolerance : float
-        By how much, relatively, a frame's proportions may differ from its format's.
+        Largest relative deviation of a frame's proportions from its format.
     px_per_mm : float, optional
-        Pixels of the overview in a millimetre, where the resolution is known.
+        Pixels of the overview per millimetre, if the resolution is known.
     hint : float, optional
-        The same where it is what the file says, which may be wrong: for frames of which an edge is missing.
+        The same according to the file, which may be wrong; used for frames with a missing edge.
     tried : int
-        Combinations of lines whose surroundings are looked at.
+        Number of combinations of lines whose surroundings are tested.
     near : ndarray (4, 2), optional
-        Approximate corners, good to a tenth of the frame's size: no other frames are looked for.
+        Approximate corners, accurate to one tenth of the frame's size; no other frames are searched.
     """
     grey, gradient = _gradients(overview)
     votes, reach = _votes(*gradient, grey.shape, max_tilt_deg)
@@ -252,7 +250,7 @@ def search_frames(
             most = 0.1 * float(size_of(near).max())
             found = [guess for guess in found if np.abs(guess.corners - near).max() < most]
         found.sort(key=lambda guess: -guess.score)
-        with warnings.catch_warnings():  # an edge beyond the scan has no tones; it is left out later
+        with warnings.catch_warnings():  # an edge outside the scan has no tones; it is excluded later
             warnings.simplefilter("ignore", RuntimeWarning)
             scored = [judged(guess, grey) for guess in _distinct(found, tried)]
             good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
@@ -263,14 +261,14 @@ def search_frames(
 
 
 def _far(guess: FrameGuess, near: Array | None) -> float:
-    """What the distance from where a frame was said to be counts against it, at most one edge."""
+    """Penalty for the distance from the given corners, at most one edge."""
     if near is None:
         return 0.0
     return float(np.abs(guess.corners - near).max() / (0.1 * size_of(near).max()))
 
 
 def _gradients(overview: NDArray[np.float32]) -> tuple[Plane, tuple[Array, Array, Array, Array]]:
-    """Grey values of most contrast, and of each pixel with a gradient: x, y, direction, weight."""
+    """Grey values of the channel with most contrast, and its gradients: x, y, direction, weight."""
     spread = np.ptp(np.quantile(overview, [0.02, 0.98], axis=(0, 1)), axis=0)
     best = int(np.argmax(spread))
     grey = np.ascontiguousarray(overview[:, :, best])
@@ -283,7 +281,7 @@ def _gradients(overview: NDArray[np.float32]) -> tuple[Plane, tuple[Array, Array
     size[:, [0, 1, -2, -1]] = 0
     row, column = np.nonzero(size > least)
     s = size[row, column].astype(np.float64)
-    # A faint edge shall count nearly as much as a strong one in the picture.
+    # A faint edge gets nearly the same weight as strong gradients of the picture.
     weight = s / (s + 2 * least)
     direction = np.arctan2(gy[row, column], gx[row, column]).astype(np.float64)
     return grey, (column.astype(np.float64), row.astype(np.float64), direction, weight)
@@ -297,7 +295,7 @@ def _turns(max_tilt_deg: float) -> range:
 def _votes(
     x: Array, y: Array, direction: Array, weight: Array, shape: tuple[int, int], max_tilt_deg: float
 ) -> tuple[Plane, int]:
-    """Votes (directions, distances), distances from the centre along the direction, and that of nought."""
+    """Votes (directions, distances); distances are from the centre along the direction; index of zero."""
     reach = int(np.hypot(*shape) / 2) + 3
     turns, width = round(2 * np.pi / _BIN), 2 * reach + 1
     own = np.rint(direction / _BIN).astype(np.intp)
@@ -318,7 +316,7 @@ def _votes(
 
 
 def _lines(votes: Plane, reach: int, direction: int, sign: float) -> _Lines:
-    """The best lines of a direction; distances along `sign` times it."""
+    """Strongest lines of a direction; distances along `sign` times the direction."""
     row = votes[direction % len(votes)]
     peak = row >= cv2.dilate(row[None], np.ones((1, 7), np.uint8))[0]
     at = np.flatnonzero(peak & (row > 0))
@@ -336,11 +334,11 @@ def _combined(
     shape: tuple[int, int],
     missing: bool,
 ) -> Iterator[FrameGuess]:
-    """Rectangles of one direction; `missing`: those of which one edge is not seen."""
+    """Rectangles of one direction; with `missing`, those with one edge that was not detected."""
     quarter = len(votes) // 4
     for polarity in (1, -1):
         base = turn if polarity > 0 else turn + 2 * quarter
-        # Normals point from dark to bright; distances are along the frame's own axes.
+        # Normals point from dark to bright; distances are along the axes of the frame.
         signs = (polarity, -polarity, -polarity, polarity)
         upper, right, lower, left = (
             _lines(votes, reach, base + quarter * k, float(sign))
@@ -360,7 +358,7 @@ def _combined(
             if px_per_mm is not None:
                 good &= np.abs(np.log(np.maximum(size_x, 1e-9)[:, None] / (w * px_per_mm))) < 2 * tolerance
             i, j = np.nonzero(good)
-            # Votes of an edge over its length: neighbours in line with it do not make it better.
+            # Votes of an edge relative to its length; neighbouring frames in line do not increase the score.
             share = np.minimum(across[i, 2:] / size_y[j, None], 1.5).sum(axis=1)
             share += np.minimum(down[j, 2:] / size_x[i, None], 1.5).sum(axis=1)
             for n in np.argsort(-share, kind="stable")[:40]:
@@ -370,7 +368,7 @@ def _combined(
 
 
 def _pairs(first: _Lines, second: _Lines, missing: bool) -> tuple[Array, NDArray[np.bool_]]:
-    """Pairs of opposite lines (k, 4): places and votes; and which are seen. With `missing`, one alone too."""
+    """Pairs of opposite lines (k, 4): distances and votes; which exist. With `missing`, also single lines."""
     i, j = (part.ravel() for part in np.meshgrid(np.arange(len(first.at)), np.arange(len(second.at))))
     both = np.stack([first.at[i], second.at[j], first.votes[i], second.votes[j]], axis=1)
     seen = np.ones((len(both), 2), dtype=bool)
@@ -396,7 +394,7 @@ def _completed(
     shape: tuple[int, int],
     px_per_mm: float | None,
 ) -> Iterator[FrameGuess]:
-    """Rectangles of three lines and the format."""
+    """Rectangles from three lines and the format."""
     for lying in (True, False):
         pairs, ones = (down, across) if lying else (across, down)
         p_seen, o_seen = (d_seen, a_seen) if lying else (a_seen, d_seen)
@@ -418,13 +416,13 @@ def _completed(
             gone = (1 if first else 3) if lying else (2 if first else 0)
             seen = tuple(k != gone for k in range(4))
             corners = _rectangle(box, turn * _BIN, shape)
-            # An edge that is in the scan and is not seen is believed in only at a scale that is known.
+            # A missing edge inside the scan is accepted only if the scale is known.
             if px_per_mm is not None or not lies_in(corners[[gone, (gone + 1) % 4]].mean(axis=0), shape):
                 yield FrameGuess(corners, polarity, size, seen, float(share[n]))  # type: ignore[arg-type]
 
 
 def _rectangle(box: Sequence[float], angle: float, shape: tuple[int, int]) -> Array:
-    """Corners of a box (x0, y0, x1, y1) in axes turned about the centre of the overview."""
+    """Corners of a box (x0, y0, x1, y1) in axes rotated about the centre of the overview."""
     x0, y0, x1, y1 = box
     at = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     c, s = np.cos(angle), np.sin(angle)
@@ -433,7 +431,7 @@ def _rectangle(box: Sequence[float], angle: float, shape: tuple[int, int]) -> Ar
 
 
 def _distinct(guesses: list[FrameGuess], most: int) -> list[FrameGuess]:
-    """The best of each group that is nearly the same."""
+    """The best of each group of nearly identical guesses."""
     kept: list[FrameGuess] = []
     corners = np.zeros((0, 8))
     for guess in guesses:
@@ -447,7 +445,7 @@ def _distinct(guesses: list[FrameGuess], most: int) -> list[FrameGuess]:
 
 
 def _apart(guesses: list[FrameGuess]) -> list[FrameGuess]:
-    """The best, and others like it that do not overlap with it: frames of one strip."""
+    """The best guess, and similar ones that do not overlap with it: frames of one strip."""
     if not guesses:
         return []
     best = guesses[0]
@@ -464,6 +462,6 @@ def _apart(guesses: list[FrameGuess]) -> list[FrameGuess]:
 
 
 def _overlap(first: Array, second: Array) -> float:
-    """Common area over that of the first."""
+    """Common area relative to that of the first."""
     common: Any = cv2.intersectConvexConvex(first.astype(np.float32), second.astype(np.float32))[0]
     return float(common) / float(np.prod(size_of(first)))

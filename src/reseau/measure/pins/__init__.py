@@ -1,4 +1,4 @@
-"""The rods of an ultrasonic test object in a picture of a scanner's screen: echoes, names, places."""
+"""Rods of an ultrasonic test object in an image of a scanner's screen: detection, numbering, measurement."""
 
 from .detection import PinDetections, PinOptions, find_pins
 from .measure import PinResult, measure_pins

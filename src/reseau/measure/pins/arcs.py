@@ -1,4 +1,4 @@
-"""Echoes matched with formed arcs: place, widths, curvature, tilt, brightness and ground together."""
+"""Matching of echoes with formed arcs: position, widths, curvature, tilt, brightness and background."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from .echoes import Echoes
 __all__ = ["ArcMatches", "ArcShape", "match_arcs"]
 
 _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
-"""Halves of windows' sides, pixels; arcs of like size are matched in one batch."""
+"""Half sides of windows, pixels; arcs of similar size are matched in one batch."""
 _SURE = 8.0
-"""Contrast over its standard deviation of an arc whose light is taken off another."""
+"""Minimum contrast over its standard deviation of an arc whose light is subtracted from others."""
 _MARGIN_PX = 4.0
-"""What a window shows of the ground around an arc."""
+"""Background shown by a window around an arc, pixels."""
 _FORM_SIGMA = np.array([0.5, 0.05, 0.3])
 """Prior standard deviations: logarithm of the width along, sag at that width over it, tilt (rad)."""
 _ACROSS_SIGMA = 0.5
 """Prior standard deviation of the logarithm of the width across."""
 _LAGS = 4
-"""Distance, in pixels along both axes, to which residuals are asked whether they go together."""
+"""Distance in pixels, along both axes, up to which the autocorrelation of residuals is summed."""
 _NUMBERS = ("contrast", "t", "noise", "correlation", "seen", "rejected")
 _HELD = 0.2
-"""Share of those for a second attempt where the first did not converge."""
+"""Factor of these in a second attempt, where the first did not converge."""
 _ROUND = 1.5
-"""Length over thickness below which a spot shows no direction."""
+"""Length over thickness below which a spot has no direction."""
 _OF_MOMENTS = 1.7
-"""Width of a Gaussian over that of what stands out of it above a third of its height, about."""
+"""Approximate width of a Gaussian over that of its part above one third of its height."""
 _REACH = 2.6
-"""Widths to both sides that a window shows."""
+"""Half size of a window, in widths of the arc."""
 _VEILED = 0.5
-"""Share of a flank from which on an arc rests on the other."""
+"""Hidden share of a flank from which the position of an arc depends on the other flank."""
 _LESS_PX = 2
-"""By how much more of an arc is left out next to what is hidden, to see how it takes that."""
+"""Width of the additional margin next to hidden pixels that is left out to test the position of an arc."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArcShape:
     """Arcs as functions of corrections: logarithm of the width along, sag over that width, tilt.
 
-    The width of the point-spread function is here that of the arc across.
+    The width of the point-spread function is that of the arc across.
 
     Parameters
     ----------
@@ -86,14 +86,14 @@ class ArcShape:
 
 @dataclass(frozen=True, eq=False)
 class ArcMatches:
-    """What came out, in columns over the m echoes.
+    """Results of matching, in columns over the m echoes.
 
     Parameters
     ----------
     xy, cov, contrast, t, noise, correlation, seen, rejected, converged : ndarray
-        As in :class:`reseau.measure.matching.Matches`; `cov` allows for residuals that go together.
+        As in :class:`reseau.measure.matching.Matches`; `cov` is corrected for correlated residuals.
     form : Arcs
-        The arcs found.
+        The matched arcs.
     """
 
     xy: Array
@@ -111,7 +111,7 @@ class ArcMatches:
 def match_arcs(
     grey: NDArray[np.float32], valid: Mask, echoes: Echoes, at: Rows, options: MatchOptions, noise: float
 ) -> ArcMatches:
-    """Match the echoes `at`, those of like size together.
+    """Match the echoes `at`, grouped by size.
 
     Parameters
     ----------
@@ -120,11 +120,11 @@ def match_arcs(
     valid : ndarray (h, w) of bool
         Pixels that may be used.
     echoes : Echoes
-        All of the frame; each keeps the others from its own light.
+        All echoes of the frame; pixels of the others are excluded.
     at : ndarray of int (m,)
-        Which are to be matched.
+        Indices of the echoes to match.
     options : MatchOptions
-        How; window and widths are set here.
+        Options of the matching; window and widths are set here.
     noise : float
         Standard deviation of the grey values.
     """
@@ -132,16 +132,16 @@ def match_arcs(
     found = _together(work.all(), len(at))
     touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
     if len(touching):
-        # How light adds up where two echoes meet is the instrument's secret: the stronger is seen, behind a
-        # logarithmic amplifier, or both. The first match took the one for true; how far the other would
-        # carry the arc is not known better.
+        # It is unknown how the instrument combines overlapping echoes: behind a logarithmic amplifier the
+        # stronger one is shown; otherwise their sum. The first match assumed the former; the difference to
+        # the latter is added to the uncertainty.
         pulled = work.without_others(touching, found)
         found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
     veiled = np.flatnonzero((work.hidden_flanks(found) > _VEILED) & found.converged)
     if len(veiled):
-        # Where one flank of an arc is hidden, its middle follows from the law by which the other fades. What
-        # the lines of a raster or a reverberation make of that law no longer cancels out, and is no noise of
-        # single pixels: how far it may carry the arc shows when a little less of it is seen.
+        # If one flank of an arc is hidden, its centre follows from the shape of the other. Effects of raster
+        # lines or reverberation on this shape no longer cancel and are not noise of single pixels. Their size
+        # is estimated by leaving out slightly more of the arc.
         pulled = work.seeing_less(veiled, found)
         found.cov[veiled] += pulled[:, :, None] * pulled[:, None, :]
     return found
@@ -165,18 +165,18 @@ class _Matching:
         self.half = _half_sides(self.start)
 
     def all(self) -> list[tuple[Rows, Matches, Arcs]]:
-        """Every arc, each kept off what belongs to another."""
+        """Match every arc, excluding the pixels of others."""
         parts = []
         for rows in self._of_like_size(np.arange(len(self.at))):
             parts.append(self._adjusted(rows, self.start, self.echoes.xy[self.at], _FORM_SIGMA))
-            # A round spot has no tilt: what does not converge is held closer to how a rod's echo lies.
+            # A round spot has no tilt: if it does not converge, tighten the prior of the form.
             again = rows[~parts[-1][1].converged]
             if len(again):
                 parts.append(self._adjusted(again, self.start, self.echoes.xy[self.at], _HELD * _FORM_SIGMA))
         return parts
 
     def without_others(self, touching: Rows, found: ArcMatches) -> Array:
-        """By how much (m, 2) arcs move when the light of the others is taken off instead of left out."""
+        """Shifts (m, 2) of arcs if the light of others is subtracted instead of excluded."""
         modelled = found.converged & (found.t > _SURE)
         pulled = np.zeros((len(touching), 2))
         for rows in self._of_like_size(touching):
@@ -187,7 +187,7 @@ class _Matching:
         return pulled
 
     def hidden_flanks(self, found: ArcMatches) -> Array:
-        """Of what tells where an arc lies, the share that is hidden on its worst side, (m,)."""
+        """Hidden share of the information about the position of an arc, on its worse side, (m,)."""
         share = np.zeros(len(self.at))
         for rows in self._of_like_size(np.flatnonzero(found.converged)):
             window = self._window(rows, found.xy[rows])
@@ -203,7 +203,7 @@ class _Matching:
         return share
 
     def seeing_less(self, veiled: Rows, found: ArcMatches) -> Array:
-        """By how much (m, 2) arcs move when the pixels next to hidden ones are left out, too."""
+        """Shifts (m, 2) of arcs if the pixels next to hidden ones are left out, too."""
         side = 2 * _LESS_PX + 1
         less = cv2.erode(self.valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         pulled = np.zeros((len(veiled), 2))
@@ -224,7 +224,7 @@ class _Matching:
         return [rows[(self.half[rows] == size).all(axis=1)] for size in sizes]
 
     def _light_of_others(self, arc: int, found: ArcMatches, modelled: Mask) -> Array:
-        """What the other arcs give to the window of one, (rows, columns)."""
+        """Light of the other arcs in the window of one, (rows, columns)."""
         window = self._window(np.array([arc]), found.xy[[arc]])
         reach = 5 * found.form.along + 5 * found.form.across
         off = np.abs(found.xy - np.rint(found.xy[arc]))
@@ -246,7 +246,7 @@ class _Matching:
         modelled: Mask | None = None,
         valid: Mask | None = None,
     ) -> tuple[Rows, Matches, Arcs]:
-        """Match the arcs `rows`, all of one size of window."""
+        """Match the arcs `rows`, all with the same size of window."""
         shape = ArcShape(start.select(rows))
         owner = self.echoes.claimed
         if modelled is not None:
@@ -275,21 +275,21 @@ class _Matching:
 
 
 def _start(echoes: Echoes, at: Rows) -> Arcs:
-    """Arcs to begin with, from the moments of the light."""
+    """Approximate arcs from the moments of the light."""
     long, wide, tilt = echoes.length[at], echoes.thickness[at], echoes.tilt[at]
-    # What has no direction of its own begins level, as the echo of a rod lies.
+    # A spot without direction starts horizontal, like the echo of a rod.
     round_ = long < _ROUND * wide
     tilt = np.where(round_, 0.0, tilt)
     wide = np.where(round_, np.sqrt(long * wide), wide)
     long = np.where(round_, wide, long)
     along, across = (_OF_MOMENTS / 4 * values for values in (long, wide))
-    # A region's moments know the bend of a short arc badly; its matching begins with a straight one.
+    # The moments determine the curvature of a short arc poorly; its matching starts with a straight one.
     bend = np.clip(echoes.curvature[at] * along, -0.3, 0.3) * (long > 2 * wide)
     return Arcs(along, across, bend / along, tilt)
 
 
 def _half_sides(start: Arcs) -> Rows:
-    """Halves of the sides of the windows (k, 2), from a few sizes."""
+    """Half sides of the windows (k, 2), from a few sizes."""
     u, v = _REACH * start.along, _REACH * start.across
     v = v + 0.5 * np.abs(start.curvature) * u**2
     c, s = np.abs(np.cos(start.tilt)), np.abs(np.sin(start.tilt))
@@ -298,13 +298,13 @@ def _half_sides(start: Arcs) -> Rows:
 
 
 def _inflation(residuals: Array) -> Array:
-    """Factors (m,) by which variances grow because neighbouring residuals go together.
+    """Factors (m,) that correct variances for correlated residuals.
 
-    The adjustment takes residuals for independent. What an echo differs from its formed image by (speckle, a
-    reverberation) goes on over several pixels, so that there is less to know than pixels: by the sum of the
-    autocorrelation, for parameters that change the image smoothly. Only correlations that chance does not
-    explain are summed: white residuals leave all as it is, and residuals of a fit, which add up to nought,
-    have negative ones farther off that tell of the fit alone.
+    The adjustment assumes independent residuals. The difference between an echo and its formed image
+    (speckle, reverberation) extends over several pixels, so there is less information than pixels: by a
+    factor of the sum of the autocorrelation, for parameters that change the image smoothly. Only significant
+    correlations are summed: white residuals leave the variances unchanged, and the negative correlations at
+    larger distances, which result from fitting alone, are ignored.
     """
     r = np.nan_to_num(residuals)
     squares = r * r
@@ -322,7 +322,7 @@ def _inflation(residuals: Array) -> Array:
 
 
 def _together(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches:
-    """Columns in the order of the echoes again."""
+    """Columns in the order of the echoes."""
 
     def column(name: str, tail: tuple[int, ...] = ()) -> Array:
         values = np.empty((count, *tail))
@@ -334,7 +334,7 @@ def _together(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches
     for rows, found, _ in parts:
         cov[rows] *= _inflation(found.residuals)[:, None, None]
     tilt, curvature = column("tilt"), column("curvature")
-    # An arc and the one turned by half a turn, bent the other way, are the same.
+    # An arc rotated by 180° with opposite curvature is the same arc.
     turns = np.round(tilt / np.pi)
     tilt, curvature = tilt - np.pi * turns, curvature * np.where(turns % 2 == 0, 1.0, -1.0)
     return ArcMatches(

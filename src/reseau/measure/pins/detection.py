@@ -1,14 +1,15 @@
-"""The light of a raster: how it falls off over a screen, told by what shines between the echoes.
+"""Detection of the rods of an ultrasonic test object: short arcs among everything else on a scanner's screen.
 
-A phosphor, a tube and a lens give less light towards the corners, to the picture as to the raster's own glow.
-Over the length of an echo that is a slope which moves its middle to the brighter side, by the slope times the
-square of its width.
+1. Find bright spots.
+2. Discard those that are drawn by the instrument, too long or too faint.
+3. Match each of the others with a formed arc.
+4. Test each by its own image and by the other spots. Rejected spots are reported with the reason.
 
-The images of the rods of an ultrasonic test object: short arcs, amid what else a scanner's screen shows.
+y is measured on the line, x at its centre (Wishahy: "the pin's images appear as horizontal curved lines").
 
-Spots that stand out → those that are drawn, too long or too faint put aside → each matched with a formed arc
-→ judged by its own image and by its fellows. y is measured on the line, x in its middle (Wishahy: "the pin's
-images appear as horizontal curved lines"). A spot that is declined is reported with the reason.
+Phosphor, tube and lens reduce the light towards the corners, of the image and of the raster's glow alike.
+Over the length of an echo this is a slope that shifts its centre to the brighter side, by the relative slope
+times the square of its width. The falloff is estimated from the glow between the echoes.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
+from ...core.failure import Code
 from ..matching import MatchOptions
+from ..points import Reason
 from ..screening import Screened, screen
 from .arcs import ArcMatches, match_arcs
 from .echoes import Echoes, Grey, find_echoes, ground_of
@@ -28,32 +31,32 @@ from .graphics import bridged, find_cuts, is_sharp, looks_sharp, same_in_all, se
 __all__ = ["PinDetections", "PinOptions", "falloff", "find_pins"]
 
 _STEP = 20
-"""Distance of the places at which the glow is looked at, pixels."""
+"""Distance of the places at which the glow is sampled, pixels."""
 _INSIDE = 0.08
-"""Part of the reseau's extent at its edges that is not looked at: there a screen may end."""
+"""Margin of the reseau's extent that is not sampled, as a share: the screen may end there."""
 _LEAST = 10.0
-"""Glow over the noise from which on the raster counts as lit."""
+"""Minimum glow of a lit raster over the noise."""
 _ROUGH = 0.1
-"""Scatter of the glow about a parabola, as a share of it, from which on it is no glow but an image."""
+"""Largest scatter of the glow about a parabola, as a share of it; a larger one belongs to an image."""
 _LIMITS = (0.5, 2.0)
 
 
 def falloff(ground: Grey, hidden: Mask, noise: float) -> Grey | None:
-    """Light of the raster relative to the middle: a paraboloid through what shines between the echoes.
+    """Light of the raster relative to the centre: a paraboloid fitted to the glow between the echoes.
 
     Parameters
     ----------
     ground : ndarray (h, w)
-        The frame without what is small in it.
+        The frame without small structures.
     hidden : ndarray (h, w) of bool
-        Pixels that a reseau covers; within its extent the raster is looked at.
+        Pixels covered by a reseau; the raster is sampled within its extent.
     noise : float
         Standard deviation of the grey values.
 
     Returns
     -------
     ndarray (h, w) or None
-        None where no raster is lit, or too little of it is seen.
+        None if no raster is lit, or too little of it is visible.
     """
     ends = [np.flatnonzero(hidden.any(axis=axis))[[0, -1]] for axis in (0, 1) if hidden.any()]
     lengths = [int(high - low) for low, high in ends]
@@ -71,7 +74,7 @@ def falloff(ground: Grey, hidden: Mask, noise: float) -> Grey | None:
     weight: Array = np.ones_like(glow)
     values: Array = np.zeros(6)
     scatter = np.inf
-    for _ in range(6):  # Tukey's weights: where an echo is as wide as the ground's window, it is none of it
+    for _ in range(6):  # Tukey's weights reject places where an echo is as wide as the window of the ground
         found = np.linalg.lstsq(design * weight[:, None], glow * weight, rcond=None)[0]
         values = np.asarray(found, dtype=np.float64)
         off = np.abs(glow - design @ values)
@@ -86,49 +89,57 @@ def falloff(ground: Grey, hidden: Mask, noise: float) -> Grey | None:
 
 
 _UPRIGHT_FROM = 1.8
-"""Length over thickness from which the direction of an arc can be told."""
+"""Minimum length over thickness from which the direction of an arc is determined."""
 _GROUND_LENGTHS = 1.0
-"""Side of the running median that is the ground, in the greatest lengths of an arc."""
+"""Side of the running median of the background, as a multiple of the maximum length of an arc."""
 _LONG_PX = 40.0
-"""Length up to which an arc is a pin's in a frame of any size."""
-_IN_ROWS = ("a character in a row of characters", "one of a scale's equally spaced marks")
+"""Minimum of the largest length of a pin's arc, in a frame of any size."""
+_IN_ROWS = (
+    Reason("a character in a row of characters", Code.DRAWN),
+    Reason("one of a scale's equally spaced marks", Code.DRAWN),
+)
 _STATIC = 0.7
-"""Share of a spot that must be the same in all frames to be no part of the image."""
+"""Share of a spot that must be the same in all frames for it to be a static graphic."""
 
 
 @dataclass(frozen=True)
 class PinOptions:
-    """How pins are found and measured.
+    """Options of the detection of pins.
 
     Parameters
     ----------
     psf_px : float
-        Width (one sigma) of the Gaussian that smooths the frame for finding echoes.
+        Width (one sigma) of the Gaussian that smooths the frame for detection.
     most_length_px : float, optional
-        Greatest length of a pin's arc; by default 6 % of the frame's diagonal, not below 40 px. What is
-        longer is an edge of the sector, the face of the transducer or an interface.
+        Largest length of a pin's arc; by default 6 % of the frame's diagonal, at least 40 px. Longer spots
+        are edges of the sector, the face of the transducer or interfaces.
     most_tilt_deg : float
-        Greatest tilt of an arc against the rows of the frame.
+        Largest tilt of an arc against the rows of the frame.
     least_strength : float
-        Least brightness over the ground, as a share of that of the brightest echo.
+        Minimum brightness over the background, as a share of that of the brightest echo.
     least_correlation : float
-        Least correlation of a spot with its formed arc, noise apart.
+        Minimum correlation of a spot with its formed arc, corrected for noise.
     most_touching : float
-        Share of its height above which a spot must not touch another.
+        A spot must not touch another above this share of its height.
     sharpest_px : float
-        Width (one sigma) of a line across below which it is drawn and no echo.
+        Minimum width (one sigma) of an echo across; sharper lines are drawn by the instrument.
     least_seen, most_rejected : float
-        Share of an arc that must lie in the frame, that may be left out as disturbed.
+        Minimum share of an arc in the frame; largest share that may be rejected as disturbed.
     most_wire_px : int
-        Greatest width of the dark cut of a wire across an echo, blur included; 0: there are no wires.
+        Largest width of the dark cut of a wire across an echo, including blur; 0 if there are no wires.
     most_sigma_px : float
-        Largest standard deviation of a coordinate that still counts as measured.
+        Largest standard deviation of a coordinate that is accepted.
     gate : float
-        How far a pin may lie from where the others have it, in the design's typical spacing.
+        Largest distance of a pin from its predicted position, relative to the typical spacing of the design.
     max_rotation_deg : float
-        Largest rotation of the design in the image; half a turn is tried as well.
+        Largest rotation of the design in the image; a rotation by 180° is tried, too.
     mirrored : bool, optional
-        Whether the image shows the design mirrored; None: to be found out.
+        Whether the image shows the design mirrored; None to determine it.
+
+    Examples
+    --------
+    >>> PinOptions(most_wire_px=0, mirrored=False).gate
+    0.15
     """
 
     psf_px: float = 1.2
@@ -149,30 +160,30 @@ class PinOptions:
 
 @dataclass(frozen=True, eq=False)
 class PinDetections:
-    """Spots of a frame and what speaks against them, in columns, the brightest first.
+    """Spots of a frame and reasons for rejection, in columns, the brightest first.
 
     Parameters
     ----------
     image, sha256 : str
         The frame.
     xy : ndarray (m, 2)
-        Middle of the line, pixels; for those never matched about where the spot lies.
+        Centre of the line, pixels; approximate for spots that were not matched.
     cov : ndarray (m, 2, 2)
         Covariances in px², NaN where not matched.
     ok : ndarray of bool (m,)
-        Which are images of point reflectors.
+        Which spots are images of point reflectors.
     why : tuple of str (m,)
-        What else the others are; empty where ok.
+        Reason for rejection; empty where ok.
     strength : ndarray (m,)
-        Brightness over the ground, as a share of the brightest echo.
+        Brightness over the background, as a share of the brightest echo.
     length, thickness, curvature, tilt : ndarray (m,)
-        Of the arc (px, px, 1/px, rad): four widths along and across, see :class:`reseau.optics.Arcs`; NaN
-        where not matched.
+        Parameters of the arc (px, px, 1/px, rad): four widths along and across, see
+        :class:`reseau.optics.Arcs`; NaN where not matched.
     contrast, t, noise, correlation : ndarray (m,)
-        Of the match: see :class:`reseau.measure.matching.Matches`; NaN where not matched.
+        Quality of the match, see :class:`reseau.measure.matching.Matches`; NaN where not matched.
     centroid : ndarray (m, 2)
-        Centre of gravity of the region above a fifth of the height, for comparison with programs that measure
-        that; the tail of a reverberation draws it down.
+        Centroid of the region above one fifth of the height, for comparison with programs that measure it;
+        the tail of a reverberation shifts it downwards.
     """
 
     image: str
@@ -196,8 +207,13 @@ class PinDetections:
         return len(self.ok)
 
     @property
+    def codes(self) -> tuple[Code | None, ...]:
+        """Codes (m,) of the reasons; None where a spot is a pin."""
+        return tuple(why.code if isinstance(why, Reason) else None for why in self.why)
+
+    @property
     def points(self) -> ImagePoints:
-        """The pins, numbered from the brightest."""
+        """The pins, numbered in order of brightness."""
         names = tuple(str(i + 1) for i in range(int(self.ok.sum())))
         return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
 
@@ -213,19 +229,20 @@ def find_pins(
     Parameters
     ----------
     frame : Frame
-        A frame with bright echoes on a dark ground.
+        A frame with bright echoes on a dark background.
     options : PinOptions, optional
-        How.
+        Options of the detection.
     others : sequence of Frame
-        Further frames of the sequence, in which the object has moved: what is the same in all is no echo.
+        Other frames of the sequence, in which the object has moved: spots that are the same in all frames are
+        no echoes.
     hidden : ndarray (h, w) of bool, optional
-        Pixels that wires of a reseau cover, where they are known; upright cuts through echoes are found.
-        The raster against which the wires stand out then tells how the light falls off.
+        Pixels covered by the wires of a reseau, if known; otherwise vertical cuts through echoes are found.
+        The raster between the wires then gives the falloff of light.
 
     Returns
     -------
     PinDetections
-        Pins, and the spots that were declined.
+        Pins, and rejected spots.
 
     Raises
     ------
@@ -249,7 +266,7 @@ def find_pins(
 
 
 class _Judge:
-    """The spots of a frame, and what speaks against each."""
+    """The spots of a frame, and the objections to each."""
 
     def __init__(
         self,
@@ -266,17 +283,17 @@ class _Judge:
         self.why = np.full(len(echoes), "", dtype=object)
 
     def verdict(self) -> PinDetections:
-        """Decline what needs no match, match the rest, decide."""
+        """Reject spots that need no match, match the others, decide."""
         e, o = self.echoes, self.options
         sharp = is_sharp(e)
         coarse = [
             (
                 e.length > self.longest,
-                "longer than a pin: an edge of the sector, a transducer's face or an interface",
+                Reason("longer than a pin: edge of the sector, transducer face or interface", Code.UNLIKE),
             ),
-            (sharp, "sharp all around: drawn by the instrument"),
-            (e.joined > o.most_touching, "touches another spot"),
-            (self._static(), "the same in all frames"),
+            (sharp, Reason("sharp all around: drawn by the instrument", Code.DRAWN)),
+            (e.joined > o.most_touching, Reason("touches another spot", Code.OVERLAPPING)),
+            (self._static(), Reason("the same in all frames", Code.DRAWN)),
         ]
         drawn = sharp | looks_sharp(e)
         coarse += zip(series(e, drawn), _IN_ROWS, strict=True)
@@ -284,9 +301,11 @@ class _Judge:
             self._object(np.arange(len(e)), mask, reason)
         open_ = self.why == ""
         brightest = float(e.height[open_].max(initial=0.0))
-        # What is far too faint is not worth a match; the final word needs the brightest pin, known only then.
+        # Very faint spots are not matched; the final test needs the brightest pin, known only afterwards.
         self._object(
-            np.arange(len(e)), e.height < 0.5 * o.least_strength * brightest, "too faint beside the others"
+            np.arange(len(e)),
+            e.height < 0.5 * o.least_strength * brightest,
+            Reason("too faint compared with the others", Code.LOW_CONTRAST),
         )
         at = np.flatnonzero(self.why == "")
         found = self._match(at)
@@ -296,11 +315,15 @@ class _Judge:
         for mask, reason in zip(series(e, drawn | self._looks_drawn(at, found)), _IN_ROWS, strict=True):
             self._object(every, mask, reason, also_sharp=sharp)
         brightest = float(e.height[self.why == ""].max(initial=0.0))
-        self._object(every, e.height < o.least_strength * brightest, "too faint beside the others")
+        self._object(
+            every,
+            e.height < o.least_strength * brightest,
+            Reason("too faint compared with the others", Code.LOW_CONTRAST),
+        )
         return self._columns(at, found, brightest)
 
-    def _object(self, at: Rows, mask: Mask, reason: str, also_sharp: Mask | None = None) -> None:
-        """Write down a reason where there is none yet; of what is drawn, the more telling one."""
+    def _object(self, at: Rows, mask: Mask, reason: Reason, also_sharp: Mask | None = None) -> None:
+        """Record a reason where there is none yet; for drawn spots keep the more specific one."""
         free = self.why[at] == ""
         if also_sharp is not None:
             free |= also_sharp[at]
@@ -316,12 +339,12 @@ class _Judge:
 
     def _match(self, at: Rows) -> ArcMatches:
         s = self.screened
-        # No echo is far brighter than what is seen of it; one that is hidden would be found to be.
+        # The hidden part of an echo is assumed to be about as bright as the visible part.
         options = MatchOptions(contrast_sigma=self.frame.full_scale)
         return match_arcs(s.grey, s.valid, self.echoes, at, options, max(s.noise, 0.3))
 
-    def _objections(self, at: Rows, found: ArcMatches) -> list[tuple[Mask, str]]:
-        """What speaks against a spot in its own image, the gravest first."""
+    def _objections(self, at: Rows, found: ArcMatches) -> list[tuple[Mask, Reason]]:
+        """Objections to spots from their own images, the most serious first."""
         o, e = self.options, self.echoes
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         upright = np.abs(e.tilt[at]) > np.deg2rad(o.most_tilt_deg)
@@ -332,20 +355,26 @@ class _Judge:
         near = (np.minimum(found.xy, border - found.xy) < 2 * found.form.along[:, None] + 2).any(axis=1)
         unseen = found.seen < o.least_seen
         return [
-            (outside | (unseen & near), "cut off by the edge of the frame"),
-            (unseen, "hidden in good part by a wire or a neighbour"),
-            (~found.converged, "the match does not converge"),
-            (found.form.across < o.sharpest_px, "sharper than an echo: drawn by the instrument"),
-            (self._likeness(found) < o.least_correlation, "not the image of an arc"),
-            (found.rejected > o.most_rejected, "disturbed by something that crosses it"),
-            (moved, "the match wanders off"),
-            (upright, "stands too steep for the arc of a pin"),
-            (4 * found.form.along > 1.6 * self.longest, "longer than a pin"),
-            (~(sigma <= o.most_sigma_px), "too uncertain"),
+            (outside | (unseen & near), Reason("cut off by the edge of the frame", Code.OUTSIDE)),
+            (unseen, Reason("largely hidden by a wire or a neighbour", Code.HIDDEN)),
+            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
+            (
+                found.form.across < o.sharpest_px,
+                Reason("sharper than an echo: drawn by the instrument", Code.DRAWN),
+            ),
+            (self._likeness(found) < o.least_correlation, Reason("not the image of an arc", Code.UNLIKE)),
+            (
+                found.rejected > o.most_rejected,
+                Reason("disturbed by an object that crosses it", Code.DISTURBED),
+            ),
+            (moved, Reason("the match moved away from the spot", Code.DEVIATES)),
+            (upright, Reason("too steep for the arc of a pin", Code.UNLIKE)),
+            (4 * found.form.along > 1.6 * self.longest, Reason("longer than a pin", Code.UNLIKE)),
+            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
     def _likeness(self, found: ArcMatches) -> Array:
-        """Correlations with the formed arcs (m,), what the noise takes from them given back."""
+        """Correlations with the formed arcs (m,), corrected for noise."""
         white = np.clip((self.screened.noise / np.maximum(found.noise, 1e-12)) ** 2, 0, 1)
         likeness: Array = np.sqrt(1 - (1 - np.clip(found.correlation, 0, 1) ** 2) * (1 - white))
         return likeness

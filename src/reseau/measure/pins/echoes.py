@@ -1,8 +1,8 @@
-"""Bright spots of a frame on a dark ground: where they are, how large, how bent, and what they touch.
+"""Bright spots on a dark background: position, size, curvature, and contact with other spots.
 
-A spot is a maximum of the smoothed frame that stands out: going down from it, a good part of its height is
-passed before it joins a higher one. Its region is what lies above a share of its height and above the level
-at which it touches the next spot. No template is needed, so that echoes of any length are found alike.
+A spot is a maximum of the smoothed frame with sufficient prominence: a large share of its height lies above
+the level at which it joins a higher one. Its region consists of the pixels above a share of its height and
+above the level of contact with the next spot. No template is needed, so echoes of all lengths are found.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ...core.data import Array, Rows
 __all__ = ["Echoes", "find_echoes", "ground_of"]
 
 _STEP = 0.85
-"""Ratio of a level to the one above it."""
+"""Ratio of successive levels."""
 _JOINED = 0.7
-"""A maximum that joins a higher one above this share of its height is a part of that one."""
+"""A maximum that joins a higher one above this share of its height is part of it."""
 _LEVEL = 0.35
-"""Share of its height above which a pixel belongs to a spot, where nothing touches it."""
+"""Share of its height above which pixels belong to an isolated spot."""
 _CLAIM_PX = 3.0
-"""How far around its region the light of a spot still counts as its own."""
+"""Distance from its region within which light is attributed to a spot."""
 _MOST = 3000
-"""Maxima that are looked at, the highest ones; graphics of a whole screen have a thousand."""
+"""Maximum number of maxima, the highest ones; graphics on a full screen have about a thousand."""
 
 Grey = NDArray[np.float32]
 
@@ -41,30 +41,30 @@ class Echoes:
     Parameters
     ----------
     xy : ndarray (m, 2)
-        Middle of the bent line through each.
+        Centre of the curved line through each spot.
     height : ndarray (m,)
-        Smoothed brightness over the ground.
+        Smoothed brightness over the background.
     length, thickness : ndarray (m,)
         Four standard deviations of the light along and across, pixels.
     curvature, tilt : ndarray (m,)
         As in :class:`reseau.optics.Arcs`.
     joined : ndarray (m,)
-        Level at which it touches another spot, as a share of its height.
+        Level of contact with another spot, as a share of the height.
     level : ndarray (m,)
-        Share of its height above which its region lies.
+        Lower limit of the region, as a share of the height.
     edge : ndarray (m, 2)
-        Squared steps of brightness from pixel to pixel over the squared brightness, summed over the region
-        and its border: in the direction where they are largest, and in the other.
+        Squared steps of brightness between pixels over the squared brightness, summed over the region and its
+        border: in the direction where they are largest, and in the other.
     box : ndarray of int (m, 4)
         First and last column, first and last row of the region.
     area : ndarray (m,)
-        Pixels of the region.
+        Number of pixels of the region.
     centroid : ndarray (m, 2)
-        Mean position of the pixels of a spot above a fifth of its height, unweighted.
+        Unweighted mean position of the pixels above one fifth of the height.
     owner : ndarray of int (h, w)
-        Row of the spot whose region a pixel belongs to, -1 where to none.
+        Index of the spot whose region contains a pixel, -1 for none.
     claimed : ndarray of int (h, w)
-        The same with the regions grown by a few pixels, for each pixel the nearest.
+        The same with regions extended by a few pixels, assigned to the nearest region.
     """
 
     xy: Array
@@ -87,7 +87,7 @@ class Echoes:
 
 
 def ground_of(grey: Grey, reach: int) -> Grey:
-    """Ground on which spots stand: the running median over squares that no spot fills by half.
+    """Background of spots: the running median over squares of which a spot covers less than half.
 
     Parameters
     ----------
@@ -108,16 +108,16 @@ def ground_of(grey: Grey, reach: int) -> Grey:
 
 
 def find_echoes(light: Grey, psf_px: float, least: float) -> Echoes:
-    """Find all spots and measure them coarsely.
+    """Find all spots and determine their approximate shape.
 
     Parameters
     ----------
     light : ndarray (h, w)
-        Brightness over the ground; what hides an echo has been bridged.
+        Brightness over the background, interpolated where an echo is hidden.
     psf_px : float
-        Width of the Gaussian that smooths.
+        Width of the smoothing Gaussian.
     least : float
-        Least height over the ground.
+        Minimum height over the background.
     """
     smooth: Grey = cv2.GaussianBlur(light, (0, 0), psf_px, borderType=cv2.BORDER_REFLECT)  # type: ignore[assignment]
     row, column = _maxima(smooth, least)
@@ -130,7 +130,7 @@ def find_echoes(light: Grey, psf_px: float, least: float) -> Echoes:
 
 
 def _maxima(smooth: Grey, least: float) -> tuple[Rows, Rows]:
-    """Rows and columns of the local maxima, the highest first."""
+    """Rows and columns of the local maxima, in descending order."""
     peak = (smooth >= cv2.dilate(smooth, np.ones((5, 5), np.uint8))) & (smooth >= least)
     row, column = np.nonzero(peak)
     order = np.argsort(-smooth[row, column], kind="stable")[:_MOST]
@@ -143,13 +143,13 @@ def _levels(highest: float, least: float) -> Array:
 
 
 def _sliced(smooth: Grey, highest: float, least: float) -> Iterator[tuple[float, NDArray[np.int32]]]:
-    """Levels from the top down, and the connected regions above each."""
+    """Levels in descending order, and the connected regions above each."""
     for level in _levels(highest, least):
         yield float(level), cv2.connectedComponents((smooth > level).astype(np.uint8), ltype=cv2.CV_32S)[1]
 
 
 def _joins(smooth: Grey, row: Rows, column: Rows, height: Array, least: float) -> Array:
-    """Level at which each maximum joins a higher one, as a share of its height; 0 for never."""
+    """Level at which each maximum joins a higher one, as a share of its height; 0 if it never does."""
     joins = np.zeros(len(row))
     if not len(row):
         return joins
@@ -165,7 +165,7 @@ def _joins(smooth: Grey, row: Rows, column: Rows, height: Array, least: float) -
 def _regions(
     smooth: Grey, row: Rows, column: Rows, height: Array, least: float
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Whose each pixel is; level of each region, and of its first touch, as shares of the heights."""
+    """Owner of each pixel; lower limit of each region, and level of first contact, as shares of heights."""
     count = len(row)
     owner = np.full(smooth.shape, -1, dtype=np.int32)
     level_of, joined = np.ones(count), np.zeros(count)
@@ -189,7 +189,7 @@ def _regions(
 def _measured(
     light: Grey, smooth: Grey, owner: NDArray[np.int32], height: Array, level: Array, joined: Array
 ) -> Echoes:
-    """Columns from the regions."""
+    """Columns of spots from their regions."""
     count = len(height)
     row, column = np.nonzero(owner >= 0)
     spot = owner[row, column]
@@ -227,7 +227,7 @@ def _measured(
 def _bent(
     spot: NDArray[np.int32], column: Rows, row: Rows, weight: Array, count: int
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Middle of a parabola through each region's light, variances along and across, curvature, tilt."""
+    """Centre of a parabola through each region's light, variances along and across, curvature, tilt."""
 
     def total(values: NDArray[Any]) -> Array:
         return np.asarray(np.bincount(spot, weight * values, minlength=count), dtype=np.float64)
@@ -240,7 +240,7 @@ def _bent(
     c, s = np.cos(tilt), np.sin(tilt)
     u, v = c[spot] * x + s[spot] * y, c[spot] * y - s[spot] * x
     along, across = total(u * u) / sums, total(v * v) / sums
-    # v = a + b u + κ u²/2, least squares; the first moments and that of u v are nought along these axes.
+    # v = a + b u + κ u²/2 by least squares; first moments and that of u v are 0 along these axes.
     skew, fourth, none = total(u**3) / sums, total(u**4) / sums, np.zeros(count)
     normal = np.stack([np.ones(count), none, along, none, along, skew, along, skew, fourth], axis=1)
     right = np.stack([none, none, total(u * u * v) / sums], axis=1)
@@ -251,7 +251,7 @@ def _bent(
 
 
 def _claimed(owner: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Regions grown by a few pixels, each point to the nearest."""
+    """Regions extended by a few pixels, each pixel assigned to the nearest."""
     if not (owner >= 0).any():
         return owner
     distance, (row, column) = distance_transform_edt(owner < 0, return_indices=True)
@@ -262,8 +262,8 @@ def _claimed(owner: NDArray[np.int32]) -> NDArray[np.int32]:
 def _edges(light: Grey, owner: NDArray[np.int32], count: int) -> Array:
     """Squared steps across and along each region and its border, over the squared light there, (m, 2).
 
-    The eigenvalues of the sum of squared differences of neighbours: a Gaussian of width σ has 1/(2σ²) along
-    an axis, a stroke of n pixels without any blur 2/n.
+    They are the eigenvalues of the sum of squared differences of neighbours: 1/(2σ²) along an axis for a
+    Gaussian of width σ, 2/n for a stroke of n pixels without blur.
     """
     around = cv2.dilate((owner + 1).astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32) - 1
     row, column = np.nonzero(around[:-1, :-1] >= 0)

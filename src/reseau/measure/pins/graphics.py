@@ -1,11 +1,11 @@
-"""What an instrument draws beside its image: characters, ticks, scale dots, markers.
+"""Graphics in front of an image: drawn characters, ticks, scale dots and markers, and wires across echoes.
 
-A drawn stroke is as sharp as the screen is, in every direction; an echo is blurred along its arc. Where a
-drawing has been softened by copying, its fellows betray it: characters stand in rows of one height, the dots
-and ticks of a scale are alike and equally spaced. A row is condemned when most of its members look drawn each
-by itself, so that rods in rows are not.
+A drawn stroke is as sharp as the screen in every direction; an echo is blurred along its arc. If copying has
+blurred a drawing, its neighbours still identify it: characters stand in rows of one height, dots and ticks of
+a scale are similar and equally spaced. A row is rejected if most of its members look drawn by themselves, so
+that rows of rods are kept.
 
-What stands before the image: wires that cross an echo, found by the sharp dark cut they leave in it.
+Wires that cross an echo are found by the sharp dark cut that they leave in it.
 """
 
 from __future__ import annotations
@@ -21,42 +21,42 @@ from .echoes import Echoes, Grey
 __all__ = ["bridged", "find_cuts", "is_sharp", "looks_sharp", "same_in_all", "series"]
 
 _SHARP = 0.16
-"""Squared steps over squared light even along the stroke: a Gaussian of 1.8 px."""
+"""Squared steps over squared light, in the direction where they are smaller: a Gaussian of 1.8 px."""
 _SUSPECT = 0.08
-"""The same of a spot that is drawn if its fellows are: a Gaussian of 2.5 px."""
+"""The same for a spot that counts as drawn if its neighbours do: a Gaussian of 2.5 px."""
 _ACROSS = 0.42
-"""The same across it: a Gaussian of 1.1 px; an echo that sharp is drawn when it is short, too."""
+"""The same in the other direction: a Gaussian of 1.1 px; a short echo that sharp is drawn, too."""
 _FEWEST = 4
-"""Members that make a row."""
+"""Minimum number of members of a row."""
 
 
 def is_sharp(echoes: Echoes) -> Mask:
-    """Spots with sharp borders all around, (m,)."""
+    """Mask (m,) of spots with sharp borders all around."""
     short = echoes.length < 8.0
     sharp: Mask = (echoes.edge[:, 1] > _SHARP) | (short & (echoes.edge[:, 0] > _ACROSS))
     return sharp
 
 
 def looks_sharp(echoes: Echoes) -> Mask:
-    """Spots about as sharp along as across, (m,): drawn, if they stand in a row of such."""
+    """Mask (m,) of spots about as sharp along as across: drawn, if they stand in a row of such spots."""
     suspect: Mask = echoes.edge[:, 1] > _SUSPECT
     return suspect
 
 
 def series(echoes: Echoes, suspect: Mask) -> tuple[Mask, Mask]:
-    """Spots that belong to rows of characters, and to rows of like marks at equal spacing.
+    """Spots in rows of characters, and in rows of similar, equally spaced marks.
 
     Parameters
     ----------
     echoes : Echoes
         The spots (m,).
     suspect : ndarray of bool (m,)
-        Which look drawn each by itself.
+        Which spots look drawn by themselves.
 
     Returns
     -------
     characters, scale : ndarray of bool (m,)
-        Spots of rows in which most are suspect.
+        Spots of rows in which most spots are suspect.
     """
     return _condemned(_lines_of_text(echoes), suspect), _condemned(_equally_spaced(echoes), suspect)
 
@@ -70,7 +70,7 @@ def _condemned(rows: list[Rows], suspect: Mask) -> Mask:
 
 
 def _lines_of_text(echoes: Echoes) -> list[Rows]:
-    """Runs of neighbours between one top and one bottom."""
+    """Runs of neighbours with common top and bottom."""
     left, right, top, bottom = echoes.box.T
     high, middle = bottom - top + 1, (top + bottom) / 2
     rows = []
@@ -82,7 +82,7 @@ def _lines_of_text(echoes: Echoes) -> list[Rows]:
                 if len(run) < _FEWEST:
                     continue
                 first, last = left[alike[run]].min(), right[alike[run]].max()
-                # Points, dashes and the parts of letters between them belong to the line.
+                # Dots, dashes and parts of letters in between belong to the line.
                 inside = (np.abs(middle - line - size / 2) < size) & (high <= 2 * size)
                 inside &= (right > first - 2 * size) & (left < last + 2 * size)
                 rows.append(np.flatnonzero(inside))
@@ -90,7 +90,7 @@ def _lines_of_text(echoes: Echoes) -> list[Rows]:
 
 
 def _runs(left: Rows, right: Rows, gap: float) -> list[Rows]:
-    """Intervals in groups whose members are at most a gap apart."""
+    """Groups of intervals with gaps of at most `gap` between members."""
     order = np.argsort(left, kind="stable")
     reached = np.maximum.accumulate(right[order])
     breaks = np.flatnonzero(left[order][1:] - reached[:-1] > gap) + 1
@@ -98,7 +98,7 @@ def _runs(left: Rows, right: Rows, gap: float) -> list[Rows]:
 
 
 def _equally_spaced(echoes: Echoes) -> list[Rows]:
-    """Rows of like spots at equal steps along a straight line."""
+    """Rows of similar spots at equal steps along a straight line."""
     rows = []
     size = np.stack([echoes.length, echoes.thickness], axis=1)
     for i in range(len(echoes)):
@@ -110,7 +110,7 @@ def _equally_spaced(echoes: Echoes) -> list[Rows]:
         if len(alike) < _FEWEST - 1:
             continue
         step = echoes.xy[alike] - echoes.xy[i]
-        # With each of its fellows as the next of the row: how many more are where the row has them?
+        # With each other spot as the next of the row: how many more lie at the expected positions?
         off = (
             np.abs(step[None] - 2 * step[:, None]).max(axis=2),
             np.abs(step[None] - 3 * step[:, None]).max(axis=2),
@@ -123,14 +123,14 @@ def _equally_spaced(echoes: Echoes) -> list[Rows]:
 
 
 def same_in_all(frame: Frame, others: tuple[Frame, ...]) -> Mask | None:
-    """Pixels that are bright and the same in all frames of a sequence; None where nothing moves at all.
+    """Pixels that are bright and the same in all frames of a sequence; None if nothing moves at all.
 
     Parameters
     ----------
     frame : Frame
-        One of them.
+        One of the frames.
     others : tuple of Frame
-        Further ones; those of another size are left out.
+        The other frames; those of another size are ignored.
     """
     stack: list[Array] = [other.pixels for other in others if other.pixels.shape == frame.pixels.shape]
     if not stack:
@@ -146,27 +146,27 @@ def same_in_all(frame: Frame, others: tuple[Frame, ...]) -> Mask | None:
 
 
 _DEPTH = 0.4
-"""Share of the light beside it that a wire takes at least."""
+"""Minimum share of the adjacent light that a wire removes."""
 _BESIDE_PX = 3
 """Width of the light on either side of a wire; strokes of characters are narrower."""
 _APART_PX = 20.0
-"""Distance within which there may be one gap more, the next wire's, but not two."""
+"""Distance within which at most one more gap is allowed, that of the next wire."""
 _AROUND_PX = 9
-"""How far beside a gap the light is asked whether it is an echo's."""
+"""Distance beside a gap within which the light is tested for being an echo."""
 _SOFT = 0.1
-"""Squared steps along the rows over squared light in an echo, at most: a Gaussian of 2.2 px."""
+"""Largest ratio of squared steps along the rows to squared light in an echo: a Gaussian of 2.2 px."""
 _FILL_PX = 2.0
-"""Width of the Gaussian by which light beside a wire is carried over it."""
+"""Width of the Gaussian that interpolates light across a wire."""
 _SLENDER = 1.0
-"""Height over width from which a dark gap is a wire's and not the space between two echoes."""
+"""Minimum height over width of the dark gap of a wire, as opposed to the space between two echoes."""
 
 
 def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
-    """Pixels of narrow dark cuts through bright spots: where upright wires cross echoes.
+    """Pixels of narrow dark cuts through bright spots, where vertical wires cross echoes.
 
-    The closing along the rows fills what is narrower than its element; a cut is what it fills by a good part
-    of the light on *both* sides, from one row to the next. Between the ends of two echoes light fades: a
-    closing has little to fill there.
+    A closing along the rows fills gaps narrower than its element. A cut is a gap that it fills by a large
+    share of the light on *both* sides, from one row to the next. Between the ends of two echoes the light
+    fades, so a closing fills little there.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
     noise : float
         Standard deviation of the grey values.
     most_px : int
-        Greatest width of a wire, blur included; 0: there are none.
+        Largest width of a wire, including blur; 0 if there are no wires.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
         return np.zeros(light.shape, dtype=bool)
     calm: Grey = cv2.GaussianBlur(light, (1, 5), 0.01, sigmaY=1.0)  # type: ignore[assignment]
     wide = cv2.morphologyEx(calm, cv2.MORPH_OPEN, np.ones((1, _BESIDE_PX), np.uint8))
-    # An even element would shift what it closes.
+    # An element of even size would shift the result.
     closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((1, most_px + 1 | 1), np.uint8))
     filled = (closed - calm > _DEPTH * closed) & (closed > 8 * noise)
     count, labels, stats, centres = cv2.connectedComponentsWithStats(filled.astype(np.uint8), connectivity=8)
@@ -195,17 +195,17 @@ def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
     if not upright.any():
         return np.zeros(light.shape, dtype=bool)
     upright &= _soft_around(light, labels.astype(np.int32), count)
-    # Wires stand far apart; between the strokes of characters there is one gap beside the other.
+    # Wires are far apart; between the strokes of characters gaps are close together.
     at = np.flatnonzero(stats[:, cv2.CC_STAT_HEIGHT] >= 3)[1:]
     crowd = KDTree(centres[at]).query_ball_point(centres[at], _APART_PX, p=np.inf, return_length=True)
     upright[at[crowd > 2]] = False
-    # The blur of the wire's edges reaches a pixel further.
+    # The blur of the wire's edges extends one pixel further.
     cut = cv2.dilate(upright[labels].astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.asarray(cut > 0)
 
 
 def _soft_around(light: Grey, labels: NDArray[np.int32], count: int) -> Mask:
-    """Which gaps lie in light that changes slowly along the rows, as in an echo and in no character."""
+    """Gaps in light that changes slowly along the rows, as in an echo but not in characters."""
     near = cv2.dilate((labels > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     apart: Grey = np.where(near, np.float32(0), light)
     both = ~near[:, 1:] & ~near[:, :-1]
@@ -221,19 +221,19 @@ def _soft_around(light: Grey, labels: NDArray[np.int32], count: int) -> Mask:
 
 
 def bridged(light: Grey, hidden: Mask) -> Grey:
-    """The light with hidden pixels filled from those beside them, for finding echoes, not for measuring.
+    """Light with hidden pixels interpolated from their neighbours; for detection, not for measurement.
 
     Parameters
     ----------
     light : ndarray (h, w)
         Brightness over the ground.
     hidden : ndarray (h, w) of bool
-        Pixels that show something else.
+        Hidden pixels.
     """
     if not hidden.any():
         return light
     seen = np.where(hidden, np.float32(0), np.float32(1))
-    # Along the rows alone: a wire that crosses an arc does not make it thicker.
+    # Along the rows only: a wire that crosses an arc does not make it thicker.
     weight, carried = (
         cv2.GaussianBlur(image, (0, 0), _FILL_PX, sigmaY=0.3) for image in (seen, seen * light)
     )

@@ -1,4 +1,4 @@
-"""The rods of a design, measured in one frame: the echoes found, told apart by the pattern, judged by it."""
+"""Measure the rods of a design in one frame: find echoes, identify them by the pattern, test them by it."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
-from ..points import Measured
+from ..points import Measured, Reason
 from .detection import PinDetections, PinOptions, find_pins
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
 __all__ = ["PinResult", "measure_pins"]
 
 _AMBIGUOUS = Remark(
-    "the design is symmetric and fits in more than one way: taken upright, y up, as far as that goes",
+    "the design is symmetric and fits in more than one way; the upright one with y up was chosen",
     Code.AMBIGUOUS,
 )
 _BESIDE_PX = 3.0
-"""How far from the middle line of an echo, at least, another rod's place counts as covered by it."""
+"""Minimum distance from the centre line of an echo within which another rod counts as covered by it."""
 _ROUNDS = 3
-"""Times that the field is fitted and the pattern laid again by it; the second settles it as a rule."""
+"""Rounds of fitting the field and assigning echoes with it; usually two suffice."""
 _COLUMNS = (
     "contrast",
     "t",
@@ -41,9 +41,9 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PinResult(Measured):
-    """The rods of a design in one frame: y on the line, x in its middle.
+    """Rods of a design in one frame: y is measured on the line, x at its centre.
 
-    `deviation` is from what all *other* rods predict (leave-one-out).
+    `deviation` is from the prediction by all other rods (leave-one-out).
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class PinResult(Measured):
     detections : PinDetections
         All spots of the frame.
     notes : tuple of Remark
-        What the user should know.
+        Notes for the user.
     """
 
     correlation: Array
@@ -77,34 +77,34 @@ def measure_pins(
     Parameters
     ----------
     frame : Frame
-        A frame that shows the echoes of the rods, bright on a dark ground.
+        A frame that shows the echoes of the rods, bright on a dark background.
     design : ReseauDesign
         The rods, with or without nominal positions in the image.
     options : PinOptions, optional
-        How.
+        Options of the measurement.
     others : sequence of Frame
-        Further frames of the sequence, see :func:`reseau.measure.find_pins`.
+        Other frames of the sequence, see :func:`reseau.measure.find_pins`.
     hidden : ndarray (h, w) of bool, optional
-        Pixels that wires of a reseau cover, where they are known.
+        Pixels covered by the wires of a reseau, if known.
 
     Returns
     -------
     PinResult or Failure
-        A failure (falsy) when the rods' pattern is not to be found among the echoes.
+        A failure (falsy) if the pattern of the rods is not found among the echoes.
 
     Raises
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
     UsageError
-        When the design is not one of rods, or tells the places of fewer than four.
+        When the marks of the design are not rods, or fewer than four have coordinates.
     """
     o = options or PinOptions()
     if design.mark.shape != "rod":
         raise UsageError(
             f"has marks of the shape {design.mark.shape!r}",
             where=f"design {design.name}",
-            do="give one of rods",
+            do="use a design of rods",
         )
     source = design.xy
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
@@ -115,7 +115,7 @@ def measure_pins(
     layout = _laid(design, known, seen.xy[echoes], o)
     if isinstance(layout, Failure):
         return Failure(
-            f"the rods of design {design.name!r} are not to be found: {layout.reason}",
+            f"the rods of design {design.name!r} were not found: {layout.reason}",
             layout.code,
             where=frame.name,
         )
@@ -125,7 +125,7 @@ def measure_pins(
 
 
 def _laid(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
-    """The pattern over the echoes, by nominal positions where the design has them."""
+    """The pattern fitted to the echoes, from nominal positions if the design has them."""
     ids = tuple(design.ids[i] for i in known)
     wires = Wires.of_points(ids, design.xy[known])
     nominal = design.nominal_px[known]
@@ -135,7 +135,7 @@ def _laid(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layo
 
 
 class _Rods:
-    """Rods and echoes of one frame, and the field between them."""
+    """Rods and echoes of one frame, and the field that maps rods to echoes."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ class _Rods:
         self._separate()
 
     def _settle(self) -> None:
-        """Fit a field through rods and echoes, assign by it, take out what the others do not bear out."""
+        """Fit a field through rods and echoes, assign echoes with it, and reject deviating ones."""
         for _ in range(_ROUNDS):
             field = self._field()
             if field is None:
@@ -178,12 +178,14 @@ class _Rods:
             worst = int(off.argmax())
             if off[worst] <= self.gate_px:
                 break
-            self.why[has[worst]] = f"{off[worst]:.1f} px off the prediction of its neighbours"
+            self.why[has[worst]] = Reason(
+                f"{off[worst]:.1f} px from the position predicted by its neighbours", Code.DEVIATES
+            )
             self.row[has[worst]] = -1
         self.deviation[self.row < 0] = np.nan
 
     def _separate(self) -> None:
-        """Decline an echo that another rod, which has none, should have a share in."""
+        """Reject an echo that also covers the predicted place of a rod without an echo."""
         has, without = np.flatnonzero(self.row >= 0), np.flatnonzero(self.row < 0)
         if not len(has) or not len(without):
             return
@@ -195,13 +197,13 @@ class _Rods:
         shared = (along < 0.5 * seen.length[at]) & (across < np.maximum(seen.thickness[at], _BESIDE_PX))
         for i, k in zip(*np.nonzero(shared), strict=True):
             one, other = has[k], without[i]
-            self.why[one] = f"its echo touches that of {self.ids[other]}"
-            self.why[other] = f"its echo touches that of {self.ids[one]}"
+            self.why[one] = Reason(f"its echo touches that of {self.ids[other]}", Code.OVERLAPPING)
+            self.why[other] = Reason(f"its echo touches that of {self.ids[one]}", Code.OVERLAPPING)
             self.row[one] = -1
             self.deviation[one] = np.nan
 
     def _field(self) -> SmoothField | None:
-        """From the design to the image; None where too few rods were found to test one."""
+        """Field from the design to the image; None if too few rods were found to test one."""
         has = np.flatnonzero(self.row >= 0)
         if len(has) < 5:
             return None
@@ -211,10 +213,10 @@ class _Rods:
         )
 
     def result(self, ids: tuple[str, ...], known: Rows) -> PinResult:
-        """Spread over all rods of the design, those without coordinates among them."""
+        """Spread results over all rods of the design, including those without coordinates."""
         n, found = len(ids), self.row >= 0
         at = self.echoes[self.row[found]]
-        why = np.full(n, "the design does not say where", dtype=object)
+        why = Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n)
         why[known] = [self._reason(i) for i in range(len(known))]
 
         def spread(values: Array) -> Array:
@@ -244,13 +246,13 @@ class _Rods:
     def _reason(self, rod: int) -> str:
         """Why a rod was not measured; empty where it was."""
         if self.row[rod] >= 0 or self.why[rod]:
-            return str(self.why[rod])
+            return self.why[rod]
         x, y = self.predicted[rod]
         if not (0 <= x <= self.frame.width - 1 and 0 <= y <= self.frame.height - 1):
-            return "outside the frame"
+            return Reason("outside the frame", Code.OUTSIDE)
         distance = np.hypot(*(self.seen.xy - self.predicted[rod]).T)
         distance[self.seen.ok] = np.inf
         nearest = int(distance.argmin()) if len(distance) else -1
         if nearest >= 0 and distance[nearest] < self.gate_px:
             return self.seen.why[nearest]
-        return "no echo where the others have it"
+        return Reason("no echo at the predicted position", Code.NOT_FOUND)

@@ -1,9 +1,10 @@
-"""Which echo is which wire: a pattern of points and segments laid over detections, mirrored or turned.
+"""Assignment of echoes to wires: fit a pattern of points and segments to detections.
 
-A rod parallel to the scanner's normal is cut by every image plane at the same place of the pattern; one that
-runs askew (the diagonal of an N) is cut somewhere on a segment. The points decide how the pattern lies: two
-of them and two detections make a similarity, and the one most others agree with is refined to an affinity,
-which takes up different scales in depth and across. The segments are read off then.
+A rod parallel to the normal of the scanner is cut by every image plane at the same point of the pattern; an
+oblique rod (the diagonal of an N) is cut somewhere on a segment. The points determine the position of the
+pattern: two points and two detections give a similarity; the one with most support is refined to an affinity,
+which allows for different scales in depth and across. Segments are assigned last. The pattern may appear
+mirrored or upside down.
 """
 
 from __future__ import annotations
@@ -20,29 +21,36 @@ from ...core.failure import Code, Failure
 __all__ = ["Layout", "LayoutOptions", "Wires", "lay_wires", "nearest_pairs"]
 
 _BASES = 30
-"""Pairs of wires far apart that are tried as a base."""
+"""Number of distant pairs of wires that are tried as a base."""
 _FOLLOWED = 40
-"""Best similarities that are refined."""
+"""Number of best similarities that are refined."""
 _LEAST = 4
-"""Fewest points that an affinity is tested by: three make one."""
+"""Minimum number of points that test an affinity; three define one."""
 _ANISOTROPY = 1.4
-"""Greatest ratio of the scales in two directions."""
+"""Largest ratio of the scales in two directions."""
 _ALIKE = 0.1
-"""Wires found, less half the scatter over the gate, by which two ways to lay a pattern must differ."""
+"""Minimum difference in score (wires found, minus half the relative rms) between two positions."""
 _BEYOND = 0.15
-"""Share of a segment's length by which a wire may be seen beyond its ends."""
+"""A wire may be seen beyond the ends of its segment by this share of its length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wires:
-    """Where wires cut the plane of the pattern, in columns.
+    """Intersections of wires with the plane of the pattern, in columns.
 
     Parameters
     ----------
     ids : tuple of str (n,)
-        Names.
+        Names of the wires.
     start, end : ndarray (n, 2)
-        Ends of the segment on which each is cut; the same point for a wire normal to the plane.
+        Ends of the segment on which each wire may be cut; identical for a wire normal to the plane.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> grid = np.stack(np.meshgrid([0.0, 10, 20], [0.0, 10]), axis=-1).reshape(-1, 2)
+    >>> Wires.of_points(tuple("abcdef"), grid).spacing
+    10.0
     """
 
     ids: tuple[str, ...]
@@ -51,12 +59,12 @@ class Wires:
 
     @classmethod
     def of_points(cls, ids: tuple[str, ...], xy: Array) -> Wires:
-        """Wires that are all normal to the plane."""
+        """Wires that are all normal to the plane, from their names and positions (n, 2)."""
         return cls(ids, xy, xy)
 
     @property
     def fixed(self) -> Mask:
-        """Which are points."""
+        """Mask (n,) of the wires normal to the plane."""
         return np.asarray((self.start == self.end).all(axis=1))
 
     @property
@@ -68,16 +76,21 @@ class Wires:
 
 @dataclass(frozen=True)
 class LayoutOptions:
-    """What is known of a pattern in the image.
+    """What is known about a pattern in the image.
 
     Parameters
     ----------
     gate : float
-        How far a wire may lie from where the others have it, in the pattern's spacing.
+        Largest distance of a wire from its predicted position, relative to the spacing of the pattern.
     max_rotation : float
-        Largest rotation (rad) against the image, or against the image turned by half a turn.
+        Largest rotation (rad) against the image, upright or upside down.
     mirrored : bool, optional
-        Whether the image has the other handedness; None: to be found out.
+        Whether the image has the opposite handedness; None to determine it.
+
+    Examples
+    --------
+    >>> LayoutOptions(mirrored=False).gate
+    0.15
     """
 
     gate: float = 0.15
@@ -87,22 +100,29 @@ class LayoutOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A pattern laid over detections.
+    """Position of a pattern in the image, and the assigned detections.
 
     Parameters
     ----------
     row : ndarray of int (n,)
-        Detection of each wire, -1 where there is none.
+        Index of the detection of each wire, -1 where there is none.
     matrix : ndarray (2, 2)
-        From the pattern to the image, linear part.
+        Linear part of the affinity from the pattern to the image.
     shift : ndarray (2,)
-        … and the image of the pattern's origin.
+        Image of the pattern's origin.
     gate_px : float
-        How far a point may lie from its prediction.
+        Largest accepted distance of a point from its prediction.
     rms_px : float
         Root mean square of the points' distances from the affinity.
     ambiguous : bool
-        Whether the pattern can be laid in another way as well: it is symmetric.
+        Whether the pattern fits in another way as well, because it is symmetric.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> layout = Layout(np.arange(4), 2 * np.eye(2), np.array([5.0, 5.0]), gate_px=3.0, rms_px=0.1)
+    >>> layout(np.array([[1.0, 2.0]]))
+    array([[7., 9.]])
     """
 
     row: Rows
@@ -117,7 +137,7 @@ class Layout:
         return xy @ self.matrix.T + self.shift
 
     def inverse(self, xy: Array) -> Array:
-        """Points of the pattern (n, 2) seen at `xy`."""
+        """Points of the pattern (n, 2) with the images `xy`."""
         return np.asarray(np.linalg.solve(self.matrix, (xy - self.shift).T).T)
 
 
@@ -129,18 +149,27 @@ def lay_wires(
     Parameters
     ----------
     wires : Wires
-        The pattern, four points or more among it.
+        The pattern, with at least four points.
     seen : ndarray (m, 2)
-        Detections in pixels, false ones among them.
+        Detections in pixels, which may include false ones.
     options : LayoutOptions, optional
-        What is known.
+        What is known about the pattern in the image.
     start : ndarray (n, 2), optional
-        Approximate positions of all wires in pixels, to half their spacing; nothing else is tried then.
+        Approximate positions of all wires in pixels, to half their spacing; no other positions are tried.
 
     Returns
     -------
     Layout or Failure
-        A failure when fewer than four points lie as the pattern has them.
+        A failure if fewer than four points agree with the pattern.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> points = np.array([[0.0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [0, 25]])
+    >>> wires = Wires.of_points(tuple("abcdef"), points)
+    >>> seen = points[::-1] * [4.0, -4.0] + [50, 120]
+    >>> lay_wires(wires, seen).row
+    array([5, 4, 3, 2, 1, 0])
     """
     o = options or LayoutOptions()
     points = wires.start[wires.fixed]
@@ -150,14 +179,12 @@ def lay_wires(
         )
     if len(seen) < _LEAST:
         return Failure(
-            f"{len(seen)} echoes of {len(wires.ids)} wires; {_LEAST} are needed to tell which is which",
+            f"{len(seen)} echoes of {len(wires.ids)} wires; {_LEAST} are needed to identify them",
             Code.TOO_FEW_POINTS,
         )
     if start is not None:
         near = _refined(wires, seen, *_affinity(points, start[wires.fixed]), o)
-        return near or Failure(
-            "the nominal positions have fewer than four echoes about them", Code.TOO_FEW_POINTS
-        )
+        return near or Failure("fewer than four echoes lie near the nominal positions", Code.TOO_FEW_POINTS)
     tried: list[tuple[float, bool, Layout]] = []
     for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
         linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
@@ -166,11 +193,11 @@ def lay_wires(
             continue
         found = int((layout.row >= 0).sum())
         score = found - 0.5 * layout.rms_px / layout.gate_px
-        # Upright with y up is what is meant where the pattern does not tell: first so, then in any other way.
+        # If the pattern is ambiguous, the upright one with y up is preferred.
         tried.append((score, not mirror or factor.real < 0, layout))
     if not tried:
         return Failure(
-            f"none of the ways to lay the {len(wires.ids)} wires over {len(seen)} echoes fits", Code.NOT_FOUND
+            f"no position of the {len(wires.ids)} wires fits the {len(seen)} echoes", Code.NOT_FOUND
         )
     highest = max(score for score, _, _ in tried)
     alike = sorted((one for one in tried if one[0] > highest - _ALIKE), key=lambda one: (one[1], -one[0]))
@@ -183,7 +210,7 @@ def lay_wires(
 def _hypotheses(
     points: Array, seen: Array, spacing: float, o: LayoutOptions
 ) -> list[tuple[complex, Array, bool]]:
-    """Similarities with which most points find a detection, as complex factor, shift and handedness."""
+    """Similarities supported by most points, as complex factor, shift and handedness."""
     first, second = np.triu_indices(len(points), 1)
     far = np.argsort(-np.hypot(*(points[first] - points[second]).T), kind="stable")[:_BASES]
     first, second = first[far], second[far]
@@ -193,7 +220,7 @@ def _hypotheses(
     for mirror in (True, False) if o.mirrored is None else (o.mirrored,):
         p = points[:, 0] + (-1j if mirror else 1j) * points[:, 1]
         factor = (z[j] - z[i])[:, None] / (p[second] - p[first])
-        turn = np.abs(np.angle(factor**2)) / 2  # against either way up
+        turn = np.abs(np.angle(factor**2)) / 2  # against upright or upside down
         pair, base = np.nonzero(turn <= o.max_rotation)
         a = factor[pair, base]
         b = z[i[pair]] - a * p[first[base]]
@@ -208,7 +235,7 @@ def _hypotheses(
 
 
 def _refined(wires: Wires, seen: Array, matrix: Array, shift: Array, o: LayoutOptions) -> Layout | None:
-    """The affinity through points and their detections, the gate narrowing; then the segments."""
+    """Affinity through points and their detections, with decreasing search radius; then the segments."""
     points, fixed = wires.start[wires.fixed], np.flatnonzero(wires.fixed)
     for factor in (2.0, 1.5, 1.0, 1.0):
         scale = np.sqrt(abs(np.linalg.det(matrix)))
@@ -233,26 +260,26 @@ def _refined(wires: Wires, seen: Array, matrix: Array, shift: Array, o: LayoutOp
 
 
 def _affinity(points: Array, seen: Array) -> tuple[Array, Array]:
-    """Linear part and shift of the affinity that fits best."""
+    """Linear part and shift of the best affinity."""
     design = np.column_stack([points, np.ones(len(points))])
     solved = np.asarray(np.linalg.lstsq(design, seen, rcond=None)[0], dtype=np.float64)
     return solved[:2].T, solved[2]
 
 
 def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Rows]:
-    """Pair points and detections one to one within a gate; the sum of squared distances is least.
+    """Pair points and detections one to one within a distance, with the least sum of squared distances.
 
     Parameters
     ----------
     predicted, seen : ndarray (n, 2), (m, 2)
-        Where they should be, where they are.
+        Predicted and detected positions.
     gate : float
-        Greatest distance.
+        Largest distance.
 
     Returns
     -------
     mine, theirs : ndarray of int (k,)
-        Rows of the one and of the other.
+        Indices of the paired points and detections.
     """
     distance = np.hypot(*np.moveaxis(predicted[:, None] - seen[None], -1, 0))
     cost = np.minimum(distance / gate, 1.0) ** 2
@@ -262,7 +289,7 @@ def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Row
 
 
 def _read_segments(wires: Wires, seen: Array, layout: Layout) -> None:
-    """Give the segments the detections that lie on them and serve no point."""
+    """Assign to the segments detections that lie on them and belong to no point."""
     askew = np.flatnonzero(~wires.fixed)
     free = np.setdiff1d(np.arange(len(seen)), layout.row)
     if not len(askew) or not len(free):

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Code
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
+from ..points import Reason
 from .placement import Placement
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
@@ -218,7 +220,7 @@ class MarkMeasurement:
         why = np.full(n, "", dtype=object)
         outside = np.ones(n, dtype=bool)
         outside[at] = False
-        why[outside] = "outside the frame"
+        why[outside] = Reason("outside the frame", Code.OUTSIDE)
         for mask, reason in self._objections(at, found):
             why[at[mask & (why[at] == "")]] = reason
         xy, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
@@ -226,7 +228,7 @@ class MarkMeasurement:
         deviation = self._judge_by_neighbours(at, found, xy, cov, why)
         return Verdict(xy, cov, why, deviation, self.field(self.source))
 
-    def _objections(self, at: Rows, found: Matches) -> list[tuple[Mask, str]]:
+    def _objections(self, at: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
@@ -239,15 +241,15 @@ class MarkMeasurement:
         )
         moved = np.hypot(*(found.xy - self.predicted[at]).T) > max(2.5, 0.6 * self.extent_px)
         return [
-            (found.seen <= _SEEN, "on lost lines or beyond the edge of the frame"),
-            (~found.converged, "the match does not converge"),
-            (~(found.t >= o.least_t), "no mark stands out from its surroundings"),
-            (found.psf_px > _BLURRED * ordinary, "blurred unlike the other marks"),
-            (unlike, "of another contrast than the other marks"),
-            (strong & (found.correlation < 0.5), "the image is not that of a mark"),
-            (found.rejected > 0.4, "disturbed by bit errors or the scene"),
-            (moved, "no mark where its neighbours have it"),
-            (~(sigma <= o.most_sigma_px), "too uncertain"),
+            (found.seen <= _SEEN, Reason("on lost lines or beyond the edge of the frame", Code.HIDDEN)),
+            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
+            (~(found.t >= o.least_t), Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST)),
+            (found.psf_px > _BLURRED * ordinary, Reason("less sharp than the other marks", Code.BLURRED)),
+            (unlike, Reason("contrast differs from the other marks", Code.UNLIKE)),
+            (strong & (found.correlation < 0.5), Reason("the image is not that of a mark", Code.UNLIKE)),
+            (found.rejected > 0.4, Reason("disturbed by bit errors or the scene", Code.DISTURBED)),
+            (moved, Reason("no mark at the position predicted by its neighbours", Code.DEVIATES)),
+            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
     def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
@@ -267,7 +269,9 @@ class MarkMeasurement:
             if excess[worst] <= 1:
                 break
             off = np.hypot(*deviation[good[worst]])
-            why[good[worst]] = f"{off:.1f} px from the position predicted by its neighbours"
+            why[good[worst]] = Reason(
+                f"{off:.1f} px from the position predicted by its neighbours", Code.DEVIATES
+            )
         deviation[why != ""] = np.nan
         return deviation
 

@@ -23,7 +23,7 @@ from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..matching import Matches
-from ..points import Measured
+from ..points import Measured, Reason
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .placement import GridOptions, PlacingOptions, place, spacing
 from .sheet import measure_sheet
@@ -204,7 +204,10 @@ def _columns(
         full[rows] = values
         return full
 
-    ok, reasons = np.zeros(n, dtype=bool), np.full(n, "the design does not say where", dtype=object)
+    ok, reasons = (
+        np.zeros(n, dtype=bool),
+        Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n),
+    )
     ok[known], reasons[known] = good, judged.why
     inside = known[at]
     return ReseauResult(

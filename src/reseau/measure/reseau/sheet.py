@@ -29,6 +29,7 @@ from ...optics import Chain, RationalPolynomial
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse
 from ..matching import Matches, MatchOptions, grey_variance, match
+from ..points import Reason
 from ..screening import Screened, screen
 from ..testfield.lattice import refit, second_order
 from ..testfield.targets import merged
@@ -570,22 +571,28 @@ class _Sheet:
         parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
         return merged(parts, [found.select(keep), curved.select(better)])
 
-    def _objections(self, found: Matches) -> list[tuple[Mask, str]]:
+    def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to disks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
         ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
         return [
-            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame"),
-            (~found.converged, "the match does not converge"),
-            (~(found.t >= o.least_t) | (found.contrast <= 0), "no disk stands out from its surroundings"),
-            (found.psf_px > _BLURRED * ordinary, "blurred unlike the other disks"),
-            (np.abs(found.form[:, 0]) > _GROWN, "of another size than the other disks"),
-            (np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT, "its outline is not that of a disk"),
-            (found.correlation < 0.8, "the image is not that of a disk"),
-            (found.rejected > 0.25, "partly hidden or disturbed"),
-            (~(sigma <= o.most_sigma_px), "too uncertain"),
+            (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
+            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
+            (
+                ~(found.t >= o.least_t) | (found.contrast <= 0),
+                Reason("no disk is distinct from its surroundings", Code.LOW_CONTRAST),
+            ),
+            (found.psf_px > _BLURRED * ordinary, Reason("less sharp than the other disks", Code.BLURRED)),
+            (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the other disks", Code.UNLIKE)),
+            (
+                np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT,
+                Reason("the outline is not that of a disk", Code.UNLIKE),
+            ),
+            (found.correlation < 0.8, Reason("the image is not that of a disk", Code.UNLIKE)),
+            (found.rejected > 0.25, Reason("partly hidden or disturbed", Code.DISTURBED)),
+            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
     def _judged(self, rows: Rows, found: Matches) -> tuple[Array, SmoothField | None]:
@@ -608,13 +615,18 @@ class _Sheet:
             if excess[worst] <= 1:
                 break
             distance = np.hypot(*deviation[worst])
-            why[good[worst]] = f"{distance:.1f} px from the position predicted by its neighbours"
+            why[good[worst]] = Reason(
+                f"{distance:.1f} px from the position predicted by its neighbours", Code.DEVIATES
+            )
         return why, field
 
     def _spread(self, rows: Rows, found: Matches, why: Array, field: SmoothField | None) -> dict[str, Any]:
         """Columns over all disks of the design."""
         n, good = len(self.at), why == ""
-        ok, reasons = np.zeros(n, dtype=bool), np.full(n, "outside the frame", dtype=object)
+        ok, reasons = (
+            np.zeros(n, dtype=bool),
+            Reason("outside the frame", Code.OUTSIDE).repeated(n),
+        )
         ok[rows], reasons[rows] = good, why
         predicted, deviation = self.mapping(self.at), np.full((n, 2), np.nan)
         if field is not None:

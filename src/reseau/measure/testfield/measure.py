@@ -17,7 +17,7 @@ from ...core.failure import Code, Failure
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches
-from ..points import Measured
+from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
 from .lattice import LatticeFit, refit, slope_of
 from .recognition import Reading, Sight
@@ -235,7 +235,10 @@ class _Measurement:
             if (why == "").sum() < 1.05 * good.sum():
                 break
         n = len(self.at)
-        ok, reasons = np.zeros(n, dtype=bool), np.full(n, "beyond the edge of the frame", dtype=object)
+        ok, reasons = (
+            np.zeros(n, dtype=bool),
+            Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(n),
+        )
         ok[wanted], reasons[wanted] = why == "", why
 
         def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
@@ -324,27 +327,43 @@ class _Measurement:
         sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
         limit = np.maximum(self.options.neighbour_px, _FAR * np.hypot(ordinary, np.nan_to_num(sigma)))
         for k in np.flatnonzero(good & (off > limit)):
-            why[k] = f"{off[k]:.2f} px from the position predicted by all targets together"
+            why[k] = Reason(
+                f"{off[k]:.2f} px from the position predicted by all targets together", Code.DEVIATES
+            )
         return why, predicted
 
-    def _objections(self, found: Matches) -> list[tuple[Mask, str]]:
+    def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to targets from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         sure = found.converged & (found.t > o.least_t)
         if not sure.any():
-            return [(np.ones(len(found), dtype=bool), "no target stands out from its surroundings")]
+            return [
+                (
+                    np.ones(len(found), dtype=bool),
+                    Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
+                )
+            ]
         width, contrast, noise = (
             float(np.median(values[sure])) for values in (found.psf_px, found.contrast, found.noise)
         )
         return [
-            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame"),
-            (~found.converged, "the match does not converge"),
-            (~(found.t >= o.least_t), "no target stands out from its surroundings"),
-            (found.rejected > 0.1, "partly hidden"),
-            (found.noise > _UNLIKE * noise, "the image is not that of the target"),
-            (np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED), "of another sharpness than the others"),
-            (np.abs(found.contrast / contrast - 1) > _PALE, "of another contrast than the others"),
-            (np.abs(found.form[:, 0]) > _GROWN, "of another size than the design has"),
-            (~(sigma <= o.most_sigma_px), "too uncertain"),
+            (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
+            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
+            (
+                ~(found.t >= o.least_t),
+                Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
+            ),
+            (found.rejected > 0.1, Reason("partly hidden", Code.HIDDEN)),
+            (found.noise > _UNLIKE * noise, Reason("the image is not that of the target", Code.UNLIKE)),
+            (
+                np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED),
+                Reason("sharpness differs from the other targets", Code.BLURRED),
+            ),
+            (
+                np.abs(found.contrast / contrast - 1) > _PALE,
+                Reason("contrast differs from the other targets", Code.UNLIKE),
+            ),
+            (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the design", Code.UNLIKE)),
+            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
