@@ -331,7 +331,7 @@ def test_a_pattern_that_is_not_there_is_a_failure_with_the_reason():
     truth = np.random.default_rng(4).uniform([40, 40], [600, 440], (5, 2))
     result = measure_pins(frame(picture(truth, arcs(5), (480, 640))), rods())
     assert not result
-    assert result.code is Code.TOO_FEW_POINTS, result.reason
+    assert result.code is Code.NOT_FOUND, result.reason
     blank = measure_pins(frame(GROUND + NOISE * np.random.default_rng(0).standard_normal((200, 300))), rods())
     assert not blank
     assert "0 echoes" in blank.reason

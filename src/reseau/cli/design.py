@@ -1,4 +1,4 @@
-"""`reseau design`: a target to print in true size, and its coordinates."""
+"""`reseau design`: draw a target for printing in true size, and write its coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 app = typer.Typer(
-    help="Draw a target to print in true size, and write its coordinates.", no_args_is_help=True
+    help="Draw a target for printing in true size, and write its coordinates.", no_args_is_help=True
 )
 
 
@@ -30,7 +30,7 @@ class Shape(StrEnum):
 
 
 class Polarity(StrEnum):
-    """Whether marks are darker or brighter than what is around them."""
+    """Whether marks are darker or brighter than the background."""
 
     DARK = "dark"
     BRIGHT = "bright"
@@ -46,7 +46,7 @@ Design = Annotated[
 
 @app.callback()
 def _targets() -> None:
-    """Draw a target to print in true size, and write its coordinates."""
+    """Draw a target for printing in true size, and write its coordinates."""
 
 
 @app.command()
@@ -55,7 +55,7 @@ def reseau(
     rows: Annotated[int, typer.Option(help="Marks in a column.")] = 11,
     pitch: Annotated[float, typer.Option(help="Distance of neighbouring marks, mm.")] = 10.0,
     shape: Annotated[Shape, typer.Option(help="Shape of a mark.")] = Shape.LINES,
-    size: Annotated[float | None, typer.Option(help="Size of a mark, mm; none for lines.")] = None,
+    size: Annotated[float | None, typer.Option(help="Size of a mark, mm; not used for lines.")] = None,
     line_width: Annotated[float, typer.Option(help="Width of the lines of a cross or grid, mm.")] = 0.3,
     polarity: Annotated[Polarity, typer.Option(help="Dark or bright marks.")] = Polarity.DARK,
     origin: Annotated[str | None, typer.Option(help="Mark O of the common system.")] = None,
@@ -98,7 +98,7 @@ def sheet(
     pdf: Pdf = None,
     out: Design = None,
 ) -> None:
-    """Design a sheet of disks, four of them in coded rings that number all of them from any side."""
+    """Design a sheet of disks, four of them in coded rings that identify all disks."""
     from ..designs import coded_sheet
 
     design = coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
@@ -115,7 +115,7 @@ def coded_field(
         tuple[float, float, float, float],
         typer.Option(help="Small squares, triangles, crosses, circles, mm."),
     ] = (9.0, 13.0, 15.0, 12.0),
-    large: Annotated[tuple[float, float, float, float], typer.Option(help="Large ones, mm.")] = (
+    large: Annotated[tuple[float, float, float, float], typer.Option(help="The same, large, mm.")] = (
         17.0,
         25.0,
         25.0,
@@ -123,7 +123,7 @@ def coded_field(
     ),
     spread: Annotated[float, typer.Option(help="Distance of targets in a square, mm.")] = 30.0,
     turn_seed: Annotated[
-        int | None, typer.Option(help="Turn every target by an angle drawn from this seed.")
+        int | None, typer.Option(help="Rotate each target by an angle drawn from this seed.")
     ] = None,
     polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "testfield",
@@ -131,7 +131,7 @@ def coded_field(
     pdf: Pdf = None,
     out: Design = None,
 ) -> None:
-    """Design a coded testfield: squares of sixteen targets, told apart by what lies where."""
+    """Design a coded testfield: squares of sixteen targets, coded by their arrangement."""
     from ..designs import coded_testfield
 
     design = coded_testfield(
@@ -152,7 +152,7 @@ def coded_field(
 def _write(
     design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
 ) -> None:
-    """Write drawings and design where they are wanted, either all of them or none, and say so."""
+    """Write the requested drawings and design, either all or none, and report their paths."""
     from ..io import write_whole
 
     to_stdout = out is not None and str(out) == "-"

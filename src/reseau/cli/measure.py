@@ -31,7 +31,7 @@ __all__ = ["app", "measurement_csv"]
 
 
 class Channel(StrEnum):
-    """What is taken of a colour image."""
+    """Channel of a colour image."""
 
     LUMA = "luma"
     RED = "red"
@@ -49,14 +49,14 @@ def _targets() -> None:
 
 @app.command()
 def reseau(
-    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the reseau.")],
     out: Out = None,
     mark_px: Annotated[
-        float | None, typer.Option(help="Size of a mark (of a grid: width of its lines) in pixels.")
+        float | None, typer.Option(help="Size of a mark in pixels (for a grid: width of its lines).")
     ] = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
-    channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
+    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -81,14 +81,14 @@ def reseau(
 
 @app.command()
 def pins(
-    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the test object's rods.")],
     out: Out = None,
     also: Annotated[
-        list[Path] | None, typer.Option(help="Further image of the sequence: what stands still is no echo.")
+        list[Path] | None, typer.Option(help="Other image of the sequence; static spots are rejected.")
     ] = None,
     max_length_px: Annotated[
-        float | None, typer.Option(min=1, help="Greatest length of an echo, pixels.")
+        float | None, typer.Option(min=1, help="Maximum length of an echo, pixels.")
     ] = None,
     max_rotation: Annotated[float, typer.Option(help="Largest rotation of the test object, degrees.")] = 12.0,
     sensor: SensorFile = None,
@@ -117,12 +117,12 @@ def pins(
 
 @app.command("testfield")
 def coded_field(
-    image: Annotated[Path, typer.Argument(help="Image, or coordinates measured before (JSON, CSV).")],
+    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield.")],
     out: Out = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
     fill: Annotated[
-        float, typer.Option(min=0, max=1, help="Light-sensitive part of the pitch of the pixels.")
+        float, typer.Option(min=0, max=1, help="Light-sensitive share of the pixel pitch.")
     ] = 1.0,
     sensor: SensorFile = None,
     as_json: AsJson = False,
@@ -147,7 +147,7 @@ def coded_field(
 
 
 def _suffix(out: Path | None) -> str:
-    """Kind of the file to write, asked for before the work begins."""
+    """Format of the output file, determined before measuring."""
     return ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
 
 
@@ -162,7 +162,7 @@ def _deliver(
     notes: tuple[Remark, ...] = (),
     spread: str = "leave-one-out",
 ) -> None:
-    """Write the measurement to its file, and say what was and was not measured."""
+    """Write the measurement to its file, and report what was measured."""
     from ..io import write_whole
 
     if out is not None:
@@ -171,7 +171,7 @@ def _deliver(
         say(found.to_json())
         return
     say(f"{image.name}: {found.found} of {found.expected} {marks} measured\n")
-    if rms is not None and rms[0] == rms[0]:  # NaN where too few were measured to tell
+    if rms is not None and rms[0] == rms[0]:  # NaN if too few were measured
         say(f"{spread} rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
     for point in found.points:
         if not point.ok:
@@ -181,7 +181,7 @@ def _deliver(
 
 
 def measurement_csv(found: ReseauMeasurement) -> str:
-    """Marks that were measured as CSV ``id,x,y,sx,sy``."""
+    """Measured marks as CSV ``id,x,y,sx,sy``."""
     points = found.image_points()
     lines = ["id,x,y,sx,sy"]
     for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):

@@ -1,4 +1,4 @@
-"""Designs made from a few numbers: reseaus, an ultrasonic test object, the coded testfield and its code."""
+"""Targets as designed: reseaus, an ultrasonic test object, the coded testfield and its code, and drawings."""
 
 from .reseaus import coded_sheet, regular_reseau, standard_reseau, test_object
 from .testfield import coded_testfield

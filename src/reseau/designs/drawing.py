@@ -1,6 +1,6 @@
-"""Designs as drawings to print in true size: SVG and PDF, with crop marks and a bar to check the print by.
+"""Drawings of designs for printing in true size: SVG and PDF, with crop marks and a scale bar.
 
-Both are written from one list of filled polygons, circles and texts in millimetres.
+Both formats are written from one list of filled polygons, circles and texts in millimetres.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..optics.targets import target_corners
 __all__ = ["design_pdf", "design_svg"]
 
 _MARGIN = 18.0
-"""Paper around the target, mm: crop marks, the bar and the title lie in it."""
+"""Margin around the target, mm, for crop marks, scale bar and title."""
 _BAR = 100.0
 _CROP = 5.0
 _GREY = "#555555"
@@ -34,13 +34,13 @@ class _Sheet:
     Parameters
     ----------
     width, height : float
-        Of the paper.
+        Size of the paper.
     target : (float, float, float, float)
-        Left, top, right and lower end of the target.
+        Left, top, right and bottom of the target.
     polygons : list of ndarray (k, 2)
-        Filled with the colour of the marks.
+        Polygons filled with the colour of the marks.
     circles : list of (x, y, radius)
-        Filled likewise.
+        Circles filled likewise.
     lines : list of (x0, y0, x1, y1)
         Hairlines outside the target.
     texts : list of (x, y, anchor, text)
@@ -58,7 +58,7 @@ class _Sheet:
 
 @dataclass(frozen=True)
 class _Content:
-    """What of a design goes on paper, in its own plane: millimetres, y up.
+    """The drawn parts of a design in its own plane: millimetres, y up.
 
     Parameters
     ----------
@@ -67,9 +67,9 @@ class _Content:
     polygons, circles
         As in :class:`_Sheet`.
     title : str
-        What it is, in a line.
+        Description in one line.
     letters : dict
-        Labels, and where their lower left corners are.
+        Labels and the positions of their lower left corners.
     """
 
     low: Array
@@ -81,7 +81,7 @@ class _Content:
 
 
 def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
-    """Lay the design out on paper.
+    """Lay out the design on paper.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
     content = _testfield(design) if isinstance(design, TestfieldDesign) else _reseau(design)
     size = content.high - content.low
     width, height = size + 2 * _MARGIN
-    # A narrow target has a sheet that still takes the bar.
+    # A narrow target has a sheet that is wide enough for the bar.
     width = max(width, _BAR + 2 * _MARGIN)
     left = float(width - size[0]) / 2
     corner = np.array([left - content.low[0], _MARGIN + content.high[1]])
@@ -119,7 +119,7 @@ def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
 
 
 def _reseau(design: ReseauDesign) -> _Content:
-    """The marks of a reseau, and half a pitch around them."""
+    """The marks of a reseau, with a margin of half a pitch."""
     xy, mark = design.xy, design.mark
     if design.unit != "mm" or not np.isfinite(xy).all():
         raise UsageError("has no millimetre coordinates for all marks", where=f"design {design.name}")
@@ -148,7 +148,7 @@ def _reseau(design: ReseauDesign) -> _Content:
 
 
 def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
-    """Sectors of the coded rings as polygons, a corner every degree: 4e-5 of the radius off the arc."""
+    """Sectors of the coded rings as polygons with one corner per degree, within 4e-5 of the radius."""
     if design.rings is None:
         return
     for name, sectors in design.rings.sectors.items():
@@ -161,7 +161,7 @@ def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
 
 
 def _testfield(design: TestfieldDesign) -> _Content:
-    """Lines and targets, and the best part of a square around them."""
+    """Lines and targets, with a margin of most of a square."""
     lines, targets = design.lines, design.targets
     x0, y0, x1, y1 = lines.extent
     around, w = 0.8 * design.pitch, lines.width / 2
@@ -211,7 +211,7 @@ def _crop_marks(target: tuple[float, ...]) -> Iterator[tuple[float, float, float
 
 
 def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, float]]:
-    """The scale bar: 100 mm between the middles of its end strokes, with a stroke every 10 mm."""
+    """The scale bar: 100 mm between the centres of its end strokes, with a stroke every 10 mm."""
     left, y = float(width - _BAR) / 2, float(bottom) + 10.0
     yield left, y, left + _BAR, y
     for k in range(11):
@@ -220,7 +220,7 @@ def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, flo
 
 
 def _colours(design: ReseauDesign | TestfieldDesign) -> tuple[str, str]:
-    """Of the ground and of the marks."""
+    """Colours of background and marks."""
     return ("#ffffff", "#000000") if design.polarity == "dark" else ("#000000", "#ffffff")
 
 
@@ -229,12 +229,28 @@ def _number(value: float) -> str:
 
 
 def design_svg(design: ReseauDesign | TestfieldDesign) -> str:
-    """The target as SVG in true size.
+    """Draw a target as SVG in true size.
+
+    Parameters
+    ----------
+    design : ReseauDesign or TestfieldDesign
+        The target.
+
+    Returns
+    -------
+    str
+        The SVG document.
 
     Raises
     ------
     UsageError
         When the design has no millimetre coordinates for all marks.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> design_svg(standard_reseau())[:4]
+    '<svg'
     """
     sheet = _sheet(design)
     ground, ink = _colours(design)
@@ -263,7 +279,17 @@ def design_svg(design: ReseauDesign | TestfieldDesign) -> str:
 
 
 def design_pdf(design: ReseauDesign | TestfieldDesign) -> bytes:
-    """The target as a PDF of one page in true size, all of it vectors.
+    """Draw a target as a PDF of one page in true size; all elements are vectors.
+
+    Parameters
+    ----------
+    design : ReseauDesign or TestfieldDesign
+        The target.
+
+    Returns
+    -------
+    bytes
+        The PDF document.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Designs made from a few numbers: regular reseaus, and an ultrasonic test object."""
+"""Parametric designs: regular reseaus, coded sheets, and an ultrasonic test object."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def regular_reseau(
     origin: str | None = None,
     axis: str | None = None,
 ) -> ReseauDesign:
-    """A grid of marks around the origin of its plane, millimetres, x right, y up.
+    """Design a grid of marks around the origin of its plane, millimetres, x right, y up.
 
     Rows are lettered from the top, columns numbered from the left: ``A1`` is the upper left mark.
 
@@ -32,17 +32,17 @@ def regular_reseau(
     columns, rows : int
         Number of marks in a row and in a column, at least 2 each.
     pitch : float
-        Distance of neighbouring marks in millimetres.
+        Distance of neighbouring marks, millimetres.
     mark : Mark
-        What a mark looks like.
+        Shape and size of a mark.
     origin, axis : str, optional
-        The marks O and S that define the common system: by default the one in the middle and the last of its
+        The marks O and S that define the common system; by default the one in the centre and the last of its
         row.
 
     Raises
     ------
     UsageError
-        When a number is impossible, marks would touch, or `origin` or `axis` is none of them.
+        When a number is not possible, marks would touch, or `origin` or `axis` is not a mark of the design.
 
     Examples
     --------
@@ -58,11 +58,11 @@ def regular_reseau(
     if not 0 < extent < pitch:
         raise UsageError(f"marks of {extent} mm do not fit a pitch of {pitch} mm", where=f"design {name}")
     if mark.shape in ("cross", "line-grid") and not mark.line_width:
-        raise UsageError(f"marks of shape {mark.shape!r} need a width of line", where=f"design {name}")
+        raise UsageError(f"marks of shape {mark.shape!r} need a line width", where=f"design {name}")
     points = tuple(
         DesignPoint(
             id=f"{_letters(row)}{column + 1}",
-            # Whole micrometres, so that the file says what was meant.
+            # Integer micrometres, so that the file contains exact numbers.
             x=float(np.round((column - (columns - 1) / 2) * pitch, 6)),
             y=float(np.round(((rows - 1) / 2 - row) * pitch, 6)),
         )
@@ -74,7 +74,7 @@ def regular_reseau(
     axis = axis or f"{middle}{columns}"
     for role, mark_id in (("origin", origin), ("axis", axis)):
         if all(point.id != mark_id for point in points):
-            raise UsageError(f"names {mark_id!r}, which is none of the marks", where=role)
+            raise UsageError(f"{mark_id!r} is not a mark of the design", where=role)
     if origin == axis:
         raise UsageError(f"both are {origin!r}; they must differ", where="origin and axis")
     return ReseauDesign(
@@ -93,10 +93,10 @@ def _letters(row: int) -> str:
 
 
 _CODES = ("000001011111", "001001101110", "000011110011", "001100001111")
-"""Sectors of four rings, counterclockwise from x. Each differs from the others, and from itself turned by
-quarters or reflected, in four of its twelve at least."""
+"""Sectors of four rings, counter-clockwise from x. Each differs from the others, and from itself rotated by
+multiples of 90° or reflected, in at least four of its twelve sectors."""
 _DISK, _RING = 0.22, (0.54, 0.96)
-"""Diameters of the disks, and of the rings, in pitches: a ring leaves a gap to the disks beside it."""
+"""Diameters of the disks and of the rings, in pitches; a ring leaves a gap to the neighbouring disks."""
 
 
 def coded_sheet(
@@ -108,7 +108,7 @@ def coded_sheet(
     name: str = "sheet",
     polarity: Literal["dark", "bright"] = "dark",
 ) -> ReseauDesign:
-    """A sheet of disks, four of them in coded rings: one ring in sight numbers all disks from any side.
+    """Design a sheet of disks, four of them in coded rings; one visible ring identifies all disks.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def coded_sheet(
     Raises
     ------
     UsageError
-        When a number is impossible, or disks do not fit into the rings.
+        When a number is not possible, or disks do not fit into the rings.
 
     Examples
     --------
@@ -160,7 +160,7 @@ def coded_sheet(
 
 
 def _sectors(code: str) -> tuple[tuple[float, float], ...]:
-    """From where to where, degrees, a ring is dark: one sector for each run of ones around it."""
+    """Start and end in degrees of the dark sectors of a ring: one for each run of ones."""
     n = len(code)
     starts = [k for k in range(n) if code[k] == "1" and code[k - 1] == "0"]
     runs = [(k, next(m for m in range(1, n) if code[(k + m) % n] == "0")) for k in starts]
@@ -170,8 +170,13 @@ def _sectors(code: str) -> tuple[tuple[float, float], ...]:
 def standard_reseau() -> ReseauDesign:
     """The reseau of the simulated bench: 15 × 11 wires of 0.3 mm in front of a screen of 150 × 120 mm.
 
-    Thin aluminium wires of the dimensions of the screen, as in the first section of Wishahy's procedure; the
-    paper does not tell their number.
+    Thin aluminium wires with the dimensions of the screen, as in the first section of Wishahy's procedure;
+    the paper does not give their number.
+
+    Examples
+    --------
+    >>> len(standard_reseau().ids)
+    165
     """
     return regular_reseau(15, 11, 10.0, Mark(shape="line-grid", line_width=0.3), name="wires-15x11")
 
@@ -183,31 +188,31 @@ _ROWS = {
     "D": (80.0, (-50, 0, 50)),
     "E": (100.0, (-50, -25, 0, 25, 50)),
 }
-"""Rows of rods: depth under the upper edge, and places along it (mm). Those at 0 are the range group."""
+"""Rows of rods: depth below the upper edge, and positions along it (mm). Those at 0 are the range group."""
 _GROUPS = {
-    # Ever nearer to each other along the row: from where on are two rods seen as one?
+    # Decreasing distances along the row, for the lateral resolution.
     "L": ((-39, 90), (-14, 90), (6, 90), (21, 90), (31, 90), (36, 90), (39, 90)),
-    # On an inclined line, ever nearer to each other in depth.
+    # On an inclined line with decreasing distances in depth.
     "X": ((-38, 28), (-36, 33), (-34, 37), (-32, 40), (-30, 42), (-28, 43)),
-    # Ever nearer to the transducer.
+    # Decreasing distances from the transducer.
     "T": ((18, 12), (28, 9), (38, 6), (48, 4)),
 }
 """Groups that show the lateral and the axial resolution, and the dead zone."""
 
 
 def test_object() -> ReseauDesign:
-    """The 100 mm ultrasonic test object: 38 stainless steel rods of 0.75 mm, each in its place to ± 0.25 mm.
+    """The 100 mm ultrasonic test object: 38 steel rods of 0.75 mm, each at its position within ± 0.25 mm.
 
-    A test object for pulse-echo apparatus such as Wishahy uses: rows 20 mm apart with rods every 25 or 50 mm
-    (``A1`` … ``E5``), of which the middle ones make the range group, a column down to 100 mm; a row of rods
-    ever nearer to each other for the lateral resolution (``L``), an inclined line for the axial one (``X``),
-    and rods close to the transducer for the dead zone (``T``). The paper tells diameter and tolerance but no
-    places; these are of that kind and not a copy of a standard's drawing.
+    A test object for pulse-echo apparatus as used by Wishahy: rows 20 mm apart with rods every 25 or 50 mm
+    (``A1`` … ``E5``), whose middle rods form the range group, a column down to 100 mm; a row of rods with
+    decreasing distances for the lateral resolution (``L``), an inclined line for the axial resolution
+    (``X``), and rods close to the transducer for the dead zone (``T``). The paper gives diameter and
+    tolerance but no positions; these are typical and not taken from a standard's drawing.
 
     Returns
     -------
     ReseauDesign
-        Millimetres, x right, y up from the middle of the upper edge, along which the transducer moves: the
+        Millimetres, x right, y up from the centre of the upper edge, along which the transducer moves: the
         depth is −y. M and N are the ends of the middle row, ``C1`` and ``C5``.
 
     Examples
@@ -237,5 +242,5 @@ def test_object() -> ReseauDesign:
     )
 
 
-# Not one for pytest, which collects what is named so wherever it is imported.
+# Prevents collection by pytest, wherever the function is imported.
 test_object.__test__ = False  # type: ignore[attr-defined]

@@ -15,8 +15,9 @@ __all__ = ["coded_testfield"]
 
 _SMALL = (9.0, 13.0, 15.0, 12.0)
 _LARGE = (17.0, 25.0, 25.0, 22.0)
-"""Sizes of squares, triangles, crosses and circles. The areas of the first two are a little smaller than
-those of the others (the paper's table 3), and those of the small ones a third of those of the large."""
+"""Sizes of squares, triangles, crosses and circles. The areas of the first two are slightly smaller than
+those of the others (the paper's table 3); areas of the small ones are one third of those of the large
+ones."""
 
 
 def coded_testfield(
@@ -32,35 +33,35 @@ def coded_testfield(
     polarity: Literal["dark", "bright"] = "dark",
     name: str = "testfield",
 ) -> TestfieldDesign:
-    """A testfield with its targets coded by topology; the dimensions of the paper (tables 1, 2) by default.
+    """Design a testfield with targets coded by topology; by default as in the paper (tables 1, 2).
 
     Parameters
     ----------
     columns, rows : int
-        Number of squares; at most 168 in all, which is what the code can tell apart.
+        Number of squares; at most 168 in total, the number of words of the code.
     pitch : float
         Distance of the lines, mm.
     line_width : float
-        Of the straight lines, mm.
+        Width of the straight lines, mm.
     small, large : sequence of 4 float
         Sizes of squares, triangles, crosses and circles, mm.
     spread : float
         Distance of neighbouring targets in a square, mm.
     turn_seed : int, optional
-        Turns every target by an angle of its own, drawn from this seed; all are upright without it.
+        Rotates every target by an angle drawn with this seed; by default all are upright.
     polarity : {"dark", "bright"}
-        Dark on a bright ground, or the other way round.
+        Dark targets on a bright background, or bright on dark.
 
     Returns
     -------
     TestfieldDesign
-        Millimetres, the origin in the middle. Squares are numbered in rows from the upper left, and so are
+        Millimetres, the origin in the centre. Squares are numbered in rows from the upper left, and so are
         the targets of a square: ``23.01`` to ``23.16``.
 
     Raises
     ------
     UsageError
-        When a number is impossible, or targets would touch each other or the lines.
+        When a number is not possible, or targets would touch each other or the lines.
 
     Examples
     --------
@@ -110,8 +111,8 @@ def coded_testfield(
 
 
 def _check_room(pitch: float, line_width: float, large: Sequence[float], spread: float, where: str) -> None:
-    """Refuse targets that would touch, however they are turned."""
-    # Radii of the circles around them; a cross's arms are a third of its length wide.
+    """Refuse targets that would touch at any rotation."""
+    # Radii of their circumscribed circles; the arms of a cross are one third of its length wide.
     around = np.array([1 / np.sqrt(2), 1 / np.sqrt(3), np.hypot(1, 1 / 3) / 2, 0.5]) * np.array(large)
     widest = float(around.max())
     if 2 * widest >= spread:

@@ -1,17 +1,17 @@
-r"""The code of a testfield: which square a cluster of sixteen targets is, by what lies where in it.
+r"""The topological code of a testfield: identification of a cluster of sixteen targets by their arrangement.
 
 A cluster is a 4×4 grid of targets of eight kinds (four shapes in two sizes), two of each. Write the place of
 a target as four bits, row and column from the upper left, and its kind as three: two for the shape, one for
 the size. The words of the code are affine functions :math:`w(p) = M p + b` over the field of two elements
-with M of rank 3, so that every kind stands in exactly two places. Two words agree where
-:math:`(M - M')\,p = b' - b`: in none, two, four or eight places. Turning and mirroring the cluster are affine
-in the place too, so that a turned word is again such a function. Of the 20160 functions those below were
-chosen such that any two words, each turned and mirrored in any of the eight ways, agree in four places at
-most: **the code has distance 12**. Up to five wrongly classified targets of a cluster are put right and up to
-eleven hidden ones are done without; with h of them hidden, (11 − h)/2 may be wrong as well.
+with M of rank 3, so that every kind occurs at exactly two places. Two words agree where
+:math:`(M - M')\,p = b' - b`: at none, two, four or eight places. Rotation and reflection of the cluster are
+affine in the place, too, so a rotated word is again such a function. Of the 20160 functions those below were
+selected such that any two words, each in any of its eight rotations and reflections, agree at most at four
+places: **the code has distance 12**. Up to five wrongly classified targets of a cluster are corrected, and up
+to eleven hidden ones are tolerated; with h hidden ones, (11 − h)/2 may also be wrong.
 
-No code of the kind can have more than 14: 256 words of eight symbols agree in 1.95 of sixteen places on the
-average (Plotkin 1960).
+No code of this kind can have a distance above 14: 256 words of eight symbols agree at 1.95 of sixteen places
+on average (Plotkin 1960).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ..io import TestfieldDesign
 __all__ = ["HIDDEN", "Decoded", "TopologicalCode"]
 
 HIDDEN = -1
-"""The symbol of a target that cannot be seen."""
+"""Symbol of a target that is not visible."""
 _SIDE = 4
 _PLACES = _SIDE * _SIDE
 _WORDS = (
@@ -42,8 +42,8 @@ _WORDS = (
     "320e 3b5c 3a9d 6a2f 6d4c 40db 4e8f 5d1d 0b64 74da 4c56 1463 7241 35a9 4492 428f 0ce8 0a1f 5459 5967 "
     "3411 5caa 2f15 3ea7 73d7 3ce5 4b9b 4762 "
 )
-"""Functions as numbers: four bits for each row of M, three for b. Of the first 64 any two differ in the
-shapes alone of eight targets, however they are turned."""
+"""Functions as numbers: four bits for each row of M, three for b. Any two of the first 64 differ in the
+shapes of eight targets, for all rotations."""
 
 Symbols = NDArray[np.intp]
 
@@ -54,7 +54,7 @@ def words(count: int) -> Symbols:
     Raises
     ------
     UsageError
-        When the code has not so many.
+        When the code has fewer words.
     """
     numbers = np.array([int(number, 16) for number in _WORDS.split()])
     if not 0 < count <= len(numbers):
@@ -63,7 +63,7 @@ def words(count: int) -> Symbols:
     symbol = np.zeros((count, _PLACES), dtype=np.intp)
     for k in range(3):
         row = numbers[:count, None] >> (11 - 4 * k) & 15
-        # The scalar product of two vectors of bits is the parity of what they share.
+        # The scalar product of two bit vectors is the parity of their common bits.
         product = _PARITY[row & place] ^ (numbers[:count, None] >> k & 1)
         symbol += product << (2 - k)
     return symbol
@@ -74,23 +74,28 @@ _PARITY = np.array([bin(value).count("1") % 2 for value in range(16)])
 
 @dataclass(frozen=True)
 class Decoded:
-    """What a cluster was read as; falsy where it was not.
+    """Result of decoding a cluster; falsy if it was not identified.
 
     Parameters
     ----------
     square : int
         Number of the square, from 1.
     quarter_turns : int
-        By how many quarters, counter-clockwise, the cluster appears turned, 0 to 3, after it was mirrored
-        left to right where it is.
+        Number of quarter turns, 0 to 3, by which the cluster appears rotated counter-clockwise (after a
+        reflection left to right, if mirrored).
     mirrored : bool
         Whether it appears mirrored.
     corrections : int
-        Targets that are not what they were taken for.
+        Number of targets that were classified wrongly.
     hidden : int
-        Targets that could not be seen.
+        Number of targets that are not visible.
     why : str
-        Why it was not read; empty where it was.
+        Reason why it was not identified; empty otherwise.
+
+    Examples
+    --------
+    >>> bool(Decoded(square=23))
+    True
     """
 
     square: int = 0
@@ -106,7 +111,7 @@ class Decoded:
 
 @dataclass(frozen=True, eq=False)
 class TopologicalCode:
-    """The clusters of a testfield as words, in all the ways in which they may appear.
+    """The clusters of a testfield as words, in all possible appearances.
 
     Parameters
     ----------
@@ -132,18 +137,18 @@ class TopologicalCode:
 
     @staticmethod
     def of(design: TestfieldDesign) -> TopologicalCode:
-        """The code of a design: its squares' targets sorted into rows.
+        """The code of a design, with its targets sorted by place.
 
         Raises
         ------
         UsageError
-            When its squares have not sixteen targets each, in a grid of four by four.
+            When a square does not have sixteen targets in a grid of four by four.
         """
         return _code_of(design)
 
     @cached_property
     def appearances(self) -> Symbols:
-        """All clusters as they may appear, (8, k, 16): turned by 0 to 3 quarters, then also mirrored."""
+        """All appearances of the clusters, (8, k, 16): rotated by 0 to 3 quarters, then also mirrored."""
         grid = self.clusters.reshape(-1, _SIDE, _SIDE)
         turned = [
             np.rot90(seen, quarters, axes=(1, 2))
@@ -154,12 +159,12 @@ class TopologicalCode:
 
     @cached_property
     def distance(self) -> int:
-        """Least number of targets in which two appearances differ, those mirrored included.
+        """Least number of targets in which two appearances differ, including mirrored ones.
 
-        Zero where the clusters do not tell squares, rotations and handedness apart.
+        Zero if the clusters do not identify squares, rotations and handedness uniquely.
         """
         every = self.appearances.reshape(-1, _PLACES)
-        # It is enough to look from the clusters as designed: where one is turned, turn both back.
+        # It is sufficient to compare with the clusters as designed: if one is rotated, rotate both back.
         least = _PLACES
         for k, cluster in enumerate(self.clusters):
             differ = (every != cluster).sum(axis=1)
@@ -168,17 +173,17 @@ class TopologicalCode:
         return least
 
     def decode(self, seen: Symbols) -> Decoded:
-        """Read a cluster.
+        """Identify a cluster.
 
         Parameters
         ----------
         seen : ndarray of int (4, 4) or (16,)
-            Symbols of its targets as they appear, in rows from the upper left, `HIDDEN` where none is seen.
+            Symbols of its targets as they appear, in rows from the upper left, `HIDDEN` for invisible ones.
 
         Returns
         -------
         Decoded
-            Falsy, with the reason, where the cluster could be more than one, or is none.
+            Falsy, with the reason, if no cluster or more than one matches.
         """
         symbols = np.asarray(seen).reshape(_PLACES)
         visible = symbols != HIDDEN
@@ -188,7 +193,7 @@ class TopologicalCode:
         way, square = divmod(best, len(self.clusters))
         corrections = int(wrong.flat[best])
         if 2 * corrections + hidden >= self.distance:
-            # Within half the distance there is one word at most; beyond it there may be two, or none.
+            # Within half the distance there is at most one word; beyond it there may be two, or none.
             why = f"{corrections} of its {_PLACES - hidden} visible targets fit no square of the design"
             if not corrections:
                 why = f"{hidden} of its targets are hidden"
@@ -198,31 +203,31 @@ class TopologicalCode:
 
 @lru_cache(maxsize=16)
 def _code_of(design: TestfieldDesign) -> TopologicalCode:
-    """One code for all frames of a testfield: its distance takes longer to find than a cluster to read."""
+    """Cached code of a testfield: computing its distance takes longer than reading a cluster."""
     return TopologicalCode(design.symbols[places(design)])
 
 
 def places(design: TestfieldDesign) -> Symbols:
-    """Which target stands where in each square, (k, 16): rows of the design's columns, from the upper left.
+    """Index of the target at each place of each square, (k, 16), in rows from the upper left.
 
     Raises
     ------
     UsageError
-        When the squares have not sixteen targets each, in a grid of four by four.
+        When a square does not have sixteen targets in a grid of four by four.
     """
     square = np.array(design.targets.square) - 1
     count = design.squares[0] * design.squares[1]
     if (np.bincount(square, minlength=count) != _PLACES).any():
-        raise UsageError("has not sixteen targets in each square", where=f"design {design.name}")
+        raise UsageError("does not have sixteen targets in each square", where=f"design {design.name}")
     relative = design.xy - design.centres[square]
     unit = np.unique(np.round(np.abs(relative), 6))
     if len(unit) != 2 or not 2.5 < unit[1] / unit[0] < 3.5:
-        raise UsageError("has its targets in no grid of four by four", where=f"design {design.name}")
+        raise UsageError("targets do not form a grid of four by four", where=f"design {design.name}")
     step = 2 * unit[0]
     column, row = (np.rint(_SIDE / 2 - 0.5 + sign * relative[:, k] / step) for k, sign in ((0, 1), (1, -1)))
     at = (row * _SIDE + column).astype(np.intp)
     table = np.full((count, _PLACES), -1, dtype=np.intp)
     table[square, at] = np.arange(len(square))
     if (table < 0).any():
-        raise UsageError("has two targets in one place", where=f"design {design.name}")
+        raise UsageError("has two targets at one place", where=f"design {design.name}")
     return table

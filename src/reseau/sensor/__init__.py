@@ -1,4 +1,4 @@
-"""A sensor calibrated: what it adds in the dark, how it answers to light, its scatter, which pixels fail."""
+"""Calibration of sensors: dark signal, response to light, noise, sharpness, defective pixels."""
 
 from .edge import EdgeSpread, FreeCurve, measure_edge
 from .fields import estimate_fields

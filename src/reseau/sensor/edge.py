@@ -1,22 +1,18 @@
-"""An edge with a Gaussian point-spread function: where it runs, its grey values, its width.
+"""Sharpness from a slanted edge (ISO 12233): modulation transfer without assumptions, and a Gaussian model.
 
-Its image is formed as that of all targets is: a Gaussian folded with the square of the pixel, which along the
-edge's normal is a trapezoid. The edge may be bent a little, as distortion bends it: x = offset + slope·y +
+A straight edge between dark and bright, slanted by a few degrees, is sampled at all distances from the centre
+of a pixel.
+
+The Gaussian edge is formed like all targets: a Gaussian convolved with the square of the pixel, which is a
+trapezoid along the normal of the edge. The edge may be slightly curved by distortion: x = offset + slope·y +
 bow·(y² − q)/k², with y from the middle row, q the mean of y², and k half the height of the region; the bow is
-how far the middle of the edge lies from its chord (px).
+the distance of the centre of the edge from its chord (px).
 
-The modulation transfer of an edge without any assumption on the point-spread function (ISO 12233).
-
-The edge-spread function is that of the Gaussian plus the integral of a spline, adjusted by least squares to
-all pixels at their distances from the edge, together with the edge's slope and bow. Its derivative is the
-line-spread function, whose Fourier transform is a closed form: no bins, no differences, no window, so none of
-their biases. Knots are close where the edge is, and farther apart with the distance from it, where blur
-changes slowly: what noise brings in there stays at low frequencies.
-
-Sharpness by a slanted edge: its free modulation transfer, and whether a Gaussian describes it.
-
-A straight edge between dark and bright, slanted by a few degrees, is seen at every distance from the centre
-of a pixel (ISO 12233).
+The free edge-spread function is that of the Gaussian plus the integral of a spline, adjusted by least squares
+to all pixels at their distances from the edge, together with the edge's slope and bow. Its derivative is the
+line-spread function, whose Fourier transform has a closed form: no bins, differences or windows, and none of
+their biases. Knots are dense at the edge and further apart with increasing distance, where blur changes
+slowly, so that noise there affects low frequencies only.
 """
 
 from __future__ import annotations
@@ -61,27 +57,27 @@ __all__ = [
 ]
 
 _NEAR_PX = 8.0
-"""From the approximate edge, where its gradient is looked for."""
+"""Distance from the approximate edge within which its gradient is evaluated."""
 _ROUNDS = 3
 _SHARPEST_PX = 0.02
-"""Width at which that of an edge is held that shows none."""
+"""Width assigned to an edge that shows none."""
 ENOUGH = Options(tolerance=1e-7)
-"""What is left to correct, in standard deviations."""
+"""Iterations end when corrections are below this share of their standard deviations."""
 _Integral = Callable[[Array, float], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class EdgePixels:
-    """Pixels of a region whose edge is nearly upright.
+    """Pixels of a region with a nearly vertical edge.
 
     Parameters
     ----------
     x, y : ndarray (n,)
-        Column, and row from the middle one.
+        Column, and row relative to the middle row.
     grey : ndarray (n,)
         Grey values.
     sigma : ndarray (n,)
-        Their standard deviations; to a common factor.
+        Their standard deviations, up to a common factor.
     size : (int, int)
         Height and width of the region.
     """
@@ -94,30 +90,30 @@ class EdgePixels:
 
     @classmethod
     def of(cls, pixels: Array, good: Mask) -> EdgePixels:
-        """Of a region (height, width); those that are not good are left out."""
+        """The good pixels of a region (height, width)."""
         rows, columns = np.mgrid[: pixels.shape[0], : pixels.shape[1]].astype(np.float64)
         rows -= (pixels.shape[0] - 1) / 2
         height, width = pixels.shape
         return cls(columns[good], rows[good], pixels[good], np.ones(int(good.sum())), (height, width))
 
     def part(self, keep: Mask) -> EdgePixels:
-        """Some of them."""
+        """A subset of the pixels."""
         return EdgePixels(self.x[keep], self.y[keep], self.grey[keep], self.sigma[keep], self.size)
 
     def distance(self, offset: float, slope: float, bow: float = 0.0) -> Array:
-        """From the edge, along its normal."""
+        """Distances from the edge along its normal."""
         turned = slope + 2 * bow * self.y / self.half**2
         distance: Array = self.aside(offset, slope, bow) / np.hypot(1.0, turned)
         return distance
 
     def aside(self, offset: float, slope: float, bow: float) -> Array:
-        """From the edge, along the row."""
+        """Distances from the edge along the row."""
         aside: Array = self.x - offset - slope * self.y - bow * self.bent
         return aside
 
     @property
     def bent(self) -> Array:
-        """What a bow of one moves the edge by."""
+        """Displacement of the edge by a bow of 1, along the normal."""
         return self.bent_at(self.y)
 
     @property
@@ -126,12 +122,12 @@ class EdgePixels:
         return self.size[0] / 2
 
     def bent_at(self, y: Array) -> Array:
-        """What a bow of one moves the edge by in rows."""
+        """Displacement of the edge by a bow of 1, along the rows."""
         bent: Array = (y**2 - (self.size[0] ** 2 - 1) / 12) / self.half**2
         return bent
 
     def turning(self, offset: float, slope: float, bow: float) -> tuple[Array, Array]:
-        """Derivatives of the distance by slope and bow."""
+        """Derivatives of the distance with respect to slope and bow."""
         turned, aside = slope + 2 * bow * self.y / self.half**2, self.aside(offset, slope, bow)
         width = np.hypot(1.0, turned)
         lean = aside * turned / width**3
@@ -139,7 +135,7 @@ class EdgePixels:
 
 
 def approximate_edge(pixels: Array) -> Array | None:
-    """Edge by the centroids of the gradient in each row, and grey values beside it; None without an edge.
+    """Edge from the centroids of the gradient in each row, with grey values beside it; None without an edge.
 
     Returns
     -------
@@ -154,7 +150,7 @@ def approximate_edge(pixels: Array) -> Array | None:
     x = np.arange(gradient.shape[1], dtype=np.float64) + 0.5
     rows = np.arange(len(pixels), dtype=np.float64) - (len(pixels) - 1) / 2
     slope, offset = _line(weight, x, rows)
-    for _ in range(_ROUNDS):  # far from the edge there is noise alone
+    for _ in range(_ROUNDS):  # far from the edge there is only noise
         near = weight * (np.abs(x - offset - slope * rows[:, None]) < _NEAR_PX)
         if not near.sum(axis=1).min() > 0:
             break
@@ -178,16 +174,16 @@ def fit_gaussian(
     Parameters
     ----------
     pixels : EdgePixels
-        With weights by their sigmas; the noise itself is found by them.
+        The pixels; weights follow from their sigmas, the scale of the noise is estimated.
     values : ndarray (6,)
         Approximate `offset` (px), `slope`, `bow` (px), `dark`, `bright` (grey values of the left and right
         side), `psf` (px, one sigma).
     reach_px : float
-        From the edge, up to which pixels take part.
+        Distance from the edge up to which pixels are used.
     bow : bool
-        Whether the edge may be bent; otherwise the bow is held.
+        Whether the edge may be curved; otherwise the bow is fixed.
     """
-    # Which pixels are near enough depends on where the edge is.
+    # The selection of near pixels depends on the position of the edge.
     for _ in range(_ROUNDS if np.isfinite(reach_px) else 0):
         fit = _fitted(pixels, values, reach_px, bow)
         if isinstance(fit, Failure):
@@ -205,7 +201,7 @@ def _fitted(pixels: EdgePixels, values: Array, reach_px: float, bow: bool) -> Ad
     )
     found = adjust(edge, ENOUGH)
     if isinstance(found, Failure) and abs(found.values.get("psf", np.inf)) < _SHARPEST_PX:
-        # The width takes part by its square alone, which would be negative here.
+        # Only the square of the width enters; it would be negative here.
         return adjust(edge.with_parameters(free.fix("psf", at=_SHARPEST_PX)), ENOUGH)
     return found
 
@@ -218,14 +214,14 @@ def _formed(pixels: EdgePixels, p: Array) -> Array:
 
 
 def _derivatives(pixels: EdgePixels, p: Array) -> Array:
-    """Of :func:`_formed` by its parameters (n, 6)."""
+    """Derivatives of :func:`_formed` with respect to its parameters (n, 6)."""
     slant, width, step = np.arctan(p[1]), abs(p[5]), p[4] - p[3]
     c, s = np.cos(slant), abs(np.sin(slant))
     d = pixels.distance(*p[:3])
     spread, rise = edge_spread(d, width, c, s), edge_slope(d, width, c, s)
     by_slope, by_bow = pixels.turning(*p[:3])
     by_offset = -1 / np.hypot(1.0, p[1] + 2 * p[2] * pixels.y / pixels.half**2)
-    # The trapezoid turns with the slope, too.
+    # The trapezoid also changes with the slope.
     wide, narrow, near = (c + s) / 2, (c - s) / 2, _close(d, width)
     dc, ds = -np.sin(slant) * c**2, np.sign(p[1]) * c**3
     by_wide, by_narrow = (_once(near + at, width) - _once(near - at, width) for at in (wide, narrow))
@@ -236,19 +232,19 @@ def _derivatives(pixels: EdgePixels, p: Array) -> Array:
 
 
 def edge_spread(d: Array, sigma: float, c: float, s: float) -> Array:
-    """Share of the bright side in a pixel at a distance: the step folded with a Gaussian and the trapezoid
-    that the unit square is when seen along a normal with the components c and s.
+    """Bright share of a pixel at a distance from the edge: the step convolved with a Gaussian and with the
+    trapezoid of the unit square along a normal with the components c and s.
     """
     return _folded(_twice, d, sigma, c, s)
 
 
 def edge_slope(d: Array, sigma: float, c: float, s: float) -> Array:
-    """Derivative of :func:`edge_spread` by the distance: the line-spread function."""
+    """Derivative of :func:`edge_spread` with respect to the distance: the line-spread function."""
     return _folded(_once, d, sigma, c, s)
 
 
 def _folded(integral: _Integral, d: Array, sigma: float, c: float, s: float) -> Array:
-    d, s = _close(d, sigma), max(s, 1e-3)  # along the rows the trapezoid is a square, which it is nearly here
+    d, s = _close(d, sigma), max(s, 1e-3)  # along the rows the trapezoid degenerates to a square
     wide, narrow = (c + s) / 2, (c - s) / 2
     ends = integral(d + wide, sigma) - integral(d + narrow, sigma) - integral(d - narrow, sigma)
     folded: Array = (ends + integral(d - wide, sigma)) / (c * s)
@@ -256,14 +252,14 @@ def _folded(integral: _Integral, d: Array, sigma: float, c: float, s: float) -> 
 
 
 def _close(d: Array, sigma: float) -> Array:
-    """Distances no farther than where all has risen: beyond, differences of squares would be rounding."""
+    """Distances clipped to where the function is constant; beyond, differences of squares lose precision."""
     reach = 9 * sigma + 1.5
     close: Array = np.clip(d, -reach, reach)
     return close
 
 
 def _never(u: Array, sigma: float) -> Array:
-    """The normal distribution of this width itself."""
+    """The normal distribution of this width."""
     integral: Array = ndtr(u / max(sigma, 1e-6))
     return integral
 
@@ -285,15 +281,15 @@ def _twice(u: Array, sigma: float) -> Array:
 
 
 FREQUENCIES: Array = np.arange(33) / 32
-"""Cycles per pixel at which the curve is told."""
+"""Frequencies in cycles per pixel at which the curve is reported."""
 NYQUIST = 0.5
 _STEP_PX = 0.25
-"""Between knots at the edge; they reproduce a line spread to 1e-4 up to one cycle per pixel."""
+"""Distance of knots at the edge; they reproduce a line spread to 1e-4 up to one cycle per pixel."""
 _FEWEST = 1.5
-"""Knots are at least so many times as far apart as the widest gap between the pixels' distances."""
+"""Minimum distance of knots, relative to the widest gap between the distances of pixels."""
 _GROWTH, _WIDEST_PX = 1.25, 2.0
 _LIMIT = 0.375
-"""Cycles per distance of knots up to which a spline follows."""
+"""Cycles per distance of knots up to which a spline can follow."""
 _SHORT = 1e-9
 
 
@@ -310,7 +306,7 @@ class _Spline:
     @cached_property
     def _lines(self) -> BSpline:
         k = self.knots
-        # Splines with knots beyond the ends have no part; those within are then whole.
+        # Exclude splines that extend beyond the end knots.
         wide = np.concatenate([k[0] - [3.0, 2.0, 1.0], k, k[-1] + [1.0, 2.0, 3.0]])
         chosen = np.zeros((len(wide) - 3, self.size))
         chosen[3 : 3 + self.size] = np.eye(self.size)
@@ -333,7 +329,7 @@ class _Spline:
         return found
 
     def transforms(self, frequency: Array) -> Array:
-        """Fourier transforms (m, size), exact but for rounding: no piece has more than two periods."""
+        """Fourier transforms (m, size), exact within rounding: no piece has more than two periods."""
         nodes, weights = np.polynomial.legendre.leggauss(20)
         half = np.diff(self.knots) / 2
         at = ((self.knots[1:] + self.knots[:-1]) / 2)[:, None] + half[:, None] * nodes
@@ -344,17 +340,17 @@ class _Spline:
 
 @dataclass(frozen=True, eq=False)
 class FreeCurve:
-    """What an edge tells of the modulation transfer by itself; the pixel's own square is in it.
+    """Modulation transfer of an edge without a model; includes the square of the pixel.
 
     Parameters
     ----------
     fit : Adjustment
-        Of `dark` (grey value), the coefficients `a0` … of the line spread beyond the Gaussian, `slope` and,
-        where it is free, `bow`.
+        Adjustment of `dark` (grey value), the coefficients `a0` … of the line spread in excess of the
+        Gaussian, `slope` and, where it is estimated, `bow`.
     spline : object
-        That they belong to.
+        The spline of these coefficients.
     base : ndarray (6,)
-        Values of the Gaussian edge; see :func:`~reseau.sensor.edge.fit_gaussian`.
+        Parameters of the Gaussian edge; see :func:`~reseau.sensor.edge.fit_gaussian`.
     limit : float
         Frequency (cycles per pixel) up to which the distances of the pixels resolve the curve.
     """
@@ -381,7 +377,7 @@ class FreeCurve:
         a, cov = self._coefficients
         step, c, s = self._step
         gaussian = np.exp(-2 * (np.pi * self.base[5] * f) ** 2) * np.sinc(f * c) * np.sinc(f * s)
-        with one_thread():  # the same sums however many processors there are
+        with one_thread():  # makes sums independent of the number of processors
             lines, areas = self.spline.transforms(f), self.spline.transforms(np.zeros(1)).real[0]
         whole = step + float(areas @ a)
         z = (step * gaussian + lines @ a) / whole
@@ -391,7 +387,7 @@ class FreeCurve:
 
     @property
     def _step(self) -> tuple[float, float, float]:
-        """Of the Gaussian edge: grey values, and the components of its normal."""
+        """Grey values of the Gaussian edge, and the components of its normal."""
         slant = np.arctan(self.base[1])
         return float(self.base[4] - self.base[3]), float(np.cos(slant)), float(abs(np.sin(slant)))
 
@@ -400,8 +396,8 @@ class FreeCurve:
 
         Notes
         -----
-        The modulus of an estimate with noise is too large: ``|Z|²`` by both variances. That along Z is the
-        modulus' own; of the one across it is freed, ``|Z|² − σ²₊``, and is zero where that is negative.
+        Noise increases the expected modulus of the estimate. The variance of the component along Z is that of
+        the modulus; the variance of the component across is subtracted, ``|Z|² − σ²₊``, at least 0.
         """
         z, cov = self.transfer(frequency)
         along = np.where(np.abs(z) > _SHORT, z / np.maximum(np.abs(z), _SHORT), 1.0)
@@ -412,7 +408,7 @@ class FreeCurve:
 
     @property
     def mtf50(self) -> tuple[float, float] | None:
-        """Frequency at which half of the modulation is left, and its sigma; None where there is none."""
+        """Frequency at which the modulation is 0.5, and its sigma; None if it stays above."""
 
         def above(frequency: float) -> float:
             return float(self.mtf(frequency)[0][0]) - 0.5
@@ -433,7 +429,7 @@ class FreeCurve:
         return float(value[0]), float(sigma[0])
 
     def line_spread(self, distance: Array) -> tuple[Array, Array]:
-        """Line-spread function (1/px) at distances from the edge, and that of the Gaussian it is beyond."""
+        """Line-spread function (1/px) at distances from the edge, and that of the underlying Gaussian."""
         step, c, s = self._step
         a, _ = self._coefficients
         gaussian = edge_slope(distance, abs(self.base[5]), c, s)
@@ -441,8 +437,8 @@ class FreeCurve:
         return (step * gaussian + self.spline.lines(distance) @ a) / whole, gaussian
 
     def ends(self) -> tuple[float, float]:
-        """How much of the step still rises in the outer quarters of the region (share), and the probability
-        that noise alone has it so: blur that reaches beyond the region, or uneven light.
+        """Share of the step that rises in the outer quarters of the region, and the probability that noise
+        alone causes it. A significant rise means blur beyond the region, or uneven light.
         """
         a, cov = self._coefficients
         k, step = self.spline.knots, self._step[0]
@@ -460,17 +456,17 @@ def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve
     Parameters
     ----------
     pixels : EdgePixels
-        All that take part.
+        All pixels to be used.
     base : ndarray (6,)
-        The Gaussian edge among them; see :func:`~reseau.sensor.edge.fit_gaussian`.
+        Parameters of the Gaussian edge; see :func:`~reseau.sensor.edge.fit_gaussian`.
     bow : bool
-        Whether the edge may be bent.
+        Whether the edge may be curved.
     """
     gap = _gap(pixels, base)
     limit = min(1.0, _LIMIT / max(_STEP_PX, _FEWEST * gap))
     if limit < NYQUIST:
         return Failure(
-            "the edge passes too few pixels: take a longer region, or another slant", Code.TOO_SMALL
+            "the edge crosses too few pixels: take a longer region, or another slant", Code.TOO_SMALL
         )
     spline = _Spline(_knots(pixels, base, max(_STEP_PX, _FEWEST * gap)))
     names = ["dark", *(f"a{j}" for j in range(spline.size)), "slope", "bow"]
@@ -499,7 +495,7 @@ def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve
 
 
 def _gap(pixels: EdgePixels, base: Array) -> float:
-    """The widest gap between the distances of pixels from the edge, of whatever row."""
+    """The widest gap between the distances of all pixels from the edge."""
     rows = np.unique(pixels.y)
     edge = base[0] + base[1] * rows + base[2] * pixels.bent_at(rows)
     phases = np.sort(np.mod(edge, 1.0))
@@ -508,8 +504,9 @@ def _gap(pixels: EdgePixels, base: Array) -> float:
 
 
 def _knots(pixels: EdgePixels, base: Array, step: float) -> Array:
-    """Close within what a blur of the Gaussian's width can reach, then farther and farther apart, to where
-    half of the rows end; what is beyond is flat.
+    """Knots: dense within the blur of the Gaussian, then with growing steps to where half of the rows end.
+
+    The curve is constant beyond.
     """
     d = pixels.distance(*base[:3])
     rows = np.unique(pixels.y, return_inverse=True)[1]
@@ -530,34 +527,34 @@ def _side(reach: float, core: float, step: float) -> Array:
 
 
 _REACH_PX, _REACH_PSF = 8.0, 4.0
-"""From the edge, up to which pixels take part in the Gaussian: the larger one, in pixels and in widths."""
+"""Distance from the edge up to which pixels are used for the Gaussian: the larger of pixels and widths."""
 _FREE_REACH_PX, _FREE_REACH_PSF = 32.0, 12.0
-"""The same of the free curve."""
+"""The same for the free curve."""
 _LEAST_SLANT, _MOST_SLANT = 0.02, 0.6
-"""Radians; below, all pixels along the edge have nearly the same distance."""
+"""Limits of the slant in radians; below, all pixels along the edge have nearly the same distance."""
 _LEAST_CONTRAST, _BESIDE_PX = 5.0, 2.0
-"""Of an edge, in standard deviations of a pixel; and from the edge, where both sides begin."""
+"""Minimum contrast of an edge over the noise of a pixel; distance from the edge of its two flat sides."""
 ALPHA = 0.01
-"""Level of the tests."""
+"""Level of significance of the tests."""
 _SATURATED = 0.005
-"""Share of the pixels of the region that may be at full scale."""
+"""Largest share of saturated pixels in the region."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeSpread:
-    """An edge, and how sharp it is.
+    """Sharpness of an edge.
 
     Parameters
     ----------
     fit : Adjustment
-        Of `offset` (px), `slope` and `bow` of the edge (held at zero where it is straight), `dark` and
-        `bright` beside it, and `psf` (px, one sigma; held where the edge shows no width).
+        Adjustment of `offset` (px), `slope` and `bow` of the edge (zero for a straight edge), `dark` and
+        `bright` beside it, and `psf` (px, one sigma; fixed if the edge shows no width).
     free : FreeCurve or Failure
-        Modulation transfer without the assumption of a Gaussian; falsy where there are too few pixels.
+        Modulation transfer without the assumption of a Gaussian; a failure if there are too few pixels.
     gaussian : NestedTest or None
-        Whether more than the Gaussian is needed; significant where it does not describe the edge.
+        Test of whether more than the Gaussian is needed; significant if it does not describe the edge.
     bent : CoefficientTest or None
-        Whether the edge is bent.
+        Test of whether the edge is curved.
     """
 
     fit: Adjustment
@@ -567,12 +564,12 @@ class EdgeSpread:
 
     @property
     def angle(self) -> float:
-        """Of the edge from its axis (rad)."""
+        """Angle of the edge from its axis (rad)."""
         return float(np.arctan(self.fit["slope"]))
 
     def mtf(self, frequency: Array | float, psf: float | None = None) -> Array:
         """Modulation transfer of the Gaussian at frequencies in cycles per pixel, along the normal of the
-        edge; the pixel's own square is in it.
+        edge; includes the square of the pixel.
         """
         f = np.asarray(frequency, dtype=np.float64)
         width = self.fit["psf"] if psf is None else psf
@@ -582,7 +579,7 @@ class EdgeSpread:
 
     @property
     def mtf50(self) -> tuple[float, float]:
-        """Frequency at which the Gaussian leaves half of the modulation (cycles per pixel), and its sigma."""
+        """Frequency at which the modulation of the Gaussian is 0.5 (cycles per pixel), and its sigma."""
 
         def half(psf: float) -> float:
             return float(brentq(lambda f: float(self.mtf(f, psf)) - 0.5, 1e-6, 0.99))
@@ -592,7 +589,7 @@ class EdgeSpread:
         return half(psf), abs(slope) * self.fit.sigma_of("psf")
 
     def quantities(self) -> dict[str, Quantity]:
-        """What was estimated, by name: of the Gaussian, and of the free curve."""
+        """Estimated quantities by name: of the Gaussian, and of the free curve."""
         half, sigma = self.mtf50
         found = {
             "psf": Quantity(value=abs(self.fit["psf"]), sigma=self.fit.sigma_of("psf"), unit="px"),
@@ -606,7 +603,7 @@ class EdgeSpread:
         return found
 
     def to_model(self) -> dict[str, Any]:
-        """For a calibration file: the free curve in columns, and that of the Gaussian beside it."""
+        """Curves for a calibration file: the free curve in columns, and that of the Gaussian."""
         if isinstance(self.free, Failure):
             return {}
         frequency = FREQUENCIES[: int(np.searchsorted(FREQUENCIES, self.free.limit, side="right"))]
@@ -615,7 +612,7 @@ class EdgeSpread:
         return {"mtf": {name: column.tolist() for name, column in columns.items()}}
 
     def tests(self) -> list[dict[str, Any]]:
-        """For a calibration file: whether a Gaussian describes it, it is straight, and flat beside."""
+        """Tests for a calibration file: Gaussian edge, straight edge, constant sides."""
         if isinstance(self.free, Failure):
             return []
         found: list[dict[str, Any]] = [
@@ -627,7 +624,7 @@ class EdgeSpread:
         return [*found, {"name": "flat beside the edge", "passed": p >= ALPHA, "statistic": rise, "p": p}]
 
     def validity(self) -> dict[str, Any]:
-        """For a calibration file: what was measured, and at which slant."""
+        """Description for a calibration file: the method and the slant."""
         free = "measured" if self.free else f"no free curve: {getattr(self.free, 'reason', '')}"
         return {"edge": free, "edge_angle_deg": float(np.rad2deg(self.angle))}
 
@@ -643,14 +640,31 @@ def measure_edge(
     Parameters
     ----------
     frame : Frame
-        With a straight edge, nearly upright or level; grey values in proportion to the light.
+        A frame with a straight edge, nearly vertical or horizontal; grey values proportional to the light.
     region : (left, top, width, height), optional
-        Where nothing else is; by default the whole frame.
+        Region that contains nothing else; by default the whole frame.
     variance : ndarray (height, width), optional
-        Of the frame's grey values, to a common factor, where the photon transfer is known; by default of two
-        values, for the dark and the bright side, found by the residuals.
+        Variance of the grey values, up to a common factor, if the photon transfer is known; by default one
+        value for the dark and one for the bright side are estimated from the residuals.
     good : ndarray (height, width) of bool, optional
         Pixels to be used; by default all.
+
+    Returns
+    -------
+    EdgeSpread or Failure
+        A failure if the region has no suitable edge.
+
+    Examples
+    --------
+    A vertical edge with a slope of 0.1 and a width of 0.9 px:
+
+    >>> import numpy as np
+    >>> from scipy.special import ndtr
+    >>> x, y = np.meshgrid(np.arange(40.0) - 20, np.arange(40.0) - 20)
+    >>> grey = 40 + 150 * ndtr((x - 0.1 * y) / 0.9) + np.random.default_rng(1).normal(0, 1, x.shape)
+    >>> found = measure_edge(Frame(grey.astype(np.float32), 255.0))
+    >>> round(float(np.rad2deg(found.angle)), 0)
+    6.0
     """
     left, top, width, height = region or (0, 0, frame.width, frame.height)
     inside = np.s_[max(top, 0) : top + height, max(left, 0) : left + width]
@@ -659,7 +673,7 @@ def measure_edge(
         return Failure("the region of the edge is smaller than 16 pixels", Code.TOO_SMALL)
     usable = np.ones(pixels.shape, dtype=bool) if good is None else good[inside]
     if np.mean(pixels[usable] >= frame.full_scale) > _SATURATED:
-        return Failure("its bright side is saturated: expose less", Code.SATURATED)
+        return Failure("its bright side is saturated: reduce the exposure", Code.SATURATED)
     noise = None if variance is None else variance[inside]
     across, along = (np.abs(np.diff(pixels, axis=axis)).sum() for axis in (1, 0))
     if along > across:
@@ -667,12 +681,12 @@ def measure_edge(
         noise = None if noise is None else noise.T
     values = approximate_edge(pixels)
     if values is None:
-        return Failure("there is a row without an edge in its region", Code.NOT_FOUND)
+        return Failure("a row of the region has no edge", Code.NOT_FOUND)
     if not _contrast(pixels, values) > _LEAST_CONTRAST:
         return Failure("there is no edge above the noise in its region", Code.LOW_CONTRAST)
     if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
-        return Failure(f"the edge is slanted by {slant:.1f}°: turn it by 3° to 20°", Code.SLANT)
+        return Failure(f"the edge is slanted by {slant:.1f}°: rotate it to 3° to 20°", Code.SLANT)
     around = EdgePixels.of(pixels, usable)
     if noise is not None:
         around = replace(around, sigma=np.sqrt(noise[usable]))
@@ -681,7 +695,7 @@ def measure_edge(
 
 
 def _contrast(pixels: Array, values: Array) -> float:
-    """Difference of the two sides over the noise of a pixel, both robust; 0 without two sides."""
+    """Difference of the two sides over the noise of a pixel, both robust; 0 if a side is missing."""
     rows = np.arange(len(pixels)) - (len(pixels) - 1) / 2
     aside = np.arange(pixels.shape[1]) - values[0] - values[1] * rows[:, None]
     left, right = pixels[aside < -_BESIDE_PX], pixels[aside > _BESIDE_PX]
@@ -693,7 +707,7 @@ def _contrast(pixels: Array, values: Array) -> float:
 
 
 def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Failure:
-    """Gaussian and free curve in turn; which of the pixels, which noise, and whether bent, they tell."""
+    """Adjust Gaussian and free curve in turn, with selection of pixels, noise and test of the bow."""
     first = fit_gaussian(pixels, values, _REACH_PX)
     if isinstance(first, Failure):
         return first
@@ -724,18 +738,18 @@ def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Fa
 
 
 def _reaches(fit: Adjustment) -> tuple[float, float]:
-    """Up to which distances pixels take part, in the Gaussian and in the free curve."""
+    """Distances up to which pixels are used, in the Gaussian and in the free curve."""
     psf = abs(fit["psf"])
     return max(_REACH_PX, _REACH_PSF * psf), max(_FREE_REACH_PX, _FREE_REACH_PSF * psf)
 
 
 def _weighed(free: FreeCurve, pixels: EdgePixels) -> EdgePixels:
-    """With the noise that the residuals have: its variance grows in a straight line with the light."""
+    """The pixels with sigmas from the residuals; the variance is a linear function of the light."""
     dark, bright = free.base[3:5]
     residual = free.fit.residuals**2 * (len(pixels.grey) / free.fit.redundancy)
     share = np.clip((pixels.grey + free.fit.residuals - dark) / (bright - dark), 0.0, 1.0)
     levels = np.full(2, float(residual.mean()))
-    for _ in range(2):  # squares scatter as their mean does
+    for _ in range(2):  # squared residuals scatter in proportion to their mean
         design = np.stack([1 - share, share], axis=1)
         weight = 1 / (design @ levels)
         found = np.linalg.lstsq(design * weight[:, None], residual * weight, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""What differs from pixel to pixel: bias, dark current, response; and the pixels that are none."""
+"""Fields over the pixels of a sensor: bias, dark current, response, and defective pixels."""
 
 from __future__ import annotations
 
@@ -13,19 +13,29 @@ from .series import Image32, Level, SensorSeries
 __all__ = ["estimate_fields"]
 
 _FALSE_ALARMS = 0.5
-"""Good pixels that are taken for defective ones, on average over a whole sensor."""
+"""Expected number of good pixels classified as defective, over a whole sensor."""
 _TESTS = 4
 _BRIGHTEST = 0.8
-"""Share of the full scale up to which levels tell the response."""
+"""Largest signal, as a share of full scale, of levels used for the response."""
 _MAD = 1.4826
 
 
 def estimate_fields(series: SensorSeries) -> Fields:
-    """Bias and dark current by straight lines through each pixel's dark levels, response by its bright ones.
+    """Estimate bias and dark current from each pixel's dark levels, the response from its bright ones.
 
-    The lines are least squares in closed form, weighted by the numbers of frames. A pixel is defective when
-    it stands out of the others in bias, dark current, response (by a robust normal test) or scatter (by χ²)
-    by more than half a good pixel of the whole sensor would.
+    Straight lines are fitted by least squares in closed form, weighted by the numbers of frames. A pixel is
+    defective if it differs from the others in bias, dark current, response (robust normal test) or scatter
+    (χ² test); the level gives half a false alarm on the whole sensor.
+
+    Parameters
+    ----------
+    series : SensorSeries
+        Frames in the dark and of even light.
+
+    Returns
+    -------
+    Fields
+        The properties of each pixel.
     """
     bias, current = _dark_lines(series.dark)
     bright = [level for level in series.bright if level.mean.mean() < _BRIGHTEST * series.full_scale]
@@ -58,7 +68,7 @@ def _dark_lines(levels: tuple[Level, ...]) -> tuple[Image32, Image32]:
 
 
 def _unshaded(response: np.ndarray) -> np.ndarray:
-    """The response without what changes slowly: light that falls off is no defect."""
+    """The response without slow changes: falloff of light is no defect."""
     across, down = (np.vander(np.linspace(-1, 1, n), 4, increasing=True) for n in response.shape[::-1])
     flat = response.ravel()
     usual = np.abs(flat - np.median(flat)) < 10 * _MAD * np.median(np.abs(flat - np.median(flat))) + 1e-12
@@ -67,7 +77,7 @@ def _unshaded(response: np.ndarray) -> np.ndarray:
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
     terms = np.stack([across[column, i] * down[row, j] for i, j in powers], axis=-1)
     surface = np.zeros((4, 4))
-    with one_thread():  # the same sums however many processors there are
+    with one_thread():  # makes sums independent of the number of processors
         surface[tuple(np.transpose(powers))] = np.linalg.lstsq(terms, flat[chosen], rcond=None)[0]
         rest: np.ndarray = response - down @ surface.T @ across.T
     return rest
@@ -82,7 +92,7 @@ def _outliers(values: np.ndarray) -> Mask:
 
 
 def _noisy(series: SensorSeries) -> Mask:
-    """Pixels that scatter in the dark more than χ² lets the others."""
+    """Mask of pixels that scatter in the dark more than χ² allows."""
     dof = sum(level.count - 1 for level in series.dark)
     pooled = np.zeros(series.shape)
     for level in series.dark:

@@ -1,4 +1,4 @@
-"""From the frames of a series to the calibration of the sensor."""
+"""Calibration of a sensor from a series of frames."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_lineari
 __all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
 
 _FULL = 0.97
-"""Of the signal at which pixels are full: beyond, an edge is cut off."""
+"""Share of the saturation signal above which an edge is clipped."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorResult:
-    """What was found of a sensor; truthy.
+    """Calibration of a sensor; truthy.
 
     Parameters
     ----------
     fields : Fields
-        Of each pixel.
+        Properties of each pixel.
     transfer : PhotonTransfer
-        Gain, noise, full well.
+        Gain, noise, full-well capacity.
     linearity : Linearity or Failure
-        The answer to light; falsy with too few exposures, and then taken as straight.
+        Response to light; a failure with too few exposures, and then treated as linear.
     full_scale : float
-        Of the frames.
+        Full scale of the frames.
     exposure_us : float
-        The brightest unsaturated one.
+        Longest unsaturated exposure time.
     edge : EdgeSpread or Failure, optional
-        Sharpness; falsy where there is no edge to be measured.
+        Sharpness; a failure if no edge could be measured.
     """
 
     fields: Fields
@@ -58,19 +58,19 @@ class SensorResult:
 
     @property
     def prnu(self) -> float:
-        """Standard deviation of the response over the good pixels, uneven light included."""
+        """Standard deviation of the response over the good pixels, including uneven light."""
         return float(self.fields.response[~self.fields.defects].std(dtype=np.float64))
 
     @property
     def correction(self) -> SensorCorrection:
-        """What is applied to frames."""
+        """The correction of frames."""
         b2, b3 = 0.0, 0.0
         if isinstance(self.linearity, Linearity):
             b2, b3 = self.linearity.fit["b2"], self.linearity.fit["b3"]
         return SensorCorrection(self.fields, b2, b3, self.full_scale, self.exposure_us)
 
     def quantities(self) -> dict[str, Quantity]:
-        """What was estimated, by name."""
+        """Estimated quantities by name."""
         fit = self.transfer.fit
         found = {
             "gain": Quantity(value=fit["gain"], sigma=fit.sigma_of("gain"), unit="e-/DN"),
@@ -87,16 +87,16 @@ class SensorResult:
         return found
 
     def variance(self, frame: Frame, exposures: int, exposure_us: float) -> Array:
-        """Of the grey values that the correction makes of a frame, by the photon transfer.
+        """Variance of the grey values of a corrected frame, from the photon transfer.
 
         Parameters
         ----------
         frame : Frame
-            Uncorrected, the mean of some exposures.
+            The uncorrected frame, a mean of several exposures.
         exposures : int
-            How many.
+            Number of exposures.
         exposure_us : float
-            Of each.
+            Exposure time of each.
 
         Notes
         -----
@@ -141,7 +141,7 @@ class SensorResult:
         )
 
     def validity(self) -> dict[str, Any]:
-        """Where the calibration holds, and how uneven the sensor is."""
+        """Validity of the calibration, and non-uniformity of the sensor."""
         height, width = self.fields.bias.shape
         straight = isinstance(self.linearity, Linearity)
         found = {
@@ -173,7 +173,7 @@ def calibrate_sensor(series: SensorSeries) -> SensorResult:
     Raises
     ------
     EstimationError
-        When gain and noise cannot be had.
+        When gain and noise cannot be determined.
     """
     fields = estimate_fields(series)
     curve = curve_of(series, fields)
@@ -188,16 +188,21 @@ def calibrate_sensor(series: SensorSeries) -> SensorResult:
 def with_edge(
     result: SensorResult, edge: Level, region: tuple[int, int, int, int] | None = None
 ) -> SensorResult:
-    """The calibration with the sharpness of an edge, which is freed of what the sensor did to it.
+    """The calibration with the sharpness of an edge, measured in corrected frames.
 
     Parameters
     ----------
     result : SensorResult
-        Of the same sensor.
+        Calibration of the same sensor.
     edge : Level
         Frames of a slanted edge.
     region : (left, top, width, height), optional
-        Where nothing else is; by default the whole frame.
+        Region that contains nothing else; by default the whole frame.
+
+    Returns
+    -------
+    SensorResult
+        The calibration with the edge.
     """
     frame = Frame(edge.mean, result.full_scale, "edge")
     corrected = result.correction.correct(frame, edge.exposure_us)

@@ -1,4 +1,4 @@
-"""What a sensor showed at each exposure: the mean of every pixel, and its scatter from frame to frame."""
+"""Series of frames of a sensor: mean and variance of every pixel at each exposure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Level:
     count : int
         Number of frames, at least two.
     mean, variance : ndarray (height, width)
-        Of each pixel over the frames; what the whole frame changed by (the lamp's flicker) is not in it.
+        Mean and variance of each pixel over the frames, corrected for changes of whole frames (lamp flicker).
     """
 
     exposure_us: float
@@ -37,7 +37,7 @@ class Level:
 
     @classmethod
     def of(cls, exposure_us: float, frames: Iterable[NDArray[Any]]) -> Level:
-        """The level of frames, which are taken one by one and not kept.
+        """The level of frames, which are read one by one and not stored.
 
         Raises
         ------
@@ -51,7 +51,7 @@ class Level:
 
 
 class LevelSums:
-    """A level while its frames come in; none is kept.
+    """Accumulator of a level; frames are not stored.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ class LevelSums:
         self._scatter: NDArray[np.float64] = np.zeros((0, 0))
 
     def add(self, frame: NDArray[Any]) -> None:
-        """Take a frame in.
+        """Add a frame.
 
         Raises
         ------
         UsageError
-            When it has another size than the first.
+            When its size differs from that of the first.
         """
         values = frame.astype(np.float64)
         if not self.count:
@@ -80,7 +80,7 @@ class LevelSums:
             return
         if values.shape != self._mean.shape:
             raise UsageError(f"frames of {self._mean.shape} and {values.shape}", where="sensor series")
-        # The frame's own mean is put to that of the first; Welford's recurrence for the rest.
+        # Adjust the frame's mean to that of the first; then Welford's recurrence.
         self.count += 1
         values -= values.mean() - self._first
         step = values - self._mean
@@ -88,7 +88,7 @@ class LevelSums:
         self._scatter += step * (values - self._mean)
 
     def level(self) -> Level:
-        """The level so far.
+        """The level of the frames added so far.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class LevelSums:
         """
         if self.count < 2:
             raise UsageError("needs at least two frames of each exposure", where="sensor series")
-        # One degree of freedom of all pixels together went into each frame's mean.
+        # One degree of freedom of all pixels together is used for each frame's mean.
         variance = self._scatter / (self.count - 1) * (self._mean.size / (self._mean.size - 1))
         mean = self._mean.astype(np.float32)
         return Level(self.exposure_us, self.count, mean, variance.astype(np.float32))
@@ -105,19 +105,19 @@ class LevelSums:
 
 @dataclass(frozen=True, eq=False)
 class SensorSeries:
-    """Frames in the dark, and of even light, at growing exposures.
+    """Frames in the dark, and of even light, at increasing exposures.
 
     Parameters
     ----------
     dark, bright : tuple of Level
-        With the lens covered; and with nothing but even light before the sensor, the same throughout.
+        With the lens covered; and with constant even light on the sensor.
     full_scale : float
         Grey value at which the converter saturates.
 
     Raises
     ------
     UsageError
-        When there are none of either, or they differ in size.
+        When either is missing, or frames differ in size.
     """
 
     dark: tuple[Level, ...]

@@ -1,8 +1,8 @@
-"""How grey values answer to light and how they scatter: linearity, and the photon transfer curve.
+"""Linearity of the response to light, and noise: the photon transfer curve.
 
-Sources: Janesick, *Photon Transfer*; EMVA Standard 1288, release 4.0. The variance of a grey value is that of
-the arriving electrons, the signal over the gain in electrons per grey value, with that of reading, and 1/12
-of rounding to whole grey values.
+Sources: Janesick, *Photon Transfer*; EMVA Standard 1288, release 4.0. The variance of a grey value is the sum
+of the variance of the electrons (the signal over the gain in electrons per grey value), of the read noise,
+and of rounding to integers (1/12).
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ __all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", 
 
 ROUNDING = 1 / 12
 _LINEAR = 0.7
-"""Share of the saturation up to which levels take part, as EMVA 1288 has it."""
+"""Largest signal of the levels used, as a share of saturation (EMVA 1288)."""
 _COLLAPSED = 0.5
-"""Of the variance that is expected: less than this is a saturated level."""
+"""A level is saturated if its variance is below this share of the expected one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Means over the good pixels, level by level; dark ones first.
+    """Means over the good pixels for each level; dark ones first.
 
     Parameters
     ----------
     exposure_us, signal, variance : ndarray (m,)
-        Exposure, grey value above the dark one, variance of a pixel from frame to frame.
+        Exposure time, grey value above the dark one, variance of a pixel from frame to frame.
     signal_sigma, variance_sigma : ndarray (m,)
         Their standard deviations.
     bright : ndarray (m,) of bool
-        Which are of light.
+        Which levels are bright.
     usable : ndarray (m,) of bool
-        Which are far enough from saturation.
+        Which levels are far enough below saturation.
     plateau : float or None
-        Signal at which it saturates; None when no level does.
+        Signal at saturation; None if no level is saturated.
     """
 
     exposure_us: Array
@@ -55,7 +55,7 @@ class Curve:
 
 
 def curve_of(series: SensorSeries, fields: Fields) -> Curve:
-    """The means of a series."""
+    """The photon transfer curve of a series."""
     good = ~fields.defects
     levels = [*series.dark, *series.bright]
     bright = np.array([False] * len(series.dark) + [True] * len(series.bright))
@@ -69,7 +69,7 @@ def curve_of(series: SensorSeries, fields: Fields) -> Curve:
     variance = np.array([float(level.variance[good].mean(dtype=np.float64)) for level in levels])
     frames = np.array([level.count for level in levels])
     freedom = (frames - 1) * int(good.sum())
-    # Where nothing scatters, as in saturation or below one grey value, the rounding does.
+    # The minimum variance is that of rounding, as in saturation or below one grey value.
     safe = np.maximum(variance, ROUNDING)
     order = np.argsort(times[bright])
     plateau, most = _saturation(signal[bright][order], variance[bright][order])
@@ -87,7 +87,7 @@ def curve_of(series: SensorSeries, fields: Fields) -> Curve:
 
 
 def _saturation(signal: Array, variance: Array) -> tuple[float | None, float]:
-    """Signal of the plateau, when there is one, and the one up to which the variance grows."""
+    """Signal of the plateau, if there is one, and the signal up to which the variance increases."""
     top = int(np.argmax(variance))
     for k in range(top + 1, len(signal)):
         if variance[k] < _COLLAPSED * variance[top]:
@@ -97,17 +97,17 @@ def _saturation(signal: Array, variance: Array) -> tuple[float | None, float]:
 
 @dataclass(frozen=True, eq=False)
 class Linearity:
-    """How far the answer is from a straight line.
+    """Deviation of the response from a straight line.
 
     Parameters
     ----------
     fit : Adjustment
-        Of `slope` (grey values per microsecond), `b2` and `b3`: signal·(1 + b2·u + b3·u²) = slope·exposure,
-        with u the signal over the full scale.
+        Adjustment of `slope` (grey values per microsecond), `b2` and `b3`:
+        signal·(1 + b2·u + b3·u²) = slope·exposure, with u the signal over full scale.
     full_scale : float
-        Of u.
+        Full scale used for u.
     worst : float
-        Largest deviation of a level from the straight line, of the signal.
+        Largest deviation of a level from the straight line, relative to its signal.
     """
 
     fit: Adjustment
@@ -115,18 +115,31 @@ class Linearity:
     worst: float
 
     def straight(self, signal: Array) -> tuple[Array, Array]:
-        """Linearised signals, and the slope of that at them."""
+        """Linearised signals, and the derivative of the linearisation there."""
         u, b2, b3 = signal / self.full_scale, self.fit["b2"], self.fit["b3"]
         return signal * (1 + b2 * u + b3 * u**2), 1 + 2 * b2 * u + 3 * b3 * u**2
 
 
 def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
-    """Fit the linearity to the levels of light below saturation; exposures are taken as true."""
+    """Fit the linearity to the bright levels below saturation; exposure times are treated as error-free.
+
+    Parameters
+    ----------
+    curve : Curve
+        Means of the levels.
+    full_scale : float
+        Grey value at which the converter saturates.
+
+    Returns
+    -------
+    Linearity or Failure
+        A failure with fewer than four levels.
+    """
     use = curve.bright & curve.usable & (curve.exposure_us > 0)
     signal, times = curve.signal[use][:, None], curve.exposure_us[use][:, None]
     if len(signal) < 4:
         return Failure(
-            "fewer than four levels of light below saturation: take more exposures", Code.TOO_FEW_LEVELS
+            "fewer than four bright levels below saturation: take more exposures", Code.TOO_FEW_LEVELS
         )
     scale = float((signal * times).sum() / (times**2).sum())
 
@@ -153,16 +166,16 @@ def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
 
 @dataclass(frozen=True, eq=False)
 class PhotonTransfer:
-    """Gain and noise.
+    """Gain and noise of a sensor.
 
     Parameters
     ----------
     fit : Adjustment
-        Of `gain` (electrons per grey value) and `read_noise` (grey values).
+        Adjustment of `gain` (electrons per grey value) and `read_noise` (grey values).
     curve : Curve
-        What it was fitted to.
+        The curve it was fitted to.
     saturation : float or None
-        Linearised signal at which it saturates; None when no level does.
+        Linearised signal at saturation; None if no level is saturated.
     """
 
     fit: Adjustment
@@ -171,7 +184,7 @@ class PhotonTransfer:
 
     @property
     def full_well(self) -> tuple[float, float] | None:
-        """Electrons at which a pixel saturates, and their sigma; None when no level reached that."""
+        """Full-well capacity in electrons, and its sigma; None if no level is saturated."""
         if self.saturation is None:
             return None
         return self.saturation * self.fit["gain"], self.saturation * self.fit.sigma_of("gain")
@@ -180,8 +193,20 @@ class PhotonTransfer:
 def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTransfer | Failure:
     """Fit the photon transfer curve: σ² = σ_read² + 1/12 + signal/gain.
 
-    Where the answer bends, the signal is the linearised one, and the light's part of the variance that of the
-    linearised signal over the square of its slope. The signal's own uncertainty is carried to the variance.
+    For a non-linear response the signal is linearised, and its part of the variance is divided by the square
+    of the slope. The uncertainty of the signal is propagated to the variance.
+
+    Parameters
+    ----------
+    curve : Curve
+        Means of the levels.
+    linearity : Linearity, optional
+        Response; by default it is linear.
+
+    Returns
+    -------
+    PhotonTransfer or Failure
+        A failure with too few levels, or if the variance does not increase with the light.
     """
     use = curve.usable
     signal, variance = curve.signal[use], curve.variance[use]
@@ -192,12 +217,12 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
         saturation = None if curve.plateau is None else float(linearity.straight(top)[0][0])
     if (curve.bright & use).sum() < 2 or not np.ptp(signal) > 0:
         return Failure(
-            "fewer than two levels of light below saturation: take shorter exposures", Code.TOO_FEW_LEVELS
+            "fewer than two bright levels below saturation: take shorter exposures", Code.TOO_FEW_LEVELS
         )
     slope, floor = np.polyfit(signal, variance, 1, w=1 / curve.variance_sigma[use])
     if not slope > 0:
         return Failure(
-            "the variance does not grow with the light: is it even, and no gamma curve set?",
+            "the variance does not increase with the light: check that it is even and no gamma curve is set",
             Code.INCONSISTENT,
         )
     sigma = np.hypot(curve.variance_sigma[use], slope * curve.signal_sigma[use] * curve.bright[use])

@@ -246,7 +246,8 @@ class _Rods:
     def _reason(self, rod: int) -> str:
         """Why a rod was not measured; empty where it was."""
         if self.row[rod] >= 0 or self.why[rod]:
-            return self.why[rod]
+            declined: str = self.why[rod]
+            return declined
         x, y = self.predicted[rod]
         if not (0 <= x <= self.frame.width - 1 and 0 <= y <= self.frame.height - 1):
             return Reason("outside the frame", Code.OUTSIDE)
