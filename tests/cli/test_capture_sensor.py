@@ -177,7 +177,9 @@ def test_an_edge_that_fills_the_pixels_is_told(
     monkeypatch.setenv("LIGHT_OF_THE_EDGE", "40")
     assert capture("--edge") == 1
     found = capsys.readouterr()
-    assert found.err.strip().splitlines()[-1] == "reseau: edge: its bright side is saturated: expose less"
+    assert found.err.strip().splitlines()[-1] == (
+        "reseau: edge: its bright side is saturated: reduce the exposure"
+    )
     with Archive.open("archive") as archive:
         results = [result.name for result in archive.session("monday").results()]
     assert results == ["calibration.json", "report.html"]

@@ -35,8 +35,8 @@ def test_the_standard_reseau_covers_its_screen_and_is_a_document() -> None:
         (5, 5, -1.0, DISK, {}, "5 × 5 marks"),
         (5, 5, 1.5, DISK, {}, "do not fit a pitch"),
         (5, 5, 10.0, Mark(shape="disk"), {}, "do not fit"),
-        (5, 5, 10.0, Mark(shape="cross", size=3.0), {}, "width of line"),
-        (5, 5, 10.0, DISK, {"origin": "Z9"}, "origin: names 'Z9'"),
+        (5, 5, 10.0, Mark(shape="cross", size=3.0), {}, "line width"),
+        (5, 5, 10.0, DISK, {"origin": "Z9"}, "origin: 'Z9' is not a mark"),
         (5, 5, 10.0, DISK, {"origin": "A1", "axis": "A1"}, "must differ"),
     ],
 )

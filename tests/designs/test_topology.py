@@ -99,7 +99,7 @@ def test_reading_is_right_or_refused(
         assert found.why
 
 
-def test_what_no_one_can_tell_is_refused_with_the_reason() -> None:
+def test_a_cluster_that_matches_no_square_is_declined_with_the_reason() -> None:
     nothing = CODE.decode(np.full(16, HIDDEN))
     assert not nothing
     assert nothing.why == "16 of its targets are hidden"
@@ -126,7 +126,7 @@ def test_squares_that_hold_no_four_by_four_have_no_code() -> None:
     with pytest.raises(UsageError, match="sixteen targets"):
         TopologicalCode.of(field.model_copy(update={"targets": field.targets.model_copy(update=fewer)}))
     moved = (field.targets.x[0] + 1.0, *field.targets.x[1:])
-    with pytest.raises(UsageError, match="no grid"):
+    with pytest.raises(UsageError, match="grid of four by four"):
         TopologicalCode.of(
             field.model_copy(update={"targets": field.targets.model_copy(update={"x": moved})})
         )

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from reseau.measure.reseau.candidates import Candidates
-from reseau.measure.reseau.placement import GridOptions, assign, lay_out
+from reseau.measure.reseau.placement import GridOptions, assign, place_grid
 
 WIDTH, HEIGHT = 900, 700
 VALID = np.ones((HEIGHT, WIDTH), dtype=bool)
@@ -74,7 +74,7 @@ def test_without_prior_positions_shift_scale_rotation_and_handedness_are_found(
 ):
     rng, xy = np.random.default_rng(seed), design()
     image = seen(xy, scale, np.deg2rad(turn), mirrored, bend, rng.uniform(-40, 40, 2))
-    found = lay_out(xy, candidates(image, rng, missing=0.05, false=0.3), VALID, GridOptions())
+    found = place_grid(xy, candidates(image, rng, missing=0.05, false=0.3), VALID, GridOptions())
     assert found is not None
     inside = ((image > 2) & (image < [WIDTH - 3, HEIGHT - 3])).all(axis=1)
     assert share_right(found, image) > 0.99
@@ -85,7 +85,7 @@ def test_without_prior_positions_shift_scale_rotation_and_handedness_are_found(
 def test_a_strong_barrel_or_pincushion_is_followed(bend):
     rng, xy = np.random.default_rng(4), design()
     image = seen(xy, 9.0, 0.1, True, bend)
-    found = lay_out(xy, candidates(image, rng), VALID, GridOptions())
+    found = place_grid(xy, candidates(image, rng), VALID, GridOptions())
     assert found is not None
     assert share_right(found, image) == 1.0
     assert np.abs(found.predicted - image).max() < 2.0
@@ -95,7 +95,7 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
     rng, xy = np.random.default_rng(6), design()
     image = seen(xy, 10.0, -0.05)
     there = (np.abs(xy[:, 1] - 10) > 1) & (np.abs(xy[:, 1] + 15) > 1) & (np.hypot(*(xy - [10, 0]).T) > 11)
-    found = lay_out(xy, candidates(image[there], rng, false=0.3), VALID, GridOptions())
+    found = place_grid(xy, candidates(image[there], rng, false=0.3), VALID, GridOptions())
     assert found is not None
     assert share_right(found, image) == 1.0
     assert (found.candidate[there] >= 0).mean() > 0.95
@@ -105,7 +105,7 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
 def test_a_handedness_that_is_known_is_kept():
     rng, xy = np.random.default_rng(7), design()
     image = seen(xy)
-    found = lay_out(xy, candidates(image, rng), VALID, GridOptions(mirrored=True))
+    found = place_grid(xy, candidates(image, rng), VALID, GridOptions(mirrored=True))
     assert found is not None
     assert np.linalg.det(found.field.jacobian(xy[:1])[0]) < 0
 
@@ -125,4 +125,4 @@ def test_marks_beyond_the_frame_or_on_lost_pixels_are_not_held_against_it():
 def test_hardly_any_candidates_are_no_grid(count):
     few = Candidates(np.full((count, 2), 50.0) + np.arange(count)[:, None], np.full(count, 9.0))
     assert assign(design(), seen(design()), few, VALID) is None
-    assert lay_out(design(), few, VALID, GridOptions()) is None
+    assert place_grid(design(), few, VALID, GridOptions()) is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.measure.matching.noise import course, grey_variance, medians
+from reseau.measure.matching.noise import grey_variance, medians, relative_weights
 
 A, B = 1.5, 0.08
 STARTS = np.stack(np.meshgrid(np.arange(20, 380, 30), np.arange(20, 280, 30)), axis=-1).reshape(-1, 2) + 0.3
@@ -61,7 +61,7 @@ def test_too_few_residuals_tell_nothing():
 
 def test_weights_are_inverse_to_the_variances_of_a_patch_and_never_wild():
     grey = np.array([[50.0, 100.0, 150.0], [0.0, 0.0, 1e6]])
-    weights = course(grey, (A, B))
+    weights = relative_weights(grey, (A, B))
     assert weights[0] * (A + B * grey[0]) == pytest.approx(np.full(3, A + B * 100))
     assert weights.max() <= 20
     assert weights.min() > 0

@@ -134,7 +134,7 @@ def test_points_of_little_weight_pull_little():
 
 
 def test_too_few_points_for_a_trend_are_refused_in_one_line():
-    with pytest.raises(UsageError, match="7 points do not bear a trend of degree 2") as raised:
+    with pytest.raises(UsageError, match="7 points are too few for a trend of degree 2") as raised:
         SmoothField.fit(grid(3)[:7], grid(3)[:7], degree=2)
     assert "\n" not in str(raised.value)
 

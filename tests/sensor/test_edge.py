@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.stats import binom
 
 from reseau.core.data import Array, Frame
-from reseau.core.failure import Failure
+from reseau.core.failure import Code, Failure
 from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
 from reseau.sensor.edge import FREQUENCIES
 
@@ -237,18 +237,19 @@ def test_the_sharpness_of_an_edge_is_recovered_within_its_sigmas() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "said"),
+    ("pixels", "code"),
     [
-        (np.zeros((8, 8)), "smaller than 16"),
-        (np.zeros((40, 40)), "without an edge"),
-        (np.repeat([[0.0] * 20 + [100.0] * 20], 40, axis=0) + np.eye(40), "slanted by"),
+        (np.zeros((8, 8)), Code.TOO_SMALL),
+        (np.zeros((40, 40)), Code.NOT_FOUND),
+        (np.repeat([[0.0] * 20 + [100.0] * 20], 40, axis=0) + np.eye(40), Code.SLANT),
         (
             np.clip(100 + 300 * np.tanh(np.add.outer(np.arange(40) / 10, np.arange(-22, 18))), 0, 255),
-            "saturated",
+            Code.SATURATED,
         ),
     ],
 )
-def test_what_is_no_slanted_edge_is_declined(pixels: Array, said: str) -> None:
+def test_what_is_no_slanted_edge_is_declined(pixels: Array, code: Code) -> None:
     found = measure_edge(Frame(pixels, 255.0))
     assert isinstance(found, Failure)
-    assert said in found.reason
+    assert found.code is code
+    assert found.reason

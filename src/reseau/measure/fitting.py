@@ -90,7 +90,7 @@ def fit_mapping(
     shortage = _shortage(model, points)
     if shortage is not None:
         return shortage
-    return adjust(mapping_problem(_begun(model, points, target), points, target, target_sigma))
+    return adjust(mapping_problem(_with_start_values(model, points, target), points, target, target_sigma))
 
 
 def reduce_mapping(
@@ -120,11 +120,11 @@ def reduce_mapping(
     shortage = _shortage(model, points)
     if shortage is not None:
         return shortage
-    problem = mapping_problem(_begun(model, points, target), points, target, target_sigma)
+    problem = mapping_problem(_with_start_values(model, points, target), points, target, target_sigma)
     return eliminate(problem, alpha, criterion, keep, options=options)
 
 
-def _begun(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:
+def _with_start_values(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:
     """The model with approximate values from a linear solution, if these fit better than the given ones.
 
     N/(1 + D) + P = T multiplied by 1 + D is linear in the parameters of N, D and P if the product D·P of two

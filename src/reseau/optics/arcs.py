@@ -1,16 +1,16 @@
-r"""The image of a point reflector in a scanned section: a bent line that is brightest in its middle.
+r"""The image of a point reflector in an ultrasonic section: an arc that is brightest at its centre.
 
-A point at range d answers to every beam that grazes it, later the more obliquely it is hit, and weaker. Where
+A point at range d reflects every beam that grazes it; the echo is later and weaker for more oblique beams. If
 the echo is late by :math:`v` at the distance :math:`u` along the scan, with a beam and a pulse of Gaussian
 profiles of widths a and b,
 
 .. math:: I = \exp\Bigl(-\frac{u^2}{2a^2} - \frac{(v - h(u))^2}{2b^2}\Bigr), \qquad
           h(u) = \frac{\sqrt{1 + \kappa^2 u^2} - 1}{\kappa} ,
 
-for ranges :math:`\sqrt{d^2 + u^2}` lie on a hyperbola of curvature :math:`\kappa = 1/d` in its vertex. In an
-image all that is turned by the tilt. The spot of a display, the lens and the pixel widen both profiles; the
-widths here are those that are seen. A pixel integrates: a Gaussian of width s folded with the pixel is one
-of :math:`\sqrt{s^2 + 1/12}` to 1e-3 of its height from s = 0.6 px on.
+since ranges :math:`\sqrt{d^2 + u^2}` lie on a hyperbola of curvature :math:`\kappa = 1/d` at its vertex. In
+an image all this is rotated by the tilt. The spot of a display, the lens and the pixel widen both profiles;
+the widths here are those in the image. A pixel integrates: a Gaussian of width s convolved with the pixel is
+one of :math:`\sqrt{s^2 + 1/12}` within 1e-3 of its height, for s above 0.6 px.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = ["Arcs"]
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """Arcs in columns; image coordinates (x right, y down), the origin in the middle of each.
+    """Arcs in columns; image coordinates (x right, y down), the origin at the centre of each.
 
     Parameters
     ----------
     along, across : ndarray (k,)
         Widths (one sigma) a along the line and b across it, pixels.
     curvature : ndarray (k,)
-        Curvature κ in the middle, 1/px; above zero the ends of a level arc lie below its middle.
+        Curvature κ at the centre, 1/px; positive if the ends of a horizontal arc lie below its centre.
     tilt : ndarray (k,)
         Angle from the x axis towards the y axis (rad).
 
@@ -54,16 +54,16 @@ class Arcs:
         return len(self.along)
 
     def select(self, rows: Rows) -> Arcs:
-        """Some of them."""
+        """A subset of the arcs."""
         return Arcs(self.along[rows], self.across[rows], self.curvature[rows], self.tilt[rows])
 
     def image(self, xy: Array, columns: Array, rows: Array) -> Array:
-        """Brightness of the pixels of windows, 1 in the middle of the line.
+        """Brightness of the pixels of windows, 1 at the centre of the line.
 
         Parameters
         ----------
         xy : ndarray (k, 2)
-            Middles of the lines, pixels.
+            Centres of the lines, pixels.
         columns, rows : ndarray (k, c), (k, r)
             Pixel coordinates of the windows.
 
@@ -78,7 +78,7 @@ class Arcs:
         return image
 
     def derivatives(self, xy: Array, columns: Array, rows: Array) -> tuple[Array, Array]:
-        """Brightness, and its derivatives by position, widths and form.
+        """Brightness, and its derivatives with respect to position, widths and form.
 
         Returns
         -------
@@ -91,7 +91,7 @@ class Arcs:
         root = np.sqrt(1 + (k * u) ** 2)
         late = v - k * u * u / (1 + root)
         image = np.exp(-0.5 * ((u / a) ** 2 + (late / b) ** 2))
-        # Derivatives of the exponent by v, and by u along and across.
+        # Derivatives of the exponent with respect to v, and to u along and across.
         by_v = -image * late / b**2
         by_u = -image * u / a**2 - by_v * k * u / root
         c, s = np.cos(self.tilt)[:, None, None], np.sin(self.tilt)[:, None, None]

@@ -1,8 +1,8 @@
 """Images of many small shapes in single precision, compiled.
 
-The sums are those of :mod:`reseau.optics.formation`; here they are taken shape by shape, so that a cache
-holds them, the normal distribution comes from a table, and a node of an outline is looked at only in the rows
-that see it.
+The sums are those of :mod:`reseau.optics.formation`; here they are computed shape by shape, so that they fit
+into a cache, the normal distribution comes from a table, and a node of an outline is evaluated only in the
+rows within its reach.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
 
 _SIDE = 5.5
-"""Where the table of the normal distribution ends, in standard deviations: 2e-8 of the light are beyond."""
+"""End of the table of the normal distribution in standard deviations: 2e-8 of the light lie beyond."""
 _PER_SIGMA = 64
-"""Its entries for one; with the next two terms of the series in between it is good to 1e-7."""
+"""Entries per standard deviation; with two more terms of the series in between, accurate to 1e-7."""
 
 
 def _table() -> tuple[Single, Single]:
@@ -36,13 +36,13 @@ _STEP, _BELL = _table()
 f32 = np.float32
 
 _FREE = {"nnan", "ninf", "nsz"}
-"""What the compiler may take for granted. Not that sums can be taken in another order, nor that a product
-goes into a sum unrounded: what it makes of that differs from one compilation to the next, in the last bits.
+"""Assumptions allowed to the compiler. Sums must not be reordered, and products not be fused into sums: both
+would make the last bits differ from one compilation to the next.
 """
 
 
 def _compiled(function: F) -> F:
-    """Compile with Numba, kept on disk; other threads may run meanwhile."""
+    """Compile with Numba, cached on disk, releasing the GIL."""
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FREE}
     return cast(F, numba.njit(**options)(function))
 
@@ -79,14 +79,14 @@ def _responses(
     if n <= 0:
         return first, first
     per, inverse, begin, lag = f32(0.5) / half, f32(1) / sigma, f32(first) - point - half, 1
-    if half == f32(0.5):  # neighbours share an edge
+    if half == f32(0.5):  # adjacent pixels share an edge
         _edges(begin, inverse, n + 1, n + 1, f32(0), work[0], work[1])
     else:
         lag = n
         _edges(begin, inverse, n, 2 * n, f32(2) * half - f32(n), work[0], work[1])
     before, beyond, bell, bells = work[0, :n], work[0, lag : lag + n], work[1, :n], work[1, lag : lag + n]
     integral, value, slope = out[0], out[1], out[2]
-    # Loops over few arrays each, so that the compiler can tell that these do not overlap.
+    # Loops over few arrays each, so that the compiler can prove that these do not overlap.
     for k in range(n):
         value[k] = (beyond[k] - before[k]) * per
     for k in range(n):
@@ -105,7 +105,7 @@ def _add_node(
     responses: tuple[Single, Single],
     parts: Single,
 ) -> None:
-    """Add what a node of an outline contributes to share and derivatives (4 + m, r, c) in its reach."""
+    """Add the contribution of a node of an outline to share and derivatives (4 + m, r, c) in its reach."""
     (top, bottom, left, right), (dx, dy), (down, across) = at, tangent, responses
     n = right - left
     integral, value, slope = across[0], across[1], across[2]
@@ -146,26 +146,26 @@ def formed(
     fill: float,
     parts: Single,
 ) -> None:
-    """Form share and derivatives of shapes, whose outlines are multiplied by 1 + Σ p_i F_i.
+    """Form share and derivatives of shapes whose outlines are multiplied by 1 + Σ p_i F_i.
 
     Parameters
     ----------
     nodes, tangents : ndarray (k, j, 2)
         Nodes of outlines, and tangents times weights; see :class:`reseau.optics.formation.Outline`.
     generators : ndarray (m, 2, 2)
-        The F.
+        The generators F_i.
     at : ndarray of int (n,)
-        Which outlines are wanted.
+        Indices of the outlines.
     place : ndarray (n, 2)
-        Where their origins lie, from the centre of the first pixel of each window.
+        Positions of their origins, from the centre of the first pixel of each window.
     form : ndarray (n, m)
-        The p.
+        The p_i.
     sigma : ndarray (n,)
         Widths of the point-spread function.
     fill : float
-        Light-sensitive part of the pitch.
+        Light-sensitive share of the pitch.
     parts : ndarray (n, 1, r, c) or (n, 4 + m, r, c)
-        The share, and if there is room its derivatives by shifts along x and y, the width, and the forms.
+        The share and, if there is room, its derivatives by shifts along x and y, width, and forms.
     """
     half, (high, wide) = f32(max(fill, 1e-6) / 2), parts.shape[2:]
     down, across = np.empty((3, high), f32), np.empty((3, wide), f32)
@@ -194,7 +194,7 @@ def formed(
             _add_node((top, bottom, left, right), (dx, dy), normals, sigma[k], (down, across), parts[k])
             for r in range(top, bottom):
                 behind[r, right] -= down[1, r - top] * dy
-        # Behind the reach of a node its integral stays 1: one sum for all.
+        # Beyond the reach of a node its integral stays 1: one sum for all.
         for r in range(high):
             total = f32(0)
             for c in range(wide):

@@ -1,4 +1,4 @@
-"""Mappings to build with: identity, similarity, one after another, the other way round."""
+"""Building blocks of mappings: identity, similarity, inverse, and composition."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Chain", "Identity", "Inverted", "Similarity"]
 
 @dataclass(frozen=True, eq=False)
 class Identity(PlaneMapping):
-    """The mapping that changes nothing; it has no parameters."""
+    """The identity mapping; it has no parameters."""
 
     names: ClassVar[tuple[str, ...]] = ()
     values: Array = field(default_factory=lambda: np.zeros(0))
@@ -28,7 +28,7 @@ class Identity(PlaneMapping):
         object.__setattr__(self, "values", as_values(self.names, self.values))
 
     def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """The points, unit matrices, and nothing."""
+        """The points, unit matrices, and no derivatives with respect to parameters."""
         points = as_points(xy)
         return Derivatives(
             points.copy(), np.tile(np.eye(2), (len(points), 1, 1)), np.zeros((len(points), 2, 0))
@@ -47,7 +47,7 @@ class Similarity(PlaneMapping):
     values : array_like (4,)
         X0, Y0, a, b; default the identity.
     mirrored : bool
-        Whether y changes its sign first, as between a plane with y down and one with y up.
+        Whether the sign of y is changed first, as between a plane with y down and one with y up.
     """
 
     names: ClassVar[tuple[str, ...]] = ("X0", "Y0", "a", "b")
@@ -59,17 +59,17 @@ class Similarity(PlaneMapping):
 
     @classmethod
     def common_system(cls, origin: ArrayLike, axis: ArrayLike, *, mirrored: bool = False) -> Self:
-        """Into the system with its origin at one mark and its x-axis through another, scale unchanged.
+        """Transformation to the system with its origin at one mark and its x-axis through another.
 
-        The common system of a reseau (Wishahy, step ii): the axis is the line joining two points of it and
-        not the wire.
+        The scale is unchanged. This is the common system of a reseau (Wishahy, step ii): the axis is the line
+        through two points, not the wire.
 
         Parameters
         ----------
         origin, axis : array_like (2,)
             The marks O1 and S1.
         mirrored : bool
-            Whether the system shall have the other handedness.
+            Whether the system has the opposite handedness.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Similarity(PlaneMapping):
 
 @dataclass(frozen=True, eq=False)
 class Inverted(PlaneMapping):
-    """A mapping the other way round, with the same parameters.
+    """The inverse of a mapping, with the same parameters.
 
     Its derivatives follow from the implicit function f(p; θ) = q: ∂p/∂q = (∂f/∂p)⁻¹ and
     ∂p/∂θ = −(∂f/∂p)⁻¹ ∂f/∂θ.
@@ -178,19 +178,19 @@ class Inverted(PlaneMapping):
 
 @dataclass(frozen=True, eq=False)
 class Chain(PlaneMapping):
-    """One mapping after another: the result of the first goes into the second.
+    """Composition of two mappings: the result of the first is mapped by the second.
 
     Parameters
     ----------
     first, second : PlaneMapping
         The mappings; parameters of the first come first.
     labels : (str, str)
-        Put before the names of the one and of the other, where both have a parameter of the same name.
+        Prefixes of the names of the first and of the second, if both have a parameter of the same name.
 
     Raises
     ------
     UsageError
-        When a name stands twice.
+        When a name occurs twice.
 
     Examples
     --------
@@ -240,7 +240,7 @@ class Chain(PlaneMapping):
         return Derivatives(value, outer @ d_xy, np.concatenate([outer @ d_first, d_second], axis=2))
 
     def one_to_one(self, xy: ArrayLike) -> Mask:
-        """Whether both mappings are, each where it is applied."""
+        """Whether both mappings are one-to-one where they are applied."""
         points = as_points(xy)
         return self.first.one_to_one(points) & self.second.one_to_one(self.first(points))
 

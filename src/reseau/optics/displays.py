@@ -1,4 +1,4 @@
-"""Displays: a cathode-ray tube as Wong models it, with the beam of an ultrasonic instrument before it.
+"""Displays: Wong's model of a cathode-ray tube, with the beam of an ultrasonic instrument.
 
 The model is a sum of corrections to the displayed point::
 
@@ -11,16 +11,16 @@ The model is a sum of corrections to the displayed point::
 
 (Wong 1975, Mathematical formulation and digital analysis in close-range photogrammetry; Wishahy, section B.)
 
-Where Wishahy's printed formulas disagree, the components above are taken and not their expansion:
+Where Wishahy's printed formulas are inconsistent, the components above are used, not their expansion:
 
-- The Δ are called distortions but are added to the measured point: they are corrections, and are that here.
+- The Δ are called distortions but are added to the measured point: they are corrections, also here.
 - (6a, b) print h1 and h3 without the prime at x² and y², the list after (7) prints h1, h2, h3, h4 without it:
   all mean the h' of the decentering. With it the signs of (6) follow from the components.
 - The beam's (Δx)ε is (Δx)e in the sum.
-- In (7) all sixteen coefficients are free, but the thirteen parameters of (6) leave three conditions:
+- In (7) all sixteen coefficients are free, but the thirteen parameters of (6) imply three conditions:
   A4 − A5 = B3 (both P2), B4 − B5 = A3 (both P1) and A6 = B6 (both k1). (7) is
-  :meth:`RationalPolynomial.ultrasonic`; a display fitted instead keeps the conditions.
-- h'1 = g1 sin θ … h'4 = g2 cos θ are four numbers from three: (6) and (7) drop h'1·h'4 = h'2·h'3.
+  :meth:`RationalPolynomial.ultrasonic`; a fitted display satisfies the conditions.
+- h'1 = g1 sin θ … h'4 = g2 cos θ are four numbers from three: (6) and (7) ignore h'1·h'4 = h'2·h'3.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _negative(terms: str) -> str:
 
 
 def wong_display() -> RationalPolynomial:
-    """Wong's display, linear in its parameters: decentering by h'1 … h'4; begins as the identity.
+    """Wong's display, linear in its parameters, with decentering by h'1 … h'4; initially the identity.
 
     Parameters k0 … k3, h'1 and h'2 (−r², −r⁴ in X), h'3 and h'4 (r², r⁴ in Y), P0 … P4, m1, m2: 15 in all.
     With k2 = k3 = 0 it is Wishahy's eq. (6a, b).
@@ -83,7 +83,7 @@ _LINEAR = (
 
 @dataclass(frozen=True, eq=False)
 class DecenteredDisplay(PlaneMapping):
-    """Wong's display with the decentering as Wong has it: profile g1, g2, g3 and the direction θ of its axis.
+    """Wong's display with his parameters of decentering: profile g1, g2, g3 and direction θ of its axis.
 
     Unlike :func:`wong_display` it is not linear in θ, and θ is undetermined where all g are zero.
 

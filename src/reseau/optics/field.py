@@ -1,13 +1,13 @@
-r"""A smooth field through measured points: polynomial trend and, where it is needed, a local model on top.
+r"""Smooth fields through measured points: a polynomial trend and, if needed, a local model on top.
 
 The local model is least-squares collocation (Krarup 1969; Moritz 1980, eq. 14-26; Kraus & Mikhail 1972),
-:math:`l = A x + s + n`: what the polynomial cannot follow is a signal s whose covariance falls off with
+:math:`l = A x + s + n`: deviations from the polynomial are a signal s whose covariance decreases with
 distance, here :math:`C(d) = s^2 (1 + z + z^2/3) e^{-z}` with :math:`z = \sqrt5\,d/L`, twice
-differentiable. Its three numbers are estimated by restricted maximum likelihood (Patterson & Thompson 1971),
-so that the trend does not bias them, and the need of the signal at all is tested.
+differentiable. Its three parameters are estimated by restricted maximum likelihood (Patterson & Thompson
+1971), so that the trend does not bias them, and the significance of the signal is tested.
 
-What the field says *beyond* the points it was made from is the trend and the fading signal: it does not
-extrapolate.
+*Beyond* the points it was fitted to, the field is the trend and the decreasing signal; do not use it for
+extrapolation.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from ..core.errors import UsageError
 __all__ = ["SmoothField", "trend_degree"]
 
 _LENGTHS = 0.12 * 2.0 ** np.arange(6)
-"""Correlation lengths looked at, in half extents of the field."""
+"""Correlation lengths that are tried, in half extents of the field."""
 _RATIOS = np.concatenate([[0.0], 10.0 ** np.arange(-2, 3.01, 0.5)])
-"""Variances of the signal over that of the noise looked at."""
+"""Ratios of the variances of signal and noise that are tried."""
 
 
 def trend_degree(points: int, most: int = 5) -> int:
-    """Highest degree of a trend that leaves five points to each pair of coefficients.
+    """Highest degree of a trend with at least five points for each pair of coefficients.
 
     Examples
     --------
@@ -47,19 +47,19 @@ class SmoothField:
     Parameters
     ----------
     source : ndarray (n, 2)
-        Where the field is known.
+        Points at which the field is known.
     target : ndarray (n, 2)
-        Its values there.
+        Values at these points.
     degree : int
         Degree of the trend.
     length : float
         Correlation length L of the signal in the unit of `source`.
     ratio : ndarray (2,)
-        Variance of the signal over that of the noise, per axis; 0 where there is none.
+        Variance of the signal over that of the noise, per axis; 0 without a signal.
     noise : ndarray (2,)
         Standard deviation of the noise of a point of weight 1, per axis.
     need : ndarray (2,)
-        Probability, per axis, that white noise alone would ask as much for a signal; NaN if not tested.
+        Probability, per axis, that white noise alone requires an equally strong signal; NaN if not tested.
     sigma : ndarray (n,)
         Relative standard deviations of the points.
     """
@@ -97,18 +97,18 @@ class SmoothField:
         sigma : ndarray (n,), optional
             Relative standard deviations of the values; equal by default.
         degree : int, optional
-            Degree of the trend; by default as high as the number of points bears.
+            Degree of the trend; by default the highest supported by the number of points.
         local : bool
             Whether a signal may be added to the trend.
         length : float, optional
-            Correlation length, where it is known; else the likeliest is taken.
+            Correlation length, if known; by default the likeliest one.
         trials : int
-            Number of simulated fields of white noise for the test of the signal's need; 0: no test.
+            Number of simulated fields of white noise for the test of the signal; 0 for no test.
         seed : int
-            Of the simulation.
+            Seed of the simulation.
         null : ndarray (trials, n, 2), optional
-            Values without a signal to test against instead, where these are not white: the residuals of an
-            adjustment lack what its parameters took.
+            Values without a signal for the test, if they are not white: residuals of an adjustment lack the
+            part absorbed by its parameters.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class SmoothField:
         relative = np.ones(len(source)) if sigma is None else np.asarray(sigma, dtype=np.float64)
         design, extent = _design(source, source, degree)
         if len(source) < design.shape[1] + 2:
-            raise UsageError(f"{len(source)} points do not bear a trend of degree {degree}")
+            raise UsageError(f"{len(source)} points are too few for a trend of degree {degree}")
         if not local:
             return _polynomial(source, target, degree, design, relative)
         q, _ = np.linalg.qr(design / relative[:, None], mode="complete")
@@ -188,12 +188,12 @@ class SmoothField:
         deviation : ndarray (n, 2)
             Value minus prediction.
         sigma : ndarray (n, 2)
-            Standard deviation of that, noise of the point included.
+            Its standard deviation, including the noise of the point.
 
         Notes
         -----
         With :math:`P` the inverse covariance after elimination of the trend, :math:`(P l)_i / P_{ii}` and
-        :math:`P_{ii}^{-1/2}` (Dubrule 1983); nothing is fitted anew.
+        :math:`P_{ii}^{-1/2}` (Dubrule 1983); nothing is adjusted again.
         """
         scale = self.sigma[:, None]
         weights = np.stack([solution[0] for solution in self._solutions], axis=1)
@@ -229,20 +229,20 @@ def _design(source: Array, xy: Array, degree: int) -> tuple[Array, float]:
 
 
 def _correlation(z: Array) -> Array:
-    """Matérn's correlation of smoothness 5/2 at distances in correlation lengths."""
+    """Matérn correlation of smoothness 5/2 at distances in correlation lengths."""
     z = np.sqrt(5) * z
     value: Array = (1 + z + z * z / 3) * np.exp(-z)
     return value
 
 
 def _spectrum(free: Array, correlation: Array, relative: Array) -> tuple[Array, Array]:
-    """Eigenvalues and vectors of the signal's covariance in the space that the trend leaves free."""
+    """Eigenvalues and eigenvectors of the signal's covariance in the space orthogonal to the trend."""
     values, vectors = eigh(free.T @ (correlation / np.outer(relative, relative)) @ free, check_finite=False)
     return np.maximum(values, 0), vectors
 
 
 def _gains(spectrum: Array, white: Array, ratios: Array) -> Array:
-    """Restricted log-likelihood over that without signal, (ratios, columns of `white`).
+    """Restricted log-likelihood relative to no signal, (ratios, columns of `white`).
 
     The variance of the noise is replaced by its estimate for each ratio.
     """
@@ -255,9 +255,9 @@ def _gains(spectrum: Array, white: Array, ratios: Array) -> Array:
 
 
 def _need(spectra: list[tuple[Array, Array]], ratios: Array, gains: Array, null: Array) -> Array:
-    """Share of simulated fields without a signal whose likelihood gains as much by one; exact in level.
+    """Share of simulated fields without a signal with at least the same gain in likelihood (an exact test).
 
-    The simulated fields (1 or 2 axes, free values, trials) are seen through the basis of each spectrum.
+    The simulated fields (1 or 2 axes, free values, trials) are transformed to the basis of each spectrum.
     """
     trials = null.shape[2]
     if not trials:

@@ -1,17 +1,17 @@
-r"""The image of plane shapes, formed exactly: any smooth mapping, point-spread function, pixel integration.
+r"""Exact formation of images of plane shapes: smooth mapping, point-spread function, pixel integration.
 
-A shape is known by its outline. With the pixel response :math:`h` along an axis (a Gaussian point-spread
-function folded with the light-sensitive width of the pixel) and :math:`H` its integral, the share of a
+A shape is given by its outline. With the pixel response :math:`h` along an axis (a Gaussian point-spread
+function convolved with the light-sensitive width of the pixel) and :math:`H` its integral, the share of a
 pixel's light that falls on the shape R is, by Green's theorem, an integral along the outline alone,
 
 .. math:: a(p) = \iint_R h(p_x - q_x)\,h(p_y - q_y)\,dq = -\oint H(p_x - q_x)\,h(p_y - q_y)\,dq_y ,
 
 so that Gauss–Legendre nodes on the outline give all pixels of a patch as one product of two small matrices.
 Nothing is sampled in the image plane: a shift of the shape by 1/1000 px is a shift of its image by 1/1000 px.
-The derivative for a motion :math:`v` of the outline is :math:`\oint h\,h\,(v_x dq_y - v_y dq_x)`, and that
-for its Gaussian's width follows from the equation of heat, :math:`\partial a/\partial s = s\,\nabla^2 a`.
+The derivative for a motion :math:`v` of the outline is :math:`\oint h\,h\,(v_x dq_y - v_y dq_x)`; that for
+the width of the Gaussian follows from the heat equation, :math:`\partial a/\partial s = s\,\nabla^2 a`.
 
-The simulators draw with this module what the measurement matches against.
+The simulators draw with this module; the measurement matches with it.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ __all__ = [
 ]
 
 _MOST_NODES = 20
-"""A longer side is divided."""
+"""Maximum number of nodes of a panel; longer sides are divided."""
 _REACH = 5.5
-"""Gaussian widths after which a response counts as nought: 4e-8 of the light."""
+"""Gaussian widths beyond which a response counts as zero: 4e-8 of the light."""
 _BATCH = 5e4
-"""Numbers that are worked on at a time."""
+"""Number of values processed at a time."""
 
 
 def _side_rule(length: float, spacing: float) -> tuple[Array, Array]:
-    """Nodes and weights on [0, 1] of a Gauss–Legendre rule for a side, of many panels when it is long."""
-    nodes = max(2.0, length / spacing + 2)  # two more make up for a short side's ends
+    """Nodes and weights on [0, 1] of a Gauss–Legendre rule for a side; long sides have several panels."""
+    nodes = max(2.0, length / spacing + 2)  # two more compensate for the ends of a short side
     panels = int(np.ceil(nodes / _MOST_NODES))
     t, w = _panel(int(np.ceil(nodes / panels)))
     return (np.arange(panels)[:, None] + t).ravel() / panels, np.tile(w / panels, panels)
@@ -61,15 +61,15 @@ def _panel(nodes: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Closed outlines as nodes of a quadrature.
+    """Closed outlines as nodes of a quadrature rule.
 
     Parameters
     ----------
     xy : ndarray (..., j, 2)
         Points on the outline.
     dxy : ndarray (..., j, 2)
-        Tangents times quadrature weights: :math:`(dq_x, dq_y)` at each node. The area on the left of the
-        direction of travel, x turning into y, is the inside.
+        Tangents times quadrature weights: :math:`(dq_x, dq_y)` at each node. The interior is on the left of
+        the direction of travel, with x turning into y.
     """
 
     xy: Array
@@ -104,12 +104,12 @@ class Outline:
         return cls(radius * unit, radius * 2 * np.pi / count * np.stack([-unit[:, 1], unit[:, 0]], axis=-1))
 
     def mapped(self, mapping: Callable[[Array], tuple[Array, Array]]) -> Outline:
-        """Carry the outline through a smooth mapping; one that mirrors wants :meth:`oriented` after it.
+        """Map the outline with a smooth mapping; after a mirroring one, call :meth:`oriented`.
 
         Parameters
         ----------
         mapping : callable
-            (n, 2) to the images (n, 2) and the Jacobians (n, 2, 2).
+            Function of points (n, 2) that returns their images (n, 2) and the Jacobians (n, 2, 2).
         """
         flat = self.xy.reshape(-1, 2)
         xy, jacobian = mapping(flat)
@@ -117,17 +117,17 @@ class Outline:
         return Outline(xy.reshape(self.xy.shape), dxy.reshape(self.dxy.shape))
 
     def oriented(self) -> Outline:
-        """Each outline with its inside on the left, as after a mapping that mirrors it is not."""
+        """Each outline with its interior on the left, also after a mirroring mapping."""
         doubled_area = (self.xy[..., 0] * self.dxy[..., 1] - self.xy[..., 1] * self.dxy[..., 0]).sum(axis=-1)
         return Outline(self.xy, self.dxy * np.where(doubled_area < 0, -1.0, 1.0)[..., None, None])
 
     def single(self) -> Outline:
-        """The same in single precision."""
+        """The outline in single precision."""
         xy, dxy = (cast(Array, nodes.astype(np.float32)) for nodes in (self.xy, self.dxy))
         return Outline(xy, dxy)
 
     def affine(self, matrix: Array, shift: Array | None = None) -> Outline:
-        """Carry the outline through matrices (..., 2, 2) and shifts (..., 2), one outline for each."""
+        """Outlines transformed by matrices (..., 2, 2) and shifts (..., 2), one for each."""
         turned = np.swapaxes(matrix, -1, -2)
         xy = self.xy @ turned
         return Outline(xy if shift is None else xy + shift[..., None, :], self.dxy @ turned)
@@ -139,7 +139,7 @@ def rectangles(edges: Array, spacing: float) -> Outline:
     Parameters
     ----------
     edges : ndarray (k, 4)
-        x and y of the one corner, then of the opposite one, both larger.
+        x and y of one corner, then of the opposite corner, both larger.
     spacing : float
         Largest mean distance of two nodes; see :meth:`Outline.polygon`.
 
@@ -152,7 +152,7 @@ def rectangles(edges: Array, spacing: float) -> Outline:
     unit, turn = Outline(np.empty((0, 2)), np.empty((0, 2))), np.array([[0.0, 1.0], [-1.0, 0.0]])
     for side in range(4):
         along, weight = _side_rule(float(size[:, side % 2].max(initial=0.0)), spacing)
-        # The lower side, turned by a quarter about the centre for each further one.
+        # The lower side; each further one is rotated by 90° about the centre.
         quarter = np.linalg.matrix_power(turn, side)
         xy = (np.stack([along, np.zeros_like(along)], axis=-1) - 0.5) @ quarter + 0.5
         dxy = np.stack([weight, np.zeros_like(along)], axis=-1) @ quarter
@@ -169,7 +169,7 @@ def mark_outline(
     ----------
     shape : {"cross", "disk", "rod", "square", "line-grid"}
         As in ``reseau-design/1``: `size` is the tip-to-tip length of a cross, the diameter of a disk or a
-        rod, the side of a square; a crossing of a line grid has no size but arms of `line_width` that run out
+        rod, the side of a square; a crossing of a line grid has no size but arms of `line_width` that extend
         to `reach`.
     spacing : float
         Largest distance of two nodes of the quadrature.
@@ -177,7 +177,7 @@ def mark_outline(
     Raises
     ------
     UsageError
-        When the shape is unknown, or a cross or a grid has no width of line.
+        When the shape is unknown, or a cross or a grid has no line width.
     """
     if shape in ("disk", "rod"):
         return Outline.circle(size / 2, spacing)
@@ -188,7 +188,7 @@ def mark_outline(
             raise UsageError(f"a mark of shape {shape!r} needs its `line_width`")
         w, r = line_width / 2, (size / 2 if shape == "cross" else reach)
         arm = np.array([[r, -w], [r, w], [w, w]])
-        turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a row vector times this is turned by +90°
+        turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # rotates a row vector by +90°
         corners = np.concatenate([arm @ np.linalg.matrix_power(turn, k) for k in range(4)])
         return Outline.polygon(corners, spacing)
     raise UsageError(f"there is no mark of shape {shape!r}")
@@ -196,12 +196,12 @@ def mark_outline(
 
 @dataclass(frozen=True)
 class PixelResponse:
-    """How a pixel answers to light along an axis: a Gaussian folded with its light-sensitive part.
+    """Response of a pixel to light along an axis: a Gaussian convolved with its light-sensitive width.
 
     Parameters
     ----------
     fill : float
-        Light-sensitive part of the pitch along the axis, 0 to 1; 0.8 for 21.6 of 27 µm.
+        Light-sensitive share of the pitch along the axis, 0 to 1; 0.8 for 21.6 of 27 µm.
     """
 
     fill: float = 1.0
@@ -220,18 +220,18 @@ class PixelResponse:
         sigma : ndarray or float
             Width of the Gaussian in pixels, broadcasting with (..., j, c).
         highest : int
-            Highest derivative wanted.
+            Highest derivative to compute.
         integral : bool
-            Whether the integral is wanted; without it and without derivatives this is twice as fast.
+            Whether to compute the integral; without it and without derivatives this is twice as fast.
 
         Returns
         -------
         list of ndarray (..., j, c)
-            :math:`H, h, h', …` up to the derivative `highest`; the first is left out when not wanted.
+            :math:`H, h, h', …` up to the derivative `highest`; without :math:`H` if not requested.
         """
         half = max(self.fill, 1e-6) / 2
         if self.fill == 1.0 and (np.diff(pixels) == 1.0).all():
-            # Neighbours that leave no gap share an edge: half the work.
+            # Adjacent pixels share an edge, which halves the work.
             edges = np.concatenate([pixels[..., :1] - half, pixels + half], axis=-1)
             found = _steps(edges[..., None, :] - points[..., None], sigma, highest, integral)
             return [np.diff(order, axis=-1) for order in found]
@@ -241,13 +241,13 @@ class PixelResponse:
 
 
 def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
-    """The blurred step's integral, the step and its derivatives at offsets `t`."""
+    """Integral of the blurred step, the step, and its derivatives at offsets `t`."""
     z = t / sigma
     step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z
     found: list[Array] = [step]
     if integral:
         found.insert(0, t * found[0] + sigma * bell)
-    # Derivatives of a Gaussian: Hermite's polynomials, He_{k+1} = z He_k - k He_{k-1}.
+    # Derivatives of a Gaussian by Hermite polynomials: He_{k+1} = z He_k - k He_{k-1}.
     before: Array | float = 0.0
     hermite: Array | float = 1.0
     for k in range(highest):
@@ -344,8 +344,8 @@ def draw(
     sigma : float
         Width of the point-spread function in pixels.
     row_shifts : ndarray (height,), optional
-        Shift of the content of each row along x in pixels (row jitter); by a series of fourth order, good to
-        1e-4 of the light for shifts below 0.3 `sigma`.
+        Shift of the content of each row along x in pixels (row jitter), by a series of fourth order, accurate
+        to 1e-4 of the light for shifts below 0.3 `sigma`.
 
     Returns
     -------
@@ -357,7 +357,7 @@ def draw(
     first = np.maximum(np.floor(outline.xy.min(axis=1) - margin), 0).astype(np.intp)
     last = np.minimum(np.ceil(outline.xy.max(axis=1) + margin), np.array(shape[::-1]) - 1).astype(np.intp)
     seen = np.flatnonzero((last >= first).all(axis=1))
-    # Shapes of like extent together, so that a batch wastes little and fits the processor's cache.
+    # Process shapes of similar extent together, so that batches are compact and fit into the cache.
     extent = last - first + 1
     seen = seen[np.lexsort((extent[seen, 0], extent[seen, 1]))]
     while len(seen):
@@ -381,7 +381,7 @@ def draw(
 def _shifted_coverage(
     outline: Outline, columns: Array, rows: Array, sigma: float, response: PixelResponse, shifts: Array | None
 ) -> Array:
-    """Coverage with every row moved by its own small shift (..., r)."""
+    """Coverage with a small shift (..., r) for every row."""
     if shifts is None:
         return coverage(outline, columns.astype(float), rows.astype(float), sigma, response)
     highest = 4

@@ -1,4 +1,4 @@
-"""A whole grid of wires as disjoint outlines: their sum is the union, exact at the crossings too."""
+"""A grid of wires as disjoint outlines: their sum is the union, exact also at the crossings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["LineGrid", "line_grid"]
 
 
 class LineGrid(NamedTuple):
-    """The pieces of a grid of wires in its own plane; none overlaps another.
+    """The pieces of a grid of wires in its own plane, which do not overlap.
 
     Parameters
     ----------
     crossings : Outline (k, j, 2)
         The squares in which wires cross.
     upright, level : Outline (m, i, 2)
-        Pieces of the wires along y and along x, from a crossing half the way to the next, and beyond the
+        Pieces of the wires along y and along x, each from a crossing half way to the next, and beyond the
         outermost crossings.
     """
 
@@ -40,11 +40,11 @@ def line_grid(
     beyond: float = 0.0,
     broken: Mask | None = None,
 ) -> LineGrid:
-    """Wires along y at `columns` and along x at `rows`, cut into pieces that do not overlap.
+    """Divide wires along y at `columns` and along x at `rows` into pieces that do not overlap.
 
-    Where two wires cross there is no more wire than where there is one: a sum of whole wires would be wrong
-    in every crossing, and that is where it is measured. Pieces share their ends, over which the integrals run
-    in both directions and cancel.
+    A crossing of two wires hides no more light than one wire: a sum of whole wires would be wrong in every
+    crossing, which is the measured point. Pieces share their ends, where integrals in opposite directions
+    cancel.
 
     Parameters
     ----------
@@ -55,14 +55,14 @@ def line_grid(
     spacing : float
         Largest distance of two nodes of the quadrature; see :meth:`Outline.polygon`.
     beyond : float
-        How far the wires run on beyond the outermost crossings.
+        Length of the wires beyond the outermost crossings.
     broken : ndarray of bool (r, c), optional
-        Crossings that are not there, with the wires as far as half the way to the next.
+        Missing crossings, with their wires up to half way to the next.
 
     Raises
     ------
     UsageError
-        When the wires are not ascending or overlap, or nothing is left.
+        When positions do not ascend, wires overlap, or nothing is left.
     """
     x, y = np.asarray(columns, dtype=np.float64), np.asarray(rows, dtype=np.float64)
     half = line_width / 2
@@ -88,9 +88,9 @@ def _between(at: Array, whole: Mask, half: float, beyond: float) -> tuple[NDArra
     Parameters
     ----------
     at : ndarray (n,)
-        Where, along the wires, crossings are.
+        Positions of the crossings along the wires.
     whole : ndarray of bool (n, wires)
-        Which of them are there.
+        Which crossings exist.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def _between(at: Array, whole: Mask, half: float, beyond: float) -> tuple[NDArra
     middle, reach = (at[1:] + at[:-1]) / 2, max(beyond, half)
     nothing = np.zeros((1, whole.shape[1]), dtype=bool)
     before, after = np.concatenate([nothing, whole]), np.concatenate([whole, nothing])
-    # One piece before each crossing and one after the last. Where a crossing is missing, it ends half way.
+    # One piece before each crossing and one after the last; at a missing crossing it ends half way.
     start = np.where(
         before,
         np.append(at[0], at + half)[:, None],

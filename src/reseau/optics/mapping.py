@@ -1,12 +1,12 @@
-"""Smooth mappings of a plane onto a plane, with analytic derivatives and one inverse for all of them.
+"""Smooth plane mappings with analytic derivatives, and one inverse for all of them.
 
-A mapping has named parameters and gives, for whole arrays of points, its values, their derivatives with
-respect to the point and with respect to every parameter. What is measured and what is corrected, what is held
-and what is estimated is decided elsewhere.
+A mapping has named parameters. For arrays of points it returns the values and their derivatives with respect
+to the point and to every parameter. It does not define which quantities are measured, corrected, fixed or
+estimated.
 
-The inverse deserves a warning. A distortion polynomial is one-to-one in a region around its centre only and
-folds back beyond it, where a second point has the same image. :meth:`PlaneMapping.inverse` answers with the
-point of the region around the centre, or with NaN; never with a point behind the fold.
+Beware of the inverse: a distortion polynomial is one-to-one only in a region around its centre. It folds back
+beyond, where a second point has the same image. :meth:`PlaneMapping.inverse` returns the point in the region
+around the centre, or NaN; never a point beyond the fold.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .newton import determinant, in_blocks, newton, solve_2x2
 
 __all__ = ["Derivatives", "Mapping", "PlaneMapping"]
 
-# Where on the way from the centre to a point the orientation of the mapping is looked at.
+# Positions between the centre and a point at which the orientation of the mapping is tested.
 ON_THE_WAY = (0.25, 0.5, 0.75, 1.0)
 
 
@@ -50,7 +50,7 @@ class Derivatives(NamedTuple):
 
 @runtime_checkable
 class Mapping(Protocol):
-    """What is asked of a plane mapping; :class:`PlaneMapping` supplies most of it."""
+    """Interface of a plane mapping; :class:`PlaneMapping` implements most of it."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ def as_points(xy: ArrayLike) -> Array:
 
 
 def as_values(names: Sequence[str], values: ArrayLike) -> Array:
-    """Parameter values as a read-only (u,) array that belongs to them alone.
+    """Parameter values as a read-only copy (u,).
 
     Raises
     ------
@@ -103,14 +103,14 @@ def as_values(names: Sequence[str], values: ArrayLike) -> Array:
 
 
 class PlaneMapping(ABC):
-    """Base of the mappings: what follows from values and derivatives alone.
+    """Base class of the mappings: everything that follows from values and derivatives.
 
-    A subclass gives `names`, `values` and :meth:`derivatives`; it overrides :meth:`_value` and :meth:`_slope`
-    where they are cheaper without the parameters, :meth:`_start` where it knows a better first guess of the
-    inverse, and :meth:`one_to_one` where it knows the region exactly.
+    A subclass defines `names`, `values` and :meth:`derivatives`. It overrides :meth:`_value` and
+    :meth:`_slope` where they are cheaper without the parameters, :meth:`_start` for a better start value of
+    the inverse, and :meth:`one_to_one` where the region is known exactly.
     """
 
-    if TYPE_CHECKING:  # a subclass may have them as fields, which a property here would hide
+    if TYPE_CHECKING:  # a subclass may define them as fields, which a property here would hide
 
         @property
         def names(self) -> tuple[str, ...]:
@@ -132,7 +132,7 @@ class PlaneMapping(ABC):
         Returns
         -------
         Derivatives
-            Value (n, 2), derivatives by the point (n, 2, 2) and by the parameters (n, 2, u).
+            Values (n, 2), derivatives with respect to the point (n, 2, 2) and to the parameters (n, 2, u).
         """
 
     def __call__(self, xy: ArrayLike) -> Array:
@@ -150,7 +150,7 @@ class PlaneMapping(ABC):
         Returns
         -------
         ndarray (n, 2)
-            Points in the first plane, to rounding error; NaN where no point of the region in which the
+            Points in the first plane, within rounding error; NaN where no point of the region in which the
             mapping is one-to-one has this image.
         """
         points = as_points(xy)
@@ -158,10 +158,10 @@ class PlaneMapping(ABC):
         return in_blocks(self._inverse, np.where(finite, points, np.nan))
 
     def one_to_one(self, xy: ArrayLike) -> Mask:
-        """Whether the mapping has not folded anywhere on the way from its centre to these points, (n,).
+        """Mask (n,) of points up to which the mapping has not folded on the way from its centre.
 
         The sign of the determinant of the derivatives is compared with that at the centre at a few points of
-        the straight way; a fold shows unless the mapping folds back within a quarter of the way.
+        the straight way; a fold is missed only if the mapping folds back within a quarter of the way.
         """
         points, centre = as_points(xy), self._centre()
         with np.errstate(all="ignore"):
@@ -177,12 +177,12 @@ class PlaneMapping(ABC):
         Parameters
         ----------
         values : array_like (u,) or mapping of names to values
-            All values in order, or some by name: the others stay.
+            All values in order, or some by name; the others are kept.
 
         Raises
         ------
         UsageError
-            When the number of values is wrong or a name is none of the parameters.
+            When the number of values is wrong or a name is not a parameter.
         """
         return self._replaced(self._merged(values))
 
@@ -195,7 +195,7 @@ class PlaneMapping(ABC):
             When there is no such parameter.
         """
         if name not in self.names:
-            raise UsageError(f"is none of the parameters {', '.join(self.names)}", where=name)
+            raise UsageError(f"is not one of the parameters {', '.join(self.names)}", where=name)
         return float(self.values[self.names.index(name)])
 
     def _merged(self, values: ArrayLike | Named[str, float]) -> Array:
@@ -203,7 +203,7 @@ class PlaneMapping(ABC):
             return as_values(self.names, values)
         unknown = [name for name in values if name not in self.names]
         if unknown:
-            raise UsageError(f"is none of the parameters {', '.join(self.names)}", where=", ".join(unknown))
+            raise UsageError(f"not among the parameters {', '.join(self.names)}", where=", ".join(unknown))
         return np.array([values.get(name, old) for name, old in zip(self.names, self.values, strict=True)])
 
     def _replaced(self, values: Array) -> Self:
@@ -217,11 +217,11 @@ class PlaneMapping(ABC):
         return self.derivatives(xy)[:2]
 
     def _centre(self) -> Array:
-        """The point (1, 2) from which the region of one-to-one mapping is reckoned."""
+        """Centre (1, 2) of the region in which the mapping is one-to-one."""
         return np.zeros((1, 2))
 
     def _start(self, xy: Array) -> Array:
-        """First guess of the inverse: that of the mapping linearised at the centre."""
+        """Start value of the inverse: that of the mapping linearised at the centre."""
         centre = self._centre()
         value, slope = self._slope(centre)
         return centre + solve_2x2(np.broadcast_to(slope, (len(xy), 2, 2)), xy - value)

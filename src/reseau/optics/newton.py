@@ -1,4 +1,4 @@
-"""Newton's method for many plane points at once."""
+"""Newton's method for many points of the plane at once."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from ..core.data import Array
 
 __all__ = ["determinant", "in_blocks", "newton", "solve_2x2"]
 
-# Small enough for the work arrays to stay in the cache, large enough for NumPy's call overhead not to count.
+# Small enough for the work arrays to stay in the cache, large enough to make NumPy's call overhead
+# negligible.
 BLOCK = 16384
 STEPS = 60
-# How often a start behind a fold is halved: to within 1/1000 of the way to the centre.
+# Number of times a start beyond a fold is halved: to within 1/1000 of the way to the centre.
 PULLS = 10
-# A Newton step shorter than this (relative) leaves less than the rounding error once it has been taken.
+# After a Newton step shorter than this (relative), the error is below rounding.
 SHORT_STEP = 1e-10
 
 
 def solve_2x2(matrix: Array, right: Array) -> Array:
-    """Solve n systems of two equations, (n, 2, 2) by (n, 2) or (n, 2, u); not finite where singular."""
+    """Solve n systems of two equations, (n, 2, 2) with (n, 2) or (n, 2, u); not finite where singular."""
     a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         adjugate = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
@@ -36,7 +37,7 @@ def determinant(matrix: Array) -> Array:
 
 
 def in_blocks(function: Callable[[Array], Array], xy: Array) -> Array:
-    """Apply a function of points to an image's worth of them, block by block."""
+    """Apply a function of points to a large array of points, block by block."""
     if len(xy) <= BLOCK:
         return function(xy)
     return np.concatenate([function(xy[i : i + BLOCK]) for i in range(0, len(xy), BLOCK)])
@@ -45,21 +46,20 @@ def in_blocks(function: Callable[[Array], Array], xy: Array) -> Array:
 def newton(
     slope_at: Callable[[Array], tuple[Array, Array]], target: Array, start: Array, centre: Array
 ) -> Array:
-    """Solve f(xy) = target for whole arrays by Newton's method with damping.
+    """Solve f(xy) = target for arrays by Newton's method with damping.
 
-    A point is accepted on the length of its *undamped* step, which is short at a root and nowhere else; so
-    a point that has got stuck is not mistaken for a solution. A step that would turn the orientation of the
-    mapping (the sign of the determinant of its derivatives) away from that at the centre leads over a fold
-    and is not taken.
+    A point is accepted if its *undamped* step is short, which is true at a root only; a stuck point is
+    therefore not mistaken for a solution. A step that would change the orientation of the mapping (the sign
+    of the determinant of its derivatives) from that at the centre crosses a fold and is rejected.
 
     Parameters
     ----------
     slope_at : callable
-        Gives f (n, 2) and its derivatives (n, 2, 2) at points (n, 2).
+        Function that returns f (n, 2) and its derivatives (n, 2, 2) at points (n, 2).
     target, start : ndarray (n, 2)
-        What f shall be, and where to begin.
+        Required values of f, and start points.
     centre : ndarray (1, 2)
-        A point of the branch that is wanted.
+        A point of the required branch.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def newton(
 def _before_the_fold(
     slope_at: Callable[[Array], tuple[Array, Array]], xy: Array, centre: Array, side: Array
 ) -> tuple[Array, Array]:
-    """Draw the starting points that lie behind a fold towards the centre, in place; value and slope there."""
+    """Move starts beyond a fold towards the centre, in place; return values and derivatives there."""
     value, slope = slope_at(xy)
     for _ in range(PULLS):
         behind = ~(determinant(slope) * side > 0)

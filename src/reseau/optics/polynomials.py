@@ -1,13 +1,13 @@
-"""Plane mappings by polynomials and quotients of polynomials, all of them one class whose terms are data.
+"""Plane mappings by polynomials and quotients of polynomials: one class whose terms are data.
 
 ::
 
     X = NX / (1 + D) + PX
     Y = NY / (1 + D) + PY
 
-Each of the five is a polynomial in x and y, linear in the parameters; one parameter may stand in several of
-them. The projectivity, the camera and the ultrasonic instrument of Wishahy, the affine, similar, bilinear and
-full polynomial transformations, and Wong's model of a display differ in their table of terms only.
+Each of the five is a polynomial in x and y, linear in the parameters; a parameter may occur in several of
+them. The projectivity, the camera and the ultrasonic instrument of Wishahy, the affine, similarity, bilinear
+and full polynomial transformations, and Wong's model of a display differ in their table of terms only.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def monomials(text: str) -> dict[tuple[int, int], float]:
     Raises
     ------
     FormatError
-        When it is no such sum.
+        When the text is not such a sum.
     """
     compact = text.replace(" ", "").replace("*", "").replace("^", "")
     found: dict[tuple[int, int], float] = {}
@@ -52,7 +52,7 @@ def monomials(text: str) -> dict[tuple[int, int], float]:
         match = _MONOMIAL.match(compact, at)
         if match is None or not match[2] + match[3] or (at > 0 and not match[1]):
             raise FormatError(
-                "is no sum of monomials in x and y", where=repr(text), do="write as in `x3 + 2x2y2`"
+                "is not a sum of monomials in x and y", where=repr(text), do="write as in `x3 + 2x2y2`"
             )
         powers = {"x": 0, "y": 0}
         for letter, power in _POWER.findall(match[3]):
@@ -64,7 +64,7 @@ def monomials(text: str) -> dict[tuple[int, int], float]:
 
 
 class _Tables(NamedTuple):
-    """The terms as arrays: what each part is made of, over one list of m monomials."""
+    """The terms as arrays: coefficients of each part for one list of m monomials."""
 
     powers: tuple[tuple[int, int], ...]
     fixed: Array
@@ -78,7 +78,7 @@ def _read(rows: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]) -> _Tables:
     for k, (name, sums) in enumerate(rows):
         for part, text in sums:
             if part not in PARTS:
-                raise FormatError(f"is none of {', '.join(PARTS)}", where=f"part {part!r} of {name!r}")
+                raise FormatError(f"is not one of {', '.join(PARTS)}", where=f"part {part!r} of {name!r}")
             read.append((k, PARTS.index(part), monomials(text)))
     powers = tuple(sorted({power for *_, sum_ in read for power in sum_}))
     table = np.zeros((len(rows), len(PARTS), len(powers)))
@@ -96,17 +96,17 @@ class RationalPolynomial(PlaneMapping):
     Parameters
     ----------
     terms : mapping
-        For each parameter the sums of monomials it multiplies, by the part they stand in (``NX``, ``NY``,
-        ``D``, ``X``, ``Y``): ``{"k": {"X": "x3 + xy2", "Y": "y3 + yx2"}}``.
+        For each parameter the sums of monomials that it multiplies, by part (``NX``, ``NY``, ``D``, ``X``,
+        ``Y``): ``{"k": {"X": "x3 + xy2", "Y": "y3 + yx2"}}``.
     values : array_like (u,), optional
         Values of the parameters in the order of the terms; default zero.
     fixed : mapping
         Monomials without a parameter, by part: ``{"X": "x", "Y": "y"}``.
     offset : (float, float)
-        Subtracted from the points before anything else, in their unit.
+        Subtracted from the points first, in their unit.
     scale : float
-        Divides the points after that. A high degree wants coordinates between −1 and 1: the normal equations
-        of degree 7 in pixels cannot be solved in double precision.
+        Divides the points after that. High degrees need coordinates between −1 and 1: the normal equations of
+        degree 7 in pixels cannot be solved in double precision.
 
     Raises
     ------
@@ -133,7 +133,7 @@ class RationalPolynomial(PlaneMapping):
             raise UsageError(f"is {self.scale!r}; a positive number is needed", where="scale of a polynomial")
         values = np.zeros(len(self.terms)) if self.values is _NO_VALUES else self.values
         object.__setattr__(self, "values", as_values(self.names, values))
-        _ = self._tables  # a table that cannot be read is told here and not at the first point
+        _ = self._tables  # reports an unreadable table now and not at the first point
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -207,7 +207,7 @@ class RationalPolynomial(PlaneMapping):
         return Derivatives(value, d_xy, np.ascontiguousarray(polynomial.transpose(2, 1, 0)))
 
     def one_to_one(self, xy: ArrayLike) -> Mask:
-        """Whether the mapping has not folded on the way from the centre, nor met the horizon 1 + D = 0."""
+        """Mask of points up to which the mapping has not folded nor passed the horizon 1 + D = 0."""
         points = as_points(xy)
         m, _ = self._monomials(points, slope=False)
         with np.errstate(invalid="ignore"):
@@ -218,12 +218,12 @@ class RationalPolynomial(PlaneMapping):
         return np.array([self.offset])
 
     def without(self, *names: str) -> RationalPolynomial:
-        """The reduced model that lacks these parameters; the others keep their values.
+        """The reduced model without these parameters; the others keep their values.
 
         Raises
         ------
         UsageError
-            When a name is none of the parameters.
+            When a name is not a parameter.
         """
         for name in names:
             self.value_of(name)
@@ -249,7 +249,7 @@ class RationalPolynomial(PlaneMapping):
         Raises
         ------
         FormatError
-            When it is no such model.
+            When the data are not such a model.
         """
         extra = set(content) - {"terms", "fixed", "offset", "scale", "values"}
         if extra or "terms" not in content:
@@ -265,13 +265,13 @@ class RationalPolynomial(PlaneMapping):
             values = as_values(tuple(terms), content.get("values", np.zeros(len(terms))))
             return cls(terms, values, fixed, (x, y), float(content.get("scale", 1.0)))
         except (TypeError, ValueError, AttributeError, UsageError) as error:
-            raise FormatError(f"is no rational polynomial ({error})", where="model") from None
+            raise FormatError(f"is not a rational polynomial ({error})", where="model") from None
 
     @classmethod
     def from_terms(
         cls, terms: Terms, values: Named[str, float] | None = None, **options: Any
     ) -> RationalPolynomial:
-        """Any model from its table of terms; values by name, the others zero. Options as of the class."""
+        """A model from its table of terms; values by name, the others zero. Options as in the class."""
         return RationalPolynomial(terms, **options).with_values(values or {})
 
     def split(self) -> RationalPolynomial:
@@ -291,12 +291,12 @@ class RationalPolynomial(PlaneMapping):
 
     @classmethod
     def projective(cls) -> RationalPolynomial:
-        """Projectivity, Wishahy eq. (3); begins as the identity."""
+        """Projectivity, Wishahy eq. (3); initially the identity."""
         return cls.from_terms(_PROJECTIVE, {"a1": 1.0, "b2": 1.0})
 
     @classmethod
     def camera(cls) -> RationalPolynomial:
-        """Camera and film of an oscilloscope (group A), Wishahy eq. (5a, b); begins as the identity.
+        """Camera and film of an oscilloscope (group A), Wishahy eq. (5a, b); initially the identity.
 
         The projectivity a1 b1 c1 a2 b2 c2 a0 b0, film deformation d1 d2 on xy, symmetric lens distortion k,
         and the terms of fourth order h1 on x⁴ and h2 on y⁴.
@@ -305,39 +305,39 @@ class RationalPolynomial(PlaneMapping):
 
     @classmethod
     def ultrasonic(cls, *, reduced: bool = False) -> RationalPolynomial:
-        """Ultrasonic instrument (group B), Wishahy eq. (7a, b); begins as the identity.
+        """Ultrasonic instrument (group B), Wishahy eq. (7a, b); initially the identity.
 
         Parameters
         ----------
         reduced : bool
-            Whether to take the model that the paper ends in after its F-tests:
+            Whether to use the model that remains after the F-tests of the paper:
             X = A0 + A1·x + A6·xy² + A7·x⁴, Y = B0 + B1·y + B2·x + B6·yx² + B7·y⁴.
         """
         return cls.from_terms(_ULTRASONIC_REDUCED if reduced else _ULTRASONIC, {"A1": 1.0, "B1": 1.0})
 
     @classmethod
     def affine(cls) -> RationalPolynomial:
-        """Affine transformation X = a1·x + b1·y + c1, Y = a2·x + b2·y + c2; begins as the identity."""
+        """Affine transformation X = a1·x + b1·y + c1, Y = a2·x + b2·y + c2; initially the identity."""
         return cls.from_terms(_AFFINE, {"a1": 1.0, "b2": 1.0})
 
     @classmethod
     def similarity(cls) -> RationalPolynomial:
-        """Similarity X = X0 + a·x − b·y, Y = Y0 + b·x + a·y; begins as the identity."""
+        """Similarity X = X0 + a·x − b·y, Y = Y0 + b·x + a·y; initially the identity."""
         return cls.from_terms(_SIMILARITY, {"a": 1.0})
 
     @classmethod
     def bilinear(cls) -> RationalPolynomial:
-        """Affine transformation with d1, d2 on xy; begins as the identity."""
+        """Affine transformation with d1, d2 on xy; initially the identity."""
         return cls.from_terms(_BILINEAR, {"a1": 1.0, "b2": 1.0})
 
     @classmethod
     def polynomial(
         cls, degree: int, *, offset: tuple[float, float] = (0.0, 0.0), scale: float = 1.0
     ) -> RationalPolynomial:
-        """Full bivariate polynomial: ``X_ij``, ``Y_ij`` at xⁱyʲ, i + j ≤ degree; begins as the identity.
+        """Full bivariate polynomial: ``X_ij``, ``Y_ij`` at xⁱyʲ, i + j ≤ degree; initially the identity.
 
-        Offset and scale normalise the points: for degree 3 and more take the centre of the image and half
-        its larger side.
+        Offset and scale normalise the points: from degree 3 use the centre of the image and half its larger
+        side.
 
         Raises
         ------

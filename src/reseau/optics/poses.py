@@ -27,7 +27,7 @@ __all__ = [
     "rotation_matrix",
 ]
 
-# From the camera of the angles (y up, z backwards, as in a vertical photograph) to ours.
+# From the camera of the angles (y up, z backwards, as in a vertical photograph) to that used here.
 _VIEW = np.diag([1.0, -1.0, -1.0])
 # Below this angle the series of (θ − sin θ)/θ³ is more exact than the formula, which cancels.
 _SMALL_ANGLE = 0.5
@@ -67,7 +67,7 @@ def rotation_matrix(r: ArrayLike) -> Array:
 
 
 def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
-    """R(r)·x and its derivative by the rotation vector.
+    """R(r)·x and its derivative with respect to the rotation vector.
 
     ∂(R x)/∂r = −R [x]× (I − (1−cos θ)/θ² [r]× + (θ−sin θ)/θ³ [r]×²), exact at r → 0 too (the right Jacobian
     of the rotation group; Gallego & Yezzi 2015, A compact formula for the derivative of a 3-D rotation in
@@ -78,7 +78,7 @@ def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
     r : array_like (3,) or (n, 3)
         Rotation vectors.
     vectors : array_like (n, 3)
-        What is rotated.
+        Vectors to rotate.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     Raises
     ------
     UsageError
-        When a matrix is no rotation to 1e-6.
+        When a matrix is not a rotation within 1e-6.
     """
     matrices = np.asarray(matrix, dtype=np.float64)
     flat = matrices.reshape(-1, 3, 3)
@@ -145,8 +145,8 @@ def angles_to_matrix(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Arra
     """R = diag(1, −1, −1)·R3(κ)·R2(φ)·R1(ω), rotations of the axes; angles in radians.
 
     With all angles zero the camera looks down along −Z, x to the right and Y up in the image: the vertical
-    photograph from which aerial photogrammetry reckons (Kraus, Photogrammetry; Mikhail, Bethel, McGlone,
-    Introduction to Modern Photogrammetry). The factor turns that camera (y up, z backwards) into ours.
+    photograph of aerial photogrammetry (Kraus, Photogrammetry; Mikhail, Bethel, McGlone, Introduction to
+    Modern Photogrammetry). The factor turns that camera (y up, z backwards) into the one used here.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def angles_to_matrix(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Arra
 def matrix_to_angles(matrix: ArrayLike) -> Array:
     """Omega, phi, kappa (..., 3) in radians of matrices (..., 3, 3); see :func:`angles_to_matrix`.
 
-    At φ = ±90° only a combination of ω and κ is determined: κ is given as zero.
+    At φ = ±90° only a combination of ω and κ is determined: κ is set to zero.
     """
     m = _VIEW @ np.asarray(matrix, dtype=np.float64)
     cos_phi = np.hypot(m[..., 0, 0], m[..., 1, 0])
@@ -185,7 +185,7 @@ def matrix_to_angles(matrix: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where cameras are and how they are turned: x_c = R(X − X0).
+    """Positions and rotations of cameras: x_c = R(X − X0).
 
     Parameters
     ----------
@@ -235,11 +235,11 @@ class Projection(NamedTuple):
     xy : ndarray (n, 2)
         Image points; NaN for a point that is not in front of its camera.
     d_pose : ndarray (n, 2, 6)
-        Derivatives by rotation vector and projection centre.
+        Derivatives with respect to rotation vector and projection centre.
     d_point : ndarray (n, 2, 3)
-        Derivatives by the object point.
+        Derivatives with respect to the object point.
     d_camera : ndarray (n, 2, u)
-        Derivatives by the camera's parameters.
+        Derivatives with respect to the camera's parameters.
     """
 
     xy: Array
@@ -276,6 +276,6 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     d_x_c[:, :, :2] = d_direction / z[:, None, None]
     d_x_c[:, :, 2] = -(d_x_c[:, :, :2] @ direction[:, :, None])[:, :, 0]
     d_point = d_x_c @ pose.matrix
-    # The parameters of a camera that sees nothing must not look determined.
+    # The parameters of a camera that sees no points must not appear determined.
     d_camera[np.isnan(xy).any(axis=1)] = np.nan
     return Projection(xy, np.concatenate([d_x_c @ d_rotation, -d_point], axis=2), d_point, d_camera)

@@ -1,7 +1,7 @@
-"""Images carried through a mapping, tile by tile: memory is bounded whatever their size.
+"""Resampling of images through a mapping, tile by tile, with bounded memory for images of any size.
 
-Grey values come from cubic splines through the pixels, at positions that are exact to 1e-6 px: the tables of
-1/32 px by which fast warping routines interpolate would shift an edge by up to 1/64 px.
+Grey values are interpolated by cubic splines at positions accurate to 1e-6 px; the tables with steps of 1/32
+px in fast warping routines would shift an edge by up to 1/64 px.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from ..core.data import Array
 __all__ = ["on_lattice", "resample"]
 
 _STEP = 12
-"""Distance of the pixels at which a mapping is evaluated; splines of third degree lie between."""
+"""Distance of the pixels at which a mapping is evaluated; cubic splines interpolate between them."""
 _MARGIN = 14
-"""Pixels around a tile; the recursive filter of a spline has forgotten them to 1e-8."""
+"""Margin around a tile, after which the recursive filter of a spline has decayed to 1e-8."""
 _TILE = 1024
 
 
 def on_lattice(mapping: Callable[[Array], Array], columns: Array, rows: Array) -> tuple[Array, Array]:
-    """A smooth mapping at all pixels of a rectangle, from its values at every twelfth.
+    """A smooth mapping at all pixels of a rectangle, interpolated from every twelfth.
 
     Parameters
     ----------
     mapping : callable
-        (n, 2) to (n, 2); NaN where there is nothing.
+        Function from (n, 2) to (n, 2); NaN where undefined.
     columns, rows : ndarray (c,), (r,)
         Pixel coordinates, in steps of one.
 
     Returns
     -------
     x, y : ndarray (r, c)
-        Good to 1e-6 of the pixel for the distortion of a camera. Where the mapping has no value anywhere
-        near, every pixel is asked by itself.
+        Mapped coordinates, accurate to 1e-6 px for the distortion of a camera. Near undefined places the
+        mapping is evaluated at every pixel.
     """
 
     def nodes(at: Array) -> Array:
@@ -62,23 +62,23 @@ def resample(
     *,
     band: int = 256,
 ) -> Iterator[NDArray[Any]]:
-    """Bands of an image carried through a mapping, from the top.
+    """Resample an image through a mapping; yields bands from the top.
 
     Parameters
     ----------
     pixels : ndarray (h, w)
-        The image; never copied whole.
+        The image; it is never copied as a whole.
     to_source : callable
-        Where in the image (n, 2) the pixels (n, 2) of the result lie; NaN where nowhere.
+        Function that maps pixels (n, 2) of the result to the image (n, 2); NaN where undefined.
     shape : (int, int)
         Height and width of the result.
     band : int
-        Rows of a band.
+        Number of rows of a band.
 
     Yields
     ------
     ndarray (rows, width)
-        Grey values of the image's type, rounded and clipped; 0 where the image does not reach.
+        Grey values of the image's type, rounded and clipped; 0 outside the image.
     """
     height, width = shape
     for top in range(0, height, band):

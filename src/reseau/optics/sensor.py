@@ -1,8 +1,8 @@
-"""What a sensor makes of the light that falls on it: noise, saturation, grey steps, jitter of its rows.
+"""Image sensors: noise, saturation, quantisation and jitter of the rows.
 
 The noise model is that of the photon transfer curve (Janesick, Photon Transfer; EMVA Standard 1288): the
-variance of a grey value is its light over the gain in electrons per grey value, plus the noise of reading,
-plus 1/12 for the rounding to whole grey values. Signal-to-noise ratios follow the convention of peak signal,
+variance of a grey value is its light over the gain in electrons per grey value, plus the read noise,
+plus 1/12 for the rounding to integers. Signal-to-noise ratios follow the convention of peak signal,
 SNR = 20·log10(255/σ) dB.
 """
 
@@ -44,7 +44,7 @@ class Sensor:
     gain : float
         Electrons per grey value.
     read_noise : float
-        Standard deviation of the noise of reading, in grey values.
+        Standard deviation of the read noise, in grey values.
     shot_noise : bool
         Whether the light arrives as a Poisson process of electrons.
     offset : float
@@ -52,12 +52,12 @@ class Sensor:
     row_jitter_px : float
         Standard deviation of the shift of a row along x, in pixels (a frame grabber's line synchronisation).
     quantise : bool
-        Whether grey values are rounded to integers; otherwise they are floats, but saturate all the same.
+        Whether grey values are rounded to integers; otherwise they are floats, which also saturate.
 
     Raises
     ------
     UsageError
-        When a value is impossible.
+        When a value is not possible.
     """
 
     width: int
@@ -99,7 +99,7 @@ class Sensor:
         irradiance : array_like (height, width)
             Light on each pixel, in grey values.
         rng : Generator
-            Source of the noise: same state, same image.
+            Source of the noise; the same state gives the same image.
 
         Returns
         -------
@@ -109,7 +109,7 @@ class Sensor:
         Raises
         ------
         UsageError
-            When the image has another size than the sensor, or light is negative or not finite.
+            When the size of the image differs from the sensor's, or light is negative or not finite.
         """
         light = self._light(irradiance)
         grey: Array = rng.poisson(light * self.gain) / self.gain if self.shot_noise else light.copy()
@@ -123,8 +123,8 @@ class Sensor:
     def variance(self, irradiance: ArrayLike) -> Array:
         """Variance of the grey values of each pixel, (height, width), in squared grey values.
 
-        It does not cover clipping at black and at saturation, and takes the rounding error as independent of
-        the light, which needs a noise of about half a grey value.
+        Clipping at black and at saturation is not included, and the rounding error is treated as independent
+        of the light, which requires a noise of at least half a grey value.
         """
         light = self._light(irradiance)
         shot = light / self.gain if self.shot_noise else np.zeros_like(light)
@@ -142,14 +142,14 @@ class Sensor:
                 f"has the shape {light.shape}, not ({self.height}, {self.width})",
                 where="irradiance of a sensor",
             )
-        # Formed images are exact to rounding error only; more than that below zero is a mistake.
+        # Formed images are exact within rounding; values further below zero are an error of the caller.
         if not (light.min() >= -1e-6 * self.full_scale and light.max() < np.inf):
             raise UsageError("is negative or not finite somewhere", where="irradiance of a sensor")
         return np.maximum(light, 0.0)
 
 
 def jpeg(pixels: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """What is left of an image after compression by JPEG.
+    """Compress an image with JPEG and decompress it.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def jpeg(pixels: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     Raises
     ------
     UsageError
-        When the image is not grey of 8 bits, or there is no such quality.
+        When the image is not grey with 8 bits, or the quality is not possible.
     """
     if pixels.dtype != np.uint8 or pixels.ndim != 2 or not 1 <= quality <= 100:
         raise UsageError(
@@ -206,7 +206,7 @@ def illumination(
     Raises
     ------
     UsageError
-        When there is a place without light.
+        When a part of the image is without light.
     """
     half = np.array([(width - 1) / 2, (height - 1) / 2])
     x = (np.arange(width) - half[0])[None, :] / half.max()

@@ -21,22 +21,22 @@ def target_corners(shape: str, size: float, angle_deg: float = 0.0, arm: float |
     shape : {"square", "triangle", "cross", "circle"}
         As in ``testfield-design/1``.
     size : float
-        Side of a square or an equilateral triangle; tip-to-tip length of a cross, whose arms are a third of
-        it wide; diameter of a circle.
+        Side of a square or an equilateral triangle; tip-to-tip length of a cross, whose arms have a width of
+        one third of it; diameter of a circle.
     angle_deg : float
-        By which it is turned from upright, x into y; the apex of the triangle points along y.
+        Rotation from upright, x into y; the apex of the triangle points along y.
     arm : float, optional
-        Width of the arms of a cross, where it is not a third of their length.
+        Width of the arms of a cross; by default one third of their length.
 
     Returns
     -------
     ndarray (k, 2) or None
-        None for a circle, which has none.
+        None for a circle, which has no corners.
 
     Raises
     ------
     UsageError
-        When there is no such shape.
+        When the shape is unknown.
     """
     if shape == "circle":
         return None
@@ -47,7 +47,7 @@ def target_corners(shape: str, size: float, angle_deg: float = 0.0, arm: float |
     elif shape == "cross":
         r, w = size / 2, (size / 3 if arm is None else arm) / 2
         end = np.array([[r, -w], [r, w], [w, w]])
-        turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a row vector times this is turned by +90°
+        turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # rotates a row vector by +90°
         corners = np.concatenate([end @ np.linalg.matrix_power(turn, k) for k in range(4)])
     else:
         raise UsageError(f"there is no target of shape {shape!r}")

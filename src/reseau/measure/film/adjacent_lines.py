@@ -32,11 +32,11 @@ from .border import Band, binned
 from .edges import NEIGHBOURS, EdgeProfiles
 
 __all__ = [
-    "FEW_DRAWN",
-    "Companion",
-    "Sharp",
+    "FEW_DISPLACED",
+    "AdjacentEdge",
+    "SharpSteps",
     "common_widths",
-    "drawn_by_lines",
+    "displaced_by_lines",
     "edge_beside_line",
     "ends_with_line",
     "sharp_steps",
@@ -50,16 +50,16 @@ _UNEVEN, _SCRATCHED = 0.2, 0.5
 from the next if it is no edge."""
 _TOO_SHARP = 0.3
 """Difference of logarithmic width from which steps are too sharp for an edge."""
-_FARTHEST_DRAWN = 1.5
+_LARGEST_DISPLACEMENT = 1.5
 """Largest displacement of a step by a line, in widths; a more distant line is visible by itself."""
-_RATIO, FEW_DRAWN = 4.0, 0.22
+_RATIO, FEW_DISPLACED = 4.0, 0.22
 """Ratio of the second step to the first where a line displaces an edge, and share of profiles that show this
 by chance."""
 _NEIGHBOURHOODS, _INDEPENDENT = 5, 2.5
 """Neighbourhoods of profiles that a line widens consistently; their effective number in picture content."""
 
 
-class Sharp(NamedTuple):
+class SharpSteps(NamedTuple):
     """Widths of sharp steps of an edge.
 
     Parameters
@@ -86,18 +86,18 @@ class Sharp(NamedTuple):
 
 def common_widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
     """Width of the blurred step for each edge: common to all, unless their sharpness differs."""
-    told = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
-    if not told:
+    measured = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
+    if not measured:
         return [None] * len(profiles)
-    if _uneven(told):
+    if _uneven(measured):
         return [None if p is None else p.width for p in profiles]
-    return [told[(len(told) - 1) // 2]] * len(profiles)
+    return [measured[(len(measured) - 1) // 2]] * len(profiles)
 
 
-def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Sharp]:
+def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:
     """Widths of sharp steps for each edge: common to all, unless their sharpness differs."""
     own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
-    sharp = [_sharp(widths) for widths in own]
+    sharp = [_sharp_steps(widths) for widths in own]
     seen = [each for each, widths in zip(sharp, own, strict=True) if len(widths)]
     if not seen:
         return sharp
@@ -107,10 +107,10 @@ def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Sharp]:
     if _uneven(sorted(each.width for each in seen)):
         return [each._replace(texture=texture) for each in sharp]
     scatter = sorted(each.scatter for each in seen)[second]
-    return [Sharp(_sharp(np.concatenate(own)).log_width, scatter, texture)] * len(profiles)
+    return [SharpSteps(_sharp_steps(np.concatenate(own)).log_width, scatter, texture)] * len(profiles)
 
 
-def drawn_by_lines(found: EdgeProfiles, sharp: Sharp) -> tuple[Array, float]:
+def displaced_by_lines(found: EdgeProfiles, sharp: SharpSteps) -> tuple[Array, float]:
     """Possible displacement of steps by lines beside the edge, pixels (n,); share of affected profiles.
 
     A second step with a share r of the contrast, at a distance s behind the first, appears as one step that
@@ -118,16 +118,16 @@ def drawn_by_lines(found: EdgeProfiles, sharp: Sharp) -> tuple[Array, float]:
     """
     sure = _unlike(found, sharp, 2.0)
     part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
-    if part > FEW_DRAWN:
+    if part > FEW_DISPLACED:
         # There is such a line; use a lower level of significance for the other profiles.
         sure = _unlike(found, sharp, 1.0)
-    moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _FARTHEST_DRAWN)
-    if part > FEW_DRAWN:
+    moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _LARGEST_DISPLACEMENT)
+    if part > FEW_DISPLACED:
         moved = moved * np.sqrt(NEIGHBOURS)  # neighbours are displaced alike
     return np.asarray(sharp.width * moved), part
 
 
-def _unlike(found: EdgeProfiles, sharp: Sharp, sigmas: float) -> Array:
+def _unlike(found: EdgeProfiles, sharp: SharpSteps, sigmas: float) -> Array:
     """Significant differences from the width of a sharp step, logarithm (n,): of profiles or groups."""
     other, variance = found.blur[0] - sharp.log_width, found.blur[1] + sharp.texture**2
     size = min(_NEIGHBOURHOODS * NEIGHBOURS, len(other))
@@ -137,14 +137,14 @@ def _unlike(found: EdgeProfiles, sharp: Sharp, sigmas: float) -> Array:
     return np.asarray(np.minimum(np.maximum(alone, together) - sharp.scatter, 1.0))
 
 
-def _sharp(widths: Array) -> Sharp:
+def _sharp_steps(widths: Array) -> SharpSteps:
     if not len(widths):
-        return Sharp(0.0, _EVEN, 0.0)
+        return SharpSteps(0.0, _EVEN, 0.0)
     low, high = np.quantile(widths, _QUANTILES)
     # Picture content changes widths at random; a line along the edge widens neighbours alike.
     apart = np.abs(np.diff(widths[::NEIGHBOURS]))
     texture = 1.4826 * float(np.median(apart)) / np.sqrt(2) if len(apart) > 3 else 0.0
-    return Sharp(float(high), max(float(high - low), _EVEN), texture)
+    return SharpSteps(float(high), max(float(high - low), _EVEN), texture)
 
 
 def _uneven(widths: Sequence[float]) -> bool:
@@ -177,7 +177,7 @@ _SHARED = 7
 """Number of parameters common to all sections: p0, p1, p2, q0, q1, q2, h."""
 
 
-class Companion(NamedTuple):
+class AdjacentEdge(NamedTuple):
     """Offsets (2,) of the edge at the positions −1 and 1, inwards, their covariance (2, 2), and its bow."""
 
     ends: Array
@@ -187,7 +187,7 @@ class Companion(NamedTuple):
 
 def edge_beside_line(
     grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
-) -> tuple[Companion | None, bool]:
+) -> tuple[AdjacentEdge | None, bool]:
     """Adjust an edge together with a line beside it; test against a model without the line.
 
     Parameters
@@ -223,18 +223,18 @@ def edge_beside_line(
     there &= np.ptp(behind) > width or (two.chi < _WELL and two.without > _CLEAR_GAIN * two.chi)
     if two.chi > _MOST_MISFIT or two.without < _LEAST_GAIN * two.chi or not there:
         return None, min(two.without, two.chi) < _MOST_MISFIT
-    return two.companion(band, line), True
+    return two.adjacent_edge(band, line), True
 
 
 def ends_with_line(
     grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
-) -> Companion | None:
+) -> AdjacentEdge | None:
     """The edge with a line behind it, without a test of the model; arguments as in :func:`edge_beside_line`.
 
     Its covariance assumes that the model is correct.
     """
     two = _two_lines(grey, band, line, level, noise, width)
-    return None if two is None else two.companion(band, line)
+    return None if two is None else two.adjacent_edge(band, line)
 
 
 class _TwoLines(NamedTuple):
@@ -250,12 +250,12 @@ class _TwoLines(NamedTuple):
     chi: float
     without: float
 
-    def companion(self, band: Band, line: Array) -> Companion:
+    def adjacent_edge(self, band: Band, line: Array) -> AdjacentEdge:
         """Its edge."""
         ends = np.array([[1.0, -1.0], [1.0, 1.0]])
         covariance = ends @ self.cofactor[:2, :2] @ ends.T * _TOGETHER**2
         fitted = np.interp([-1.0, 1.0], band.place, line)
-        return Companion(fitted + ends @ self.x[:2], covariance, float(self.x[2]))
+        return AdjacentEdge(fitted + ends @ self.x[:2], covariance, float(self.x[2]))
 
 
 def _two_lines(

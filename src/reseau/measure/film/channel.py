@@ -11,11 +11,11 @@ from scipy.ndimage import median_filter
 
 from ...core.data import Array, Mask
 from .adjacent_lines import (
-    FEW_DRAWN,
-    Companion,
-    Sharp,
+    FEW_DISPLACED,
+    AdjacentEdge,
+    SharpSteps,
     common_widths,
-    drawn_by_lines,
+    displaced_by_lines,
     edge_beside_line,
     sharp_steps,
 )
@@ -23,13 +23,13 @@ from .border import Band, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
 
-__all__ = ["FAR", "Channel", "channels_by_contrast", "measure_channel"]
+__all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
 
 _NEIGHBOURHOOD_PX = 0.05
 """Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
 _TONE = 0.12
 """Standard deviation of the tone of film along an edge relative to the noise of a pixel."""
-_FEW_GOOD, FAR = 0.2, 2.5
+_FEW_GOOD, WIDER_SEARCH = 0.2, 2.5
 """Minimum share of profiles that show a step; otherwise the edge is searched in a wider range, by this
 factor."""
 _FOREIGN = 0.25
@@ -98,7 +98,7 @@ def measure_channel(
     films: list[Film | None] = [None] * 4
 
     def measured(k: int, wide: bool, width: float | None = None) -> EdgeProfiles | None:
-        pixels, reached = band(k, wide, far[k]), FAR * reach if far[k] else reach
+        pixels, reached = band(k, wide, far[k]), WIDER_SEARCH * reach if far[k] else reach
         if pixels is None:
             return None
         return measure_profiles(pixels, channel, polarity, reached, gap, width, films[k])
@@ -147,14 +147,14 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
 
 
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, sharp: Sharp, channel: int, polarity: int
+    band: Band | None, found: EdgeProfiles | None, sharp: SharpSteps, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
     """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
         return None, 0, "is not in the scan, or nothing separates it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    drawn, part = drawn_by_lines(found, sharp)
+    drawn, part = displaced_by_lines(found, sharp)
     place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
     line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
     sigma = np.hypot(sigma, drawn[found.good])
@@ -171,7 +171,7 @@ def _edge(
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
     hidden = False
-    if part > (FEW_DRAWN if found.good.mean() > _CLEAR else FEW_DRAWN / 5):
+    if part > (FEW_DISPLACED if found.good.mean() > _CLEAR else FEW_DISPLACED / 5):
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
         # A line displaces an edge by at most its width; a larger bow is real.
         own = bow if abs(bow) > 2 * found.width else 0.0
@@ -226,7 +226,7 @@ def _points(band: Band, place: Array, offset: Array) -> Array:
     return np.asarray(band.start + along + offset[:, None] * band.normal)
 
 
-def _along_chord(band: Band, found: Companion, bow: float, common: float) -> EdgeData:
+def _along_chord(band: Band, found: AdjacentEdge, bow: float, common: float) -> EdgeData:
     """An edge known by its two ends, as points of a line with the same precision."""
     middle = float(found.covariance.sum() / 4)
     slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)

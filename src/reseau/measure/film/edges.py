@@ -32,7 +32,7 @@ _INWARD, _OUTWARD = 2.0, 4.0
 NEIGHBOURS = 15
 """Number of neighbouring profiles used to estimate how well a step is determined."""
 _BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("danish", 2.5))
-_FREE, _HELD = 0.5, (0.02, 0.12)
+_FREE, _TIGHTENED = 0.5, (0.02, 0.12)
 """Standard deviation of the logarithm of the width: at first; then for a width from other edges, and for one
 from this edge."""
 _MODEL = 0.012, 0.05
@@ -163,7 +163,7 @@ def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tup
         width = float(np.clip(np.exp(np.median(first.blur[0][first.good])), 0.4, 6.0))
         for _ in range(_ROUNDS):
             width = _common_width(grey, band, border, start, first, width)
-    steps = _one_by_one(grey, band, border, start, width, _HELD[known is None])
+    steps = _one_by_one(grey, band, border, start, width, _TIGHTENED[known is None])
     return None if steps is None else (steps, width)
 
 
@@ -180,12 +180,12 @@ def _one_by_one(
     p, step = fit.estimates[:, 0], fit.estimates[:, 3]
     scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
     own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
-    told = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
+    measured = np.isfinite(own) & (fit.reasons <= 1) & (weight.sum(axis=1) > 8)
     # From neighbours: a profile whose step is too high by chance is located too far inwards and would get a
     # larger weight.
-    sigma = _along(np.where(told, own, np.inf))
-    ratio = _along(np.where(told & (step > 0), step / np.where(told, own_step, 1.0), 0.0))
-    good = told & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
+    sigma = _along(np.where(measured, own, np.inf))
+    ratio = _along(np.where(measured & (step > 0), step / np.where(measured, own_step, 1.0), 0.0))
+    good = measured & (ratio > 4) & (step > 0) & (own < 3 * sigma) & (sigma < 0.8 * width)
     good &= np.abs(p - start) < 2.5 * width + 1.5
     if not good.any():
         return None
@@ -248,11 +248,11 @@ def _common_width(
         values[: sections * each].reshape(sections, -1)
         for values in (value, distance, weight * lit[:, None] * part**2)
     )
-    told = (weight > 0).sum(axis=1) > _LEAST_PIXELS
-    if not told.any():
+    measured = (weight > 0).sum(axis=1) > _LEAST_PIXELS
+    if not measured.any():
         return width
-    none = np.zeros(int(told.sum()))
-    fit = _fit(value[told], distance[told], weight[told], border, none, none, width, _FREE)
+    none = np.zeros(int(measured.sum()))
+    fit = _fit(value[measured], distance[measured], weight[measured], border, none, none, width, _FREE)
     found = fit.estimates[fit.converged, 2]
     # If another structure runs along the edge, few sections converge.
     return float(np.clip(np.exp(np.median(found)), 0.4, 6.0)) if len(found) > 0.5 * sections else width

@@ -14,7 +14,7 @@ from ...core.failure import Code, Failure
 from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...io.scans import Scan
 from .border import Band, read_band
-from .channel import FAR, Channel, channels_by_contrast, measure_channel
+from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
 from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
 from .search import FrameGuess, search_frames
 
@@ -25,7 +25,7 @@ FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 4
 
 _OVERVIEWS = ((500, 60), (1000, 300))
 """Longer side of the overviews in pixels, and number of combinations of lines tested in each."""
-_SURE = 3.0
+_RELIABLE = 3.0
 """Score of a frame from which no finer overview is needed."""
 _REACH = 4.0
 """Largest error of an approximate edge, in pixels of the overview."""
@@ -66,7 +66,7 @@ class FrameOptions:
     Examples
     --------
     >>> FrameOptions(formats=((36.0, 24.0),), dpi=2400).max_tilt_deg
-    8.0
+    16.0
     """
 
     formats: tuple[tuple[float, float], ...] = FORMATS
@@ -218,7 +218,7 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
         )
         if found and (not best or _rank(found) > _rank(best)):
             best, reduction = found, r
-        if best and all(best[0].supported) and best[0].score > _SURE:
+        if best and all(best[0].supported) and best[0].score > _RELIABLE:
             break
         reduction = reduction if best else r
     if best:
@@ -248,7 +248,7 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
     @cache
     def band(k: int, wide: bool, far: bool = False) -> Band | None:
         ends = corners[k], corners[(k + 1) % 4]
-        beside = (FAR * reach if far else reach) + _FILM_MM * scale
+        beside = (WIDER_SEARCH * reach if far else reach) + _FILM_MM * scale
         return read_band(scan, *ends, beside, beside + 8, wide=wide) if guess.supported[k] else None
 
     shape = options.shape

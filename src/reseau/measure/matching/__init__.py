@@ -2,7 +2,7 @@
 
 from .matcher import SIZE, Matches, MatchOptions, match
 from .noise import grey_variance
-from .shapes import FormedShape, GrownOutline, Shape, Some, Window
+from .shapes import FormedShape, GrownOutline, Shape, ShapeSubset, Window
 
 __all__ = [
     "SIZE",
@@ -11,7 +11,7 @@ __all__ = [
     "MatchOptions",
     "Matches",
     "Shape",
-    "Some",
+    "ShapeSubset",
     "Window",
     "grey_variance",
     "match",

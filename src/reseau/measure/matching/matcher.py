@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...core.data import Array, Mask, Rows
 from ...optics.formation import Outline, PixelResponse
-from .noise import course, medians
-from .shapes import GrownOutline, Shape, Some, Window
+from .noise import medians, relative_weights
+from .shapes import GrownOutline, Shape, ShapeSubset, Window
 
 __all__ = [
     "CONTRAST",
@@ -156,7 +156,7 @@ class Patches:
             owner, mine = claims
             usable &= (owner[r, c] < 0) | (owner[r, c] == mine[:, None, None])
         self.weights = usable.reshape(k, -1).astype(np.float64)
-        self.course = np.ones(self.grey.shape)
+        self.relative_weights = np.ones(self.grey.shape)
         self.whitener: tuple[Array, Array] | None = None
         self._formed: tuple[Array, Rows, Array, Array] | None = None
         self.shares = np.zeros(self.shape)
@@ -205,7 +205,7 @@ class Patches:
             x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
         if self.options.variance is not None:
             grey, _ = self.form_image(x, np.arange(len(x)))
-            self.course = course(grey, self.options.variance)
+            self.relative_weights = relative_weights(grey, self.options.variance)
         return x
 
     def width(self, x: Array, at: Rows) -> Array:
@@ -321,10 +321,13 @@ class Patches:
         """
         _, jacobian = self._form(x, np.arange(len(self.xy)))
         slope = jacobian[..., X].reshape(self.shape) * self.weights.reshape(self.shape).astype(jacobian.dtype)
-        length2 = (self.course.reshape(self.shape) * slope**2).sum(axis=2, keepdims=True)
+        length2 = (self.relative_weights.reshape(self.shape) * slope**2).sum(axis=2, keepdims=True)
         q2 = (jitter / np.maximum(sigma, 1e-12))[:, :, None] ** 2
         factor = (1 - 1 / np.sqrt(1 + q2 * length2)) / np.maximum(length2, 1e-300)
-        self.whitener = (slope, (slope * factor * self.course.reshape(self.shape)).astype(slope.dtype))
+        self.whitener = (
+            slope,
+            (slope * factor * self.relative_weights.reshape(self.shape)).astype(slope.dtype),
+        )
 
     def _whitened(self, grey: Array, jacobian: Array, at: Rows) -> tuple[Array, Array]:
         assert self.whitener is not None
@@ -507,7 +510,7 @@ def match(
     few = Patches(
         pixels,
         valid,
-        Some(outline, amiss),
+        ShapeSubset(outline, amiss),
         xy[amiss],
         replace(options, psf_px=patch.psf[amiss]),
         None if claims is None else (claims[0], claims[1][amiss]),
@@ -526,7 +529,7 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
             lambda x, at: patch.form_image(x, rows[at]),
             start_at[rows],
             patch.grey[rows],
-            weights=used[rows] * patch.course[rows] / scale[rows] ** 2,
+            weights=used[rows] * patch.relative_weights[rows] / scale[rows] ** 2,
             prior=(start[rows], free),
             options=BatchOptions(share=options.settled, max_iterations=most),
         )
@@ -564,7 +567,7 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         patch.form_image,
         start,
         patch.grey,
-        weights=patch.weights * patch.course / noise**2,
+        weights=patch.weights * patch.relative_weights / noise**2,
         prior=(start, free),
         values=patch.form_values,
         options=BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["course", "grey_variance", "medians"]
+__all__ = ["grey_variance", "medians", "relative_weights"]
 
 _SIGNIFICANT = 5.0
 """The slope of the variance must exceed this many of its standard deviations to be used."""
@@ -60,7 +60,7 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     return (float(a), float(b)) if b > _SIGNIFICANT * sigma else None
 
 
-def course(grey: Array, variance: tuple[float, float]) -> Array:
+def relative_weights(grey: Array, variance: tuple[float, float]) -> Array:
     """Relative weights (k, n) of grey values, about 1 on average in each patch."""
     expected = variance[0] + variance[1] * grey
     mean = np.maximum(expected.mean(axis=1, keepdims=True), 1e-12)

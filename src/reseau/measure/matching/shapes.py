@@ -14,7 +14,7 @@ import numpy as np
 from ...core.data import Array, Rows
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["FormedShape", "GrownOutline", "Shape", "Some", "Window"]
+__all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class GrownOutline:
 
 
 @dataclass(frozen=True, eq=False)
-class Some:
+class ShapeSubset:
     """A subset of the marks of a shape, itself a shape.
 
     Parameters

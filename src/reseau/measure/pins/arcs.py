@@ -17,7 +17,7 @@ __all__ = ["ArcMatches", "ArcShape", "match_arcs"]
 
 _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
 """Half sides of windows, pixels; arcs of similar size are matched in one batch."""
-_SURE = 8.0
+_RELIABLE = 8.0
 """Minimum contrast over its standard deviation of an arc whose light is subtracted from others."""
 _MARGIN_PX = 4.0
 """Background shown by a window around an arc, pixels."""
@@ -28,7 +28,7 @@ _ACROSS_SIGMA = 0.5
 _LAGS = 4
 """Distance in pixels, along both axes, up to which the autocorrelation of residuals is summed."""
 _NUMBERS = ("contrast", "t", "noise", "correlation", "seen", "rejected")
-_HELD = 0.2
+_TIGHTENED = 0.2
 """Factor of these in a second attempt, where the first did not converge."""
 _ROUND = 1.5
 """Length over thickness below which a spot has no direction."""
@@ -36,9 +36,9 @@ _OF_MOMENTS = 1.7
 """Approximate width of a Gaussian over that of its part above one third of its height."""
 _REACH = 2.6
 """Half size of a window, in widths of the arc."""
-_VEILED = 0.5
+_HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
-_LESS_PX = 2
+_WIDER_GAP_PX = 2
 """Width of the additional margin next to hidden pixels that is left out to test the position of an arc."""
 
 
@@ -129,21 +129,21 @@ def match_arcs(
         Standard deviation of the grey values.
     """
     work = _Matching(grey, valid, echoes, at, options, noise)
-    found = _together(work.all(), len(at))
+    found = _in_order(work.all(), len(at))
     touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
     if len(touching):
         # It is unknown how the instrument combines overlapping echoes: behind a logarithmic amplifier the
         # stronger one is shown; otherwise their sum. The first match assumed the former; the difference to
         # the latter is added to the uncertainty.
-        pulled = work.without_others(touching, found)
+        pulled = work.shift_without_others(touching, found)
         found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
-    veiled = np.flatnonzero((work.hidden_flanks(found) > _VEILED) & found.converged)
-    if len(veiled):
+    half_hidden = np.flatnonzero((work.hidden_flanks(found) > _HALF_HIDDEN) & found.converged)
+    if len(half_hidden):
         # If one flank of an arc is hidden, its centre follows from the shape of the other. Effects of raster
         # lines or reverberation on this shape no longer cancel and are not noise of single pixels. Their size
         # is estimated by leaving out slightly more of the arc.
-        pulled = work.seeing_less(veiled, found)
-        found.cov[veiled] += pulled[:, :, None] * pulled[:, None, :]
+        pulled = work.shift_with_wider_gap(half_hidden, found)
+        found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
     return found
 
 
@@ -172,12 +172,14 @@ class _Matching:
             # A round spot has no tilt: if it does not converge, tighten the prior of the form.
             again = rows[~parts[-1][1].converged]
             if len(again):
-                parts.append(self._adjusted(again, self.start, self.echoes.xy[self.at], _HELD * _FORM_SIGMA))
+                parts.append(
+                    self._adjusted(again, self.start, self.echoes.xy[self.at], _TIGHTENED * _FORM_SIGMA)
+                )
         return parts
 
-    def without_others(self, touching: Rows, found: ArcMatches) -> Array:
+    def shift_without_others(self, touching: Rows, found: ArcMatches) -> Array:
         """Shifts (m, 2) of arcs if the light of others is subtracted instead of excluded."""
-        modelled = found.converged & (found.t > _SURE)
+        modelled = found.converged & (found.t > _RELIABLE)
         pulled = np.zeros((len(touching), 2))
         for rows in self._of_like_size(touching):
             others = np.stack([self._light_of_others(k, found, modelled) for k in rows])
@@ -202,15 +204,15 @@ class _Matching:
                 share[rows] = np.maximum(share[rows], hidden.max(axis=1))
         return share
 
-    def seeing_less(self, veiled: Rows, found: ArcMatches) -> Array:
+    def shift_with_wider_gap(self, half_hidden: Rows, found: ArcMatches) -> Array:
         """Shifts (m, 2) of arcs if the pixels next to hidden ones are left out, too."""
-        side = 2 * _LESS_PX + 1
+        side = 2 * _WIDER_GAP_PX + 1
         less = cv2.erode(self.valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-        pulled = np.zeros((len(veiled), 2))
-        for rows in self._of_like_size(veiled):
+        pulled = np.zeros((len(half_hidden), 2))
+        for rows in self._of_like_size(half_hidden):
             _, again, _ = self._adjusted(rows, found.form, found.xy, _FORM_SIGMA, valid=less)
             moved = np.where(again.converged[:, None], again.xy - found.xy[rows], np.nan)
-            pulled[np.searchsorted(veiled, rows)] = moved
+            pulled[np.searchsorted(half_hidden, rows)] = moved
         return pulled
 
     def _window(self, rows: Rows, xy: Array) -> tuple[Array, Array]:
@@ -321,7 +323,7 @@ def _inflation(residuals: Array) -> Array:
     return total
 
 
-def _together(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches:
+def _in_order(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches:
     """Columns in the order of the echoes."""
 
     def column(name: str, tail: tuple[int, ...] = ()) -> Array:

@@ -26,7 +26,7 @@ from ..points import Reason
 from ..screening import Screened, screen
 from .arcs import ArcMatches, match_arcs
 from .echoes import Echoes, Grey, find_echoes, ground_of
-from .graphics import bridged, find_cuts, is_sharp, looks_sharp, same_in_all, series
+from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
 
 __all__ = ["PinDetections", "PinOptions", "falloff", "find_pins"]
 
@@ -295,7 +295,7 @@ class _Judge:
             (e.joined > o.most_touching, Reason("touches another spot", Code.OVERLAPPING)),
             (self._static(), Reason("the same in all frames", Code.DRAWN)),
         ]
-        drawn = sharp | looks_sharp(e)
+        drawn = sharp | looks_drawn(e)
         coarse += zip(series(e, drawn), _IN_ROWS, strict=True)
         for mask, reason in coarse:
             self._object(np.arange(len(e)), mask, reason)

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Frame, Mask, Rows
 from .echoes import Echoes, Grey
 
-__all__ = ["bridged", "find_cuts", "is_sharp", "looks_sharp", "same_in_all", "series"]
+__all__ = ["bridged", "find_cuts", "is_sharp", "looks_drawn", "same_in_all", "series"]
 
 _SHARP = 0.16
 """Squared steps over squared light, in the direction where they are smaller: a Gaussian of 1.8 px."""
@@ -37,7 +37,7 @@ def is_sharp(echoes: Echoes) -> Mask:
     return sharp
 
 
-def looks_sharp(echoes: Echoes) -> Mask:
+def looks_drawn(echoes: Echoes) -> Mask:
     """Mask (m,) of spots about as sharp along as across: drawn, if they stand in a row of such spots."""
     suspect: Mask = echoes.edge[:, 1] > _SUSPECT
     return suspect

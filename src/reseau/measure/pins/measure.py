@@ -112,7 +112,7 @@ def measure_pins(
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
     seen = find_pins(frame, o, others, hidden)
     echoes = np.flatnonzero(seen.ok)
-    layout = _laid(design, known, seen.xy[echoes], o)
+    layout = _placed_pattern(design, known, seen.xy[echoes], o)
     if isinstance(layout, Failure):
         return Failure(
             f"the rods of design {design.name!r} were not found: {layout.reason}",
@@ -124,7 +124,7 @@ def measure_pins(
     return work.result(design.ids, known)
 
 
-def _laid(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
+def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
     """The pattern fitted to the echoes, from nominal positions if the design has them."""
     ids = tuple(design.ids[i] for i in known)
     wires = Wires.of_points(ids, design.xy[known])

@@ -25,7 +25,7 @@ from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
 from .candidates import Candidates, find_candidates
 
-__all__ = ["Assignment", "GridOptions", "Placement", "PlacingOptions", "assign", "lay_out", "place"]
+__all__ = ["Assignment", "GridOptions", "Placement", "PlacingOptions", "assign", "place", "place_grid"]
 
 _NEIGHBOURS = 6
 _NEARLY = 0.75
@@ -252,7 +252,7 @@ def _robust_field(
     return field, scatter
 
 
-def lay_out(source: Array, candidates: Candidates, valid: Mask, options: GridOptions) -> Assignment | None:
+def place_grid(source: Array, candidates: Candidates, valid: Mask, options: GridOptions) -> Assignment | None:
     """Find the design among candidates without approximate positions.
 
     Parameters
@@ -511,7 +511,7 @@ def _lay(
 ) -> Assignment | None:
     if options.nominal is not None:
         return assign(source, options.nominal, candidates, screened.valid, within_px=options.within_px)
-    found = lay_out(source, candidates, screened.valid, options.grid)
+    found = place_grid(source, candidates, screened.valid, options.grid)
     if found is None or size is None or options.mark_px is not None:
         return found
     # A pattern of the scene may fit the grid, but not with marks of another size than the design's.

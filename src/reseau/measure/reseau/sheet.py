@@ -357,7 +357,7 @@ _SLOPE = 0.3
 """Standard deviation of the change of contrast from the centre of a disk to the edge of its window, caused by
 reflected light."""
 _SEEN = 0.95
-_UNEASY = 1.4
+_HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
 _BLURRED, _GROWN, _BENT = 1.8, 0.2, 0.12
 """Tolerances of sharpness (factor), size and shape (shares) of a disk."""
@@ -407,7 +407,7 @@ def _arc(start: float, end: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Appearance:
     """Appearance of the disks of this frame."""
 
     psf_px: float
@@ -434,7 +434,7 @@ class _Sheet:
         self.at = design.xy @ placed.frame.T + placed.origin
         self.found = placed.disk >= 0
         self.start = np.where(self.found[:, None], disks.xy[placed.disk], self.mapping(self.at))
-        self.look = _Look(options.psf_px, design.mark.size, None)
+        self.look = _Appearance(options.psf_px, design.mark.size, None)
 
     def columns(self) -> dict[str, Any]:
         """Columns of the result."""
@@ -549,7 +549,7 @@ class _Sheet:
             return
         rows = rows[sure]
         self.mapping = through(self.at[rows], first.xy[sure], self.screened.grey.shape)
-        self.look = _Look(
+        self.look = _Appearance(
             float(np.median(first.psf_px[sure])),
             self.look.size * (1 + float(np.median(first.form[sure, 0]))),
             grey_variance(self.screened.grey, self.start[rows], first.residuals[sure]),
@@ -561,7 +561,7 @@ class _Sheet:
         """Match disks; on an uneven background with a curved one if that is better."""
         found = self._match(rows)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
-        uneasy = ~found.converged | (found.noise > _UNEASY * ordinary) | (found.rejected > 0.05)
+        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.05)
         if not uneasy.any():
             return found
         curved = self._match(rows[uneasy], background=2)

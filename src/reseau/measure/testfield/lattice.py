@@ -488,12 +488,12 @@ def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: f
             if line is None:
                 continue
             side = (beside - middle)[np.rint(line.along).astype(np.intp)]
-            shift, told = located(grey, line, 0.5 * np.abs((side * line.normal).sum(axis=1)), blur)
-            place = np.full((len(told), 2), float(number))
+            shift, measured = located(grey, line, 0.5 * np.abs((side * line.normal).sum(axis=1)), blur)
+            place = np.full((len(measured), 2), float(number))
             place[:, 1 - axis] = np.interp(line.along, np.arange(len(along)), along)
-            xy.append(line.xy(shift)[told])
-            normal.append(line.normal[told])
-            at.append(place[told])
+            xy.append(line.xy(shift)[measured])
+            normal.append(line.normal[measured])
+            at.append(place[measured])
     points = [np.concatenate(column) for column in (xy, normal, at)]
     if len(points[0]) < _LEAST_POINTS:
         return fit

@@ -131,5 +131,5 @@ def located(
     x = np.linalg.solve(normal, np.swapaxes(design, 1, 2) @ seen[..., None])[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = x[:, 2] / x[:, 1]
-    told = inside & (x[:, 1] < 0) & (np.abs(shift) < _MOST_PX)
-    return np.where(told, shift, 0.0), told
+    measured = inside & (x[:, 1] < 0) & (np.abs(shift) < _MOST_PX)
+    return np.where(measured, shift, 0.0), measured

@@ -20,7 +20,7 @@ from ..matching import Matches
 from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
 from .lattice import LatticeFit, refit, slope_of
-from .recognition import Reading, Sight
+from .recognition import Reading, SearchedFrame
 from .targets import Light, Scene, match_targets, merged
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
@@ -41,7 +41,7 @@ _UNMODELLED_PX = 0.03
 """Scatter of positions about a mapping of third degree beyond their own sigmas."""
 _SEEN = 0.95
 """Minimum share of a target on pixels that carry an image."""
-_UNEASY = 1.4
+_HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
 _UNLIKE = 2.0
 """Multiple of the usual residuals from which an image is that of another object."""
@@ -136,7 +136,7 @@ def measure_testfield(
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     noise = quiet_noise(grey)
-    seen = Sight(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
+    seen = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     read = seen.read()
     if isinstance(read, Failure):
         # Lines of one pixel width may be recovered from a blurred frame by sharpening.
@@ -145,7 +145,7 @@ def measure_testfield(
         if isinstance(read, Failure):
             return failure
         seen = sharp
-    if seen.another(read):
+    if seen.shows_second(read):
         return Failure(
             f"shows two testfields {design.name!r}; crop the image to one of them",
             Code.SEVERAL_TARGETS,
@@ -300,7 +300,7 @@ class _Measurement:
         """Match all targets; on an uneven background with a curved one if that is better."""
         found = match_targets(self.scene, self.rows, self.inside)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
-        uneasy = ~found.converged | (found.noise > _UNEASY * ordinary) | (found.rejected > 0.02)
+        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
         if not uneasy.any():
             return found
         some = self.inside.copy()

@@ -33,7 +33,7 @@ from .lattice import LatticeFit, Ridges, find_lattice, lattices, ridge_points, s
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 
-__all__ = ["Kinds", "Placement", "Read", "Reading", "Sight", "locate", "read_clusters"]
+__all__ = ["Kinds", "Placement", "Read", "Reading", "SearchedFrame", "locate", "read_clusters"]
 
 _ALIKE = 0.06
 """Relative difference of local frames below which they share one set of formed images."""
@@ -348,7 +348,7 @@ class Read:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SearchedFrame:
     """A frame in which a testfield is searched.
 
     Parameters
@@ -372,7 +372,7 @@ class Sight:
     response: PixelResponse
     taken_px2: float = 0.0
 
-    def sharpened(self, noise: float) -> Sight:
+    def sharpened(self, noise: float) -> SearchedFrame:
         """The frame sharpened by removing most of an assumed blur; `noise` is its noise."""
         power = max(_LEAST_POWER, (noise / max(float(self.grey.std()), 1e-9)) ** 2)
         grey, dark = (_sharpened(image, power) for image in (self.grey, self.dark))
@@ -407,7 +407,7 @@ class Sight:
             failure = Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
         return failure
 
-    def another(self, read: Read) -> bool:
+    def shows_second(self, read: Read) -> bool:
         """Whether a second testfield is visible beyond the one that was read."""
         x0, y0, x1, y1 = self.design.lines.extent
         corners = (

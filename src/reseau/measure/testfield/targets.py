@@ -19,7 +19,7 @@ from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
-from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, Some, Window, match
+from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, ShapeSubset, Window, match
 from .lattice import slope_of
 from .line_profiles import blur_of, crossings, strip
 from .target_images import form_targets
@@ -210,7 +210,7 @@ class _Canvas:
         right, down = (np.arange(-n, n + 1.0) for n in half)
         window = Window(centre[:, :1] + right, centre[:, 1:] + down, self.scene.response)
         width, form = np.full(len(part), self.scene.psf_px), np.zeros((len(part), 1))
-        formed: Shape = Some(self.images, part)
+        formed: Shape = ShapeSubset(self.images, part)
         if wanted:
             share, slopes = self.images.derivatives(xy, width, form, part, window)
             formed = FormedShape(formed, xy, width, share, slopes)
