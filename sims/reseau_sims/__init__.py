@@ -1,6 +1,6 @@
-"""Instruments that behave like hardware, all in one shared world."""
+"""Simulated instruments in one shared, seeded world."""
 
-from .camera import Camera, film
+from .camera import FilmCamera, film
 from .display import Bending, Display, Instrument
 from .faults import Faults, swapped
 from .plate import Plate
@@ -12,11 +12,11 @@ from .world import Truth, World
 
 __all__ = [
     "Bending",
-    "Camera",
     "Display",
     "Faults",
     "FieldBench",
     "FieldTruth",
+    "FilmCamera",
     "Instrument",
     "Plate",
     "Reflectors",

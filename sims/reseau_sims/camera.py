@@ -1,4 +1,4 @@
-"""A non-metric camera: where it stands, its lens, its film, and the device that scans the film."""
+"""A non-metric film camera: its pose, its lens, its film, and the scan of the film."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from reseau.optics import (
 )
 from reseau.optics.formation import PixelResponse
 
-__all__ = ["Camera", "film"]
+__all__ = ["FilmCamera", "film"]
 
 _FILM = {
     "ax": {"X": "x"},
@@ -36,25 +36,30 @@ _FILM = {
 
 
 def film(**deformation: float) -> RationalPolynomial:
-    """Deformation of a film: from where a point lies on the deformed film (mm) to where light had put it.
+    """Deformation of a film: maps a point on the deformed film (mm) to its position before the deformation.
 
     Parameters
     ----------
     **deformation : float
         `ax`, `ay` stretch the axes (their difference is the affinity), `bx` shears them, `d1`, `d2` (mm⁻¹) on
         xy, `h1`, `h2` (mm⁻³) on x⁴ and y⁴ as Wishahy found on Polaroid film, eq. (4, 5).
+
+    Examples
+    --------
+    >>> film(ax=-2e-3)(np.array([[10.0, 5.0]]))
+    array([[9.98, 5.  ]])
     """
     return RationalPolynomial(_FILM, fixed={"X": "x", "Y": "y"}).with_values(deformation)
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A camera that photographs a plane, and what becomes of its film.
+class FilmCamera:
+    """A camera that photographs a plane on film, and the scan of that film.
 
     Parameters
     ----------
     pose : Pose
-        Of the camera in the system of the plane (mm, z towards the camera).
+        Pose of the camera in the system of the plane (mm, z towards the camera).
     lens : Brown
         From ideal directions to photo-coordinates (mm).
     film : RationalPolynomial
@@ -62,11 +67,18 @@ class Camera:
     scan : PixelGrid
         Pixels on the film.
     sensor : Sensor
-        What scans it.
+        Sensor of the scanner.
     psf_px : float
         Width (one sigma) of the point-spread function of lens, film and scan.
     response : PixelResponse
-        Of the scan's pixels.
+        Response of the scan's pixels.
+
+    Examples
+    --------
+    >>> from reseau_sims import World
+    >>> camera = World.standard(seed=7).camera
+    >>> camera.shape, camera.view(np.zeros((1, 2))).round(0)[0].shape
+    ((1200, 1600), (2,))
     """
 
     pose: Pose
@@ -77,15 +89,15 @@ class Camera:
     psf_px: float = 0.9
     response: PixelResponse = field(default_factory=PixelResponse)
 
-    def moved(self, shift: Array, turn: float) -> Camera:
-        """The camera after someone has pushed it.
+    def moved(self, shift: Array, turn: float) -> FilmCamera:
+        """The camera after a displacement.
 
         Parameters
         ----------
         shift : ndarray (3,)
-            Of the projection centre (mm).
+            Displacement of the projection centre (mm).
         turn : float
-            About the axis of the camera (rad).
+            Rotation about the axis of the camera (rad).
         """
         matrix = rotation_matrix(np.array([0.0, 0.0, turn])) @ self.pose.matrix
         return replace(self, pose=Pose(matrix_to_vector(matrix), self.pose.x0 + shift))
@@ -97,13 +109,13 @@ class Camera:
 
     @cached_property
     def view(self) -> PlaneMapping:
-        """From the plane z = 0 (mm) to the pixels of a frame: the truth about this camera."""
+        """True mapping from the plane z = 0 (mm) to the pixels of a frame."""
         return self.view_at(0.0)
 
     def view_at(self, z: float) -> PlaneMapping:
-        """From the plane at a height z (mm, towards the camera) to the pixels of a frame.
+        """True mapping from the plane at a height z (mm, towards the camera) to the pixels of a frame.
 
-        What lies behind the reseau, z < 0, is seen nearer to the point under the camera: the parallax.
+        Points behind the reseau, z < 0, are imaged nearer to the point below the camera: the parallax.
         """
         (px, py), (cx, cy) = self.scan.pixels_per_mm, self.scan.centre
         scan = RationalPolynomial.affine().with_values([px, 0.0, cx, 0.0, py, cy])

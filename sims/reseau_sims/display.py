@@ -1,4 +1,4 @@
-"""A cathode-ray tube: draws video line by line, a little beside its place, with a spot of some size."""
+"""A cathode-ray tube: draws video line by line, with geometric distortion and a spot of finite size."""
 
 from __future__ import annotations
 
@@ -22,28 +22,34 @@ from .screen import Screen
 __all__ = ["Bending", "Display", "Instrument"]
 
 _SPARE_MM = 6.0
-"""What the raster reaches beyond the phosphor: distortion carries it in from there."""
+"""Margin of the raster beyond the phosphor; distortion displaces parts of it into the visible area."""
 _CHARGE_STEP = 10
-"""Samples of the picture for one of the map of its charge."""
+"""Samples of the picture per node of the charge map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instrument(PlaneMapping):
-    """Correction of a display with the beam of a scanner: from what is displayed to where it belongs.
+    """Correction of a display and the beam of a scanner: from displayed to true positions.
 
     The sum of Wishahy's eq. (6): X = x + (Δx)s + (Δx)d + (Δx)o + m1·x + m2·y, all at the displayed point.
 
     Parameters
     ----------
     display : PlaneMapping
-        Of the tube alone.
+        Correction of the tube alone.
     m1, m2 : float
-        Of the beam.
+        Coefficients of the beam.
 
     Raises
     ------
     UsageError
         When the display has parameters `m1` or `m2` of its own.
+
+    Examples
+    --------
+    >>> instrument = Instrument(RationalPolynomial.affine(), m1=0.01)
+    >>> instrument(np.array([[10.0, 0.0]]))
+    array([[10.1,  0. ]])
     """
 
     display: PlaneMapping
@@ -52,7 +58,9 @@ class Instrument(PlaneMapping):
 
     def __post_init__(self) -> None:
         if {"m1", "m2"} & set(self.display.names):
-            raise UsageError("m1 and m2 belong to the scanner; take them out", where="model of a display")
+            raise UsageError(
+                "has m1 and m2, which belong to the scanner; remove them", where="model of a display"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -86,17 +94,23 @@ class Instrument(PlaneMapping):
 
 @dataclass(frozen=True, eq=False)
 class Bending(PlaneMapping):
-    """What bright areas do to the electron beam near them: from what is displayed to where it was aimed at.
+    """Displacement of the electron beam near bright areas: from displayed to intended positions.
 
-    The charge that a bright area leaves on the phosphor pushes the beam away, by an amount proportional to
-    the gradient of the charge.
+    The charge of a bright area on the phosphor repels the beam, by an amount proportional to the gradient of
+    the charge.
 
     Parameters
     ----------
     x, y : ndarray (c,), (r,)
         Nodes, ascending (mm).
     shift : ndarray (r, c, 2)
-        To be added to a displayed point (mm).
+        Correction of a displayed point (mm).
+
+    Examples
+    --------
+    >>> nodes = np.arange(4.0)
+    >>> Bending(nodes, nodes, np.full((4, 4, 2), 0.1))(np.array([[1.5, 1.5]]))
+    array([[1.6, 1.6]])
     """
 
     names: ClassVar[tuple[str, ...]] = ()
@@ -131,25 +145,32 @@ class Display:
     Parameters
     ----------
     correction : PlaneMapping
-        From what is displayed to where it belongs, in the plane of the screen (mm). Drawing is its inverse.
+        From displayed to true positions in the plane of the screen (mm). Drawing applies its inverse.
     line_mm, sample_mm : float
         Distance of the lines of the raster and of the samples on a line.
     spot_mm : float
         Width (one sigma) of the spot across the lines.
     glow : float
-        Grey value of black: the raster is never quite dark, and the reseau stands out against it.
+        Grey value of black: the raster is never completely dark, so that the reseau is visible.
     contrast : float
-        Grey values that a signal of 1 adds.
+        Grey values added by a signal of 1.
     grain : float
         Relative standard deviation of the phosphor's light, from sample to sample.
     gradient, falloff : (float, float), float
         Unevenness of its light; see :meth:`reseau_sims.screen.Screen.illuminate`.
     bending_mm : float
-        How far the beam is pushed away at the edge of a large area of full brightness.
+        Displacement of the beam at the edge of a large area of full brightness.
     bending_reach_mm : float
         Width (one sigma) over which the charge of a bright area acts.
     bright : tuple of (float, float, float)
         Bright disks that the instrument shows: x, y on an ideal screen and radius (mm).
+
+    Examples
+    --------
+    >>> display = Display.drawn(np.random.default_rng(1))
+    >>> x, y = display.raster(Screen())
+    >>> x.shape, y.shape
+    ((1701,), (337,))
     """
 
     correction: PlaneMapping
@@ -167,7 +188,7 @@ class Display:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Display:
-        """A tube of Wong's model with distortions of a millimetre or two at the corners."""
+        """A random tube of Wong's model, with distortions of one to two millimetres at the corners."""
         values = {
             "k0": rng.normal(0.0, 4.0e-3),
             "k1": rng.normal(3.0e-6, 6.0e-7),
@@ -185,13 +206,13 @@ class Display:
 
     @classmethod
     def polynomial(cls, rng: np.random.Generator) -> Display:
-        """A tube that Wishahy's eq. (7a, b) corrects exactly; each coefficient has a value of its own."""
+        """A random tube that Wishahy's eq. (7a, b) corrects exactly."""
         mean = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 3.0e-6, 0.0]
         sigma = [0.6, 4.0e-3, 4.0e-3, 4.0e-5, 4.0e-5, 4.0e-5, 6.0e-7, 3.0e-9]
         return cls(RationalPolynomial.ultrasonic().with_values(rng.normal([*mean, *mean], [*sigma, *sigma])))
 
     def raster(self, screen: Screen) -> tuple[Array, Array]:
-        """Coordinates x (samples,) and y (lines,) on an ideal screen (mm) that video has to be given for."""
+        """Coordinates x (samples,) and y (lines,) of the video raster on an ideal screen (mm)."""
         half = np.array([screen.width_mm, screen.height_mm]) / 2 + _SPARE_MM
         samples, lines = np.ceil(half / (self.sample_mm, self.line_mm)).astype(int)
         x = np.arange(-samples, samples + 1) * self.sample_mm
@@ -199,14 +220,14 @@ class Display:
         return x, y
 
     def path(self, video: Video, beam: tuple[float, float] = (0.0, 0.0)) -> PlaneMapping:
-        """From what is displayed of a video to where it belongs, with all that acts on it.
+        """Mapping from displayed to true positions of a video, with all effects.
 
         Parameters
         ----------
         video : Video
             Its bright areas bend the beam.
         beam : (float, float)
-            m1 and m2 of the scanner that made it.
+            m1 and m2 of the scanner.
         """
         instrument = Instrument(self.correction, *beam)
         return instrument if not self.bending_mm else Chain(self._bending(video), instrument)
@@ -214,16 +235,16 @@ class Display:
     def show(
         self, video: Video, screen: Screen, rng: np.random.Generator, beam: tuple[float, float] = (0.0, 0.0)
     ) -> None:
-        """Draw a video on a screen; what was there before is gone.
+        """Draw a video on a screen; replaces its present light.
 
         Parameters
         ----------
         video : Video
-            On the raster of this display.
+            Video on the raster of this display.
         screen : Screen
-            Takes the light.
+            Screen to draw on.
         rng : Generator
-            Of the phosphor's grain.
+            Source of the phosphor's grain.
         beam : (float, float)
             m1 and m2 of the scanner.
         """
@@ -232,7 +253,7 @@ class Display:
         step = screen.pitch_mm
 
         def aimed(at: Array) -> Array:
-            """Where in the picture the samples (column, row) of the screen look."""
+            """Picture coordinates of the samples (column, row) of the screen."""
             belongs = path(np.stack([x[0] + step * at[:, 0], y[0] - step * at[:, 1]], axis=-1))
             return np.stack([belongs[:, 0] - video.x[0], video.y[0] - belongs[:, 1]], -1) / self.sample_mm
 
@@ -264,7 +285,7 @@ class Display:
     def _bending(self, video: Video) -> Bending:
         signal, reach = self._with_disks(video), self.bending_reach_mm
         steps = np.array([self.line_mm, self.sample_mm])
-        # One node a millimetre is enough for what is blurred over several.
+        # One node per millimetre is enough: the charge is blurred over several millimetres.
         every = np.maximum(1, np.rint(_CHARGE_STEP * self.sample_mm / steps)).astype(int)
         charge = gaussian_filter(signal, reach / steps)[:: every[0], :: every[1]][::-1].astype(np.float64)
         x, y = video.x[:: every[1]], video.y[:: every[0]][::-1]

@@ -1,4 +1,4 @@
-"""What goes wrong between the light and the file, and what stands behind the marks."""
+"""Faults of a simulated world: damaged marks, transmission errors, wrong set-up."""
 
 from __future__ import annotations
 
@@ -15,35 +15,47 @@ __all__ = ["Faults", "swapped"]
 
 
 def swapped(design: ReseauDesign) -> ReseauDesign:
-    """The design as one gets it who confuses O with S, or M with N."""
+    """The design with O and S, or M and N, exchanged.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> design = standard_reseau()
+    >>> swapped(design).origin == design.axis
+    True
+    """
     return design.model_copy(update={"origin": design.axis, "axis": design.origin})
 
 
 @dataclass(frozen=True)
 class Faults:
-    """How much of each fault a world has; none by default.
+    """Amount of each fault in a world; none by default.
 
     Parameters
     ----------
     missing : int
-        Marks that are broken off.
+        Number of broken marks.
     false_marks : int
-        Things beside the marks that look like one.
+        Number of false marks between the marks.
     scene : float
         Grey values of bright and dark disks on the screen behind the marks.
     bit_errors : int
-        Pixels of which one bit arrives wrong.
+        Number of pixels with one wrong bit.
     lost_rows : int
-        Rows that do not arrive: they are black.
+        Number of lost rows; they are black.
     parallax_mm : float
         Gap between the reseau and the phosphor behind it.
     camera_moved_mm : float
-        How far someone pushed the camera after PHOTO I, in a direction of the seed; it turned with it, by a
-        degree for 20 mm.
+        Displacement of the camera after PHOTO I, in a random direction; it also rotates, by 1° per 20 mm.
     object_turned_deg : float
-        How far the test object stands turned in the tank.
+        Rotation of the test object in the tank.
     missing_row : str
-        Row of rods of the test object that send no echo, by the letters of their names.
+        Row of rods of the test object without echoes, by the letters of their names.
+
+    Examples
+    --------
+    >>> sorted(Faults(missing_row="B").silent(("A1", "B1", "B2")))
+    ['B1', 'B2']
     """
 
     missing: int = 0
@@ -57,12 +69,12 @@ class Faults:
     missing_row: str = ""
 
     def silent(self, names: tuple[str, ...]) -> frozenset[str]:
-        """Those of the rods that send no echo.
+        """The rods without echoes.
 
         Raises
         ------
         UsageError
-            When the missing row is none of theirs.
+            When no rod belongs to the missing row.
         """
         row = self.missing_row
         gone = frozenset(name for name in names if row and name.rstrip("0123456789") == row)
@@ -71,7 +83,7 @@ class Faults:
         return gone
 
     def transmit(self, pixels: NDArray[Any], bits: int, rng: np.random.Generator) -> NDArray[Any]:
-        """What arrives of a frame."""
+        """The frame after transmission, with bit errors and lost rows."""
         arrived = pixels.copy()
         if self.bit_errors:
             at = rng.choice(arrived.size, self.bit_errors, replace=False)

@@ -1,8 +1,8 @@
-"""Scanned frames of 35 and 70 mm film with known truth: the gate's edges, the film around, what disturbs.
+"""Scanned frames of 35 and 70 mm film with known truth: edges of the gate, surrounding film, disturbances.
 
-A camera's gate lets light fall on the film; around its image the film stays as the unexposed film is, dark on
-a slide and bright on a negative. What a scanner makes of it is formed from the signed distance of each pixel
-from the gate's outline: a Gaussian spread folded with the pixel's square, exact along a straight edge.
+The gate of a camera limits the exposed area; outside it the film remains unexposed, dark on a slide and
+bright on a negative. The scan is formed from the signed distance of each pixel from the gate's outline: a
+Gaussian point-spread function convolved with the pixel's square, exact along a straight edge.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ HASSELBLAD = FrameFormat(56.0, 56.0, 61.5, radius=0.4, slits=(4.0, 8.0))
 
 @dataclass(frozen=True)
 class Beside:
-    """What else is on the film or in the picture; all of it off by default.
+    """Disturbances on the film or in the picture; none by default.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Beside:
     rods : int
         Bright rods in the picture, bent by the lens and nearly parallel to an edge (figure 7A), dark beyond.
     blown : bool
-        A corner so overexposed that light has spread beyond the gate.
+        Overexposed corner whose light has spread beyond the gate.
     dust, scratches : int
         Grains and hairs of dust; scratches, most of them along the film.
     """
@@ -93,19 +93,19 @@ class FilmFrame:
     Parameters
     ----------
     seed : int
-        Of everything random.
+        Seed of all random numbers.
     format : FrameFormat
-        The camera's frame.
+        Frame of the camera.
     dpi : float
         Resolution of the scan.
     tilt_deg : float
-        Turn of the film on the glass, counter-clockwise as seen.
+        Rotation of the film on the glass, counter-clockwise in the scan.
     mirrored : bool
         Whether the film lay with its wrong side up.
     negative : bool
         Whether unexposed film is bright.
     contrast : float
-        Of the picture against unexposed film, as part of the scale of 255.
+        Contrast of the picture against unexposed film, as a fraction of 255.
     noise : float
         Standard deviation of the scanner's noise, grey values.
     grain : float
@@ -115,7 +115,7 @@ class FilmFrame:
     gate_sigma_mm : float
         Standard deviation of the gate's corners about the nominal format.
     gate_seed : int
-        Which camera: frames of one roll share it.
+        Seed of the camera's gate; frames of one roll share it.
     film_mm, scanner : float
         Deformation of the film, mm at the corners, and difference of the scanner's two scales.
     bow_mm : float
@@ -123,9 +123,9 @@ class FilmFrame:
     margin_mm : float
         Unexposed film around the frame that was scanned.
     crop : str
-        Which edge lies outside the scan, if any: one of the names of the edges.
+        Name of the edge outside the scan, or empty.
     beside : Beside
-        What disturbs.
+        Disturbances.
     bits : int
         Depth of the scan, 8 or 16.
     colour : bool
@@ -204,7 +204,7 @@ class FilmFrame:
 
     @cached_property
     def truth(self) -> FrameTruth:
-        """Where the corners are."""
+        """True corners."""
         film = stream(self.seed, "film").normal(0, self.film_mm, (4, 2))
         corners = (self.gate + film) @ self._matrix.T + self._shift
         # As seen: the wrong side shows the frame's right at the left.
@@ -217,7 +217,7 @@ class FilmFrame:
         return np.asarray(bow)
 
     def light(self) -> Array:
-        """What the scanner sees without noise, grey values (h, w) of 255."""
+        """Light on the scanner without noise, grey values (h, w) of 255."""
         return _light(self)
 
     def scan(self) -> NDArray[Any]:

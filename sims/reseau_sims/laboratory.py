@@ -1,8 +1,8 @@
-"""The world in motion: what the scanner sweeps is on the screen that oscilloscope and camera see; where the
-turntable stands is where the camera sees the testfield.
+"""The world over time: oscilloscope and camera see the sweep of the scanner; the camera sees the testfield as
+the turntable positions it.
 
-All simulators of one bench share one laboratory; it may be asked from several threads. Its axes are asked
-where they stand whenever someone looks: a table that moves is seen moving. An exposure is taken to be short.
+All simulators of one bench share one laboratory; it is safe for use by several threads. The positions of its
+axes are read at each exposure, so that a moving table is seen moving; exposures are regarded as short.
 """
 
 from __future__ import annotations
@@ -32,25 +32,30 @@ from .world import World
 __all__ = ["AXES", "GRADIANS", "Laboratory", "Room"]
 
 AXES = ("tilt", "roll", "camera_roll", "z")
-"""Of the turntable: the board's tilt and its turn in its mount, the camera's turn (degrees), and the way of
-the table away from the camera (mm)."""
+"""Axes of the turntable: tilt of the board, its roll in the mount, roll of the camera (degrees), and
+displacement of the table away from the camera (mm)."""
 GRADIANS = 400
-"""Of a turn of the scanner's head; 200 looks straight down into the tank."""
+"""Gradians in a full turn of the scanner's head; 200 points straight down into the tank."""
 _AHEAD = 200
 _NOISE = 1.5
-"""Of an echo's samples, of 255."""
+"""Standard deviation of the noise of an echo's samples, of 255."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """What changes of itself while the clock runs.
+    """Drift of the environment with time.
 
     Parameters
     ----------
     light_per_hour : float
-        By which share the lamp gets brighter.
+        Relative increase of the light per hour.
     drift_mm_per_hour : (float, float, float)
-        How the camera creeps on its stand: along x, y and its axis.
+        Drift of the camera on its stand: along x, y and its axis.
+
+    Examples
+    --------
+    >>> Room(light_per_hour=0.005).drift_mm_per_hour
+    (0.0, 0.0, 0.0)
     """
 
     light_per_hour: float = 0.0
@@ -58,25 +63,25 @@ class Room:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Room:
-        """A room as one meets it: half a per cent, and hundredths of a millimetre, in an hour."""
+        """A random room: about 0.5 % and some hundredths of a millimetre per hour."""
         x, y, z = rng.normal(0.0, 0.02, 3)
         return cls(float(rng.normal(0.0, 0.005)), (float(x), float(y), float(z)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Mounted(FieldBench):
-    """The testfield on its turntable: set up once, then moved; the paper's stations are set up anew."""
+    """The testfield on its turntable: one set-up for all stations, unlike :class:`FieldBench`."""
 
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, field: FieldBench, shift: Array) -> _Mounted:
-        """The same bench, with the camera elsewhere by so much."""
+        """The same bench with a displaced camera."""
         same = {each.name: getattr(field, each.name) for each in fields(FieldBench)}
         return cls(**same, shift_mm=(float(shift[0]), float(shift[1]), float(shift[2])))
 
     def pose(self, station: Station) -> Pose:
-        """Of the camera in the system of the board: that of the first setup, carried along."""
+        """Pose of the camera in the system of the board, from that of the first set-up."""
         first = super().pose(Station(0.0))
         phi, kappa, camera = np.deg2rad([station.phi, station.kappa, station.camera_kappa])
         board = rotation_matrix(np.array([0.0, phi, 0.0])) @ rotation_matrix(np.array([0.0, 0.0, kappa]))
@@ -93,7 +98,7 @@ def _same_camera(one: World, two: World) -> bool:
 
 
 class Laboratory:
-    """A world, and what its instruments have done to it so far.
+    """A world and its present state, changed by its instruments.
 
     Parameters
     ----------
@@ -102,12 +107,12 @@ class Laboratory:
     field : FieldBench, optional
         Testfield and camera on the turntable; by default those of the paper, of the world's seed.
     room : Room, optional
-        By default drawn from the world's seed.
+        Drift; by default random, from the world's seed.
     clock : callable
-        Seconds.
+        Time in seconds.
     repeatable : bool
-        Whether the same state gives the same picture to the bit: nothing drifts, and noise is that of the
-        state, not of the exposure.
+        Whether the same state gives the same picture to the bit: without drift, and with noise that depends
+        on the state and not on the exposure.
 
     Examples
     --------
@@ -134,7 +139,7 @@ class Laboratory:
         self.room = room or (Room() if repeatable else Room.drawn(world.rng("room")))
         self.lock = threading.RLock()
         self.swept = np.zeros(GRADIANS, dtype=bool)
-        """Head angles of which echoes have been drawn."""
+        """Head angles whose echoes have been drawn."""
         self.echoes: NDArray[np.uint8] = np.zeros(0, np.uint8)
         """The last line of echoes; the oscilloscope's first channel shows it."""
         self._axes: dict[str, Callable[[], float]] = {}
@@ -146,23 +151,23 @@ class Laboratory:
 
     @property
     def hours(self) -> float:
-        """Since it was opened."""
+        """Hours since it was created."""
         return (self._clock() - self._began) / 3600
 
     def attach(self, axis: str, where: Callable[[], float]) -> None:
-        """Have an axis of :data:`AXES` stand where this says (degrees or millimetres)."""
+        """Connect an axis of :data:`AXES` to a function that returns its position (degrees or mm)."""
         if axis not in AXES:
             raise UsageError(f"is none of {', '.join(AXES)}", where=axis)
         self._axes[axis] = where
 
     @property
     def axes(self) -> dict[str, float]:
-        """Where the axes stand at this moment; one that nothing moves stands at 0."""
+        """Present positions of the axes; 0 for an axis that is not connected."""
         return {name: self._axes[name]() if name in self._axes else 0.0 for name in AXES}
 
     @property
     def tank(self) -> Reflectors:
-        """What stands in the tank."""
+        """Reflectors in the tank."""
         return self._tank
 
     @tank.setter
@@ -172,18 +177,18 @@ class Laboratory:
             self.swept[:] = False
 
     def line(self, angle: int, samples: int, period_s: float, gain: float = 1.0) -> NDArray[np.uint8]:
-        """Send a pulse, and listen; the line appears on the screen.
+        """Send a pulse and record its echoes; the line appears on the screen.
 
         Parameters
         ----------
         angle : int
-            Of the head (gradians).
+            Angle of the head (gradians).
         samples : int
-            How many.
+            Number of samples.
         period_s : float
-            From one sample to the next.
+            Sampling period.
         gain : float
-            Factor of the amplifier.
+            Gain of the amplifier.
 
         Returns
         -------
@@ -199,7 +204,7 @@ class Laboratory:
             off = np.arctan2(x, depth) - (angle - _AHEAD) * 2 * np.pi / GRADIANS
             width = scanner.beam_mm(depth) / distance
             strength = scanner.brightness * tank.strength * np.exp(-0.5 * (off / width) ** 2)
-            # A sample is a mean over its time: an echo is never narrower than that.
+            # A sample is a mean over its period, which limits the width of an echo.
             pulse = np.hypot(scanner.pulse_mm, step / 2)
             late = (ranges[:, None] - distance[None, :]) / pulse
             signal = (np.exp(-0.5 * late**2) * strength).sum(axis=1)
@@ -215,7 +220,7 @@ class Laboratory:
     """Size of a pixel of :meth:`section`, along and in depth."""
 
     def section(self) -> NDArray[np.uint8]:
-        """A section as the scanner itself hands it over, no tube between; pixels of :attr:`SECTION_MM`."""
+        """A section directly from the scanner, without a tube; pixels of :attr:`SECTION_MM`."""
         with self.lock:
             scanner = self.world.scanner
             along, down = self.SECTION_MM
@@ -229,9 +234,9 @@ class Laboratory:
             return np.clip(np.rint(255 * video.signal), 0, 255).astype(np.uint8)
 
     def pulse(self, place_mm: float) -> NDArray[np.uint8]:
-        """Echoes of a transducer that stands so far along the tank, from its left end, on an oscilloscope.
+        """Echoes on an oscilloscope of a transducer at `place_mm` from the left end of the tank.
 
-        1000 samples of a microsecond, the pulse in their middle; 128 is nothing.
+        1000 samples of a microsecond with the pulse in the middle; 128 is zero.
         """
         with self.lock:
             scanner, tank = self.world.scanner, self._tank
@@ -247,7 +252,7 @@ class Laboratory:
             return np.asarray(np.clip(np.rint(128 + signal), 0, 255), np.uint8)
 
     def screen(self) -> Screen:
-        """The tube as it glows now: of the section, what has been swept."""
+        """The present screen, with the part of the section that has been swept."""
         with self.lock:
             key = np.packbits(self.swept).tobytes()
             if self._drawn is None or self._drawn[0] != key:
@@ -255,34 +260,34 @@ class Laboratory:
             return self._drawn[1]
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """The tube as a grey picture, as the oscilloscope's own screen shows it."""
+        """The tube as a grey picture, as on the oscilloscope's own screen."""
         light = self.screen().light
         return np.clip(cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA), 0, 255).astype(
             np.uint8
         )
 
     def photograph(self, name: str) -> Frame:
-        """What the camera sees now of the reseau before the tube; the same name has the same noise."""
+        """Photograph the reseau in front of the tube; the same name gives the same noise."""
         with self.lock:
             return self._standing().photograph(name, self.screen())
 
     def field_truth(self) -> FieldTruth:
-        """Where the targets of the testfield are now, in space and in the image."""
+        """Present true positions of the targets of the testfield, in space and in the image."""
         with self.lock:
             station, bench = self._moved()
             return bench.truth(station)
 
     def expose(self, sight: Literal["screen", "testfield"], light: float = 1.0, gain: float = 1.0) -> Frame:
-        """A frame of what a camera sees now; no two have the same noise.
+        """Take a frame; each has its own noise, unless `repeatable`.
 
         Parameters
         ----------
         sight : {"screen", "testfield"}
-            The reseau before the tube, or the testfield on the turntable.
+            The reseau in front of the tube, or the testfield on the turntable.
         light : float
-            Exposure, of the nominal one.
+            Exposure relative to the nominal one.
         gain : float
-            Factor of the amplifier.
+            Gain of the amplifier.
         """
         with self.lock:
             self._exposures += 1
@@ -300,29 +305,29 @@ class Laboratory:
             return Frame(pixels, sensor.full_scale, name, sha256(pixels.tobytes()).hexdigest())
 
     def _state(self) -> str:
-        """All that a picture shows, as a name."""
+        """The state that determines a picture, as a string."""
         axes = " ".join(f"{name} {value:.6f}" for name, value in self.axes.items())
         tank = sha256(self._tank.xy.tobytes() + np.packbits(self.swept).tobytes()).hexdigest()
         return f"{axes} {tank}"
 
     def _drift(self) -> Array:
-        """How far the cameras have crept (mm), to a micrometre: no frame shows less."""
+        """Drift of the cameras (mm), rounded to a micrometre, which no frame resolves."""
         crept: Array = np.round(self.hours * np.array(self.room.drift_mm_per_hour), 3)
         return crept
 
     def _standing(self) -> World:
-        """The world with the camera where it stands now."""
+        """The world with the camera at its present position."""
         drift = self._drift()
         if not drift.any():
             return self.world
         crept = replace(self.world, camera=self.world.camera.moved(drift, 0.0))
-        # What was computed of a camera holds as long as it stands there.
+        # Reuse cached mappings of the camera while it does not move.
         if self._stood is None or not _same_camera(self._stood, crept):
             self._stood = crept
         return replace(crept, camera=self._stood.camera)
 
     def _moved(self) -> tuple[Station, FieldBench]:
-        """How the table stands, and the testfield on it."""
+        """Present station of the table, and the testfield on it."""
         axes = self.axes
         station = Station(axes["tilt"], axes["roll"], axes["camera_roll"])
         return station, _Mounted.of(self.field, self._drift() + np.array([0.0, 0.0, axes["z"]]))

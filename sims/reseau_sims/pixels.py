@@ -1,4 +1,4 @@
-"""A sensor whose pixels differ, with everything about it known: what a calibration of sensors has to find."""
+"""A sensor with individual pixels and known parameters, as truth for a calibration of sensors."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["PixelSensor"]
 
 @dataclass(frozen=True, eq=False)
 class PixelSensor:
-    """Pixels with bias, dark current and response of their own.
+    """Pixels with individual bias, dark current and response.
 
     Parameters
     ----------
     bias, dark_current, response : ndarray (height, width)
         Grey values, grey values per microsecond, and factors of a mean of 1.
     hot, dead : ndarray (height, width) of bool
-        Pixels that are far too bright in the dark; pixels that answer to light with a tenth.
+        Hot pixels are far too bright in the dark; dead pixels have a tenth of the response.
     gain : float
         Electrons per grey value.
     read_noise : float
         Grey values.
     full_well : float
-        Electrons at which a pixel is full.
+        Electrons at which a pixel saturates.
     b2, b3 : float
         Of the electronics: a true signal s reads as g with g·(1 + b2·u + b3·u²) = s, u = g / full scale.
     bits : int
@@ -49,7 +49,7 @@ class PixelSensor:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, width: int = 96, height: int = 64, **known: Any) -> Self:
-        """One of a seed: bias 60 ± 1, response ± 1 %, three hot pixels and two dead ones."""
+        """A random sensor: bias 60 ± 1, response ± 1 %, three hot pixels and two dead ones."""
         shape = height, width
         hot, dead = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         chosen = rng.choice(height * width, 5, replace=False)
@@ -78,7 +78,7 @@ class PixelSensor:
         exposure_us : float
             Exposure time.
         rng : Generator
-            Of the noise.
+            Source of the noise.
         """
         answer = np.where(self.dead, 0.1, self.response)
         glow = np.where(self.hot, 0.02, self.dark_current)
@@ -90,7 +90,7 @@ class PixelSensor:
         return np.clip(np.rint(grey), 0, self.full_scale).astype(kind)
 
     def _read(self, signal: Array) -> Array:
-        """What the electronics make of a signal: the inverse of its linearisation, by iteration."""
+        """Output of the electronics: the inverse of the linearisation, by iteration."""
         read = signal
         for _ in range(20):
             u = read / self.full_scale

@@ -1,4 +1,4 @@
-"""A reseau in front of the screen: what its marks do to the light on its way to the camera."""
+"""A reseau in front of the screen, whose marks change the light on its way to the camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reseau.io import ReseauDesign
 from reseau.optics.formation import Outline, draw, mark_outline
 from reseau.optics.grids import line_grid
 
-from .camera import Camera
+from .camera import FilmCamera
 
 __all__ = ["Plate"]
 
@@ -29,15 +29,26 @@ class Plate:
     design : ReseauDesign
         Coordinates in millimetres, y up, in the system of the screen.
     opacity : float
-        Share of the light behind it that a dark mark takes; a wire reflects a little of the room's.
+        Fraction of the light behind it that a dark mark absorbs; a wire reflects a little ambient light.
     brightness : float
-        Grey values that a bright mark adds.
+        Grey values added by a bright mark.
     beyond_mm : float
-        How far wires run on beyond the outermost crossings, to their frame.
+        Length of the wires beyond the outermost crossings.
     missing : frozenset of str
-        Marks that are broken off.
+        Broken marks.
     false_marks : ndarray (k, 2)
-        Where dirt looks like a mark (mm).
+        Positions of dirt that looks like a mark (mm).
+
+    Raises
+    ------
+    UsageError
+        When marks of the design have no coordinates.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> len(Plate(standard_reseau()).design.ids)
+    165
     """
 
     design: ReseauDesign
@@ -54,17 +65,17 @@ class Plate:
         if not np.isfinite(self.design.xy).all():
             raise UsageError("lacks coordinates of marks", where=f"design {self.design.name}")
 
-    def over(self, light: Array, camera: Camera, row_shifts: Array | None = None) -> Array:
+    def over(self, light: Array, camera: FilmCamera, row_shifts: Array | None = None) -> Array:
         """The light (height, width) that reaches the camera past the marks."""
         share = self._share(camera, row_shifts)
         if self.design.polarity == "bright":
             return light + self.brightness * share
         return light * (1 - self.opacity * share)
 
-    def _share(self, camera: Camera, row_shifts: Array | None) -> Array:
-        """Share (height, width) of the light that falls on marks; the last one is kept."""
+    def _share(self, camera: FilmCamera, row_shifts: Array | None) -> Array:
+        """Fraction (height, width) of the light that falls on marks; the last result is cached."""
         of = (camera, self.design, self.missing, self.false_marks, self.beyond_mm)
-        # A reseau stays where it is from one photograph to the next, and drawing it is most of the work.
+        # The reseau is the same in consecutive photographs, and drawing it takes most of the time.
         if row_shifts is None and all(a is b for a, b in zip(self._kept[0], of, strict=False)):
             return self._kept[1]
         share = np.zeros(camera.shape)
@@ -84,7 +95,7 @@ class Plate:
         if mark.shape == "line-grid":
             return [*self._wires(there, spacing), *dirt]
         if mark.size is None:
-            raise UsageError("does not tell the size of its marks", where=f"design {self.design.name}")
+            raise UsageError("has no size of its marks", where=f"design {self.design.name}")
         outline = mark_outline(mark.shape, mark.size, mark.line_width, spacing)
         return [_at(outline, self.design.xy[there]), *dirt]
 
@@ -101,7 +112,7 @@ class Plate:
         )
 
     def _dirt(self, spacing: float) -> Outline:
-        """What looks like a mark: one of the design, or two crossed splinters of wire."""
+        """A false mark: one of the design, or two crossed splinters of wire."""
         mark = self.design.mark
         if mark.shape == "line-grid":
             width = mark.line_width or 0.0
@@ -113,7 +124,7 @@ def _at(outline: Outline, xy: Array) -> Outline:
     return outline.affine(np.tile(np.eye(2), (len(xy), 1, 1)), xy)
 
 
-def _mm_per_px(camera: Camera) -> float:
+def _mm_per_px(camera: FilmCamera) -> float:
     """Smallest length in the plane that a pixel sees, at the corners and the centre of the frame."""
     height, width = camera.shape
     corners = np.array([(x, y) for x in (0, width / 2, width) for y in (0, height / 2, height)])

@@ -1,4 +1,4 @@
-"""What stands in the tank: the rods of a test object as they really are, or a body of unknown points."""
+"""Reflectors in the tank: the rods of a test object as manufactured, or a body of unknown points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _APART = np.array([14.0, 8.0])
 
 @dataclass(frozen=True, eq=False)
 class Reflectors:
-    """Points that send an echo back, in columns.
+    """Point reflectors, in columns.
 
     Parameters
     ----------
@@ -28,12 +28,18 @@ class Reflectors:
     xy : ndarray (n, 2)
         True coordinates in the system of the object: millimetres, x right, y up, the depth is −y.
     strength : ndarray (n,)
-        Echo amplitude beside that of a rod of the test object.
+        Echo amplitude relative to a rod of the test object.
 
     Raises
     ------
     UsageError
         When the columns differ in length, or a point is not below the transducer.
+
+    Examples
+    --------
+    >>> rods = Reflectors(("A1", "A2"), np.array([[0.0, -20.0], [10.0, -20.0]]), np.ones(2))
+    >>> rods.without(frozenset({"A1"})).names
+    ('A2',)
     """
 
     names: tuple[str, ...]
@@ -51,21 +57,22 @@ class Reflectors:
         return len(self.names)
 
     def without(self, names: frozenset[str]) -> Reflectors:
-        """Those that are not named."""
+        """The reflectors without these names."""
         keep = np.array([name not in names for name in self.names], dtype=bool)
         return Reflectors(
             tuple(name for name in self.names if name not in names), self.xy[keep], self.strength[keep]
         )
 
     def moved(self, mapping: PlaneMapping) -> Reflectors:
-        """The same elsewhere."""
+        """The reflectors at mapped positions."""
         return Reflectors(self.names, mapping(self.xy), self.strength)
 
 
 def rods_of(design: ReseauDesign, rng: np.random.Generator) -> Reflectors:
-    """The rods of a design where the workshop put them.
+    """The rods of a design as manufactured.
 
-    Their places deviate from the design normally, by the sigmas of its points; their echoes differ by 5 %.
+    Their positions deviate from the design by normal errors with the sigmas of its points; their echoes
+    differ by 5 %.
 
     Raises
     ------
@@ -81,7 +88,7 @@ def rods_of(design: ReseauDesign, rng: np.random.Generator) -> Reflectors:
 
 
 def body_of(count: int, rng: np.random.Generator) -> Reflectors:
-    """A body of points that nobody has measured, inside the area that the rods of the test object span.
+    """A body of random points, inside the area of the rods of the test object.
 
     Parameters
     ----------
@@ -91,7 +98,7 @@ def body_of(count: int, rng: np.random.Generator) -> Reflectors:
     Raises
     ------
     UsageError
-        When there is no room for so many.
+        When this number of points does not fit.
     """
     found = np.empty((0, 2))
     for _ in range(200 * count):

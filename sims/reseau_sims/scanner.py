@@ -1,12 +1,12 @@
-r"""An ultrasonic scanner: a transducer moves along the upper edge and draws what comes back under itself.
+r"""An ultrasonic scanner: a transducer moves along the upper edge and draws the echoes below itself.
 
-At the place s of the transducer a reflector at (X, depth d) answers after the way to it and back. It is drawn
-under the transducer at the range :math:`r = \sqrt{d^2 + (s-X)^2}`, as long as the beam touches it: a point
-becomes a short arc that hangs down at its ends. Its middle, s = X and r = d, is the reflector's place.
+With the transducer at s, the echo of a reflector at (X, depth d) is drawn below the transducer at the range
+:math:`r = \sqrt{d^2 + (s-X)^2}`, as long as the beam meets it: a point becomes a short arc that bends down at
+its ends. Its middle, s = X and r = d, is the position of the reflector.
 
 The beam is as wide as the transducer and diverges with depth (diffraction of a round piston, sin θ = 1.22
-λ/D); in between, the echo fades as a Gaussian. That the beam displaces what is drawn, (Δx)ε = m1·x + m2·y
-(Wishahy, section B), is a correction at the displayed point and stands in
+λ/D); across the beam, the echo decreases as a Gaussian. The displacement by the beam, (Δx)ε = m1·x + m2·y
+(Wishahy, section B), is a correction at the displayed point; see
 :class:`reseau_sims.display.Instrument`.
 """
 
@@ -27,14 +27,14 @@ from .reflectors import Reflectors
 __all__ = ["Scanner", "Video"]
 
 _REACH = 4.5
-"""Widths after which an echo counts as nought."""
+"""Widths beyond which an echo is neglected."""
 _MIXING = 4
-"""Of echoes at one place the stronger is seen, as behind a logarithmic amplifier: their powers add."""
+"""Exponent by which overlapping echoes add: the stronger dominates, as with a logarithmic amplifier."""
 
 
 @dataclass(frozen=True, eq=False)
 class Video:
-    """One picture as it is handed to a display.
+    """One picture, as input of a display.
 
     Parameters
     ----------
@@ -51,20 +51,20 @@ class Video:
 
 @dataclass(frozen=True)
 class Scanner:
-    """A transducer, its receiver, and how its section is laid on the screen.
+    """A transducer, its receiver, and the position of its section on the screen.
 
     Parameters
     ----------
     frequency_mhz, diameter_mm : float
-        Of the transducer.
+        Frequency and diameter of the transducer.
     speed : float
-        Of sound, mm/µs.
+        Speed of sound, mm/µs.
     cycles : float
         Length of the pulse in periods, as 2.35 standard deviations of its envelope.
     scale : (float, float)
         λ1 and λ2: millimetres on the screen for one in the object, along the edge and in depth.
     middle_mm, top_mm : float
-        Where on the screen the middle of the upper edge is drawn, x and y.
+        Position of the middle of the upper edge on the screen, x and y.
     half_sweep_mm, depth_mm : float
         Extent of the section to both sides of the middle, and in depth.
     m1, m2 : float
@@ -72,11 +72,17 @@ class Scanner:
     brightness : float
         Signal of a rod at the focus.
     loss : float
-        What the compensation of depth leaves of the loss of echoes: share at the greatest depth.
+        Uncompensated loss of echoes at the greatest depth, as a fraction.
     face : float
         Signal of the transducer's face, a line along the upper edge.
     noise : float
         Standard deviation of the receiver's noise at the greatest depth; half of it at the face.
+
+    Examples
+    --------
+    >>> scanner = Scanner()
+    >>> round(scanner.wavelength_mm, 3), round(scanner.pulse_mm, 3)
+    (0.684, 0.378)
     """
 
     frequency_mhz: float = 2.25
@@ -102,7 +108,7 @@ class Scanner:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Scanner:
-        """A scanner as one meets it: scales and beam differ from one to the other by parts in a hundred."""
+        """A random scanner: scales and beam differ by about one per cent between scanners."""
         lambda_1, lambda_2 = rng.normal([1.03, 0.98], 0.006)
         return cls(
             scale=(float(lambda_1), float(lambda_2)),
@@ -114,12 +120,12 @@ class Scanner:
 
     @property
     def wavelength_mm(self) -> float:
-        """Of the ultrasound."""
+        """Wavelength of the ultrasound."""
         return self.speed / self.frequency_mhz
 
     @property
     def pulse_mm(self) -> float:
-        """Width (one sigma) of an echo in depth; the way there and back halves it."""
+        """Width (one sigma) of an echo in depth; half the pulse, as the path is travelled twice."""
         return self.cycles * self.wavelength_mm / 2.355
 
     def beam_mm(self, depth: Array) -> Array:
@@ -142,11 +148,11 @@ class Scanner:
         Parameters
         ----------
         reflectors : Reflectors
-            What is in the tank, where it stands now.
+            Reflectors in the tank at their present positions.
         x, y : ndarray (samples,), (lines,)
             Raster of the display on an ideal screen (mm), x ascending and y descending.
         rng : Generator
-            Of the receiver's noise.
+            Source of the receiver's noise.
         """
         place, depth = (x - self.middle_mm) / self.scale[0], (self.top_mm - y) / self.scale[1]
         power = np.zeros((len(y), len(x)))
@@ -155,7 +161,7 @@ class Scanner:
             self._add_echo(power, place, depth, at, -height, width, echo)
         signal = power ** (1 / _MIXING)
         signal += self.face * np.exp(-0.5 * ((depth - 0.8) / 0.45) ** 2)[:, None]
-        # Nothing is drawn where the transducer does not go, nor beyond the last echo that is waited for.
+        # Nothing is drawn outside the sweep, or beyond the maximum depth.
         swept = 0.5 - 0.5 * np.tanh((np.abs(place) - self.half_sweep_mm) / 0.5)
         lit = 0.5 + 0.5 * np.tanh(np.minimum(depth + 0.5, self.depth_mm - depth) / 0.3)
         noise = gaussian_filter1d(rng.standard_normal(power.shape), 2.0, axis=1)
@@ -173,7 +179,7 @@ class Scanner:
     def _add_echo(
         self, power: Array, place: Array, depth: Array, at: float, range_: float, width: float, echo: float
     ) -> None:
-        """Add the arc of one reflector, in the window that it touches."""
+        """Add the arc of one reflector, within its window."""
         reach = _REACH * width
         columns = np.flatnonzero(np.abs(place - at) < reach)
         lowest = np.hypot(range_, reach) + _REACH * self.pulse_mm

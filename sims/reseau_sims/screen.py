@@ -1,4 +1,4 @@
-"""The screen of a cathode-ray tube: light on a raster in its plane, on which others may draw."""
+"""The screen of a cathode-ray tube: light on a raster in its plane."""
 
 from __future__ import annotations
 
@@ -17,21 +17,28 @@ __all__ = ["Screen"]
 
 @dataclass
 class Screen:
-    """Light that the phosphor gives, in the plane of the screen: millimetres, origin at the centre, y up.
+    """Light of the phosphor in the plane of the screen: millimetres, origin at the centre, y up.
 
     Parameters
     ----------
     width_mm, height_mm : float
         Size of the phosphor.
     pitch_mm : float
-        Distance of the samples of its raster.
+        Spacing of the raster.
     margin_mm : float
-        Width of the dark tube around it that the raster covers too.
+        Width of the dark margin that the raster includes.
 
     Attributes
     ----------
     light : ndarray (rows, columns)
-        Grey values that a camera sees of each sample; row 0 at the top. Nothing is lit at first.
+        Grey values that a camera sees of each sample; row 0 at the top. Initially dark.
+
+    Examples
+    --------
+    >>> screen = Screen()
+    >>> screen.draw_disk(0.0, 0.0, radius=10.0, light=100.0)
+    >>> screen.light.shape, bool(screen.light.max() > 99)
+    ((1341, 1701), True)
     """
 
     width_mm: float = 158.0
@@ -61,18 +68,18 @@ class Screen:
         falloff: float = 0.10,
         grain: float = 0.001,
     ) -> None:
-        """Light the phosphor, evenly or with a picture, as far as a tube can.
+        """Set the light of the phosphor, uniform or a picture, with the unevenness of a tube.
 
         Parameters
         ----------
         level : float or ndarray (rows, columns)
-            Grey value that a phosphor as good as that at the centre would give.
+            Grey value for a phosphor as bright as at the centre.
         rng : Generator
             Source of the phosphor's grain.
         gradient : (float, float)
             Relative change of the light from the centre to the right and to the upper edge.
         falloff : float
-            What is missing in the corners.
+            Relative loss in the corners.
         grain : float
             Relative standard deviation of the phosphor's grain, from sample to sample.
         """
@@ -93,7 +100,7 @@ class Screen:
         self.light = np.maximum(self.light + change, 0).astype(np.float32)
 
     def seen(self, view: PlaneMapping, shape: tuple[int, int], blur_px: float = 0.0) -> Array:
-        """Light that falls on the pixels of a camera.
+        """Light on the pixels of a camera.
 
         Parameters
         ----------
@@ -108,7 +115,7 @@ class Screen:
         Returns
         -------
         ndarray (height, width)
-            Grey values; beyond the raster the tube is as dark as at its edge.
+            Grey values; constant beyond the edge of the raster.
         """
         height, width = shape
         x, y = on_lattice(view.inverse, np.arange(float(width)), np.arange(float(height)))

@@ -1,4 +1,4 @@
-"""Streams of random numbers, one for each purpose: nothing random depends on what was asked for before it."""
+"""Independent streams of random numbers, one for each purpose, so that their order is irrelevant."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ __all__ = ["stream"]
 
 
 def stream(seed: int, *purpose: str | int | float) -> np.random.Generator:
-    """The stream of a seed for one purpose, which is what the words tell."""
+    """The random stream of a seed for one purpose, named by words."""
     words = sha256(repr(purpose).encode()).digest()
     return np.random.default_rng([seed, *np.frombuffer(words, dtype="<u4").tolist()])

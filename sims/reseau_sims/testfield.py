@@ -1,8 +1,8 @@
 """The coded testfield on a turntable, and the camera of Vosselman and Förstner that records it.
 
 The board is tilted by φ about the vertical axis of its mount and turned by κ in its own plane; the camera
-looks at it from 5 m and is turned about its axis. It is no plane: it bends, and as in the paper the bend
-depends on the tilt and keeps its direction in the mount when the board is turned in it.
+is 5 m away and is turned about its axis. The board is not plane: it bends, and as in the paper the bend
+depends on the tilt and keeps its direction relative to the mount when the board is turned in it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,13 @@ _SPACING_PX = 0.7
 
 
 class Station(NamedTuple):
-    """One recording: tilt and turn of the board, turn of the camera, all in degrees; height of the board."""
+    """One recording: tilt and turn of the board, turn of the camera, all in degrees; height of the board.
+
+    Examples
+    --------
+    >>> Station(30.0, 90.0).name
+    'phi 30 kappa 90 camera 0'
+    """
 
     phi: float
     kappa: float = 0.0
@@ -54,7 +60,7 @@ class Station(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the recording is called."""
+        """Name of the recording."""
         lifted = f" height {self.height_mm:g}" if self.height_mm else ""
         return f"phi {self.phi:g} kappa {self.kappa:g} camera {self.camera_kappa:g}{lifted}"
 
@@ -62,7 +68,12 @@ class Station(NamedTuple):
 def paper_stations(tilts: tuple[float, ...] = (0.0, 30.0, 45.0)) -> tuple[Station, ...]:
     """The paper's recordings, 36 of them: from nine positions, with the camera turned by 0, 90, 180, 270°.
 
-    A board that is not tilted is recorded from one position, another from four, as it is turned in its mount.
+    A board without tilt is recorded from one position, a tilted one from four, turned in its mount.
+
+    Examples
+    --------
+    >>> len(paper_stations())
+    36
     """
     quarters = (0.0, 90.0, 180.0, 270.0)
     return tuple(
@@ -76,8 +87,13 @@ def paper_stations(tilts: tuple[float, ...] = (0.0, 30.0, 45.0)) -> tuple[Statio
 class Stain(NamedTuple):
     """A round spot in the image: centre and radius in pixels, and the grey value seen there.
 
-    An opaque one hides what is behind it; otherwise it is glare, whose light is added and falls off as a
+    An opaque one hides the image behind it; otherwise it is glare, whose light is added and decreases as a
     Gaussian of this width.
+
+    Examples
+    --------
+    >>> Stain(120.0, 80.0, radius=6.0, grey=10.0).opaque
+    True
     """
 
     x: float
@@ -89,20 +105,26 @@ class Stain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FieldTruth:
-    """Where everything really is in a recording.
+    """True positions in a recording.
 
     Parameters
     ----------
     names : tuple of str (n,)
         The targets.
     xyz : ndarray (n, 3)
-        Their centroids on the bent board, in its system (mm).
+        Their true centroids on the bent board, in its system (mm).
     xy : ndarray (n, 2)
-        The images of these (px), inside the frame or not.
+        Their true images (px), inside the frame or not.
     pose : Pose
         Of the camera in the system of the board.
     view : callable
         From the plane of the design (n, 2) to the image (n, 2), and its Jacobian (n, 2, 2).
+
+    Examples
+    --------
+    >>> truth = FieldBench(seed=1).truth(Station(30.0))
+    >>> truth.xyz.shape == (len(truth.names), 3)
+    True
     """
 
     names: tuple[str, ...]
@@ -119,38 +141,37 @@ class FieldBench:
     Parameters
     ----------
     seed : int
-        Where all that is random begins: noise, jitter, and how exactly things were set up.
+        Seed of noise, jitter, and set-up errors.
     design : TestfieldDesign
-        What stands on the board.
+        Targets and lines of the board.
     bend_mm : float
-        By how much the edges of the paper's 4 × 4 squares lie behind the middle at a tilt of 45°. It grows
-        with the sine of the tilt.
+        Sag of the edges of the paper's 4 × 4 squares at a tilt of 45°; proportional to the sine of the tilt.
     bend_with : {"mount", "board"}
-        What the direction of the bend is fixed to.
+        System in which the direction of the bend is constant.
     distance_mm : float
         From the camera to the middle of the board.
     camera : Brown
         From ideal directions to pixels.
     sensor : Sensor
-        What noise there is, and the jitter of the rows.
+        Sensor with its noise and row jitter.
     psf_px : float
         Width (one sigma) of the point-spread function.
     response : PixelResponse
         21.6 of 27 µm are sensitive to light.
     level, contrast : float
-        Grey value of the bright, and the share of it that the dark lacks.
+        Grey value of bright areas, and relative difference of dark ones.
     gradient : (float, float)
         Relative change of the light from the middle of the frame to its edges.
     stains : tuple of Stain
         Hidden parts and glare.
     missing : frozenset of str
-        Targets that are not there.
+        Missing targets.
     mirrored : bool
         Whether the frame is seen in a mirror, left to right.
     stage_tilt : (float, float)
-        Of the stage that lifts the board: x and y of its axis in the system of the board (rad).
+        Tilt of the axis of the stage that lifts the board: x and y in the system of the board (rad).
     stage_sigma_mm : float
-        How far it stands off the height that it tells.
+        Standard deviation of the true height of the stage about its reading.
 
     Examples
     --------
@@ -193,9 +214,10 @@ class FieldBench:
     stage_sigma_mm: float = 0.0
 
     def distorted(self, edge_px: float) -> FieldBench:
-        """The bench with a lens whose radial distortion moves the middles of the frame's edges by so much.
+        """The bench with a lens whose radial distortion displaces the middles of the edges by `edge_px`.
 
-        Outwards it is a polynomial of the ideal point, inwards the inverse of one: neither folds.
+        A positive displacement is a polynomial of the ideal point, a negative one the inverse of a
+        polynomial, so that both are invertible.
         """
         half, moved = (self.sensor.width / 2) * PITCH_MM, edge_px * PITCH_MM
         at = half if edge_px > 0 else half + moved
@@ -203,7 +225,7 @@ class FieldBench:
         return replace(self, camera=camera.with_values({"K1": abs(moved) / at**3}))
 
     def pose(self, station: Station) -> Pose:
-        """Of the camera in the system of the board; things are set up to some millimetres."""
+        """Pose of the camera in the system of the board, with set-up errors of a few millimetres."""
         rng = stream(self.seed, "setup", *station[:3])
         turn = np.deg2rad(station.camera_kappa) + rng.normal(0, 5e-3)
         roll = rotation_matrix(np.array([0, 0, turn]))
@@ -213,7 +235,7 @@ class FieldBench:
         return Pose(matrix_to_vector(looks @ board), board.T @ x0 - self._lift(station))
 
     def _lift(self, station: Station) -> Array:
-        """By what the stage moves the board (mm), in its system."""
+        """Displacement of the board by the stage (mm), in its system."""
         if not station.height_mm:
             return np.zeros(3)
         moved = station.height_mm + self.stage_sigma_mm * stream(self.seed, "stage", *station).normal()
@@ -221,7 +243,7 @@ class FieldBench:
         return np.asarray(moved * axis / np.linalg.norm(axis))
 
     def truth(self, station: Station) -> FieldTruth:
-        """Exact positions of all targets in a recording, and the mapping that forms it."""
+        """True positions of all targets in a recording, and the mapping that forms it."""
         pose, surface = self.pose(station), self.surface(station)
 
         def view(xy: Array) -> tuple[Array, Array]:
@@ -237,7 +259,7 @@ class FieldBench:
         return FieldTruth(self.design.ids, surface(xy)[0], view(xy)[0], pose, view)
 
     def inside(self, truth: FieldTruth, margin_px: float) -> Mask:
-        """Which targets (n,) have their centre in the frame, at least so far from its edges."""
+        """Targets (n,) whose centre is in the frame, at least `margin_px` from its edges."""
         size = np.array([self.sensor.width, self.sensor.height]) - 1
         within: Mask = (truth.xy >= margin_px) & (truth.xy <= size - margin_px)
         return np.asarray(within.all(axis=1))
@@ -287,7 +309,7 @@ class FieldBench:
         return surface
 
     def _outlines(self) -> list[Outline]:
-        """All that stands on the board, in its plane, in batches of like outlines."""
+        """Outlines of targets and lines in the plane of the board, in batches of equal shape."""
         spacing = _SPACING_PX * self.psf_px * self._mm_per_px()
         targets, xy = self.design.targets, self.design.xy
         there = np.array([name not in self.missing for name in targets.id])
@@ -308,7 +330,7 @@ class FieldBench:
         ]
 
     def _mm_per_px(self) -> float:
-        """Length on a board at right angles that a pixel sees."""
+        """Size of a pixel on a board perpendicular to the axis."""
         assert self.camera.grid is not None
         return float(self.distance_mm / (self.camera.values[0] * self.camera.grid.pixels_per_mm[0]))
 

@@ -1,7 +1,7 @@
-"""One shared, seeded state that all simulators draw from: what one instrument does, another sees.
+"""Shared, seeded state of all simulators: an effect of one instrument is visible to the others.
 
-A world is not asked for images in an order: everything random has a stream of its own, named after what it is
-for. PHOTO I is the same to the bit whether or not another photograph was taken before it.
+Results do not depend on the order of calls: each purpose has its own stream of random numbers. PHOTO I is the
+same to the bit whether or not another photograph was taken before it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from reseau.optics import (
     matrix_to_vector,
 )
 
-from .camera import Camera, film
+from .camera import FilmCamera, film
 from .display import Display
 from .faults import Faults
 from .plate import Plate
@@ -40,14 +40,14 @@ from .streams import stream
 __all__ = ["Truth", "World"]
 
 PHOTO_I, PHOTO_II, PHOTO_III = "PHOTO I", "PHOTO II", "PHOTO III"
-"""What the photographs of the procedure are called."""
+"""Names of the photographs of the procedure."""
 _LEVEL = 190.0
 """Grey value of the lit screen, of 255."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Where everything really is.
+    """True coordinates in the plane and in the image.
 
     Parameters
     ----------
@@ -55,12 +55,18 @@ class Truth:
         Marks of the reseau, rods of the test object or points of a body.
     object_xy : ndarray (n, 2)
         Their coordinates in the plane of the reseau or of the object (mm). Those of rods are of the rods as
-        they were made, not as they were designed.
+        manufactured, not as designed.
     xy : ndarray (n, 2)
-        Their positions in the image without noise (px). For a rod, that of the middle of its arc: where the
-        line along which the arc is brightest passes the place of the reflector.
+        Their positions in the image without noise (px). For a rod, the middle of its arc: where the ridge
+        line of the arc passes the position of the reflector.
     view : PlaneMapping
-        From the plane to the image, and by its inverse back.
+        Mapping from the plane to the image.
+
+    Examples
+    --------
+    >>> truth = World.standard(seed=7).truth()
+    >>> len(truth.names), truth.xy.shape
+    (165, (165, 2))
     """
 
     names: tuple[str, ...]
@@ -76,23 +82,23 @@ class World:
     Parameters
     ----------
     seed : int
-        Where all that is random begins.
+        Seed of all random numbers.
     screen : Screen
-        What is lit.
+        Screen of the tube.
     plate : Plate
         The reseau.
-    camera : Camera
-        What photographs them.
+    camera : FilmCamera
+        Camera that photographs the reseau and the screen.
     display : Display
-        The tube that draws on the screen what the scanner sweeps.
+        Tube that draws the video of the scanner on the screen.
     scanner : Scanner
         The ultrasonic instrument.
     test_object : ReseauDesign
-        Its rods, as designed.
+        Rods of the test object, as designed.
     rods : Reflectors
-        Its rods, as made.
+        Rods of the test object, as manufactured.
     faults : Faults
-        What goes wrong.
+        Faults.
 
     Examples
     --------
@@ -107,7 +113,7 @@ class World:
     seed: int
     screen: Screen
     plate: Plate
-    camera: Camera
+    camera: FilmCamera
     display: Display
     scanner: Scanner
     test_object: ReseauDesign
@@ -121,27 +127,27 @@ class World:
         *,
         design: ReseauDesign | None = None,
         faults: Faults | None = None,
-        camera: Camera | None = None,
+        camera: FilmCamera | None = None,
         display: Display | Literal["wong", "polynomial"] = "wong",
         scanner: Scanner | None = None,
         rods: ReseauDesign | None = None,
     ) -> World:
-        """The bench of the oscilloscope procedure: everything non-metric in it is drawn from the seed.
+        """The bench of the oscilloscope procedure, with random non-metric components.
 
         Parameters
         ----------
         seed : int
-            Of the world. The camera, its film and the way it was set up differ from seed to seed.
+            Seed of the world; camera, film and set-up differ between seeds.
         design : ReseauDesign, optional
             The reseau; by default the standard one.
         faults : Faults, optional
             None by default.
-        camera : Camera, optional
-            Instead of the one drawn.
+        camera : FilmCamera, optional
+            Camera; random by default.
         display : Display or {"wong", "polynomial"}
-            One of Wong's model, or one that eq. (7a, b) corrects exactly, or this one.
+            A random display of Wong's model, a random one that eq. (7a, b) corrects exactly, or this one.
         scanner : Scanner, optional
-            Instead of the one drawn.
+            Scanner; random by default.
         rods : ReseauDesign, optional
             The test object; by default the 100 mm one. The rods as made are drawn from its sigmas.
         """
@@ -174,10 +180,10 @@ class World:
         return self.plate.design
 
     def view(self) -> PlaneMapping:
-        """From the plane of the reseau (mm) to the image (px), without noise: the truth."""
+        """True mapping from the plane of the reseau (mm) to the image (px)."""
         return self.camera.view
 
-    def camera_of(self, photo: str) -> Camera:
+    def camera_of(self, photo: str) -> FilmCamera:
         """The camera as it stood for a photograph."""
         pushed = self.faults.camera_moved_mm
         if not pushed or photo not in (PHOTO_II, PHOTO_III):
@@ -186,24 +192,24 @@ class World:
         return self.camera.moved(pushed * way / np.hypot(*way[:2]) * (1, 1, 0.2), np.deg2rad(pushed / 20))
 
     def truth(self, photo: str = PHOTO_I) -> Truth:
-        """Exact positions of all marks of the reseau in a photograph, also of those that are missing."""
+        """True positions of all marks of the reseau in a photograph, including missing ones."""
         design, view = self.design, self.camera_of(photo).view
         return Truth(design.ids, design.xy, view(design.xy), view)
 
     def truth_ii(self) -> Truth:
-        """Exact positions of the rods' images in PHOTO II, also of those that send no echo."""
+        """True positions of the rods' images in PHOTO II, including those without echoes."""
         return self._truth_of(self.rods, PHOTO_II)
 
     def truth_iii(self, body: Reflectors | None = None) -> Truth:
-        """Exact positions of a body's points in PHOTO III."""
+        """True positions of a body's points in PHOTO III."""
         return self._truth_of(self.body() if body is None else body, PHOTO_III)
 
     def body(self, count: int = 24) -> Reflectors:
-        """An invisible body whose points nobody has measured; the world knows them."""
+        """An invisible body of random points with known true positions."""
         return body_of(count, self.rng("body"))
 
     def check_marks(self) -> tuple[str, ...]:
-        """Marks spread over the reseau that are meant to be held out of an adjustment: about one in nine."""
+        """Check marks spread over the reseau, about one in nine, for exclusion from an adjustment."""
         held = {self.design.origin, self.design.axis}
         x, y = (np.unique(c, return_inverse=True)[1] for c in self.design.xy.T)
         return tuple(
@@ -232,7 +238,7 @@ class World:
         return screen
 
     def photograph(self, name: str, screen: Screen | None = None) -> Frame:
-        """What the camera sees of a screen, by default the lit one; the same name gives the same noise."""
+        """Photograph a screen, by default the evenly lit one; the same name gives the same noise."""
         rng, camera = self.rng("exposure", name), self.camera_of(name)
         jitter = camera.sensor.row_shifts(rng) if camera.sensor.row_jitter_px else None
         behind = camera.view_at(-self.faults.parallax_mm)
@@ -245,7 +251,7 @@ class World:
         return Frame(pixels, camera.sensor.full_scale, name, sha256(pixels.tobytes()).hexdigest())
 
     def _standing(self, photo: str) -> Similarity:
-        """From the system of the object to that of the transducer's way; it may stand turned."""
+        """From the system of the object to that of the transducer's path, with the rotation of the object."""
         angle = np.deg2rad(self.faults.object_turned_deg if photo == PHOTO_II else 0.0)
         middle = np.array([0.0, -self.scanner.depth_mm / 2])
         c, s = np.cos(angle), np.sin(angle)
@@ -253,7 +259,7 @@ class World:
         return Similarity(np.array([*shift, c, s]))
 
     def _video(self, reflectors: Reflectors, photo: str) -> Video:
-        """What the scanner hands to the display of reflectors in the tank, faults included."""
+        """Video of reflectors in the tank, including faults."""
         silent = self.faults.silent(self.rods.names) if photo == PHOTO_II else frozenset()
         audible = reflectors.without(silent).moved(self._standing(photo))
         return self.scanner.sweep(audible, *self.display.raster(self.screen), self.rng("receiver", photo))
@@ -277,7 +283,7 @@ class World:
 
 
 def _between_marks(xy: Array, count: int, rng: np.random.Generator) -> Array:
-    """Places that keep away from every mark by a quarter of the way to its neighbour."""
+    """Random positions that are not close to any mark."""
     gap = np.partition(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)), 1, axis=1)[:, 1].min()
     found: list[Array] = []
     while len(found) < count:
@@ -287,10 +293,10 @@ def _between_marks(xy: Array, count: int, rng: np.random.Generator) -> Array:
     return np.array(found).reshape(-1, 2)
 
 
-def _non_metric(rng: np.random.Generator) -> Camera:
+def _non_metric(rng: np.random.Generator) -> FilmCamera:
     """An oscilloscope camera on Polaroid film: reproduction 0.57, nearly perpendicular, uncalibrated."""
     turn = angles_to_matrix(*np.deg2rad(rng.normal(0.0, [0.5, 0.5, 0.7])))
-    # Whoever set it up looked at the middle of the screen: the axis meets it there, nearly.
+    # The camera is aimed at the middle of the screen, with a small error.
     aim = np.array([*rng.normal(0.0, 0.3, 2), 0.0])
     pose = Pose(matrix_to_vector(turn), aim - turn[2] * rng.normal(264.0, 0.5))
     lens = Brown(side="image").with_values(
@@ -314,4 +320,4 @@ def _non_metric(rng: np.random.Generator) -> Camera:
     )
     sensor = Sensor(1600, 1200, gain=12.0, read_noise=1.0)
     scan = PixelGrid(sensor.width, sensor.height, (0.063, 0.063))
-    return Camera(pose, lens, deformation, scan, sensor)
+    return FilmCamera(pose, lens, deformation, scan, sensor)

@@ -21,6 +21,7 @@ from reseau.bundle import (
 )
 from reseau.calibration import Calibration
 from reseau.core.errors import UsageError
+from reseau.core.failure import Code, Failure
 
 from . import networks
 
@@ -71,7 +72,9 @@ def test_too_many_blunders_are_refused() -> None:
     network, _ = disturbed(world.noisy(1), 0.2, 1)
     result = adjust_network(network, Options(outliers="reject", max_fraction=0.1))
     assert not result
-    assert "look at the model" in result.reason  # type: ignore[union-attr]
+    assert isinstance(result, Failure)
+    assert result.code is Code.TOO_MANY_OUTLIERS
+    assert "check the model" in result.reason
 
 
 def test_rows_are_told_apart_from_columns_by_variance_components() -> None:

@@ -43,7 +43,7 @@ def test_selection_is_by_names_in_their_order_or_by_mask() -> None:
 
 
 def test_impossible_points_are_refused() -> None:
-    with pytest.raises(UsageError, match="a: stands twice"):
+    with pytest.raises(UsageError, match="a: occurs twice"):
         ImagePoints.with_sigma(["a", "b", "a"], np.zeros((3, 2)), 1.0)
     with pytest.raises(UsageError, match="2 names with coordinates"):
         ImagePoints(("a", "b"), np.zeros((3, 2)), np.zeros((3, 2, 2)))

@@ -1,4 +1,4 @@
-"""What is passed between the packages: a frame, and image coordinates in columns."""
+"""Data passed between the packages: frames, and image coordinates in columns."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One grey image as it came from an instrument or a file.
+    """One grey image from an instrument or a file, with unchanged grey values.
 
     Parameters
     ----------
@@ -30,14 +30,20 @@ class Frame:
     full_scale : float
         The grey value at which the sensor or the file saturates: 255 for 8 bits.
     name : str
-        What the frame is called in messages and results, a file name as a rule.
+        Name in messages and results, usually a file name.
     sha256 : str
-        Hash of the bytes it was read from; of the pixels where there was no file.
+        Hash of the file, or of the pixels where there is no file.
 
     Raises
     ------
     ImageError
-        When the pixels are no grey image of at least 2×2, or hold values that are not finite.
+        When the pixels are not a grey image of at least 2×2, or contain values that are not finite.
+
+    Examples
+    --------
+    >>> frame = Frame(np.zeros((480, 640), np.uint8), 255.0, "left.png")
+    >>> frame.width, frame.height
+    (640, 480)
     """
 
     pixels: NDArray[Any]
@@ -47,9 +53,11 @@ class Frame:
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or min(self.pixels.shape) < 2:
-            raise ImageError(f"has the shape {self.pixels.shape}, not that of a grey image", where=self.name)
+            raise ImageError(
+                f"has the shape {self.pixels.shape}; a grey image has (height, width)", where=self.name
+            )
         if self.pixels.dtype.kind == "f" and not np.isfinite(self.pixels).all():
-            raise ImageError("holds grey values that are not finite", where=self.name)
+            raise ImageError("contains grey values that are not finite", where=self.name)
 
     @property
     def width(self) -> int:
@@ -78,7 +86,7 @@ class ImagePoints:
     Raises
     ------
     UsageError
-        When the columns differ in length or a name stands twice.
+        When the columns differ in length or a name occurs twice.
 
     Examples
     --------
@@ -97,7 +105,7 @@ class ImagePoints:
             raise UsageError(f"{n} names with coordinates {self.xy.shape} and covariances {self.cov.shape}")
         if len(set(self.names)) != n:
             twice = next(name for i, name in enumerate(self.names) if name in self.names[:i])
-            raise UsageError("stands twice among the points", where=twice)
+            raise UsageError("occurs twice among the points", where=twice)
 
     @classmethod
     def with_sigma(cls, names: Iterable[str], xy: ArrayLike, sigma: ArrayLike) -> Self:

@@ -1,25 +1,26 @@
-"""The errors that leave a public call, and nothing else does.
+"""All exceptions that a public call raises.
 
 ::
 
     ReseauError
-    ├── UsageError           arguments that cannot be meant together            exit status 2
-    │   └── SettingError         … a setting beyond its limits; nothing was sent
-    ├── InputError           a file or a value from outside that cannot be used exit status 2
-    │   ├── ImageError       … that should be an image
-    │   └── FormatError      … that should be one of the project's documents
-    ├── ArchiveError         the archive cannot keep or give what was asked     exit status 1
-    ├── EstimationError      an estimate that was required could not be had     exit status 1
-    └── InstrumentError      an instrument did not do what was asked            exit status 1
-        ├── ConnectionLost       it cannot be reached, or went away
-        ├── DeadlineError        it did not answer, or was not done, in the time allowed
-        ├── ProtocolError        what it sent is no answer in its protocol
-        ├── RefusedError         it understood, and said no
-        ├── StateError           it is not in a state to do so: not homed, stalled, at a limit, stopped
-        └── BenchError           several instruments failed; names them all
+    ├── UsageError           wrong or contradictory arguments                   exit status 2
+    │   └── SettingError         … a setting out of its limits; nothing was sent
+    ├── InputError           an unusable file or external value                 exit status 2
+    │   ├── ImageError       … an unusable image
+    │   └── FormatError      … an invalid document
+    ├── ArchiveError         the archive cannot store or return an item         exit status 1
+    ├── EstimationError      a required estimate failed                         exit status 1
+    └── InstrumentError      an instrument did not execute a command            exit status 1
+        ├── ConnectionLost       it cannot be reached, or the connection broke
+        ├── DeadlineError        it did not answer or finish in time
+        ├── ProtocolError        its answer violates its protocol
+        ├── RefusedError         it refused the command
+        ├── StateError           its state does not allow it: not homed, stalled, at a limit, stopped
+        └── BenchError           several instruments failed
 
-Each says in one line *what* is wrong, *where*, and what to *do*. An estimator that fails does not raise: it
-returns a falsy value with its reason; `EstimationError` is for those who must have the estimate.
+Each message says in one line *what* is wrong, *where*, and what to *do*. An estimator that fails does not
+raise: it returns a :class:`reseau.core.failure.Failure`; `EstimationError` is raised where the estimate is
+required.
 """
 
 from __future__ import annotations
@@ -46,16 +47,16 @@ __all__ = [
 
 
 class ReseauError(Exception):
-    """Root of the tree; carries one line for the user.
+    """Root of the exceptions, with a one-line message for the user.
 
     Parameters
     ----------
     what : str
         What is wrong.
     where : object, optional
-        The file, key, mark or argument it is about; named first.
+        File, key, mark or argument concerned; named first.
     do : str, optional
-        What would help; named last.
+        What to do; named last.
 
     Examples
     --------
@@ -72,46 +73,46 @@ class ReseauError(Exception):
 
 
 class UsageError(ReseauError):
-    """Arguments that cannot be meant together."""
+    """Wrong or contradictory arguments."""
 
     exit_status = 2
 
 
 class InputError(ReseauError):
-    """A file or a value from outside that cannot be used."""
+    """A file or external value that cannot be used."""
 
     exit_status = 2
 
 
 class ImageError(InputError):
-    """A file or an array that should be an image and is none we can measure in."""
+    """A file or an array that is not a usable image."""
 
 
 class FormatError(InputError):
-    """A document that does not keep to its schema."""
+    """A document that does not conform to its schema."""
 
 
 class ArchiveError(ReseauError):
-    """The archive cannot keep or give what was asked: full, read-only, damaged, or not there."""
+    """The archive cannot store or return an item: full, read-only, damaged, or missing."""
 
 
 class EstimationError(ReseauError):
-    """An estimate that was required could not be had."""
+    """A required estimate failed."""
 
 
 class SettingError(UsageError):
-    """A setting that an instrument does not have, or a value beyond its limits; nothing was sent."""
+    """A setting that an instrument does not have, or a value out of its limits; nothing was sent."""
 
 
 class InstrumentError(ReseauError):
-    """An instrument did not do what was asked.
+    """An instrument did not execute a command.
 
     Parameters
     ----------
     what, where, do
         As for :class:`ReseauError`; `where` is the name of the instrument.
     command : str, optional
-        What it had been told when it happened.
+        The last command.
 
     Examples
     --------
@@ -128,32 +129,38 @@ class InstrumentError(ReseauError):
 
 
 class ConnectionLost(InstrumentError):
-    """The instrument cannot be reached, or went away."""
+    """The instrument cannot be reached, or the connection broke."""
 
 
 class DeadlineError(InstrumentError):
-    """The instrument did not answer, or was not done, in the time allowed."""
+    """The instrument did not answer or finish in time."""
 
 
 class ProtocolError(InstrumentError):
-    """What the instrument sent is no answer in its protocol."""
+    """The answer of the instrument violates its protocol."""
 
 
 class RefusedError(InstrumentError):
-    """The instrument understood, and said no."""
+    """The instrument refused the command."""
 
 
 class StateError(InstrumentError):
-    """The instrument is not in a state to do what was asked: not homed, stalled, at a limit, stopped."""
+    """The state of the instrument does not allow the command: not homed, stalled, at a limit, stopped."""
 
 
 class BenchError(InstrumentError):
-    """Several instruments failed, or one of several; all of them are named.
+    """One or more of several instruments failed; all of them are named.
 
     Parameters
     ----------
     failures : sequence of ReseauError
-        What happened to each.
+        Failure of each.
+
+    Examples
+    --------
+    >>> first, second = StateError("is not homed", where="table"), DeadlineError("timed out", where="scope")
+    >>> str(BenchError([first, second]))
+    'bench: 2 failed: table: is not homed | scope: timed out'
     """
 
     def __init__(self, failures: Sequence[ReseauError]) -> None:

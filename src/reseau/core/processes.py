@@ -1,4 +1,4 @@
-"""Processes that work side by side; light, so that they can be started before anything heavy is imported."""
+"""Worker processes; without heavy imports, so that they can start before heavy modules are imported."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ __all__ = ["cores", "process_context", "start_early"]
 
 
 def cores() -> int:
-    """Cores that this process may run on."""
+    """Number of cores available to this process.
+
+    Examples
+    --------
+    >>> cores() >= 1
+    True
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def process_context(modules: Sequence[str]) -> BaseContext:
-    """How to start processes that share no threads with this one.
+    """Context for processes that share no threads with this one.
 
     Parameters
     ----------
     modules : sequence of str
-        What they need, imported once for all of them.
+        Modules to import once for all of them.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
@@ -32,6 +38,6 @@ def process_context(modules: Sequence[str]) -> BaseContext:
 
 
 def start_early(modules: Sequence[str]) -> None:
-    """Let the modules be imported for later processes while this one goes on with its own work."""
+    """Import the modules for later processes in the background."""
     if process_context(modules).get_start_method() == "forkserver":
         forkserver.ensure_running()

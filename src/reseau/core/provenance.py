@@ -1,4 +1,4 @@
-"""How a result came about: its inputs by hash, the options, the version of the software."""
+"""Provenance of a result: hashes of its inputs, its options, the version of the software."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ def sha256_of(source: bytes | Path) -> str:
     ------
     InputError
         When the file cannot be read.
+
+    Examples
+    --------
+    >>> sha256_of(b"reseau")[:8]
+    'f669f700'
     """
     if isinstance(source, bytes):
         return hashlib.sha256(source).hexdigest()
@@ -32,20 +37,31 @@ def sha256_of(source: bytes | Path) -> str:
 
 
 def canonical_json(value: Any) -> str:
-    """Render JSON that is the same to the byte for the same content, with a newline at its end."""
+    """Render JSON with reproducible bytes, with a newline at its end.
+
+    Examples
+    --------
+    >>> canonical_json({"sigma": 0.5})
+    '{\\n "sigma": 0.5\\n}\\n'
+    """
     return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a result was computed from, with what options, by which version.
+    """Inputs, options and software version of a result.
 
     Parameters
     ----------
     inputs : dict
         SHA-256 by the role or the name of each input.
     options : dict
-        The options that influenced the result, JSON values.
+        The options that influence the result, JSON values.
+
+    Examples
+    --------
+    >>> Provenance({"left.png": "00"}, {"alpha": 0.05}).to_dict()["options"]
+    {'alpha': 0.05}
     """
 
     inputs: dict[str, str] = field(default_factory=dict)
@@ -53,7 +69,7 @@ class Provenance:
     software: str = f"reseau {__version__}"
 
     def to_dict(self) -> dict[str, Any]:
-        """As it stands in a document; keys sorted, so that their order says nothing."""
+        """Dictionary for a document, with sorted keys."""
         return {
             "inputs": dict(sorted(self.inputs.items())),
             "options": dict(sorted(self.options.items())),
