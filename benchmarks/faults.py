@@ -1,6 +1,6 @@
-"""The table driver × transport × fault, from the tests that fill its cells: `python benchmarks/faults.py`.
+"""Write docs/faults.md from the fault tests of all drivers: ``python benchmarks/faults.py``.
 
-With `--exchanges 10000` the endurance of every driver on every transport too.
+With ``--exchanges 10000``, the endurance of every driver on every transport is included.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ ROOT = Path(__file__).resolve().parents[1]
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "faults.md")
-    parser.add_argument("--exchanges", type=int, default=0, help="of each driver with 1 %% faults")
+    parser.add_argument(
+        "--exchanges", type=int, default=0, help="number of exchanges per driver, with 1 %% faults"
+    )
     asked = parser.parse_args()
     which = ["-k", "a_fault_gives"]
     if asked.exchanges:

@@ -1,4 +1,4 @@
-"""`--evidence FILE` writes what the battery found as a table: driver × transport × fault."""
+"""`--evidence FILE` writes the outcomes of the fault tests as a table: driver × transport × fault."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ import pytest
 from reseau_sims.serving import KINDS
 
 HEAD = """\
-# Faults: what happens
+# Faults and reactions of drivers
 
-By `python benchmarks/faults.py --exchanges 10000`; each cell is one or more tests of `test_battery.py`.
-A fault befalls an answer in the middle of the driver's work: in process the 1st, 2nd, 3rd and 5th after the
-work began, elsewhere the 3rd. In a cell stands what came of it, and the longest time until it was known:
-*right*, the work was done as if nothing had happened, or the error of the tree, which names instrument and
-command. Deadlines are short here: 0.15 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for
-a call of BK and of a camera, 0.7 s of an oscilloscope. Asserted in every cell besides: no answer was taken
-for that to another question, the instrument could be brought back, the work after it was right, and file
-descriptors, sockets and threads are as many as before.
+Written by `python benchmarks/faults.py --exchanges 10000`; each cell is one or more tests of
+`test_battery.py`. A fault affects an answer during the work of the driver: in process the 1st, 2nd, 3rd and
+5th answer, otherwise the 3rd. A cell contains the outcome and the longest time until it was known: *right*
+(the work succeeded as without the fault), or the class of the error, which names instrument and command. Time
+limits are short in these tests: 0.15 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for a
+call of BK and of a camera, 0.7 s for an oscilloscope. Every test also asserts that no answer was taken for
+the answer to another query, that the instrument could be recovered, that the following work was right, and
+that the numbers of file descriptors, sockets and threads are unchanged.
 
-Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disconnected; of the instrument:
-stuck, wrong state, out of range, power-cycled. `test_endurance` goes on with one fault in a hundred answers.
+Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disconnected; faults of the
+instrument: stuck, wrong state, out of range, power-cycled. `test_endurance` continues with one fault in a
+hundred answers.
 
-Of cameras an answer is a frame. Late, it is sent late; dropped, all of it is lost; truncated, half of its
-packets are lost (GigE Vision) or it is torn in the middle (V4L2); corrupted, the same, as a packet with a
-wrong checksum never arrives, or its buffer is marked as damaged; repeated, the one of before comes again.
-Disconnected, the cable is pulled, and on GigE Vision put back 0.2 s later; stuck, no frame comes any more
-until it is started anew; wrong state, control is lost, or the kernel's queue reports an error; out of
-range, the frame is stamped an hour ahead; power-cycled, the camera forgets who had it and how it was set.
-No frame that was handed out was damaged, stale, or another one's.
+For cameras an answer is a frame. Late: it is sent late; dropped: it is lost completely; truncated: half of
+its packets are lost (GigE Vision) or half of its data are missing (V4L2); corrupted: the same, because
+packets with a wrong checksum are discarded, or its buffer is marked as damaged; repeated: the previous frame
+is sent again. Disconnected: the cable is pulled, and on GigE Vision plugged in again 0.2 s later; stuck: no
+more frames until the next start; wrong state: control is lost, or the kernel's queue reports an error; out of
+range: the time stamp is one hour ahead; power-cycled: the camera loses control and settings. No returned
+frame was damaged, stale or repeated.
 
 """
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--evidence", metavar="FILE", help="write the table of faults there (Markdown)")
+    parser.addoption("--evidence", metavar="FILE", help="write the table of faults to this file (Markdown)")
 
 
 _LOG: list[pytest.TestReport] = []
@@ -78,7 +79,7 @@ def _table(cells: dict[tuple[str, str], dict[str, list[tuple[str, float]]]]) -> 
 
 
 def _endurance(found: list[dict[str, object]]) -> str:
-    """What came of many exchanges with random faults."""
+    """Table of the outcomes of many exchanges with random faults."""
     if not found:
         return ""
     keys = ("driver", "transport", "exchanges", "faults", "errors", "longest")
@@ -88,13 +89,13 @@ def _endurance(found: list[dict[str, object]]) -> str:
         *sorted([f"{f[key]:.1f} s" if key == "longest" else str(f[key]) for key in keys] for f in found),
     ]
     return (
-        "\n## Endurance\n\nOne fault in a hundred answers, of all kinds; everything else was right.\n\n"
+        "\n## Endurance\n\nOne fault in a hundred answers, of all kinds; all other results were right.\n\n"
         + "".join("| " + " | ".join(row) + " |\n" for row in rows)
     )
 
 
 def _cell(found: list[tuple[str, float]]) -> str:
-    """What came of a fault, each outcome once, with the longest time that it took."""
+    """Outcomes of a fault, each with the longest time it took."""
     longest: dict[str, float] = {}
     for outcome, seconds in found:
         longest[outcome] = max(longest.get(outcome, 0.0), seconds)

@@ -15,7 +15,7 @@ from reseau.core.errors import UsageError
 from reseau_drivers.turntable import zaber
 from reseau_sims import FieldBench, World
 from reseau_sims.laboratory import Laboratory, Room
-from reseau_sims.serving import FaultScript, PtyServer, Server, TcpServer, Wire, ZaberChain
+from reseau_sims.serving import FaultyConnection, PtyServer, Server, TcpServer, ZaberChain
 
 AXES = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
 PX = 57.5 / 0.027
@@ -31,7 +31,7 @@ def moving(kind: type[Server]) -> Iterator[tuple[Laboratory, ZaberChain, Any]]:
         motor.speed = 1e6
     for name, key in AXES.items():
         laboratory.attach(name, lambda key=key: chain.position(*key) / 1000)  # type: ignore[misc]
-    with kind(lambda: Wire(chain, FaultScript())) as server:
+    with kind(lambda: FaultyConnection(chain)) as server:
         yield laboratory, chain, server
 
 

@@ -1,4 +1,4 @@
-"""A bench of simulated instruments behind their real protocols, all in one laboratory."""
+"""Bench of simulated instruments with their real protocols, all in one laboratory."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ __all__ = ["SimulatedBench", "TableKind", "serve"]
 TableKind = Literal["zaber", "smc100"]
 SceneName = Literal["screen", "testfield"]
 _PATIENCE_S = 120.0
-"""For the port of another simulated camera of this machine."""
+"""Time to wait for the port of another simulated camera on this machine (s)."""
 _DISTORTION_PX = 1.5
-"""At the edge of a frame of the flat testfield."""
+"""Distortion at the edge of a frame of the flat testfield (px)."""
 
 _CHAIN = {"tilt": (1, 1), "roll": (1, 2), "camera_roll": (2, 1), "z": (3, 1)}
-"""Device and axis on the chain of Zaber's; of Newport's each axis has a controller of its own."""
+"""Device and axis on the Zaber chain; each axis of the Newport table has its own controller."""
 _STEPS = 1000.0
-"""Of Zaber's for a degree or a millimetre."""
+"""Steps of the Zaber devices per degree or millimetre."""
 _HIGH = {"tilt": 75.0, "roll": 360.0, "camera_roll": 360.0, "z": 300.0}
 _LOW = -5.0
-"""Below zero: also that is come to from below."""
+"""Below zero, so that zero can be approached from below."""
 _SCREEN = (800, 480)
 
 _BENCH = """\
@@ -92,36 +92,42 @@ class SimulatedBench:
     Parameters
     ----------
     seed : int
-        Of the world.
+        Seed of the world.
     table : {"zaber", "smc100"}
-        Whose controllers move it.
+        Controllers of the table.
     family : str
-        Of the oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
+        Oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
     camera : {"screen", "testfield"}, optional
-        What a camera looks at, over GigE Vision where Aravis is installed; elsewhere it has a node of
-        Video4Linux within this process, `video`, and does not stand in the ``bench.toml``.
+        Object in front of a camera. The camera uses GigE Vision if Aravis is installed; otherwise it is a
+        Video4Linux camera in this process (`video`) and not part of the ``bench.toml``.
     repeatable : bool
         See :class:`~reseau_sims.laboratory.Laboratory`.
     flat : bool
-        Whether the testfield is a plane, before a lens that distorts.
+        Whether the testfield is a plane in front of a lens with distortion.
     in_process : bool
-        Whether the camera is in this process also where Aravis is installed.
+        Whether the camera is in this process even if Aravis is installed.
 
     Attributes
     ----------
     toml : str
-        The ``bench.toml`` that leads to them.
+        ``bench.toml`` for the instruments.
     laboratory : Laboratory
-        What they share.
+        Common simulated world.
     scripts : dict
-        What goes wrong, by instrument; nothing at first.
+        Faults by instrument; initially none.
     video : VideoCamera or None
-        The camera, where it is in this process.
+        Camera in this process, if any.
 
     Raises
     ------
     UsageError
-        When nobody simulates such a table or oscilloscope.
+        If the table, oscilloscope or scene does not exist.
+
+    Examples
+    --------
+    >>> with SimulatedBench(seed=3) as bench:  # doctest: +SKIP
+    ...     print(bench.toml.splitlines()[1])
+    name = "simulated"
     """
 
     def __init__(
@@ -141,7 +147,9 @@ class SimulatedBench:
             ("scene for a camera", get_args(SceneName), camera),
         ):
             if asked is not None and asked not in known:
-                raise UsageError(f"is no simulated {what}", where=asked, do=f"there are {', '.join(known)}")
+                raise UsageError(
+                    f"is not a simulated {what}", where=asked, do=f"choose from {', '.join(known)}"
+                )
         field = FieldBench(seed=seed, bend_mm=0.0).distorted(_DISTORTION_PX) if flat else None
         self.laboratory = laboratory = Laboratory(World.standard(seed), field, repeatable=repeatable)
         self._pulser = CompactPulser()
@@ -176,8 +184,8 @@ class SimulatedBench:
         self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + entry
 
     def _camera(self, scene: SceneName, in_process: bool, stack: ExitStack) -> str:
-        """The camera; its part of the ``bench.toml``, where it can be reached from outside."""
-        first = self.laboratory.expose(scene)  # what takes long is computed now
+        """Create the camera; return its part of the ``bench.toml`` if it can be reached from outside."""
+        first = self.laboratory.expose(scene)  # do the long computations now
         body = SimulatedCamera(LaboratoryScene(self.laboratory, scene), first.width, first.height)
         self.scripts["camera"] = body.script
         if in_process or not aravis_is_installed():
@@ -188,7 +196,7 @@ class SimulatedBench:
         return _CAMERA.format(address=served.address, width=first.width, height=first.height)
 
     def _table(self, kind: TableKind) -> Machine:
-        """The controllers of the table; the laboratory's axes stand where they are."""
+        """Create the controllers of the table, and connect them to the axes of the laboratory."""
         if kind == "smc100":
             line = Smc100Line(len(AXES), low=_LOW, high=400.0, speed=20.0)
             for address, name in enumerate(AXES, 1):
@@ -200,18 +208,18 @@ class SimulatedBench:
         return chain
 
     def _channel(self) -> NDArray[np.uint8]:
-        """Channel 1 of the oscilloscope: echoes of the pulser while it sends, else of the scanner."""
+        """Channel 1 of the oscilloscope: echoes of the pulser while it sends, otherwise of the scanner."""
         if not self._pulser.values["P"]:
             return self.laboratory.echoes
         return self.laboratory.pulse(self.laboratory.axes["z"])
 
     @property
     def violations(self) -> dict[str, list[str]]:
-        """What clients did wrong, by instrument."""
+        """Protocol violations of clients, by instrument."""
         return {name: list(machine.violations) for name, machine in self.machines.items()}
 
     def close(self) -> None:
-        """Hang up on all."""
+        """Close all connections."""
         self._servers.close()
 
     def __enter__(self) -> Self:
@@ -222,12 +230,12 @@ class SimulatedBench:
 
 
 def _units(chain: ZaberChain, device: int, axis: int) -> float:
-    """Where an axis stands, in degrees or millimetres."""
+    """Position of an axis, in degrees or millimetres."""
     return chain.position(device, axis) / _STEPS
 
 
 def _axis_entry(kind: TableKind, name: str) -> str:
-    """The line of ``bench.toml`` for an axis."""
+    """Line of ``bench.toml`` for an axis."""
     device, axis = _CHAIN[name]
     where = f"device = {device}, axis = {axis}, per_unit = {_STEPS}"
     if kind == "smc100":
@@ -237,13 +245,13 @@ def _axis_entry(kind: TableKind, name: str) -> str:
 
 
 def serve(seed: int = 0, **options: Any) -> SimulatedBench:
-    """A simulated bench; found by its entry point.
+    """Create a simulated bench; entry point ``bench``.
 
     Parameters
     ----------
     seed : int
-        Of the world.
+        Seed of the world.
     **options
-        Of :class:`SimulatedBench`.
+        Further arguments of :class:`SimulatedBench`.
     """
     return SimulatedBench(seed, **options)

@@ -1,6 +1,6 @@
-"""A BK scanner's OEM interface: its windows in pixels and metres, and grabbed frames.
+"""OEM interface of a BK scanner: windows in pixels and metres, and grabbed frames.
 
-Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``. While frames are asked for, one comes before every answer.
+Source: PLUS's ``vtkPlusBkProFocusOemVideoSource``. While frames are enabled, one precedes every answer.
 """
 
 from __future__ import annotations
@@ -20,23 +20,28 @@ __all__ = ["BkScanner"]
 
 
 def _grey() -> NDArray[np.uint8]:
-    """A picture with every byte that has to be escaped, for want of a world."""
+    """Test image that contains every byte that must be escaped."""
     return np.add.outer(np.arange(60), np.arange(80)).astype(np.uint8)
 
 
 class BkScanner(Machine):
-    """The scanner.
+    r"""Simulated BK scanner.
 
     Parameters
     ----------
     section : callable
-        The grey picture that it shows.
+        Returns the grey image.
     mm_per_px : (float, float)
-        Of it, along x and down.
+        Pixel size along x and in depth (mm).
     announces_wrongly : bool
-        Whether the length before a frame is wrong, as on a BK5000.
+        Whether the announced length of a frame is wrong, as on a BK5000.
     acknowledges_off : bool
-        Whether the end of frames is acknowledged; reports of instruments differ.
+        Whether the end of frames is acknowledged; instruments differ.
+
+    Examples
+    --------
+    >>> BkScanner().receive(bk.encode(b"QUERY:US_WIN_SIZE;"))[0]
+    b'\x01DATA:US_WIN_SIZE 80,60;\x04'
     """
 
     def __init__(
@@ -54,7 +59,7 @@ class BkScanner(Machine):
         self._silent, self._refuse, self._wrong_size, self._stamp = 0, False, False, 0
 
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Messages in answer."""
+        """Return the messages in answer."""
         answers: list[bytes] = []
         for message in self._messages.feed(data):
             if isinstance(message, Damaged):
@@ -72,12 +77,12 @@ class BkScanner(Machine):
         return answers
 
     def disconnected(self) -> None:
-        """A message that was begun is forgotten, and frames go to nobody."""
+        """Discard an incomplete message and stop the frames."""
         self._messages.reset()
         self.streaming = False
 
     def inject_fault(self, kind: Kind) -> None:
-        """Stuck: one answer stays out; wrong state: an error; out of range: too few rows."""
+        """Stuck: one answer is missing; wrong state: an error; out of range: too few rows."""
         if kind == "stuck":
             self._silent = 1
         self._refuse = self._refuse or kind == "wrong state"
@@ -97,7 +102,7 @@ class BkScanner(Machine):
             case b"QUERY:B_GEOMETRY_US_FRAME_GRAB:A;":
                 return f"DATA:B_GEOMETRY_US_FRAME_GRAB:A 0,0,{width - 1},{height - 1};".encode()
             case b"QUERY:B_GEOMETRY_PIXEL:A;":
-                # Of the whole screen, on which the section is a part.
+                # Box of the whole screen, which contains the section.
                 return f"DATA:B_GEOMETRY_PIXEL:A 200,50,{200 + width},{50 + height};".encode()
             case b"QUERY:B_GEOMETRY_TISSUE:A;":
                 right, down = width * self._mm[0] / 1000, height * self._mm[1] / 1000

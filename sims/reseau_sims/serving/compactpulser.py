@@ -1,4 +1,4 @@
-"""A CompactPulser: settings by single letters, no answers but to questions.
+"""Simulated CompactPulser: settings by single letters; only queries are answered.
 
 Source: see :mod:`reseau_drivers.codecs.compactpulser`.
 """
@@ -20,12 +20,18 @@ _START = {"P": 0, "W": 100, "V": 100, "D": 1, "M": 0, "T": 0, "G": 5}
 
 
 class CompactPulser(Machine):
-    """The pulser; its values by letter are in `values`.
+    r"""Simulated pulser; `values` contains its values by letter.
 
     Parameters
     ----------
     readable : str
-        The letters that it answers questions about.
+        Letters that can be queried.
+
+    Examples
+    --------
+    >>> pulser = CompactPulser()
+    >>> pulser.receive(b"V120\rV?\r")
+    [b'V=120\r']
     """
 
     def __init__(self, readable: str = "".join(LETTERS)) -> None:
@@ -36,7 +42,7 @@ class CompactPulser(Machine):
         self._ignore_command, self._silent, self._wrong_value = False, 0, False
 
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Answers to questions."""
+        """Return the answers to queries."""
         answers: list[bytes] = []
         for line in self._lines.feed(data):
             try:
@@ -44,7 +50,7 @@ class CompactPulser(Machine):
                     raise ProtocolError(str(line))
                 setting, is_answer = decode(line)
                 if is_answer:
-                    raise ProtocolError(f"an answer to nothing: {line!r}")
+                    raise ProtocolError(f"an unexpected answer: {line!r}")
             except ProtocolError as error:
                 self.violations.append(error.what)
                 continue
@@ -63,11 +69,11 @@ class CompactPulser(Machine):
         return answers
 
     def disconnected(self) -> None:
-        """A command that was begun is forgotten."""
+        """Discard an incomplete command."""
         self._lines.reset()
 
     def inject_fault(self, kind: Kind) -> None:
-        """Stuck: one answer stays out; wrong state: one command is not taken; out of range: a wrong value."""
+        """Stuck: one answer is missing; wrong state: one command is ignored; out of range: a wrong value."""
         if kind == "stuck":
             self._silent = 1
         self._ignore_command = self._ignore_command or kind == "wrong state"

@@ -1,4 +1,4 @@
-"""What goes wrong on the way from a simulator to its client, and when."""
+"""Faults of simulated instruments and of their connections, and when they occur."""
 
 from __future__ import annotations
 
@@ -27,24 +27,34 @@ Kind = Literal[
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 LINE_KINDS: tuple[Kind, ...] = KINDS[:6]
-"""Those that befall an answer on its way."""
+"""Faults of the transmission of an answer."""
 DEVICE_KINDS: tuple[Kind, ...] = KINDS[6:]
-"""Those that befall the instrument itself."""
+"""Faults of the instrument itself."""
 
 Output = tuple[float, bytes | None]
-"""Seconds to wait, and bytes to send then; None hangs up."""
+"""Delay in seconds, and bytes to send after it; None closes the connection."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One of them.
+    """One fault.
 
     Parameters
     ----------
     kind : Kind
-        What goes wrong.
+        Kind of the fault.
     seconds : float
-        How late a late answer is.
+        Delay of a late answer (s).
+
+    Raises
+    ------
+    UsageError
+        If the kind is unknown.
+
+    Examples
+    --------
+    >>> Fault("late", 0.1)
+    Fault(kind='late', seconds=0.1)
     """
 
     kind: Kind
@@ -52,24 +62,32 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise UsageError(f"is none of {', '.join(KINDS)}", where=f"fault {self.kind!r}")
+            raise UsageError(f"is not one of {', '.join(KINDS)}", where=f"fault {self.kind!r}")
 
 
 class FaultScript:
-    """Which answers suffer which fault.
+    """Assignment of faults to answers.
 
     Parameters
     ----------
     faults : mapping
-        By the number of the answer, counted from 0 over all connections.
+        Faults by the number of the answer, counted from 0 over all connections.
     rate : float
-        Share of answers, besides, that suffer one at random.
+        Fraction of answers with an additional random fault.
     seed : int
-        Of these.
+        Seed of the random faults.
     kinds : iterable of Kind
-        Of these.
+        Kinds of the random faults.
     seconds : float
-        How late late answers are among these.
+        Delay of late answers among them (s).
+
+    Examples
+    --------
+    >>> script = FaultScript({1: Fault("dropped")})
+    >>> script.draw(), script.draw().kind, script.count
+    (None, 'dropped', 2)
+    >>> FaultScript.spoil(b"answer", Fault("truncated"))
+    [(0.0, b'ans')]
     """
 
     def __init__(
@@ -86,25 +104,25 @@ class FaultScript:
         self._lock = threading.Lock()
         self._count = 0
         self.happened: list[Fault] = []
-        """What has happened so far."""
+        """Faults that have occurred so far."""
 
     @property
     def count(self) -> int:
-        """How many answers there were."""
+        """Number of answers so far."""
         return self._count
 
     def fault_at(self, number: int, fault: Fault) -> None:
-        """Have a fault befall the answer of this number."""
+        """Assign a fault to the answer with this number."""
         with self._lock:
             self._faults[number] = fault
 
     def at_random(self, rate: float, *, seed: int = 0, seconds: float = 0.3) -> None:
-        """From now on, have this share of the answers suffer a fault at random."""
+        """Inject random faults into this fraction of the following answers."""
         with self._lock:
             self._rate, self._rng, self._seconds = rate, np.random.default_rng(seed), seconds
 
     def draw(self) -> Fault | None:
-        """What befalls the answer that is due now."""
+        """Return the fault of the next answer, or None."""
         with self._lock:
             fault = self._faults.pop(self._count, None)
             self._count += 1
@@ -116,7 +134,7 @@ class FaultScript:
 
     @staticmethod
     def spoil(answer: bytes, fault: Fault) -> list[Output]:
-        """What arrives of an answer, and when; a fault of the instrument itself leaves it as it is."""
+        """Return the outputs for an answer with a fault; faults of the instrument itself do not change it."""
         middle = len(answer) // 2
         spoiled: dict[Kind, list[Output]] = {
             "late": [(fault.seconds, answer)],

@@ -40,7 +40,13 @@ _AN_HOUR_NS = 3_600_000_000_000
 
 
 def aravis_is_installed() -> bool:
-    """Whether the library is there, and what programs in Python use it with."""
+    """Whether the library and its Python bindings are installed.
+
+    Examples
+    --------
+    >>> isinstance(aravis_is_installed(), bool)
+    True
+    """
     typelibs = any(Path("/usr/lib").glob("*/girepository-1.0/Aravis-0.8.typelib"))
     return _library_is_there() and typelibs and importlib.util.find_spec("gi") is not None
 
@@ -50,25 +56,32 @@ def _library_is_there() -> bool:
 
 
 class GigeCamera:
-    """A camera on ``127.0.0.1``.
+    """Camera on ``127.0.0.1``.
 
     Parameters
     ----------
     body : SimulatedCamera
-        What it looks with; frames are the upper left part of what it sees, as large as they are asked for. A
-        picture has to be drawn within two seconds: the library answers nothing meanwhile, and its client
-        gives control up. Where drawing takes long, trigger by software.
+        Forms the images; frames are the upper left part of the requested size. An image must be drawn within
+        two seconds: the library does not answer meanwhile, and its client releases control. If drawing takes
+        longer, use software triggers.
     serial : str
-        What it is called.
+        Serial number.
     features : str
-        File of further features (GenICam) that it has, beside those of the library's.
+        File with additional GenICam features.
     wait_s : float
-        How long one waits for another simulated camera of this machine to end: there is one port.
+        Time to wait for another simulated camera on this machine to end (s): there is one port.
 
     Raises
     ------
     UsageError
-        When the library is not installed, or the port is taken.
+        If the library is not installed, or the port is in use.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import SimulatedCamera
+    >>> with GigeCamera(SimulatedCamera()) as camera:  # doctest: +SKIP
+    ...     camera.address
+    '127.0.0.1'
     """
 
     ADDRESS = "127.0.0.1"
@@ -145,7 +158,7 @@ class GigeCamera:
             self._heard.notify_all()
 
     def _filled(self, view: View) -> NDArray[Any]:
-        """What is seen; black where a frame reaches beyond the sensor."""
+        """Return the image; black where the frame exceeds the sensor."""
         seen = self.body.draw(view)
         if seen.shape == (view.height, view.width):
             return seen
@@ -161,7 +174,7 @@ class GigeCamera:
         if kind in ("dropped", "stuck"):
             loss = 1.0
         elif kind in ("truncated", "corrupted"):
-            # Each packet has a checksum: a damaged one never arrives.
+            # Each packet has a checksum: a damaged one is discarded.
             loss = 0.5
         elif kind == "repeated" and self._last is not None:
             number_, stamp_, pixels = self._last
@@ -174,11 +187,11 @@ class GigeCamera:
             self._apply_fault(fault)
 
     def _apply_fault(self, fault: Fault) -> None:
-        """What befalls the camera itself, behind the frame."""
+        """Apply a fault of the camera itself after the frame."""
         if fault.kind == "stuck":
             self._send_command(gige_process.STICK)
         elif fault.kind == "disconnected":
-            # The thread of the frames, which this is, ends with the process that is unplugged.
+            # This is the thread of the frames, which ends with the unplugged process.
             self._replugging = threading.Thread(target=self._unplug_for, args=(fault.seconds,), daemon=True)
             self._replugging.start()
         elif fault.kind == "wrong state":
@@ -187,21 +200,21 @@ class GigeCamera:
             self.power_cycle()
 
     def hang_up(self) -> None:
-        """Take its control from whoever has it, and stop; it can be opened anew."""
+        """Revoke the control of the client, and stop; the camera can be opened again."""
         self._send_command(gige_process.HANG_UP)
 
     def power_cycle(self) -> None:
-        """Switch it off and on: it forgets who had it, and how it was set."""
+        """Switch the camera off and on: control and settings are lost."""
         self._send_command(gige_process.RESET)
 
     def pull_plug(self) -> None:
-        """Nobody answers any more, until :meth:`plug_in`."""
+        """Disconnect the camera until :meth:`plug_in`."""
         self._process.kill()
         self._process.wait()
         self._thread.join(5.0)
 
     def plug_in(self) -> None:
-        """There it is again, as switched on."""
+        """Connect the camera again, with default settings."""
         self._close_pipes()
         self._start()
 
@@ -211,7 +224,7 @@ class GigeCamera:
         self.plug_in()
 
     def _send_command(self, kind: bytes) -> None:
-        """An order besides any frame, obeyed when this returns, unless the frames' own thread gives it."""
+        """Send a command to the camera and wait for its execution (except in the frames' thread)."""
         with self._heard:
             self._issued += 1
             number = self._issued
@@ -236,7 +249,7 @@ class GigeCamera:
             stdin.flush()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         if self._ended:
             return
         self._ended = True
@@ -270,7 +283,7 @@ class GigeCamera:
 
 
 def _one_at_a_time(wait_s: float) -> int:
-    """A lock that goes with the process: the library binds one port of the machine."""
+    """Acquire a lock that ends with the process: the library binds one port of the machine."""
     path = Path(tempfile.gettempdir()) / f"reseau-gige-{os.getuid()}.lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     until = time.monotonic() + wait_s
@@ -282,6 +295,6 @@ def _one_at_a_time(wait_s: float) -> int:
             if time.monotonic() >= until:
                 os.close(descriptor)
                 raise UsageError(
-                    "another simulated GigE camera runs on this machine", do="end that one first"
+                    "another simulated GigE camera runs on this machine", do="end it first"
                 ) from None
             time.sleep(0.05)

@@ -21,13 +21,13 @@ import time
 from typing import Any, BinaryIO
 
 REQUEST = struct.Struct("<QQIIIIIIII")
-"""Number, its own time (ns), exposure (µs), gain (dB), pixel format, left, top, width, height, triggered."""
+"""Number, own time (ns), exposure (µs), gain (dB), pixel format, left, top, width, height, triggered."""
 DONE = bytes(REQUEST.size)
-"""In place of a request: up and running, or an order besides any frame was obeyed."""
+"""Sent instead of a request: the process is ready, or has executed a command."""
 ORDER = struct.Struct("<cddqqI")
-"""Kind, seconds to wait, share of packets lost, frame number or −1, time (ns) or −1, bytes of the frame."""
+"""Kind, delay (s), fraction of packets lost, frame number or −1, time (ns) or −1, frame size (bytes)."""
 FRAME, STICK, HANG_UP, RESET, END = b"F", b"S", b"H", b"R", b"E"
-"""Kinds: of a frame, and besides any frame."""
+"""Kinds of orders: for a frame, and for the camera."""
 
 WIDTH, HEIGHT, GAIN, EXPOSURE, ACQUISITION, FORMAT = 0x100, 0x104, 0x110, 0x120, 0x124, 0x128
 LEFT, TOP, PERIOD, TRIGGER_MODE, TRIGGER_SOURCE = 0x130, 0x134, 0x138, 0x300, 0x304
@@ -36,7 +36,7 @@ DEFAULTS = {
     WIDTH: 512, HEIGHT: 512, GAIN: 0, EXPOSURE: 10000, FORMAT: 0x01080001, LEFT: 0, TOP: 0,
     PERIOD: 40000, TRIGGER_MODE: 0, TRIGGER_SOURCE: 0,
 }  # fmt: skip
-"""Registers as the library has them after switching on."""
+"""Default values of the library's registers."""
 
 _POINTER = ctypes.c_void_p
 _FILL = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32)
@@ -61,18 +61,18 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 
 
 class FakeCameraServer:
-    """The fake camera, and the pipe to the simulator.
+    """Fake camera, and the pipe to the simulator.
 
     Parameters
     ----------
     address, serial : str
-        On which it listens, and what it is called.
+        Address on which it listens, and serial number.
     memory : mmap
-        Where the pixels of the next frame lie.
+        Pixels of the next frame.
     orders, requests : binary files
         The pipe.
     features : str
-        File of further features (GenICam), read from the end of the library's own.
+        File with additional GenICam features, inserted at the end of the library's own.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class FakeCameraServer:
         self._library.arv_fake_camera_set_fill_pattern(self._camera, self._fill, None)
 
     def _described(self, features: str) -> bytes:
-        """Name of a file with the library's own description of the camera, and the further features."""
+        """Return the name of a file with the library's description of the camera and additional features."""
         size = ctypes.c_size_t()
         bare = self._library.arv_fake_camera_new(b"bare")
         text = ctypes.string_at(
@@ -114,7 +114,7 @@ class FakeCameraServer:
         with open(features, "rb") as file:
             more = file.read()
         for name in re.findall(rb'Name="(\w+)"', more):
-            # One of the same name takes the place of the library's.
+            # A feature with the same name replaces that of the library.
             text = re.sub(rb'<(\w+) Name="%s".*?</\1>' % name, b"", text, count=1, flags=re.DOTALL)
         end = text.rindex(b"</RegisterDescription>")
         whole = features + ".xml"
@@ -123,7 +123,7 @@ class FakeCameraServer:
         return whole.encode()
 
     def run(self) -> None:
-        """Obey orders until there are none any more."""
+        """Execute orders until there are no more."""
         self._send(DONE)
         while len(data := self._orders.read(ORDER.size)) == ORDER.size:
             order = ORDER.unpack(data)
@@ -134,7 +134,7 @@ class FakeCameraServer:
             else:
                 self._execute(order[0])
                 self._send(DONE)
-        # The library's thread may wait for a frame, which never comes now.
+        # The library's thread may wait for a frame that will not arrive.
         os._exit(0)
 
     def _execute(self, kind: bytes) -> None:
@@ -156,7 +156,7 @@ class FakeCameraServer:
         _, wait, loss, number, stamp, size = self._frames.get()
         if wait > 0:
             time.sleep(wait)
-        # The library asks for the share of lost packets with every packet of the frame that is sent next.
+        # The library reads the fraction of lost packets with every packet of the next frame.
         self._objects.g_object_set(_POINTER(self._server), b"gvsp-lost-ratio", ctypes.c_double(loss), None)
         if number >= 0:
             library.arv_buffer_set_frame_id(buffer, number)
@@ -181,7 +181,7 @@ class FakeCameraServer:
 
 
 def main() -> None:
-    """Serve until the simulator hangs up."""
+    """Serve until the simulator ends."""
     address, serial, descriptor, size, *features = sys.argv[1:]
     memory = mmap.mmap(int(descriptor), int(size))
     FakeCameraServer(address, serial, memory, sys.stdin.buffer, sys.stdout.buffer, *features).run()

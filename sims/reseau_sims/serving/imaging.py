@@ -1,4 +1,4 @@
-"""What every simulated camera has: something to look at, and settings that act on the picture."""
+"""Common part of all simulated cameras: a scene, and settings that affect the image."""
 
 from __future__ import annotations
 
@@ -21,26 +21,32 @@ from .faults import FaultScript
 __all__ = ["LaboratoryScene", "LampScene", "Scene", "SimulatedCamera", "StillScene", "StripeScene", "View"]
 
 NOMINAL_US = 10_000.0
-"""Exposure at which a scene has its own brightness."""
+"""Exposure time at which a scene has its nominal brightness (µs)."""
 _KEPT = 16
 
 
 @dataclass(frozen=True)
 class View:
-    """How a camera is set.
+    """Settings of a camera.
 
     Parameters
     ----------
     exposure_us : float
-        Exposure time.
+        Exposure time (µs).
     gain_db : float
-        Of its amplifier.
+        Gain of the amplifier (dB).
     offset : float
         Grey values added at the end.
     left, top, width, height : int
-        Region of the sensor.
+        Region of the sensor (px).
     full_scale : float
-        Grey value at which it saturates.
+        Grey value at saturation.
+
+    Examples
+    --------
+    >>> view = View(5000.0, 6.0, 0.0, 0, 0, 96, 64, 255.0)
+    >>> view.light, round(view.gain, 3)
+    (0.5, 1.995)
     """
 
     exposure_us: float
@@ -54,16 +60,16 @@ class View:
 
     @property
     def light(self) -> float:
-        """Light that is gathered, of that of the nominal exposure."""
+        """Exposure relative to the nominal one."""
         return self.exposure_us / NOMINAL_US
 
     @property
     def gain(self) -> float:
-        """Factor of the amplifier."""
+        """Gain factor."""
         return float(10 ** (self.gain_db / 20))
 
     def seen(self, whole: NDArray[Any]) -> NDArray[Any]:
-        """The region of a whole picture that already has exposure and gain, with the offset."""
+        """Return the region of a complete image that already contains exposure and gain, plus the offset."""
         part = whole[self.top : self.top + self.height, self.left : self.left + self.width]
         if not self.offset:
             return part
@@ -71,22 +77,34 @@ class View:
 
 
 class Scene(Protocol):
-    """What a camera looks at."""
+    """Scene in front of a camera.
+
+    Examples
+    --------
+    >>> scene: Scene = StripeScene(96, 64)
+    >>> scene(View(10_000.0, 0.0, 0.0, 0, 0, 96, 64, 255.0)).shape
+    (64, 96)
+    """
 
     def __call__(self, view: View) -> NDArray[Any]:
-        """The picture; the same view gives the same one."""
+        """Return the image of a view; equal views give equal images."""
 
 
 @dataclass(frozen=True)
 class StripeScene:
-    """Slanted stripes that tell their shift: a picture that is no other's.
+    """Slanted stripes that encode a shift: every shift has a unique image.
 
     Parameters
     ----------
     width, height : int
-        Of the sensor.
+        Size of the sensor (px).
     shift : int
-        Of the stripes.
+        Shift of the stripes.
+
+    Examples
+    --------
+    >>> int(StripeScene(shift=1)(View(10_000.0, 0.0, 0.0, 0, 0, 96, 64, 255.0))[0, 0])
+    27
     """
 
     width: int = 96
@@ -94,7 +112,7 @@ class StripeScene:
     shift: int = 0
 
     def __call__(self, view: View) -> NDArray[Any]:
-        """The picture of a view."""
+        """Return the image of a view."""
         y, x = np.mgrid[: self.height, : self.width]
         stripes = (3 * x + 5 * y + 7 * self.shift) % 101 + 20
         grey = np.minimum(stripes * (view.full_scale / 255 * view.light * view.gain), view.full_scale)
@@ -103,53 +121,69 @@ class StripeScene:
 
 @dataclass(frozen=True, eq=False)
 class StillScene:
-    """A picture that was taken at the nominal exposure; other settings scale it.
+    """Image taken at the nominal exposure; other settings scale it.
 
     Parameters
     ----------
     frame : Frame
-        The picture.
+        The image.
+
+    Examples
+    --------
+    >>> scene = StillScene(Frame(np.full((4, 6), 100, np.uint8), 255.0))
+    >>> int(scene(View(5_000.0, 0.0, 0.0, 0, 0, 6, 4, 255.0))[0, 0])
+    50
     """
 
     frame: Frame
 
     def __call__(self, view: View) -> NDArray[Any]:
-        """The picture of a view."""
+        """Return the image of a view."""
         return view.seen(_levelled(self.frame, view, view.light * view.gain))
 
 
 @dataclass(frozen=True, eq=False)
 class LaboratoryScene:
-    """What a camera of the laboratory sees now; no two pictures have the same noise.
+    """Current scene of a camera in the laboratory; each image has its own noise.
 
     Parameters
     ----------
     laboratory : Laboratory
-        Where it stands.
+        Laboratory with the camera.
     scene : {"screen", "testfield"}
-        What stands before it.
+        Object in front of the camera.
+
+    Examples
+    --------
+    >>> LaboratoryScene.__dataclass_fields__["scene"].default
+    'screen'
     """
 
     laboratory: Laboratory
     scene: Literal["screen", "testfield"] = "screen"
 
     def __call__(self, view: View) -> NDArray[Any]:
-        """The picture of a view."""
+        """Return the image of a view."""
         return view.seen(_levelled(self.laboratory.expose(self.scene, view.light, view.gain), view, 1.0))
 
 
 @dataclass(eq=False)
 class LampScene:
-    """A sensor of uneven pixels before a lamp, without a lens; no two pictures have the same noise.
+    """Sensor with non-uniform pixels in front of a lamp, without a lens; each image has its own noise.
 
     Parameters
     ----------
     sensor : PixelSensor
-        What is seen is what it makes of the light; gain and scale of a view are the sensor's own.
+        Forms the image; gain and scale of a view are those of the sensor.
     light : ndarray or float
-        Grey values per microsecond; 0 when it is covered.
+        Grey values per microsecond; 0 if the sensor is covered.
     seed : int
-        Of the noise.
+        Seed of the noise.
+
+    Examples
+    --------
+    >>> LampScene.__dataclass_fields__["light"].default
+    0.25
     """
 
     sensor: PixelSensor
@@ -158,14 +192,14 @@ class LampScene:
     _taken: int = field(default=0, init=False)
 
     def __call__(self, view: View) -> NDArray[Any]:
-        """The picture of a view."""
+        """Return the image of a view."""
         self._taken += 1
         rng = stream(self.seed, "lamp", self._taken)
         return view.seen(self.sensor.expose(self.light, view.exposure_us, rng))
 
 
 def _levelled(frame: Frame, view: View, factor: float) -> NDArray[Any]:
-    """Grey values of a frame on the scale of a view: of eight bits in sixteen, each step is 257."""
+    """Convert the grey values of a frame to the scale of a view: from 8 to 16 bits, each step is 257."""
     factor *= view.full_scale / frame.full_scale
     dtype = np.uint8 if view.full_scale <= 255 else np.uint16
     if factor == 1.0 and frame.pixels.dtype == dtype:
@@ -174,25 +208,31 @@ def _levelled(frame: Frame, view: View, factor: float) -> NDArray[Any]:
 
 
 class SimulatedCamera:
-    """A sensor that looks at something; the doors in front of it are V4L2 or GigE Vision.
+    """Simulated sensor with a scene; it is connected through a Video4Linux or GigE Vision interface.
 
     Parameters
     ----------
     scene : Scene
-        What it looks at first.
+        Initial scene.
     width, height : int
-        Of its sensor.
+        Size of the sensor (px).
     script : FaultScript, optional
-        Which frames suffer which fault.
+        Faults of frames.
 
     Attributes
     ----------
     violations : list of str
-        What its client did wrong.
+        Protocol violations of the client.
     drawn : deque of ndarray
-        The last pictures.
+        The last images.
     before_change : list of callable
-        Called before it looks at something else, so that what was exposed until then is what was seen then.
+        Called before the scene changes, so that exposures started earlier show the previous scene.
+
+    Examples
+    --------
+    >>> camera = SimulatedCamera()
+    >>> camera.draw(View(10_000.0, 0.0, 0.0, 0, 0, 96, 64, 255.0)).shape
+    (64, 96)
     """
 
     def __init__(
@@ -208,18 +248,18 @@ class SimulatedCamera:
 
     @property
     def scene(self) -> Scene:
-        """What it looks at."""
+        """Current scene."""
         return self._scene
 
     def point_at(self, scene: Scene) -> None:
-        """Turn it to something else."""
+        """Change the scene."""
         with self.lock:
             for each in self.before_change:
                 each()
             self._scene = scene
 
     def draw(self, view: View) -> NDArray[Any]:
-        """The picture that it takes now."""
+        """Return the current image."""
         with self.lock:
             picture = self._scene(view)
             self.drawn.append(picture)

@@ -1,4 +1,4 @@
-"""What every simulated instrument has: a state, answers, and a list of what its client did wrong."""
+"""Base of simulated instruments: state, answers, and a list of protocol violations of the client."""
 
 from __future__ import annotations
 
@@ -13,52 +13,77 @@ __all__ = ["FaultyConnection", "Machine", "Session"]
 
 
 class Machine(ABC):
-    """An instrument behind a stream of bytes; may be called from several threads."""
+    r"""Instrument behind a stream of bytes; may be called from several threads.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import ZaberChain
+    >>> chain = ZaberChain([1])
+    >>> chain.receive(b"/01 0 00 tools echo:BF\n")
+    [b'@01 0 00 OK IDLE WR 0:BE\r\n']
+    >>> chain.violations
+    []
+    """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.violations: list[str] = []
-        """What the client sent that the protocol, or the maker, forbids."""
+        """Messages of the client that the protocol or the maker does not allow."""
 
     @abstractmethod
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Answers to these bytes, one by one."""
+        """Return the answers to these bytes."""
 
     @abstractmethod
     def inject_fault(self, kind: Kind) -> None:
-        """Have one of :data:`DEVICE_KINDS` happen."""
+        """Apply one of :data:`DEVICE_KINDS`."""
 
     @abstractmethod
     def disconnected(self) -> None:
-        """The client went away: a command that was begun is forgotten."""
+        """Discard an incomplete command: the client has disconnected."""
 
 
 class Session(Protocol):
-    """One connection to an instrument."""
+    r"""One connection to an instrument.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import ZaberChain
+    >>> session: Session = FaultyConnection(ZaberChain([1]))
+    >>> session.receive(b"/01 0 00 tools echo:BF\n")
+    [(0.0, b'@01 0 00 OK IDLE WR 0:BE\r\n')]
+    """
 
     def receive(self, data: bytes) -> list[Output]:
-        """What is sent in answer."""
+        """Return the outputs in answer to these bytes."""
 
     def disconnected(self) -> None:
-        """The connection is over."""
+        """End the connection."""
 
 
 class FaultyConnection:
-    """A connection on which answers suffer faults.
+    r"""Connection that injects faults into the answers.
 
     Parameters
     ----------
     machine : Machine
-        Answers.
-    script : FaultScript
-        Says which answers suffer.
+        Simulated instrument.
+    script : FaultScript, optional
+        Faults; none by default.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import Fault, ZaberChain
+    >>> connection = FaultyConnection(ZaberChain([1]), FaultScript({0: Fault("dropped")}))
+    >>> connection.receive(b"/01 0 00 tools echo:BF\n")
+    []
     """
 
     def __init__(self, machine: Machine, script: FaultScript | None = None) -> None:
         self.machine, self.script = machine, script or FaultScript()
 
     def receive(self, data: bytes) -> list[Output]:
-        """What is sent in answer."""
+        """Return the outputs in answer to these bytes."""
         sent: list[Output] = []
         with self.machine.lock:
             for answer in self.machine.receive(data):
@@ -72,6 +97,6 @@ class FaultyConnection:
         return sent
 
     def disconnected(self) -> None:
-        """The connection is over."""
+        """End the connection."""
         with self.machine.lock:
             self.machine.disconnected()

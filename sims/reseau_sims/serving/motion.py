@@ -1,4 +1,4 @@
-"""An axis that moves: what controllers of any make have in common."""
+"""Motor of an axis, common to the simulated controllers of all makers."""
 
 from __future__ import annotations
 
@@ -13,16 +13,25 @@ Clock = Callable[[], float]
 
 @dataclass
 class Motor:
-    """A motor with its gear; positions in steps.
+    """Motor with its gear; positions in steps.
 
     Parameters
     ----------
     low, high : float
-        Where its limit switches are.
+        Positions of the limit switches.
     speed : float
         Steps per second.
     clock : callable
-        Seconds.
+        Returns the time in seconds.
+
+    Examples
+    --------
+    >>> seconds = 0.0
+    >>> motor = Motor(0.0, 1000.0, 100.0, lambda: seconds, at=0.0)
+    >>> motor.go(500.0)
+    >>> seconds = 2.0
+    >>> motor.position, motor.moving
+    (200.0, True)
     """
 
     low: float
@@ -33,10 +42,10 @@ class Motor:
     homing: bool = False
     stalled: bool = False
     limit: int = 0
-    """-1 and 1: the switch that was met."""
+    """-1 or 1 if the lower or upper limit switch was reached."""
     enabled: bool = True
     at: float = 1234.0
-    """Where it stands when it is switched on."""
+    """Position after switching on."""
     _start: float = field(default=0.0, init=False, repr=False)
     _target: float = field(default=0.0, init=False, repr=False)
     _began: float = field(default=0.0, init=False, repr=False)
@@ -46,7 +55,7 @@ class Motor:
 
     @property
     def position(self) -> float:
-        """Where it is now."""
+        """Current position."""
         way = self._target - self._start
         gone = min(abs(way), (self.clock() - self._began) * self.speed)
         now = self._start + (gone if way > 0 else -gone)
@@ -62,37 +71,37 @@ class Motor:
 
     @property
     def target(self) -> float:
-        """Where it goes, or stands."""
+        """Target of the movement, or the current position."""
         return self._target
 
     @property
     def moving(self) -> bool:
-        """Whether it is on its way."""
+        """Whether the motor moves."""
         position = self.position
         return position != self._target
 
     def go(self, target: float) -> None:
-        """Begin to move."""
+        """Start a movement."""
         self._start, self._target, self._began = self.position, target, self.clock()
         self.limit, self.stalled = 0, False
 
     def home(self) -> None:
-        """Begin to look for the reference, at 0."""
+        """Start the search for the reference at 0."""
         self.go(0.0)
         self.homing, self.homed = True, False
 
     def stop(self) -> None:
-        """Stand still; a search that was not finished has found nothing."""
+        """Stop; an unfinished search for the reference is cancelled."""
         self._stand(self.position)
         self.homing = False
 
     def stall(self) -> None:
-        """Something is in its way."""
+        """Stop because of an obstacle."""
         self.stop()
         self.stalled = True
 
     def cut_power(self) -> None:
-        """It stands where it stood, and nobody knows where that is."""
+        """Stop and lose the reference."""
         self.stop()
         self.homed, self.stalled, self.limit, self.enabled = False, False, 0, True
 

@@ -1,7 +1,6 @@
-"""An oscilloscope that speaks SCPI in the way of one of several makers; on its screen is what the world
-shows.
+"""Simulated SCPI oscilloscope with the commands of one of several makers; it shows the simulated world.
 
-Source: the makers' programming manuals; the sequences by which each hands over its screen and its waveforms.
+Source: programming manuals of the makers: sequences that transfer the screen and waveforms.
 """
 
 from __future__ import annotations
@@ -24,32 +23,39 @@ from .machine import Machine
 __all__ = ["FAMILIES", "Family", "Oscilloscope"]
 
 _LONGEST = 4096
-"""Bytes of the longest program message."""
+"""Largest size of a program message (bytes)."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """How one maker's instruments differ from others.
+    """Commands of the instruments of one maker.
 
     Parameters
     ----------
     idn : str
         Answer to ``*IDN?``.
     screen : str
-        Header of the question for the screen, or of the command after which it comes.
+        Header of the query for the screen, or of the command that returns it.
     screen_arguments : str
-        Upper case; what it has to be asked with.
+        Required arguments, in upper case.
     picture : str
         ``.png`` or ``.bmp``.
     as_block : bool
-        Whether it comes as a block.
+        Whether the picture is sent as a block.
+    newline : bool
+        Whether a newline follows the picture.
     prepared_by : tuple of str
-        Headers that have to be sent before, in any order.
+        Headers that must be sent before, in any order.
     accepts : tuple of str
-        Other headers that are taken.
+        Other accepted headers.
     waveform : str
-        Way of waveforms: ``keysight``, ``rigol``, ``siglent``, ``siglent-block`` (and ``-wide``, of 16 bits),
-        ``tektronix``, ``rohde``.
+        Transfer of waveforms: ``keysight``, ``rigol``, ``siglent``, ``siglent-block`` (and ``-wide``, with 16
+        bits), ``tektronix``, ``rohde``.
+
+    Examples
+    --------
+    >>> FAMILIES["rigol-1000z"].screen
+    ':DISPlay:DATA?'
     """
 
     idn: str
@@ -137,11 +143,11 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 )
 
 _PREAMBLE = (1e-6, -5e-4, 0.04, 0.12)
-"""Seconds of a step, of the first sample; volts of a step, of the middle."""
+"""Time step and time of the first sample (s); voltage step and voltage of the middle (V)."""
 
 
 def _grey() -> NDArray[np.uint8]:
-    """A picture, for want of a world."""
+    """Test image."""
     return np.add.outer(np.arange(120), np.arange(200)).astype(np.uint8)
 
 
@@ -151,16 +157,21 @@ def _ramp() -> NDArray[np.uint8]:
 
 @dataclass(eq=False)
 class Oscilloscope(Machine):
-    """The instrument.
+    r"""Simulated oscilloscope.
 
     Parameters
     ----------
     family : str
         One of :data:`FAMILIES`.
     screen : callable
-        The grey picture on its screen.
+        Returns the grey image on the screen.
     samples : callable
-        The samples of channel 1, 0 to 255.
+        Returns the samples of channel 1, 0 to 255.
+
+    Examples
+    --------
+    >>> Oscilloscope("rohde").receive(b"*IDN?\n")
+    [b'Rohde&Schwarz,RTB2004,1333.1005k04/000001,02.400\n']
     """
 
     family: str = "keysight"
@@ -179,7 +190,7 @@ class Oscilloscope(Machine):
         self._piece, self._wide = 0, False
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Answers to program messages that end with a newline, as on a raw socket."""
+        """Return the answers to program messages that end with a newline, as on a raw socket."""
         *messages, self._begun = (self._begun + data).split(b"\n")
         if len(self._begun) > _LONGEST:
             self.violations.append("a program message without end")
@@ -187,11 +198,11 @@ class Oscilloscope(Machine):
         return [answer for message in messages if (answer := self.execute(message)) is not None]
 
     def disconnected(self) -> None:
-        """A message that was begun is forgotten."""
+        """Discard an incomplete message."""
         self._begun = b""
 
     def inject_fault(self, kind: Kind) -> None:
-        """Stuck: two answers stay out; wrong state: an error; out of range: cut off; power: defaults."""
+        """Stuck: two answers are missing; wrong state: an error; out of range: truncated; power: defaults."""
         if kind == "stuck":
             self._silent = 2
         elif kind == "wrong state":
@@ -205,7 +216,7 @@ class Oscilloscope(Machine):
             self.running = True
 
     def execute(self, message: bytes) -> bytes | None:
-        """The answer to a program message, if it asks for one; several are joined by semicolons."""
+        """Return the answer to a program message, if any; several answers are joined by semicolons."""
         text = message.strip(b"\r\n").decode("latin-1")
         answers = []
         for header, arguments in split_message(text):
@@ -268,7 +279,7 @@ class Oscilloscope(Machine):
     def _screenshot(self, arguments: str) -> bytes | None:
         like = self._like
         wanted, asked = like.screen_arguments.replace(" ", ""), arguments.upper().replace(" ", "")
-        # Keysight's can do both.
+        # Keysight supports both.
         as_bmp = wanted == "PNG,COLOR" and asked == "BMP,COLOR"
         if asked != wanted and not as_bmp:
             self._error(f'-108,"Parameter not allowed"; {like.screen} {arguments}')
@@ -283,7 +294,7 @@ class Oscilloscope(Machine):
         return block(data) if like.as_block else data
 
     def _waveform(self) -> dict[str, Callable[[str, str], bytes | None]]:
-        """Headers of the maker's way to hand over waveforms."""
+        """Return the headers with which this maker transfers waveforms."""
         dx, x0, dy, y0 = _PREAMBLE
 
         def say(text: str) -> Callable[[str, str], bytes]:
@@ -342,15 +353,15 @@ class Oscilloscope(Machine):
         return {}
 
     def _descriptor(self, code: NDArray[np.int16]) -> dict[str, Callable[[str, str], bytes | None]]:
-        """Siglent's newer way: a wave descriptor, and samples in pieces."""
+        """Newer Siglent instruments: a wave descriptor, and samples in pieces."""
         dx, x0, dy, y0 = _PREAMBLE
         wide = self._like.waveform == "siglent-wide"
         samples = (16 * code).astype("<i2") if wide else code.astype(np.int8)
         head = bytearray(346)
-        # A probe of ten: volts at its tip are ten times those of the descriptor.
-        told = (116, "<i", len(code)), (156, "<f", 2.5 * dy), (160, "<f", -y0 / 10), (328, "<f", 10.0)
+        # A 10:1 probe: the voltage at its tip is ten times that of the descriptor.
+        values = (116, "<i", len(code)), (156, "<f", 2.5 * dy), (160, "<f", -y0 / 10), (328, "<f", 10.0)
         scale = (164, "<f", 25.0 * (16 if wide else 1)), (172, "<H", 12 if wide else 8)
-        for at, how, value in (*told, *scale, (176, "<f", dx), (180, "<d", 0.0)):
+        for at, how, value in (*values, *scale, (176, "<f", dx), (180, "<d", 0.0)):
             struct.pack_into(how, head, at, value)
 
         def start(arguments: str, _header: str) -> None:

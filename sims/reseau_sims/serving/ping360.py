@@ -1,4 +1,4 @@
-"""A Ping360: a head that turns, sends pulses, and reports their echoes.
+"""Simulated Ping360: a rotating head that sends pulses and reports their echoes.
 
 Source: *Ping Protocol*, "Common Messages" and "Ping360 Messages", with the ranges of their fields.
 """
@@ -24,17 +24,24 @@ _GAINS = (0.5, 1.0, 2.0)
 
 
 def _silence(angle: int, samples: int, period_s: float, gain: float) -> NDArray[np.uint8]:
-    """Echoes that tell the angle, for want of a world."""
+    """Test echoes that encode the angle."""
     return np.full(samples, angle % 256, np.uint8)
 
 
 class Ping360(Machine):
-    """The sonar.
+    """Simulated sonar.
 
     Parameters
     ----------
     echo : callable
-        Echoes of a pulse: angle (gradians), number of samples, their period (s), and the factor of the gain.
+        Echoes of a pulse, given angle (gradians), number of samples, sample period (s), and gain factor.
+
+    Examples
+    --------
+    >>> answers = Ping360().receive(ping.encode(ping.Transducer(1, 7, 32, 80, 740, 200).frame()))
+    >>> frame = ping.FrameDecoder().feed(answers[0])[0]
+    >>> set(ping.DeviceData.parse(frame.payload).samples)
+    {7}
     """
 
     def __init__(self, echo: Echo = _silence) -> None:
@@ -44,11 +51,11 @@ class Ping360(Machine):
         self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
 
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Messages in answer."""
+        """Return the messages in answer."""
         answers: list[bytes] = []
         for frame in self._frames.feed(data):
             if isinstance(frame, Damaged):
-                # By a lone U, behind a break, the instrument finds the speed of the line.
+                # A single U after a break is used by the instrument to detect the baud rate.
                 if frame.data == b"U":
                     continue
                 self.violations.append(str(frame))
@@ -57,11 +64,11 @@ class Ping360(Machine):
         return answers
 
     def disconnected(self) -> None:
-        """A message that was begun is forgotten."""
+        """Discard an incomplete message."""
         self._frames.reset()
 
     def inject_fault(self, kind: Kind) -> None:
-        """Stuck: the head does not turn; wrong state: it refuses; out of range: too many samples."""
+        """Stuck: the head does not rotate; wrong state: it refuses; out of range: too many samples."""
         self._stuck = self._stuck or kind == "stuck"
         self._refuse = self._refuse or kind == "wrong state"
         self._wrong_size = self._wrong_size or kind == "out of range"

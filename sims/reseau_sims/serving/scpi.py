@@ -1,8 +1,7 @@
-"""VXI-11 and HiSLIP in front of an instrument that takes program messages.
+"""VXI-11 and HiSLIP servers for an instrument that executes program messages.
 
-Source: VXI-11 revision 1.0, section B.6; RFC 1833; IVI-6.1 HiSLIP, section 3. In both, an answer waits in an
-output queue until it is read; one that is read while there is none is waited for as long as the client
-allows.
+Source: VXI-11 revision 1.0, section B.6; RFC 1833; IVI-6.1 HiSLIP, section 3. In both protocols an answer
+waits in an output queue until it is read; a read from an empty queue waits as long as the client allows.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ Execute = Callable[[bytes], bytes | None]
 """Executes a program message; returns the answer, or None if there is none."""
 
 _LARGEST = 1 << 20
-"""Bytes of the largest message that is taken."""
+"""Largest size of a message (bytes)."""
 
 
 class AnswerQueue:
-    """Answers that wait to be read, each from its time on; None hangs up."""
+    """Queue of answers with their times; None closes the connection."""
 
     def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self._machine, self._execute, self._script = machine, execute, script
@@ -37,11 +36,11 @@ class AnswerQueue:
         self._surplus = False
 
     def write(self, message: bytes) -> None:
-        """Take a program message."""
+        """Execute a program message."""
         with self._machine.lock:
             if self._waiting and self._waiting[0][0] <= time.monotonic():
-                # IEEE 488.2, 6.3.2.3: what was not read before the next message is gone, and an error.
-                # One that was given twice is not the client's fault.
+                # IEEE 488.2, 6.3.2.3: an answer not read before the next message is lost, and an error.
+                # A repeated answer is not the client's fault.
                 if not self._surplus:
                     self._machine.violations.append(f"{message!r} interrupted an answer")
                 self._waiting.clear()
@@ -59,33 +58,46 @@ class AnswerQueue:
             self._waiting += [(time.monotonic() + delay, data) for delay, data in sent]
 
     def available(self) -> bool:
-        """Whether something can be read."""
+        """Whether an answer can be read."""
         return bool(self._waiting) and self._waiting[0][0] <= time.monotonic()
 
     def clear(self) -> None:
-        """Throw away what waits."""
+        """Discard all answers."""
         self._waiting.clear()
 
     def take(self, patience: float) -> tuple[float, bytes | None, bool]:
-        """Wait so long, then hand over this; the last tells whether there is anything at all."""
+        """Return delay, answer, and whether there is an answer, waiting at most `patience` (s)."""
         if not self._waiting or self._waiting[0][0] - time.monotonic() > patience:
             return patience, b"", False
         due, data = self._waiting.pop(0)
         return max(0.0, due - time.monotonic()), data, True
 
     def put_back(self, rest: bytes) -> None:
-        """What did not fit into one read."""
+        """Return the rest of an answer that did not fit into one read."""
         self._waiting.insert(0, (0.0, rest))
 
 
 class PortmapperSession:
-    """Tells on which port the core channel is."""
+    """Reports the port of the VXI-11 core channel.
+
+    Parameters
+    ----------
+    port : int
+        Port of the core channel.
+
+    Examples
+    --------
+    >>> query = rpc.Call(1, rpc.PORTMAPPER, 2, rpc.GETPORT, rpc.pack(vxi11.CORE, 1, 6, 0))
+    >>> [(_, reply)] = PortmapperSession(4321).receive(rpc.record(rpc.encode_call(query)))
+    >>> rpc.Unpacker(rpc.decode_reply(reply[4:])[2]).number()
+    4321
+    """
 
     def __init__(self, port: int) -> None:
         self._port, self._records = port, rpc.RecordDecoder(1024)
 
     def receive(self, data: bytes) -> list[Output]:
-        """Replies to GETPORT."""
+        """Return the replies to GETPORT."""
         sent: list[Output] = []
         for record in self._records.feed(data):
             if isinstance(record, Damaged):
@@ -107,11 +119,32 @@ class PortmapperSession:
         return sent
 
     def disconnected(self) -> None:
-        """Nothing is kept."""
+        """Do nothing."""
 
 
 class Vxi11Session:
-    """One connection to the core channel, with its links."""
+    """One connection to the core channel, with its links.
+
+    Parameters
+    ----------
+    machine : Machine
+        Simulated instrument.
+    execute : callable
+        Executes a program message.
+    script : FaultScript
+        Faults of the answers.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import Oscilloscope
+    >>> scope = Oscilloscope()
+    >>> session = Vxi11Session(scope, scope.execute, FaultScript())
+    >>> create = rpc.Call(1, vxi11.CORE, 1, vxi11.Procedure.CREATE_LINK)
+    >>> [(_, reply)] = session.receive(rpc.record(rpc.encode_call(create)))
+    >>> results = rpc.Unpacker(rpc.decode_reply(reply[4:])[2])
+    >>> results.number(), results.number()
+    (0, 1)
+    """
 
     def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self._machine = machine
@@ -122,11 +155,11 @@ class Vxi11Session:
         self._records = rpc.RecordDecoder(_LARGEST + 1024)
 
     def disconnected(self) -> None:
-        """Links end with their connection."""
+        """Close the links of the connection."""
         self._links.clear()
 
     def receive(self, data: bytes) -> list[Output]:
-        """Replies to calls."""
+        """Return the replies to calls."""
         sent: list[Output] = []
         for record in self._records.feed(data):
             try:
@@ -215,7 +248,26 @@ class Vxi11Session:
 
 
 class HislipInstrument:
-    """Sessions of HiSLIP: each a synchronous and an asynchronous channel."""
+    """HiSLIP sessions, each with a synchronous and an asynchronous channel.
+
+    Parameters
+    ----------
+    machine : Machine
+        Simulated instrument.
+    execute : callable
+        Executes a program message.
+    script : FaultScript
+        Faults of the answers.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import Oscilloscope
+    >>> scope = Oscilloscope()
+    >>> channel = HislipInstrument(scope, scope.execute, FaultScript()).channel()
+    >>> [(_, reply)] = channel.receive(hislip.encode(hislip.Message(hislip.Type.INITIALIZE)))
+    >>> hislip.MessageDecoder().feed(reply)[0].type == hislip.Type.INITIALIZE_RESPONSE
+    True
+    """
 
     def __init__(self, machine: Machine, execute: Execute, script: FaultScript) -> None:
         self.machine = machine
@@ -224,11 +276,11 @@ class HislipInstrument:
         self._numbers = itertools.count(1)
 
     def channel(self) -> _Channel:
-        """A new connection; its first message tells which channel it is."""
+        """Open a connection; its first message determines which channel it is."""
         return _Channel(self)
 
     def begin(self) -> int:
-        """A new session."""
+        """Start a session."""
         number = next(self._numbers) & 0xFFFF
         self.queues[number] = self.open_queue()
         return number
@@ -245,12 +297,12 @@ class _Channel:
         self._begun = b""
 
     def disconnected(self) -> None:
-        """A session ends with its synchronous channel."""
+        """End the session if this is its synchronous channel."""
         if self._synchronous and self._session is not None:
             self._instrument.queues.pop(self._session, None)
 
     def receive(self, data: bytes) -> list[Output]:
-        """Messages in answer."""
+        """Return the messages in answer."""
         sent: list[Output] = []
         for message in self._decoder.feed(data):
             if isinstance(message, Damaged):
@@ -272,7 +324,7 @@ class _Channel:
         if kind == hislip.Type.ASYNC_INITIALIZE:
             self._session = message.parameter & 0xFFFF
             if self._session not in self._instrument.queues:
-                return self._fatal(3, f"session {self._session} was not begun")
+                return self._fatal(3, f"session {self._session} does not exist")
             return [(0.0, _coded(hislip.Type.ASYNC_INITIALIZE_RESPONSE, 0, 0))]
         queue = self._instrument.queues.get(self._session) if self._session is not None else None
         if queue is None:
@@ -286,7 +338,7 @@ class _Channel:
                 if message.type == hislip.Type.DATA:
                     return [] if len(self._begun) <= _LARGEST else self._fatal(0, "a message without end")
                 program, self._begun = self._begun, b""
-                # An answer goes out by itself; none is left to be interrupted.
+                # An answer is sent at once; none is left to be interrupted.
                 queue.write(program)
                 return self._sent(queue, message.parameter)
             case hislip.Type.TRIGGER:
@@ -306,7 +358,7 @@ class _Channel:
             if data is None:
                 sent.append((wait, None))
                 return sent
-            # In two messages, as instruments send what is long.
+            # In two messages, as instruments send long answers.
             half = len(data) // 2
             if half > 100:
                 sent.append((wait, _coded(hislip.Type.DATA, 0, number, data[:half])))

@@ -1,7 +1,7 @@
-"""Doors to simulated instruments: TCP on loopback, pseudo-terminals, and none at all within one process.
+"""Servers of simulated instruments: TCP and UDP on loopback, pseudo-terminals, and links within one process.
 
-A server is one thread that waits on all its connections. It never trusts its client either: what a connection
-has to send is bounded, and a client that does not read is hung up on.
+A server is one thread that waits for all its connections. It does not trust its client: the output of a
+connection is limited, and a client that does not read is disconnected.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LARGEST_SENT, _LARGEST_RECEIVED = 4096, 65536
 
 
 class _Connection:
-    """A file descriptor, its session, and what is still to be sent."""
+    """File descriptor, session, and pending output."""
 
     def __init__(self, fd: int, session: Session, close: Callable[[], None]) -> None:
         self.fd, self.session, self.close = fd, session, close
@@ -45,14 +45,14 @@ class _Connection:
         self._last = 0.0
 
     def put(self, outputs: list[Output]) -> None:
-        """Add what a session wants to send; what comes later is sent later, as on any wire."""
+        """Queue the outputs of a session; later outputs are never sent before earlier ones."""
         for delay, data in outputs:
             self._last = max(self._last, time.monotonic() + delay)
             heapq.heappush(self._due, (self._last, self._send_order, data))
             self._send_order += 1
 
     def mature(self) -> bool:
-        """Make what is due ready to be sent; False when the session wants to hang up then."""
+        """Move due outputs to the send buffer; False if the session closes the connection."""
         while self._due and self._due[0][0] <= time.monotonic():
             data = heapq.heappop(self._due)[2]
             if data is None:
@@ -62,7 +62,7 @@ class _Connection:
 
     @property
     def next_due(self) -> float | None:
-        """When something is due next."""
+        """Time of the next output."""
         return self._due[0][0] if self._due else None
 
 
@@ -72,7 +72,15 @@ class Server(ABC):
     Parameters
     ----------
     open_session : callable
-        Makes the session of a new connection.
+        Creates the session of a new connection.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import FaultyConnection, ZaberChain
+    >>> chain = ZaberChain([1])
+    >>> with TcpServer(lambda: FaultyConnection(chain)) as server:
+    ...     isinstance(server, Server)
+    True
     """
 
     def __init__(self, open_session: Callable[[], Session]) -> None:
@@ -87,27 +95,27 @@ class Server(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """As a driver takes it."""
+        """Address for a driver."""
 
     @abstractmethod
     def _accept(self, fd: int) -> bool:
-        """Whether the descriptor is one that brings new connections; if so, one is taken."""
+        """Accept a connection if the descriptor is a listener; return whether it is."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Close what is not a connection."""
+        """Close everything except connections."""
 
     @abstractmethod
     def _after_loss(self) -> None:
-        """A connection is over."""
+        """Handle the end of a connection."""
 
     def start(self) -> Self:
-        """Begin to serve."""
+        """Start the thread."""
         self._thread.start()
         return self
 
     def close(self) -> None:
-        """Hang up on all and end the thread."""
+        """Close all connections and end the thread."""
         if self._closing:
             return
         self._closing = True
@@ -121,7 +129,7 @@ class Server(ABC):
         self._wake()
 
     def _wake(self) -> None:
-        # The thread may have seen the flag by itself, and be gone.
+        # The thread may have seen the flag already and ended.
         with suppress(BrokenPipeError):
             os.write(self._wake_in, b"x")
 
@@ -189,11 +197,11 @@ class Server(ABC):
         connection.put(connection.session.receive(data))
 
     def _read(self, fd: int) -> bytes:
-        """What a client has sent; nothing when it went away."""
+        """Return the bytes from a client; none if it disconnected."""
         return os.read(fd, _CHUNK)
 
     def _write(self, fd: int, data: bytes) -> int:
-        """Send as much as is taken; how much that is."""
+        """Send as many bytes as possible; return their number."""
         return os.write(fd, data)
 
     def _flush(self, connection: _Connection) -> None:
@@ -219,9 +227,17 @@ class TcpServer(Server):
     Parameters
     ----------
     open_session : callable
-        Makes the session of a new connection.
+        Creates the session of a new connection.
     port : int
-        0 takes a free one.
+        Port; 0 selects a free one.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import FaultyConnection, ZaberChain
+    >>> chain = ZaberChain([1])
+    >>> with TcpServer(lambda: FaultyConnection(chain)) as server:
+    ...     server.address.startswith("tcp://127.0.0.1:")
+    True
     """
 
     HOST = "127.0.0.1"
@@ -258,21 +274,29 @@ class TcpServer(Server):
         return True
 
     def _after_loss(self) -> None:
-        """Others may connect as before."""
+        """Do nothing: other clients can connect."""
 
     def _release(self) -> None:
         self._listener.close()
 
 
 class UdpServer(Server):
-    """Serves datagrams on a port of the loopback interface; whoever spoke last is answered.
+    """Serves datagrams on a port of the loopback interface; answers go to the last sender.
 
     Parameters
     ----------
     open_session : callable
-        Makes the session of a client that was not heard before.
+        Creates the session of a new client.
     port : int
-        0 takes a free one.
+        Port; 0 selects a free one.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import FaultyConnection, Ping360
+    >>> sonar = Ping360()
+    >>> with UdpServer(lambda: FaultyConnection(sonar)) as server:
+    ...     server.address.startswith("udp://127.0.0.1:")
+    True
     """
 
     HOST = "127.0.0.1"
@@ -303,7 +327,7 @@ class UdpServer(Server):
         if not data:
             raise BlockingIOError
         if peer != self._peer:
-            # What another had begun is not continued.
+            # Discard an incomplete message of another client.
             self._peer = peer
             self._connections[fd].session.disconnected()
         return data
@@ -317,11 +341,25 @@ class UdpServer(Server):
         self._bind()
 
     def _release(self) -> None:
-        """Its socket was its connection."""
+        """Do nothing: the socket is the connection."""
 
 
 class PtyServer(Server):
-    """Serves on a pseudo-terminal, under a name that stays when it is unplugged and plugged in again."""
+    """Serves on a pseudo-terminal with a name that persists when it is unplugged and plugged in again.
+
+    Parameters
+    ----------
+    open_session : callable
+        Creates the session of a new connection.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import FaultyConnection, ZaberChain
+    >>> chain = ZaberChain([1])
+    >>> with PtyServer(lambda: FaultyConnection(chain)) as server:
+    ...     os.path.basename(server.address)
+    'tty'
+    """
 
     def __init__(self, open_session: Callable[[], Session]) -> None:
         super().__init__(open_session)
@@ -331,13 +369,13 @@ class PtyServer(Server):
 
     @property
     def address(self) -> str:
-        """The terminal's name."""
+        """Path of the terminal."""
         return os.path.join(self._folder, "tty")
 
     def _plug_in(self) -> None:
         master, slave = os.openpty()
         tty.setraw(slave)
-        # One end is kept open here: otherwise the master hangs up whenever the client closes.
+        # Keep one end open: otherwise the master is disconnected whenever the client closes.
         old, self._slave = self._slave, slave
         if old >= 0:
             os.close(old)
@@ -358,12 +396,22 @@ class PtyServer(Server):
 
 
 class InProcess:
-    """A link that leads straight into a simulator: no sockets, no threads.
+    r"""Link to a simulator in the same process, without sockets or threads.
 
     Parameters
     ----------
     open_session : callable
-        Makes the session of a new connection.
+        Creates the session of a new connection.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import FaultyConnection, ZaberChain
+    >>> chain = ZaberChain([1])
+    >>> link = InProcess(lambda: FaultyConnection(chain))
+    >>> link.open(Deadline(1.0))
+    >>> link.write(b"/01 0 00 tools echo:BF\n", Deadline(1.0))
+    >>> link.read(Deadline(1.0))
+    b'@01 0 00 OK IDLE WR 0:BE\r\n'
     """
 
     def __init__(self, open_session: Callable[[], Session]) -> None:
@@ -371,7 +419,7 @@ class InProcess:
         self._connection: _Connection | None = None
 
     def open(self, deadline: Deadline) -> None:
-        """Open a new session."""
+        """Open a session; an open one is ended before."""
         self.close()
         self._connection = _Connection(-1, self._open_session(), lambda: None)
 
@@ -382,7 +430,7 @@ class InProcess:
             connection.session.disconnected()
 
     def write(self, data: bytes, deadline: Deadline) -> None:
-        """Hand it over."""
+        """Pass the bytes to the simulator."""
         connection = self._opened()
         connection.put(connection.session.receive(data))
 
@@ -391,11 +439,11 @@ class InProcess:
         connection = self._opened()
         if not connection.mature():
             self.close()
-            raise ConnectionLost("the simulator hung up")
+            raise ConnectionLost("the simulator closed the connection")
         return bool(connection.ready)
 
     def read(self, deadline: Deadline) -> bytes:
-        """What is due, or comes due before the deadline."""
+        """Return the bytes that are due before the deadline."""
         while not self.pending():
             due = self._opened().next_due
             if due is None or due - time.monotonic() > deadline.left:

@@ -1,7 +1,7 @@
-"""Newport SMC100 controllers on one line.
+"""Simulated Newport SMC100 controllers on one line.
 
-Source: see :mod:`reseau_drivers.codecs.smc100`. Where the manual leaves doubt it is strict: a velocity is not
-taken without a reference.
+Source: see :mod:`reseau_drivers.codecs.smc100`. Where the manual is ambiguous the simulator is strict: a
+velocity is not accepted without a reference.
 """
 
 from __future__ import annotations
@@ -21,18 +21,23 @@ __all__ = ["Smc100Line"]
 
 
 class Smc100Line(Machine):
-    """Controllers on one line, addressed from 1.
+    r"""Simulated controllers on one line, addressed from 1.
 
     Parameters
     ----------
     count : int
-        How many.
+        Number of controllers.
     low, high : float
-        Their software limits (units).
+        Software limits (units).
     speed : float
         Units per second.
     clock : callable
-        Seconds.
+        Returns the time in seconds.
+
+    Examples
+    --------
+    >>> Smc100Line(1).receive(b"1TS\r\n")
+    [b'1TS00000A\r\n']
     """
 
     def __init__(
@@ -53,12 +58,12 @@ class Smc100Line(Machine):
         self._errors = dict.fromkeys(self.motors, "@")
 
     def position(self, address: int) -> float:
-        """Where an axis stands at this moment (units), whether anybody asks it or not."""
+        """Return the current position of an axis (units), independent of queries."""
         with self.lock:
             return self.motors[address].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Answers to these bytes; most commands have none."""
+        """Return the answers to these bytes; most commands have none."""
         answers: list[bytes] = []
         for line in self._lines.feed(data):
             if isinstance(line, Damaged):
@@ -71,7 +76,7 @@ class Smc100Line(Machine):
                 continue
             motor = self.motors.get(command.address)
             if motor is None:
-                self.violations.append(f"nobody at address {command.address}")
+                self.violations.append(f"no controller at address {command.address}")
                 continue
             said = self._obey(command, motor)
             if said is not None:
@@ -79,7 +84,7 @@ class Smc100Line(Machine):
         return answers
 
     def disconnected(self) -> None:
-        """A command that was begun is forgotten."""
+        """Discard an incomplete command."""
         self._lines.reset()
 
     def inject_fault(self, kind: Kind) -> None:
@@ -97,7 +102,7 @@ class Smc100Line(Machine):
                 motor.cut_power()
 
     def _state(self, motor: Motor) -> tuple[int, int]:
-        """Error bits and state."""
+        """Return error bits and state."""
         moving = motor.moving
         errors = (
             (0x01 if motor.limit < 0 else 0)
@@ -118,7 +123,7 @@ class Smc100Line(Machine):
             case "TP", "" | "?":
                 return f"{motor.position:.6f}"
             case "TS", "" | "?":
-                # What went wrong is told once.
+                # Errors are reported once.
                 motor.stalled, motor.limit = False, 0
                 return f"{errors:04X}{state:02X}"
             case "TE", "" | "?":
@@ -139,7 +144,7 @@ class Smc100Line(Machine):
         return None
 
     def _command(self, command: Line, motor: Motor, state: int) -> str:
-        """Obey a command that has no answer; the error that TE will tell."""
+        """Execute a command without answer; return the error code for TE."""
         forbidden = {0x0A: "H", 0x1E: "L", 0x28: "M", 0x3C: "J"}
         try:
             value = float(command.value) if command.value else None

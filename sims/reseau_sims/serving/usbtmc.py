@@ -1,7 +1,7 @@
-"""A USBTMC instrument without hardware: a back end of pyusb on which it is plugged in.
+"""Simulated USBTMC instrument: a PyUSB backend on which it is plugged in.
 
-Source: *USBTMC* 1.0, sections 3 and 4.2; *USBTMC-USB488* 1.0, section 4.2. Any program that uses pyusb's
-libusb-1.0 back end lists it, opens it, and speaks to it, unmodified.
+Source: *USBTMC* 1.0, sections 3 and 4.2; *USBTMC-USB488* 1.0, section 4.2. Every program that uses PyUSB's
+libusb-1.0 backend can list, open and use it without modification.
 """
 
 from __future__ import annotations
@@ -38,18 +38,25 @@ Fields = SimpleNamespace
 
 
 class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
-    """The bus with this one instrument on it.
+    """USB bus with this instrument.
 
     Parameters
     ----------
     machine : Machine
-        Answers.
+        Simulated instrument.
     execute : callable
-        Takes program messages.
+        Executes program messages.
     script : FaultScript
-        What goes wrong.
+        Faults.
     serial : str
-        Number of the instrument.
+        Serial number of the instrument.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import Oscilloscope
+    >>> scope = Oscilloscope()
+    >>> UsbInstrument(scope, scope.execute, FaultScript()).resource
+    'USB0::4617::1::SIM1::0::INSTR'
     """
 
     def __init__(
@@ -70,15 +77,15 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
 
     @property
     def resource(self) -> str:
-        """As VISA writes it."""
+        """VISA resource string."""
         return f"USB0::{_VENDOR}::{_PRODUCT}::{self._strings[3]}::0::INSTR"
 
     def enumerate_devices(self) -> Iterator[object]:
-        """The instrument, when it is plugged in."""
+        """Yield the instrument if it is plugged in."""
         return iter([self] if self.present else [])
 
     def get_device_descriptor(self, dev: object) -> Fields:
-        """Its device descriptor (USB 2.0, table 9-8)."""
+        """Return the device descriptor (USB 2.0, table 9-8)."""
         return Fields(
             bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
             bMaxPacketSize0=64, idVendor=_VENDOR, idProduct=_PRODUCT, bcdDevice=0x100, iManufacturer=1,
@@ -87,7 +94,7 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: object, config: int) -> Fields:
-        """Its one configuration."""
+        """Return the only configuration."""
         if config:
             raise IndexError(config)
         return Fields(
@@ -96,7 +103,7 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: object, intf: int, alt: int, config: int) -> Fields:
-        """Its one interface: application specific, USBTMC, USB488."""
+        """Return the only interface: application specific, USBTMC, USB488."""
         if intf or alt or config:
             raise IndexError(intf)
         return Fields(
@@ -106,56 +113,56 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: object, ep: int, intf: int, alt: int, config: int) -> Fields:
-        """Bulk-out and bulk-in."""
+        """Return the bulk-out or bulk-in endpoint."""
         return Fields(
             bLength=7, bDescriptorType=5, bEndpointAddress=(_OUT, _IN)[ep], bmAttributes=2,
             wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: object) -> object:
-        """A handle to it."""
+        """Open a handle."""
         self._attached()
         self.open_handles += 1
         return self
 
     def close_device(self, dev_handle: object) -> None:
-        """The handle is given back."""
+        """Close a handle."""
         self.open_handles -= 1
 
     def set_configuration(self, dev_handle: object, config_value: int) -> None:
-        """There is only one."""
+        """Do nothing: there is only one configuration."""
 
     def get_configuration(self, dev_handle: object) -> int:
-        """The only one."""
+        """Return the only configuration."""
         return 1
 
     def set_interface_altsetting(self, dev_handle: object, intf: int, altsetting: int) -> None:
-        """There is only one."""
+        """Do nothing: there is only one setting."""
 
     def claim_interface(self, dev_handle: object, intf: int) -> None:
-        """Taken."""
+        """Claim the interface."""
         self._attached()
 
     def release_interface(self, dev_handle: object, intf: int) -> None:
-        """Given back."""
+        """Release the interface."""
 
     def reset_device(self, dev_handle: object) -> None:
-        """What was begun is forgotten."""
+        """Discard incomplete transfers."""
         with self._lock:
             self._begun, self._asked, self._sending, self._short = b"", None, b"", False
             self._queue.clear()
 
     def clear_halt(self, dev_handle: object, ep: int) -> None:
-        """It never halts."""
+        """Do nothing: endpoints never halt."""
 
     def is_kernel_driver_active(self, dev_handle: object, intf: int) -> bool:
-        """No kernel is involved."""
+        """Return False: there is no kernel driver."""
         return False
 
     def ctrl_transfer(
         self, dev_handle: object, kind: int, request: int, value: int, index: int, data: Any, timeout: int
     ) -> int:
-        """Strings, capabilities, and the requests of USB488."""
+        """Answer requests for strings, capabilities, and those of USB488."""
         self._attached()
         answer = bytes([_NOT_IN_PROGRESS, 0])
         if request == _GET_DESCRIPTOR and kind == 0x80:
@@ -172,7 +179,7 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         return taken
 
     def bulk_write(self, dev_handle: object, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """A transfer from the host."""
+        """Receive a transfer from the host."""
         self._attached()
         packet = bytes(data)
         with self._lock:
@@ -189,20 +196,20 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
                 self._machine.violations.append("a message without end")
                 self._begun = b""
             if transfer.end:
-                # An answer that nobody reads is given up when the next message comes.
+                # The next message discards an answer that was not read.
                 self._asked, self._sending, self._short = None, b"", False
                 message, self._begun = self._begun, b""
                 self._queue.write(message)
             return len(packet)
 
     def bulk_read(self, dev_handle: object, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """A transfer to the host, or its next packets."""
+        """Send a transfer to the host, or its next packets."""
         self._attached()
         with self._lock:
             if not self._sending and not self._short:
                 self._begin_answer(timeout)
             given, self._sending = self._sending[: len(buff)], self._sending[len(buff) :]
-            # A transfer ends with a short packet, if need be an empty one.
+            # A transfer ends with a short packet, which may be empty.
             self._short = not self._sending and len(given) > 0 and len(given) % _PACKET == 0
             buff[: len(given)] = type(buff)(buff.typecode, given)
             return len(given)
@@ -223,7 +230,7 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
         self._sending = usbtmc.encode_in(asked.tag, part, not rest)
 
     def unplug(self) -> None:
-        """The cable is pulled and plugged in again: handles of before are dead."""
+        """Pull the cable and plug it in again: existing handles become invalid."""
         self.reset_device(self)
         raise usb.core.USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
 
@@ -234,7 +241,16 @@ class UsbInstrument(usb.backend.IBackend):  # type: ignore[misc]
 
 @contextmanager
 def plugged_in(instrument: UsbInstrument) -> Iterator[UsbInstrument]:
-    """Have pyusb find this instrument, and no other, as long as the context lasts."""
+    """Make PyUSB find this instrument, and no other, within the context.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import Oscilloscope
+    >>> scope = Oscilloscope()
+    >>> with plugged_in(UsbInstrument(scope, scope.execute, FaultScript())) as instrument:
+    ...     instrument.present
+    True
+    """
     original = usb.backend.libusb1.get_backend
     usb.backend.libusb1.get_backend = lambda *_, **__: instrument
     try:

@@ -1,7 +1,7 @@
-"""The kernel's interface in front of a simulated camera, all within one process.
+"""Kernel interface of a simulated Video4Linux camera, within one process.
 
-It keeps to *Linux Media Infrastructure userspace API*, part I: who has buffers owns the camera, formats do
-not change while they are there, frames without a buffer are counted and lost.
+It follows *Linux Media Infrastructure userspace API*, part I: the client with buffers owns the camera,
+formats do not change while there are buffers, and frames without a buffer are counted and lost.
 """
 
 from __future__ import annotations
@@ -24,7 +24,24 @@ def _fail(number: int) -> OSError:
 
 
 class VideoCamera(Video):
-    """A camera with nodes; parameters as of :class:`Video`."""
+    """Camera with device nodes.
+
+    Parameters
+    ----------
+    body : SimulatedCamera
+        Forms the images.
+    first, start_of_exposure, webcam
+        As for :class:`Video`.
+
+    Examples
+    --------
+    >>> from reseau_sims.serving import SimulatedCamera
+    >>> camera = VideoCamera(SimulatedCamera())
+    >>> node = camera.open()
+    >>> camera.nodes
+    1
+    >>> node.close()
+    """
 
     def __init__(
         self, body: SimulatedCamera, *, first: int = 0, start_of_exposure: bool = False, webcam: bool = False
@@ -34,7 +51,7 @@ class VideoCamera(Video):
         self._nodes: list[VideoNode] = []
 
     def open(self) -> VideoNode:
-        """A node of it, as the kernel opens one; any number may be open."""
+        """Open a node, as the kernel does; several may be open."""
         with self.body.lock:
             if not self.plugged_in:
                 raise _fail(errno.ENODEV)
@@ -44,11 +61,11 @@ class VideoCamera(Video):
 
     @property
     def nodes(self) -> int:
-        """How many are open."""
+        """Number of open nodes."""
         return len(self._nodes)
 
     def unplug(self, *, power: bool = False) -> None:
-        """Pull its cable: all nodes are dead from now on; new ones can be opened while it is plugged in."""
+        """Pull the cable: all nodes become invalid; new ones can be opened."""
         with self.body.lock:
             super().unplug(power=power)
             for node in self._nodes:
@@ -56,7 +73,7 @@ class VideoCamera(Video):
             self._nodes = []
 
     def left(self, node: VideoNode) -> None:
-        """A node was closed; what it owned is free."""
+        """Release what a closed node owned."""
         if self.stream is not None and self.stream.owner is node:
             self.stream = None
         if node in self._nodes:
@@ -64,12 +81,12 @@ class VideoCamera(Video):
 
 
 class VideoNode:
-    """One who has opened it.
+    """Open device node.
 
     Parameters
     ----------
     camera : VideoCamera
-        What was opened.
+        Camera of the node.
     """
 
     def __init__(self, camera: VideoCamera) -> None:
@@ -77,7 +94,7 @@ class VideoNode:
         self.dead, self._closed = False, False
 
     def ioctl(self, request: int, data: bytearray) -> None:
-        """Answer as the kernel does; the answer replaces the data."""
+        """Execute a request as the kernel does; the answer replaces the data."""
         with self._camera.body.lock:
             self._alive()
             self._camera.expose()
@@ -88,7 +105,7 @@ class VideoNode:
             data[:] = answer(self, bytes(data)).ljust(len(data), b"\0")
 
     def map(self, length: int, offset: int) -> Memory:
-        """Memory of a buffer."""
+        """Map the memory of a buffer."""
         with self._camera.body.lock:
             self._alive()
             memory = self._owned().memory[offset // length]
@@ -96,7 +113,7 @@ class VideoNode:
             return memory
 
     def wait(self, seconds: float) -> bool:
-        """Wait until a frame can be fetched; whether it can."""
+        """Wait until a frame is available; return whether one is."""
         until = time.monotonic() + seconds
         while True:
             with self._camera.body.lock:
@@ -113,7 +130,7 @@ class VideoNode:
             time.sleep(max(0.0, min(left, min(due) / 1e9 - time.monotonic(), 0.01)))
 
     def close(self) -> None:
-        """Close it; what it owned is free."""
+        """Close the node and release what it owned."""
         with self._camera.body.lock:
             self._closed = True
             self._camera.left(self)
@@ -162,7 +179,7 @@ class VideoNode:
         width = min(max(asked.width, 2), body.width - left)
         height = min(max(asked.height, 2), body.height - top)
         stride = width * names[fourcc].stored
-        # A compressed picture may be as large as the raw one, and its head.
+        # A compressed image may be as large as the raw one plus a header.
         size = stride * height or width * height * 2 + 4096
         self._camera.format = uapi.Format(width, height, fourcc, stride, size)
         return self._camera.format.build()
@@ -243,7 +260,7 @@ class VideoNode:
     def _queue(self, data: bytes) -> bytearray:
         index, stream = uapi.Buffer.parse(data).index, self._owned()
         if index >= len(stream.memory) or index in stream.queued:
-            raise self._wrong(f"buffer {index} queued, which is none or queued already")
+            raise self._wrong(f"buffer {index} queued, which does not exist or is queued already")
         stream.queued.append(index)
         return bytearray(data)
 

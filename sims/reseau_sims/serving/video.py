@@ -1,6 +1,6 @@
-"""A camera that exposes frames into buffers at times of its own: no threads, it catches up when it is asked.
+"""Camera that exposes frames into buffers at its own times, without threads: it catches up when called.
 
-What a frame shows is what was there when its exposure began.
+A frame shows the scene at the start of its exposure.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ FORMATS = ("GREY", "Y10", "Y12", "Y16", "YUYV", "MJPEG", "SRGGB8")
 
 
 class Memory:
-    """Memory of a buffer, as it is mapped.
+    """Mapped memory of a buffer.
 
     Parameters
     ----------
     size : int
-        Bytes.
+        Size (bytes).
     """
 
     def __init__(self, size: int) -> None:
@@ -46,13 +46,13 @@ class Memory:
         return bytes(self.data[part])
 
     def close(self) -> None:
-        """Give it back."""
+        """Unmap the memory."""
         self.mapped = False
 
 
 @dataclass
 class _Exposed:
-    """A frame between the beginning of its exposure and its delivery."""
+    """Frame between the start of its exposure and its delivery."""
 
     sequence: int
     began_ns: int
@@ -65,7 +65,7 @@ class _Exposed:
 
 @dataclass
 class Stream:
-    """The buffers of one who owns the camera, and what is on its way into them."""
+    """Buffers of the owner of the camera, and frames in progress."""
 
     owner: object
     memory: list[Memory]
@@ -80,19 +80,19 @@ class Stream:
 
 
 class Video:
-    """A camera and what is on its way out of it.
+    """Camera with frames in progress.
 
     Parameters
     ----------
     body : SimulatedCamera
-        What it looks with.
+        Forms the images.
     first : int
-        Number of its first frame.
+        Number of the first frame.
     start_of_exposure : bool
-        What it stamps; otherwise the end of the frame.
+        Whether stamps refer to the start of the exposure; otherwise to the end of the frame.
     webcam : bool
-        Whether it is on USB: the kernel stamps its frames when their first packet comes, and calls that the
-        start of the exposure.
+        Whether it is a USB camera: the kernel stamps frames when their first packet arrives, and declares
+        this as the start of the exposure.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Video:
     ) -> None:
         self.body, self.first, self._at_start, self.webcam = body, first, start_of_exposure, webcam
         self.stream: Stream | None = None
-        """Of the one who owns it."""
+        """Stream of the owner."""
         self._last: _Exposed | None = None
         body.before_change.append(self.expose)
         self._switch_on()
@@ -112,7 +112,7 @@ class Video:
         self.period = uapi.Interval(1, 100)
 
     def unplug(self, *, power: bool = False) -> None:
-        """Pull its cable: what was open is dead from now on; without power it forgets how it was set."""
+        """Pull the cable: open nodes become invalid; without power the settings are lost."""
         with self.body.lock:
             self.stream = None
             if power:
@@ -120,7 +120,7 @@ class Video:
 
     @property
     def view(self) -> View:
-        """How it is set."""
+        """Current settings."""
         layout = next(each for each in VIDEO.values() if each.code == self.format.fourcc)
         automatic = self.controls[uapi.EXPOSURE_AUTO] != uapi.EXPOSURE_MANUAL
         return View(
@@ -134,7 +134,7 @@ class Video:
         )
 
     def expose(self) -> None:
-        """Expose what is due until now, and hand over what has been read out."""
+        """Expose the frames that are due, and deliver those that have been read out."""
         with self.body.lock:
             stream, now = self.stream, time.monotonic_ns()
             if stream is None or not stream.on:
@@ -149,7 +149,7 @@ class Video:
         layout = next(each for each in VIDEO.values() if each.code == self.format.fourcc)
         began, ended = stream.next_ns, stream.next_ns + int(view.exposure_us * 1000)
         stamp = began if self._at_start else ended
-        # A frame that no buffer waits for is lost, and need not be drawn.
+        # A frame without a buffer is lost and need not be drawn.
         waited_for = len(stream.queued) > len(stream.coming)
         data = encode(layout, self.body.draw(view)) if waited_for else b""
         stream.coming.append(_Exposed(stream.sequence, began, ended + 1_000_000, stamp, data))
@@ -170,7 +170,7 @@ class Video:
         self._last = frame
 
     def _survives(self, stream: Stream, frame: _Exposed, fault: Fault) -> bool:
-        """Whether the frame is delivered now, after what befell it."""
+        """Whether the frame is delivered now, after applying its fault."""
         match fault.kind:
             case "late":
                 frame.due_ns = time.monotonic_ns() + int(fault.seconds * 1e9)

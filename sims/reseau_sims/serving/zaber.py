@@ -1,4 +1,4 @@
-"""A chain of Zaber devices.
+"""Simulated chain of Zaber devices.
 
 Source: *Zaber ASCII Protocol Manual*, "Commands", "Settings", "Reply: rejection reasons" and "Warning Flags".
 """
@@ -21,20 +21,26 @@ __all__ = ["ZaberChain"]
 _LONGEST = 80
 _SPEED = 1.6384
 _RANK = ("FS", "FE", "FD", "WR", "NI")
-"""Flags from the gravest on."""
+"""Flags in order of decreasing severity."""
 
 
 class ZaberChain(Machine):
-    """Devices on one line.
+    r"""Simulated devices on one line.
 
     Parameters
     ----------
     axes : sequence of int
-        How many axes each device has; devices are numbered from 1.
+        Number of axes of each device; devices are numbered from 1.
     low, high : float
         Limits of all axes (steps).
     clock : callable
-        Seconds.
+        Returns the time in seconds.
+
+    Examples
+    --------
+    >>> chain = ZaberChain([2, 1])
+    >>> chain.receive(b"/02 1 05 get pos:F6\n")
+    [b'@02 1 05 OK IDLE WR 1234:1D\r\n']
     """
 
     def __init__(
@@ -55,12 +61,12 @@ class ZaberChain(Machine):
         self._interrupted: set[tuple[int, int]] = set()
 
     def position(self, device: int, axis: int) -> float:
-        """Where an axis stands at this moment (steps), whether anybody asks it or not."""
+        """Return the current position of an axis (steps), independent of queries."""
         with self.lock:
             return self.motors[device, axis].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
-        """Replies to these bytes."""
+        """Return the replies to these bytes."""
         replies: list[bytes] = []
         for line in self._lines.feed(data):
             if isinstance(line, Damaged):
@@ -77,11 +83,11 @@ class ZaberChain(Machine):
         return replies
 
     def disconnected(self) -> None:
-        """A command that was begun is forgotten."""
+        """Discard an incomplete command."""
         self._lines.reset()
 
     def inject_fault(self, kind: Kind) -> None:
-        """Stuck: something is in the way; wrong state: drivers off; out of range: a limit met."""
+        """Stuck: an obstacle; wrong state: drivers off; out of range: a limit switch reached."""
         for motor in self.motors.values():
             if kind == "stuck":
                 motor.stall()
