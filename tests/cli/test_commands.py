@@ -36,16 +36,22 @@ def test_help_is_not_kept_waiting_by_heavy_imports() -> None:
     assert out.strip() == "[]"
 
 
-def test_help_answers_at_once() -> None:
-    # Processor time, not that of the clock: tests share their machine.
+def _processor_seconds(code: str) -> float:
+    """Least processor time of five runs: tests share their machine."""
     times = []
     for _ in range(5):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        code = "from reseau.cli import main; main(['--help'])"
         subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         times.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    assert min(times) < 0.3  # seconds
+    return min(times)
+
+
+def test_help_answers_at_once() -> None:
+    seconds = _processor_seconds("from reseau.cli import main; main(['--help'])")
+    # Shared caches and cores make a busy machine slower also in processor time: by as much as Typer itself.
+    typer = _processor_seconds("import typer, typer.rich_utils, rich.table, rich.markdown")
+    assert seconds < max(0.3, 2 * typer)
 
 
 def test_the_version_is_that_of_the_package(reseau: Run) -> None:
