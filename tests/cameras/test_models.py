@@ -277,7 +277,7 @@ def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
 
 @EVERY
 def test_commands_take_it_and_write_report_and_calibration(case: Case, reseau: Run, tmp_path: Path) -> None:
-    """`reseau bundle`, and `reseau calibrate` of a testfield, with report, calibration and comparison."""
+    """`reseau bundle`, and `reseau calibrate` of a testfield, with report, calibration and its use."""
     _, path = network_file(case, tmp_path / "network.json")
     status, out, err = reseau("bundle", path, "--json", "--report", tmp_path / "B.html")
     assert (status, err) == (0, "")
@@ -305,7 +305,17 @@ def test_commands_take_it_and_write_report_and_calibration(case: Case, reseau: R
     expected = case.model.start_values(57.5 / 0.027, PixelGrid(240, 240, (0.027, 0.027)))
     found = written["parameters"][f]
     assert abs(found["value"] - expected[case.model.names.index(f)]) < 5 * found["sigma"]
-    status, out, err = reseau(*command, *free, "--against", tmp_path / "K.json")
+    points = tmp_path / "00.csv"
+    status, out, err = reseau("apply", tmp_path / "K.json", points, "--directions", "-o", tmp_path / "D.csv")
+    assert (status, err) == (0, "")
+    given = np.array([line.split(",")[1:3] for line in points.read_text().split()[1:]], dtype=np.float64)
+    lines = (tmp_path / "D.csv").read_text().split()[1:]
+    uv = np.array([line.split(",")[1:3] for line in lines], dtype=np.float64)
+    values = [written["parameters"][name]["value"] for name in case.model.names]
+    lens = case.model.mapping(values, PixelGrid(240, 240, (0.027, 0.027)), case.options)
+    # Directions are written with seven decimals.
+    np.testing.assert_allclose(lens(uv), given, rtol=0, atol=0.6e-7 * 57.5 / 0.027)
+    status, out, err = reseau("compare", tmp_path / "K.json", tmp_path / "K.json")
     assert (status, err) == (0, "")
     assert "p = 1\n" in out
 
