@@ -248,6 +248,18 @@ def find_pins(
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from reseau.optics import Arcs
+    >>> arcs = Arcs(*np.array([[6.0] * 2, [2.0] * 2, [0.01] * 2, [0.0] * 2]))
+    >>> x, y = np.tile(np.arange(140.0), (2, 1)), np.tile(np.arange(120.0), (2, 1))
+    >>> light = arcs.image(np.array([[40.0, 40.0], [100.0, 60.0]]), x, y).sum(axis=0)
+    >>> grey = 20 + 150 * light + np.random.default_rng(0).normal(0, 1, light.shape)
+    >>> pins = find_pins(Frame(grey, 255.0))
+    >>> sorted(np.rint(pins.points.xy[:, 0]).tolist()), pins.codes
+    ([40.0, 100.0], (None, None))
     """
     o = options or PinOptions()
     screened = screen(frame, run=None)

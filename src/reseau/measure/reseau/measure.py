@@ -121,6 +121,24 @@ def measure_reseau(
         When the frame is all black, saturated, or of one grey.
     UsageError
         When the design has neither coordinates nor nominal positions.
+
+    Examples
+    --------
+    Form an image of dark disks and measure their centres:
+
+    >>> import numpy as np
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.optics.formation import Outline, draw
+    >>> design = regular_reseau(5, 4, 10.0, Mark(shape="disk", size=2.0))
+    >>> centres = design.xy * [2.0, -2.0] + [60, 50]
+    >>> disk = Outline.circle(2.0, 0.5)
+    >>> outlines = Outline(centres[:, None] + disk.xy, np.broadcast_to(disk.dxy, (20, *disk.dxy.shape)))
+    >>> grey = 200 * (1 - 0.7 * draw(outlines, (100, 120), 0.8))
+    >>> grey += np.random.default_rng(0).normal(0, 1, grey.shape)
+    >>> found = measure_reseau(Frame(grey, 255.0), design, ReseauOptions(mark_px=4.0))
+    >>> found.found, bool(np.abs(found.xy - centres).max() < 0.05)
+    (20, True)
     """
     options = options or ReseauOptions()
     source = _source(design)
