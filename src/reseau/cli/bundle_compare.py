@@ -1,4 +1,4 @@
-"""`reseau compare`: two calibrations of one camera, place by place."""
+"""`reseau compare`: the difference of two calibrations of a camera over its image."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SCHEMA = "reseau-difference/1"
 
 def compare(
     first: Annotated[Path, typer.Argument(help="Calibration of a camera, reseau-calibration/1.")],
-    second: Annotated[Path, typer.Argument(help="Another, of the same camera.")],
+    second: Annotated[Path, typer.Argument(help="Another calibration of the same camera.")],
     out: Out = None,
     figure: Annotated[Path | None, typer.Option(help="Map of the difference to draw, SVG.")] = None,
-    places: Annotated[int, typer.Option(min=2, help="Places across the image.")] = 25,
+    places: Annotated[int, typer.Option(min=2, help="Number of places across the image.")] = 25,
     as_json: AsJson = False,
 ) -> None:
-    """Compare two calibrations as a field over the image, with its significance."""
+    """Compare two calibrations: their difference over the image, with its significance."""
     from ..calibration import calibration_difference
     from ..core.provenance import canonical_json
     from ..io import write_whole
@@ -50,14 +50,13 @@ def compare(
 
 def read_lens(path: Path) -> CameraMapping:
     """A camera from its calibration."""
-    from ..calibration import CameraMapping
-    from ..calibration.document import Calibration
+    from ..calibration import CameraMapping, read_calibration
 
-    return CameraMapping.from_calibration(Calibration.read(path))
+    return CameraMapping.from_calibration(read_calibration(path))
 
 
 def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, Any]:
-    """The field in rows of the image; null where no ray is imaged by both."""
+    """The field in rows of the image; null where no ray is imaged by both cameras."""
     import numpy as np
 
     from ..core.provenance import sha256_of

@@ -35,7 +35,7 @@ class Transform(StrEnum):
 
 @dataclass(frozen=True)
 class _Job:
-    """One image and what to do with it; goes to another process."""
+    """One image and its options, for another process."""
 
     image: Path
     name: str
@@ -51,7 +51,7 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Done:
-    """What came of one image."""
+    """Result of one image."""
 
     documents: list[FrameOrientation]
     results: list[FrameResult]
@@ -61,7 +61,7 @@ class _Done:
 def orient(
     images: Annotated[list[Path], typer.Argument(help="Scans of film frames: TIFF, PNG, JPEG, BMP.")],
     frame: Annotated[
-        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56; without it usual ones are tried.")
+        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56; default: the usual ones are tried.")
     ] = None,
     corners: Annotated[
         Path | None, typer.Option("--corners", "-c", help="Calibrated corners (frame-corners/1).")
@@ -69,21 +69,28 @@ def orient(
     transform: Annotated[
         Transform, typer.Option(help="Transformation to the calibrated corners.")
     ] = Transform.affine,
-    dpi: Annotated[float | None, typer.Option(min=10, help="Resolution, where the file is wrong.")] = None,
-    near: Annotated[
-        str | None, typer.Option(help="Where the frame roughly is: left,top,right,bottom in pixels.")
+    dpi: Annotated[
+        float | None, typer.Option(min=10, help="Resolution of the scan, if that in the file is wrong.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write into.")] = None,
+    near: Annotated[
+        str | None, typer.Option(help="Approximate position of the frame: left,top,right,bottom in pixels.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to.")] = None,
     marked: Annotated[bool, typer.Option(help="Write copies with the corners marked.")] = True,
-    roll: Annotated[bool, typer.Option(help="Let the frames of a roll help each other.")] = True,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores by default.")] = None,
+    roll: Annotated[bool, typer.Option(help="Use what the frames of a roll have in common.")] = True,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Orient scanned film frames by their four edges."""
+    """Orient scanned film frames by their four edges.
+
+    `reseau apply` uses each document as a calibration of its scan.
+    """
     from ..io import FrameCorners
 
     if corners is not None:
-        FrameCorners.read(corners)  # a mistake in it is told before the work begins
+        FrameCorners.read(corners)  # reports a mistake in it before the work begins
     box = _numbers(near)
     _format(frame)
     if out is not None:
@@ -159,7 +166,7 @@ def _options(job: _Job) -> FrameOptions:
 
 
 def _run(job: _Job, before: _Done | None = None) -> _Done:
-    """Orient the frames of one image and write what came of them; in a process of its own."""
+    """Orient the frames of one image and write the results; runs in a process of its own."""
     from ..io import FrameCorners
     from ..io.images import open_scan
     from ..procedures.film_frame import orient_scan, orientation_of, reorient_scan
@@ -183,7 +190,7 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
 
 
 def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
-    """JSON, CSV, picture and marked copy; last the provenance, by which a run goes on after a break."""
+    """Write JSON, CSV, picture and marked copy; last the provenance, by which an interrupted run resumes."""
     from ..core.provenance import canonical_json
     from ..io import write_whole
     from ..io.images import write_image
@@ -222,7 +229,7 @@ def _csv(document: FrameOrientation) -> str:
 
 
 def _kept(job: _Job) -> _Done | None:
-    """What an earlier run made of the same image with the same options."""
+    """Result of an earlier run for the same image with the same options."""
     import json
 
     from ..io import FrameOrientation
@@ -242,7 +249,7 @@ def _kept(job: _Job) -> _Done | None:
 
 
 def _all(work: list[_Job], jobs: int | None) -> Iterator[_Done]:
-    """Every image in its order, several at a time."""
+    """Orient all images, several at a time; results in their order."""
     from concurrent.futures import ProcessPoolExecutor
 
     kept = [_kept(job) for job in work]
@@ -269,7 +276,7 @@ def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iter
 
 
 def _common(done: dict[str, _Done]) -> Roll | None:
-    """What the frames of the images have in common, if they are many enough."""
+    """Common properties of the frames, if there are enough of them."""
     from ..core.failure import Failure
     from ..procedures.film_frame import roll_of
 
@@ -278,7 +285,7 @@ def _common(done: dict[str, _Done]) -> Roll | None:
 
 
 def _again(work: list[_Job], done: dict[str, _Done], roll: Roll, jobs: int | None) -> None:
-    """Doubtful frames once more, with what the roll knows."""
+    """Orient doubtful frames again, with the properties of the roll."""
     from dataclasses import replace
 
     for job in work:
@@ -325,7 +332,7 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
 
 
 def _line(document: FrameOrientation) -> str:
-    """One frame in a line."""
+    """One line about a frame."""
     if document.corners is None or document.principal_point is None:
         return f"{document.image}: declined: {document.why}\n"
     largest = max(max(c.sx, c.sy) for c in document.corners.values())
