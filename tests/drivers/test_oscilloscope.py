@@ -255,7 +255,7 @@ def test_our_driver_finds_the_core_channel_by_the_portmapper() -> None:
 
 @pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
 @pytest.mark.parametrize("way", ["stop", "close"])
-def test_a_call_that_hangs_is_broken_off_from_another_thread(transport: str, way: str) -> None:
+def test_a_hanging_call_is_interrupted_from_another_thread(transport: str, way: str) -> None:
     script = FaultScript()
     with rig("oscilloscope", transport, script) as found:
         caught: list[Exception] = []

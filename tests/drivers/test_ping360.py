@@ -47,7 +47,7 @@ def test_a_section_shows_reflectors_at_their_millimetres() -> None:
     assert machine.violations == []
 
 
-def test_what_the_scanner_sweeps_is_drawn_on_the_screen() -> None:
+def test_the_screen_shows_the_echoes_of_the_scanner() -> None:
     laboratory = Laboratory(World.standard(seed=3))
     dark = laboratory.picture(400, 300).copy()
     device, _ = sonar(laboratory, middle=170, half_sector=29)
@@ -65,7 +65,7 @@ def test_what_the_scanner_sweeps_is_drawn_on_the_screen() -> None:
 
 
 @pytest.mark.slow
-def test_the_camera_sees_what_was_swept() -> None:
+def test_the_camera_images_the_echoes_of_the_scanner() -> None:
     laboratory = Laboratory(World.standard(seed=3))
     before = laboratory.photograph("PHOTO I").pixels.astype(float)
     device, _ = sonar(laboratory, half_sector=60)
@@ -114,7 +114,7 @@ def test_settings_are_checked_before_anything_is_sent() -> None:
     device.close()
 
 
-def test_over_udp_a_peer_that_went_away_is_said_and_found_again() -> None:
+def test_a_lost_udp_peer_raises_and_is_found_again() -> None:
     machine = serving.Ping360()
     with UdpServer(lambda: FaultyConnection(machine)) as server:
         device = ping360("sonar", server.address, seconds=0.5)

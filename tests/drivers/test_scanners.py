@@ -36,7 +36,7 @@ def bk_pair() -> tuple[BkScanner, serving.BkScanner]:
     return bk_oem("bk", InProcess(lambda: FaultyConnection(machine))), machine
 
 
-def test_a_frame_comes_with_its_millimetres() -> None:
+def test_a_frame_has_its_pixel_size() -> None:
     device, machine = bk_pair()
     with device:
         assert isinstance(device, UltrasonicScanner)
@@ -59,7 +59,7 @@ def test_a_frame_comes_with_its_millimetres() -> None:
         b"DATA:B_GEOMETRY_US_FRAME_GRAB:A 10,0,10,59;",
     ],
 )
-def test_a_window_outside_the_frame_gives_pixels_and_never_wrong_millimetres(stated: bytes) -> None:
+def test_a_window_outside_the_frame_gives_no_pixel_size(stated: bytes) -> None:
     device, machine = bk_pair()
     answer = machine._answer
     machine._answer = lambda m: stated if b"FRAME_GRAB:A" in m else answer(m)  # type: ignore[method-assign]
@@ -69,7 +69,7 @@ def test_a_window_outside_the_frame_gives_pixels_and_never_wrong_millimetres(sta
         assert scan.pixels.shape == (60, 80)
 
 
-def test_a_box_of_the_whole_screen_gives_no_millimetres_either() -> None:
+def test_a_box_of_the_whole_screen_gives_no_pixel_size() -> None:
     machine = serving.BkScanner()
     with bk_oem("bk", InProcess(lambda: FaultyConnection(machine)), box="B_GEOMETRY_PIXEL") as device:
         assert device.scan().mm_per_px is None
@@ -77,7 +77,7 @@ def test_a_box_of_the_whole_screen_gives_no_millimetres_either() -> None:
         bk_oem("bk", "tcp://127.0.0.1:1", box="B_GEOMETRY")
 
 
-def test_a_window_that_changes_while_a_frame_is_taken_is_found() -> None:
+def test_a_window_that_changes_during_a_frame_is_detected() -> None:
     device, machine = bk_pair()
     answer, sizes = machine._answer, iter([b"80,60", b"80,60", b"60,80"])
     machine._answer = lambda m: (  # type: ignore[method-assign]
@@ -91,7 +91,7 @@ def test_a_window_that_changes_while_a_frame_is_taken_is_found() -> None:
 @pytest.mark.parametrize(
     "size", [b"1e9,1e9", b"0,0", b"80.5,60", b"nan,60", b"-80,60", b"80", b"x,y", b"80,60,1", b"inf,60"]
 )
-def test_a_size_that_no_scanner_has_is_refused(size: bytes) -> None:
+def test_implausible_sizes_are_rejected(size: bytes) -> None:
     device, machine = bk_pair()
     answer = machine._answer
     machine._answer = lambda m: (  # type: ignore[method-assign]
@@ -102,7 +102,7 @@ def test_a_size_that_no_scanner_has_is_refused(size: bytes) -> None:
     device.close()
 
 
-def test_a_frame_of_another_size_is_refused() -> None:
+def test_a_bk_frame_of_another_size_is_rejected() -> None:
     device, machine = bk_pair()
     machine._frame = lambda: bk.encode_frame(bk.GrabbedFrame(1, bytes(100), 104))  # type: ignore[method-assign]
     with pytest.raises(ProtocolError, match="101 bytes for 4800 pixels"):
@@ -150,7 +150,7 @@ def test_a_readable_gain_checks_the_other_settings() -> None:
     assert machine.violations == []
 
 
-def test_a_transducer_that_is_carried_along_makes_sections() -> None:
+def test_a_moved_transducer_makes_sections() -> None:
     chain, shown = ZaberChain([1]), serving.Oscilloscope("keysight")
     where, speed, step_s = np.array([12.0, 300.0]), 1480.0, 1e-6
 
@@ -188,7 +188,7 @@ def test_a_transducer_that_is_carried_along_makes_sections() -> None:
     assert machine.violations == chain.violations == shown.violations == []
 
 
-def test_stop_ends_a_section_and_the_carrier_stands() -> None:
+def test_stop_ends_a_section_and_stops_the_carrier() -> None:
     chain, shown = ZaberChain([1]), serving.Oscilloscope("keysight")
     axes = {"z": {"per_unit": 1000.0, "unit": "mm", "high": 300.0}}
     table = zaber("table", linked(chain), axes=axes, settings={"speed": 20.0})
@@ -245,7 +245,7 @@ def test_combined_instruments_are_named_on_the_bench() -> None:
             Bench(BenchFile.parse_toml(wrong, where="bench.toml"))
 
 
-def test_a_pulser_that_was_off_gets_all_its_settings_back() -> None:
+def test_settings_of_a_pulser_are_restored_after_power_loss() -> None:
     machine, script = serving.CompactPulser(), FaultScript()
     device = compact_pulser(
         "pulser", InProcess(lambda: FaultyConnection(machine, script)), settings={"voltage": 250.0}

@@ -112,7 +112,7 @@ def test_a_move_that_takes_too_long_is_stopped(which: int) -> None:
     ("kind", "said"),
     [("stuck", "stalled"), ("out of range", "limit switch"), ("wrong state", "driver is off")],
 )
-def test_flags_of_a_movement_are_said(kind: str, said: str) -> None:
+def test_flags_of_a_movement_raise(kind: str, said: str) -> None:
     chain, script = ZaberChain([1]), FaultScript()
     link = InProcess(lambda: FaultyConnection(chain, script))
     with Table("table", Zaber(link), {"tilt": AxisPlan(per_unit=1000.0)}) as table:
@@ -122,7 +122,7 @@ def test_flags_of_a_movement_are_said(kind: str, said: str) -> None:
             table.move("tilt", 200.0)
 
 
-def test_a_table_that_lost_power_says_so_and_gets_its_speed_back() -> None:
+def test_a_table_after_power_loss_raises_and_regains_its_speed() -> None:
     chain, script = ZaberChain([1]), FaultScript()
     with Table(
         "table",

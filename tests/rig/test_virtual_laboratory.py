@@ -73,7 +73,7 @@ def test_in_the_virtual_laboratory(name: str, laboratory: dict[str, list[Element
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_kernel_did_not_complain(
+def test_the_kernel_log_has_no_errors(
     laboratory: dict[str, list[ElementTree.Element]], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     base = tmp_path_factory.getbasetemp()

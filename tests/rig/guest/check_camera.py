@@ -52,7 +52,7 @@ def _seen(camera: Any, shift: int) -> None:
             raise AssertionError(f"{wrong.sum()} pixels differ: {told}; loop: {value('camera.state')}")
 
 
-def test_frames_are_to_the_bit_what_was_drawn(looped: tuple[str, str]) -> None:
+def test_frames_equal_the_drawn_image(looped: tuple[str, str]) -> None:
     node, name = looped
     with v4l2("camera", node, settings={"format": name}) as camera:
         for shift in (0, 9, WORLD):
@@ -81,7 +81,7 @@ def test_brightness_and_gain_act_on_the_picture(grey: str) -> None:
 
 
 @pytest.mark.parametrize("source", ["End of Frame", "Start of Exposure"])
-def test_frames_are_fresh_and_their_time_is_told(grey: str, source: str) -> None:
+def test_frames_are_fresh_with_an_uncertainty_of_their_time(grey: str, source: str) -> None:
     with v4l2("camera", grey) as camera:
         steer("camera._choose", "Timestamp Source", source)
         for _ in range(5):
@@ -106,7 +106,7 @@ def test_lost_frames_are_counted(grey: str) -> None:
     assert shots[-1].dropped - shots[0].dropped == gaps > 0
 
 
-def test_numbers_wrap_without_a_gap_of_billions(grey: str) -> None:
+def test_frame_numbers_wrap_without_a_gap(grey: str) -> None:
     # The virtual driver begins at −128 then.
     with v4l2("camera", grey) as camera:
         camera.stop()
@@ -122,7 +122,7 @@ def test_numbers_wrap_without_a_gap_of_billions(grey: str) -> None:
 
 
 @pytest.mark.parametrize("button", ["Inject VIDIOC_STREAMON Error", "Inject Fatal Streaming Error"])
-def test_faults_of_the_driver_are_said_and_survived(grey: str, button: str) -> None:
+def test_faults_of_the_driver_raise_and_are_recovered(grey: str, button: str) -> None:
     with v4l2("camera", grey) as camera:
         camera.expose()
         if "STREAMON" in button:
@@ -136,7 +136,7 @@ def test_faults_of_the_driver_are_said_and_survived(grey: str, button: str) -> N
         assert camera.expose().fresh
 
 
-def test_a_second_process_is_refused_and_disturbs_nothing(grey: str) -> None:
+def test_a_second_process_is_refused_without_effect(grey: str) -> None:
     program = (
         "from reseau_drivers.camera import v4l2\n"
         "from reseau.core.errors import RefusedError\n"
@@ -157,7 +157,7 @@ def test_the_self_test_passes(grey: str) -> None:
     assert found["frames"].startswith("640 × 480, ")
 
 
-def test_what_the_camera_cannot_do_is_refused(grey: str) -> None:
+def test_unsupported_settings_are_refused(grey: str) -> None:
     with v4l2("camera", grey) as camera:
         with pytest.raises(RefusedError, match="no control of the exposure time"):
             camera.configure(exposure_us=1000.0)
@@ -170,7 +170,7 @@ def test_the_nodes_are_found(grey: str) -> None:
     assert grey in {os.path.realpath(path) for path in video_devices()}
 
 
-def test_v4l2_ctl_agrees_with_what_our_driver_set(grey: str) -> None:
+def test_v4l2_ctl_reports_the_settings_of_the_driver(grey: str) -> None:
     if shutil.which("v4l2-ctl") is None:
         pytest.skip("no v4l2-ctl on the host: apt-get install v4l-utils")
     with v4l2("camera", grey, settings={"brightness": 77}) as camera:
@@ -199,7 +199,7 @@ def test_v4l2_ctl_captures_the_same_frame(grey: str, tmp_path: Any) -> None:
     assert file.read_bytes() == wanted.tobytes()
 
 
-def test_unplugged_and_plugged_in_again_it_is_set_as_before(grey: str) -> None:
+def test_settings_are_restored_after_unplugging(grey: str) -> None:
     with v4l2("camera", grey, settings={"brightness": 140}) as camera:
         camera.expose()
         steer("camera._set", "Disconnect", 1)

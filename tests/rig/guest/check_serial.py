@@ -88,7 +88,7 @@ def test_a_driver_works_at_the_port(name: str) -> None:
 
 @pytest.mark.parametrize("kind", ["late", "dropped", "truncated", "repeated", "corrupted", "disconnected"])
 @pytest.mark.parametrize("name", DRIVERS)
-def test_a_fault_is_survived_or_said(name: str, kind: str) -> None:
+def test_a_fault_gives_the_right_result_or_an_error(name: str, kind: str) -> None:
     make, work, recover = DRIVERS[name]
     steer("connect", name)
     with make() as device:
@@ -107,7 +107,7 @@ def test_a_fault_is_survived_or_said(name: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", DRIVERS)
-def test_unplugged_and_plugged_in_again(name: str) -> None:
+def test_reconnection_after_unplugging(name: str) -> None:
     make, work, recover = DRIVERS[name]
     steer("connect", name)
     with make() as device:

@@ -36,7 +36,7 @@ def scope() -> Iterator[Any]:
         yield made
 
 
-def test_its_screen_arrives_to_the_byte(scope: Any) -> None:
+def test_the_screen_is_transferred_unchanged(scope: Any) -> None:
     shown = scope.screen().frame().pixels
     assert shown.shape == steer("scope.screen").shape
     assert (shown == steer("scope.screen")).all()
@@ -44,7 +44,7 @@ def test_its_screen_arrives_to_the_byte(scope: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", ["late", "dropped", "truncated", "corrupted", "disconnected"])
-def test_a_fault_is_survived_or_said(scope: Any, kind: str) -> None:
+def test_a_fault_gives_the_right_result_or_an_error(scope: Any, kind: str) -> None:
     wanted = steer("scope.screen")
     scope.screen()
     steer("befall", "scope", kind)
@@ -57,7 +57,7 @@ def test_a_fault_is_survived_or_said(scope: Any, kind: str) -> None:
     assert (scope.screen(10.0).frame().pixels == wanted).all()
 
 
-def test_unplugged_and_plugged_in_again(scope: Any) -> None:
+def test_reconnection_after_unplugging(scope: Any) -> None:
     scope.screen()
     steer("usb.gadget.unplug")
     try:
@@ -69,7 +69,7 @@ def test_unplugged_and_plugged_in_again(scope: Any) -> None:
     assert scope.reconnections >= 2
 
 
-def test_the_project_s_udev_rules_let_plugdev_open_it_and_nobody_else() -> None:
+def test_the_udev_rules_give_access_to_plugdev_only() -> None:
     settle()
     (node,) = _nodes()
     assert stat.S_IMODE(node.stat().st_mode) == 0o660
@@ -82,7 +82,7 @@ def test_the_project_s_udev_rules_let_plugdev_open_it_and_nobody_else() -> None:
     assert subprocess.run([*nobody, "--clear-groups", *opened], stderr=subprocess.DEVNULL).returncode != 0
 
 
-def test_the_kernel_s_own_driver_reads_the_simulated_instrument() -> None:
+def test_the_kernel_driver_reads_the_simulated_instrument() -> None:
     subprocess.run(["/run/busybox", "insmod", "/run/modules/usbtmc.ko"], check=True)
     fd = os.open(appeared("/dev/usbtmc0"), os.O_RDWR)
     try:
