@@ -43,7 +43,8 @@ numpydoc_xref_param_type = False
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 # Links from the pages to files of the project outside this folder, which are not part of the site.
-suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure"]
+# Names of types in signatures that two packages define, as Frame, are linked to the first.
+suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure", "ref.python"]
 keep_warnings = True
 
 html_theme = "pydata_sphinx_theme"
