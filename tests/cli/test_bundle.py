@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reseau.bundle import ResultDocument
 from reseau.io.network import Network1
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import Pose, matrix_to_vector, project
@@ -234,3 +235,18 @@ def test_swapped_control_points_are_no_silent_nonsense(
     # The control is a symmetric plane figure: the other pair would do as well.
     assert f"p{pair[0]} and p{pair[1]}" in said
     assert "exchanged" in said
+
+
+def test_the_document_is_read_back_with_its_provenance(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "result.json"
+    assert reseau("bundle", network(), "--out", out, "--cov")[0] == 0
+    document = ResultDocument.read(out)
+    assert document.to_json() == out.read_text("utf-8")
+    assert document.provenance is not None
+    assert list(document.provenance["inputs"]) == ["network.json"]
+    older = json.loads(out.read_text("utf-8"))
+    assert list(older)[-1] == "provenance"
+    del older["provenance"], older["warning_codes"]
+    assert ResultDocument.parse(json.dumps(older), where="older").to_dict() == older

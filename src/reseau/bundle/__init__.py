@@ -30,7 +30,15 @@ from .modelling import (
     reweighted,
     search_model,
 )
-from .network import Additional, Camera, ControlPoints, Network, Stage, example_network
+from .network import (
+    Additional,
+    Camera,
+    ControlPoints,
+    Network,
+    Stage,
+    calibrated_camera,
+    example_network,
+)
 from .solver import Approximate, BundleFit, BundleProblem, approximate
 
 __all__ = [
@@ -56,6 +64,7 @@ __all__ = [
     "approximate",
     "by_place",
     "by_point",
+    "calibrated_camera",
     "calibration_of",
     "camera_mapping",
     "common_pattern",

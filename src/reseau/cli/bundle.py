@@ -24,9 +24,9 @@ from .bundle_options import (
 from .common import AsJson, Out, progress, required, say
 
 if TYPE_CHECKING:
-    from ..bundle import Network, Result
+    from ..bundle import Result
 
-__all__ = ["bundle", "read_network"]
+__all__ = ["bundle"]
 
 
 def bundle(
@@ -41,19 +41,25 @@ def bundle(
     cov: Annotated[
         bool, typer.Option("--cov", help="Include full covariances of the points in the result.")
     ] = False,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(help="Calibration of a camera of the network, as ID=calibration.json; repeatable."),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust a network of images: orientation, calibration and object points, with their quality."""
     from ..bundle import Options, ResultDocument, search_model
-    from ..core.provenance import Provenance
+    from ..core.provenance import Provenance, sha256_of
+    from ..exchange import read_network
     from ..io import write_whole
 
     level_of(alpha, "--alpha")
     outputs(out, report)
     distance = positive(distance)
-    content = read_network(network)
+    calibrations = _calibrations(camera or [])
+    content = read_network(network, calibrations)
     with progress("adjusting", 30) as step:
         options = Options(
             outliers="reject" if reject else "keep", alpha=alpha, watch=lambda k, cost: step(f"iteration {k}")
@@ -62,7 +68,8 @@ def bundle(
         result = required(found, network)
     settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
                 "eliminate": eliminate}  # fmt: skip
-    provenance = Provenance(_hashes(network), settings)
+    hashes = {file.name: sha256_of(file) for file in calibrations.values()}
+    provenance = Provenance(_hashes(network) | hashes, settings)
     document = ResultDocument.of(result, covariances=cov, provenance=provenance)
     if report is not None:
         from ..report.bundle import bundle_report
@@ -78,23 +85,27 @@ def bundle(
 
 
 def _hashes(path: Path) -> dict[str, str]:
-    """SHA-256 of a file, or of the text files in a folder."""
+    """SHA-256 of a network file and the calibrations it names, or of the text files in a folder."""
     from ..core.provenance import sha256_of
+    from ..exchange import calibration_files
 
     if path.is_file():
-        return {path.name: sha256_of(path)}
+        files = [path, *calibration_files(path)]
+        return {file.name: sha256_of(file) for file in files}
     return {f"{path.name}/{file.name}": sha256_of(file) for file in sorted(path.glob("*.txt"))}
 
 
-def read_network(path: Path) -> Network:
-    """A network from a file of ours, or of another program, told apart by what is in it."""
-    from ..bundle import Network
-    from ..exchange import read_foreign
-    from ..io.network import Network1
+def _calibrations(texts: list[str]) -> dict[str, Path]:
+    """Calibration files by camera, from ``ID=file``."""
+    from ..core.errors import UsageError
 
-    if path.is_dir() or path.suffix.lower() != ".json":
-        return read_foreign(path)
-    return Network.from_document(Network1.read(path))
+    found: dict[str, Path] = {}
+    for text in texts:
+        name, equals, file = text.partition("=")
+        if not equals or not name or not file or name in found:
+            raise UsageError(f"is {text!r}", where="--camera", do="write ID=calibration.json, each ID once")
+        found[name] = Path(file)
+    return found
 
 
 def _say(path: Path, result: Result) -> None:

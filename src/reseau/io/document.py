@@ -66,7 +66,9 @@ def _one_line(error: ValidationError) -> str:
     """Say the first complaint of pydantic in one line, and how many more there are."""
     complaints = error.errors(include_url=False, include_context=False)
     first = complaints[0]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    # Tags of unions, in angle brackets, are no keys of the document.
+    parts = [part for part in first["loc"] if not str(part).startswith("<")]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts).lstrip(".")
     text = {
         "extra_forbidden": f"unknown key `{key}`",
         "missing": f"missing key `{key}`",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from ..core.errors import UsageError
 from ..optics.cameras import additional_models, camera_model, camera_models
@@ -13,6 +13,7 @@ from .document import Document, Strict
 
 __all__ = [
     "AdditionalParameters",
+    "CalibratedCameraEntry",
     "CameraEntry",
     "DistanceColumns",
     "ImageColumns",
@@ -111,6 +112,34 @@ class CameraEntry(Strict):
         return self
 
 
+class CalibratedCameraEntry(Strict):
+    """A camera whose interior orientation is that of a calibration file.
+
+    `calibration` is the path of a ``reseau-calibration/1`` of a camera, relative to the network file. With
+    `use` "observed" its parameters are observations with their joint covariance, with "held" they are held.
+    """
+
+    id: str = Field(min_length=1)
+    calibration: str = Field(min_length=1)
+    use: Literal["observed", "held"] = "observed"
+
+    @property
+    def additional(self) -> None:
+        """None: additional parameters are part of the calibration."""
+        return
+
+
+def _kind_of_camera(entry: Any) -> str:
+    given = "calibration" in entry if isinstance(entry, dict) else isinstance(entry, CalibratedCameraEntry)
+    return "<calibrated>" if given else "<camera>"
+
+
+AnyCamera = Annotated[
+    Annotated[CameraEntry, Tag("<camera>")] | Annotated[CalibratedCameraEntry, Tag("<calibrated>")],
+    Discriminator(_kind_of_camera),
+]
+
+
 class _Columns(Strict):
     """Columns of one length."""
 
@@ -181,7 +210,7 @@ class Network1(Document):
 
     SCHEMA: ClassVar[str] = "reseau-network/1"
     unit: str
-    cameras: tuple[CameraEntry, ...]
+    cameras: tuple[AnyCamera, ...]
     images: ImageColumns
     points: PointColumns
     observations: ObservationColumns

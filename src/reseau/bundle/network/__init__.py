@@ -1,5 +1,6 @@
 """What is adjusted: cameras, images, points and their observations, in columns."""
 
+from .calibrated import calibrated_camera
 from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network, Usable, finite, usable
 from .stage import Stage, StageValues, perpendicular
@@ -12,6 +13,7 @@ __all__ = [
     "Stage",
     "StageValues",
     "Usable",
+    "calibrated_camera",
     "example_network",
     "finite",
     "perpendicular",

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...io.network import CameraEntry, Network1
+from ...io.network import CalibratedCameraEntry, CameraEntry, Network1
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
 from ...optics.cameras import distortion_names
 from .stage import Stage
@@ -347,9 +347,27 @@ class Network(Display):
             raise UsageError("needs control, and a pose for each image", where="Network.stage")
 
     @classmethod
-    def from_document(cls, document: Network1) -> Self:
-        """The network of a ``reseau-network/1`` document."""
-        cameras = tuple(Camera.from_entry(entry) for entry in document.cameras)
+    def from_document(cls, document: Network1, calibrated: Mapping[str, Camera] | None = None) -> Self:
+        """Create the network of a ``reseau-network/1`` document.
+
+        Parameters
+        ----------
+        document : Network1
+            The document.
+        calibrated : mapping of str to Camera, optional
+            Cameras by their id, in place of those of the document; needed for those that name a calibration,
+            see :func:`~reseau.bundle.calibrated_camera`.
+
+        Raises
+        ------
+        UsageError
+            When a camera that names a calibration is not given, or one is given that the document has not.
+        """
+        given = calibrated or {}
+        for name in given:
+            if name not in [entry.id for entry in document.cameras]:
+                raise UsageError("is no camera of the network", where=name)
+        cameras = tuple(_camera(entry, given) for entry in document.cameras)
         images, points, seen = document.images, document.points, document.observations
         camera_row = {camera.id: i for i, camera in enumerate(cameras)}
         point_row = {name: i for i, name in enumerate(points.id)}
@@ -420,6 +438,20 @@ class Network(Display):
     def posed(self) -> Mask:
         """Images whose pose is known (m,)."""
         return finite(self.x0) & finite(self.rotation)
+
+    def with_cameras(self, cameras: Mapping[str, Camera]) -> Self:
+        """Return the network with other cameras in place of those with these ids.
+
+        Raises
+        ------
+        UsageError
+            When the network has no such camera.
+        """
+        known = [camera.id for camera in self.cameras]
+        for name in cameras:
+            if name not in known:
+                raise UsageError("is no camera of the network", where=name)
+        return replace(self, cameras=tuple(cameras.get(camera.id, camera) for camera in self.cameras))
 
     def select(self, observations: Mask) -> Self:
         """The same network with some of the image observations (n,)."""
@@ -506,6 +538,18 @@ def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
 def finite(rows: Array) -> Mask:
     """Rows (k,) of an array (k, …) that hold finite numbers alone."""
     return np.asarray(np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))), dtype=np.bool_)
+
+
+def _camera(entry: CameraEntry | CalibratedCameraEntry, calibrated: Mapping[str, Camera]) -> Camera:
+    if entry.id in calibrated:
+        return calibrated[entry.id]
+    if isinstance(entry, CalibratedCameraEntry):
+        raise UsageError(
+            f"needs its calibration {entry.calibration}",
+            where=f"camera {entry.id}",
+            do="read the file with reseau.exchange.read_network",
+        )
+    return Camera.from_entry(entry)
 
 
 def _rows(names: Sequence[str], rows: dict[str, int]) -> Rows:
