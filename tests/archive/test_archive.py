@@ -121,7 +121,7 @@ def test_the_index_refuses_to_change_or_delete_anything(opened: Callable[[], Arc
                 connection.execute(sa.text(statement))
 
 
-def test_a_name_is_given_once_and_an_unknown_one_is_told(opened: Callable[[], Archive]) -> None:
+def test_a_name_is_unique_and_an_unknown_one_is_refused(opened: Callable[[], Archive]) -> None:
     with opened() as archive:
         archive.begin("s", "frames", {})
         with pytest.raises(ArchiveError, match="--resume"):
@@ -232,7 +232,7 @@ def test_pixels_and_facts_come_back_from_a_tiff_as_they_were(
 
 @given(data=st.binary(max_size=300))
 @settings(deadline=None, max_examples=60)
-def test_bytes_that_are_no_frame_are_told(data: bytes) -> None:
+def test_bytes_that_are_not_a_frame_are_refused(data: bytes) -> None:
     with pytest.raises(ArchiveError, match="is not a frame"):
         frame_of(data, "here")
 
@@ -272,7 +272,7 @@ def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> 
     assert len([p for p in (tmp_path / "objects").rglob("*") if p.is_file()]) == 2
 
 
-def test_places_that_cannot_be_used_are_told_in_one_line(tmp_path: Path) -> None:
+def test_places_that_cannot_be_used_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ArchiveError, match="is not an archive; create one with `reseau capture`"):
         Archive.open(tmp_path / "none")
     (tmp_path / "file").write_text("x")
@@ -335,7 +335,7 @@ def test_what_a_killed_process_left_in_the_log_is_read_on_a_read_only_disk_too(
         Archive.open(tmp_path, create=True)
 
 
-def test_an_index_that_is_damaged_is_told(tmp_path: Path) -> None:
+def test_a_damaged_index_is_reported(tmp_path: Path) -> None:
     with Archive.open(tmp_path, create=True) as archive:
         session = archive.begin("s", "frames", {})
         for k in range(50):

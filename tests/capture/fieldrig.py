@@ -90,7 +90,7 @@ class Axis:
 
 
 class FieldTable(_Simple):
-    """A table that is where it is told to be."""
+    """A table that moves at once."""
 
     def __init__(self, name: str, axes: tuple[str, ...] = AXES) -> None:
         super().__init__(name, Settings())

@@ -70,12 +70,12 @@ def test_a_plan_leaves_frames_verdicts_documents_and_results(rig: FieldRig, kept
     assert rig.table.stops > 0
 
 
-def test_it_is_told_what_the_next_pose_would_bring(rig: FieldRig, kept: Session) -> None:
+def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    (foretold,) = [facts for kind, facts in rig.events if kind == "outlook"]
-    (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == foretold["step"]]
-    assert abs(foretold["sigma_c"] / came["sigma_c"] - 1) < 0.1
+    (predicted,) = [facts for kind, facts in rig.events if kind == "outlook"]
+    (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == predicted["step"]]
+    assert abs(predicted["sigma_c"] / came["sigma_c"] - 1) < 0.1
 
 
 def test_a_disk_that_is_full_ends_the_session_and_with_room_it_goes_on(
@@ -154,7 +154,7 @@ def test_retakes_end_and_the_session_goes_on(rig: FieldRig, kept: Session) -> No
     assert declined[0]
 
 
-def test_a_frame_exposed_while_the_table_moves_is_no_good(rig: FieldRig, kept: Session) -> None:
+def test_a_frame_exposed_while_the_table_moves_is_rejected(rig: FieldRig, kept: Session) -> None:
     def push(number: int) -> None:
         if number == 1:
             rig.table.stands["tilt"] += 0.5
@@ -271,7 +271,7 @@ def test_an_instrument_that_fails_ends_the_session_at_rest_and_nothing_is_lost(
     assert rig.table.stands["tilt"] != 0  # it stays where it stopped
 
 
-def test_it_parks_only_where_it_is_told_to_and_only_when_all_is_done(rig: FieldRig, kept: Session) -> None:
+def test_it_parks_only_if_asked_and_only_when_done(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept)
     carry_out(run, plans.poses(run, FEW[:2]))
     assert rig.table.stands["tilt"] == 30
@@ -281,9 +281,7 @@ def test_it_parks_only_where_it_is_told_to_and_only_when_all_is_done(rig: FieldR
     assert rig.camera.exposures == 2
 
 
-def test_it_retreats_only_where_it_is_told_to_and_only_when_it_was_ended_before(
-    rig: FieldRig, kept: Session
-) -> None:
+def test_it_retreats_only_if_asked_and_only_when_ended_early(rig: FieldRig, kept: Session) -> None:
     def stall(axis: str, position: float) -> None:
         if position == 90:
             raise StateError("stalled", where="table", command="move")
@@ -296,7 +294,7 @@ def test_it_retreats_only_where_it_is_told_to_and_only_when_it_was_ended_before(
     stops = rig.table.stops
     with pytest.raises(
         StateError, match="stalled"
-    ):  # where it cannot, that is told, and the first error counts
+    ):  # a failed retreat is reported, and the first error is raised
         carry_out(run, plans.poses(run, FEW[:3]), retreat={"roll": 90.0})
     assert ("rest", {"failed": "table (move): stalled"}) in rig.events
     assert rig.table.stops > stops
@@ -305,7 +303,7 @@ def test_it_retreats_only_where_it_is_told_to_and_only_when_it_was_ended_before(
     assert rig.table.stands["tilt"] == 30
 
 
-def test_a_plan_of_ones_own_is_a_generator(rig: FieldRig, kept: Session) -> None:
+def test_an_own_plan_is_a_generator(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept)
 
     def twice_from_both_sides() -> Plan:
@@ -320,7 +318,7 @@ def test_a_plan_of_ones_own_is_a_generator(rig: FieldRig, kept: Session) -> None
     assert rig.camera.exposures == 4
 
 
-def test_what_cannot_be_meant_is_told_before_anything_moves(rig: FieldRig, kept: Session) -> None:
+def test_wrong_use_is_refused_before_anything_moves(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept)
     with pytest.raises(UsageError, match=r"has no axis height; use tilt, roll, camera_roll"):
         carry_out(run, plans.poses(run, [Step("a", {"height": 1.0})]))
@@ -333,7 +331,7 @@ def test_what_cannot_be_meant_is_told_before_anything_moves(rig: FieldRig, kept:
         carry_out(wrong, plans.frames(wrong, 1))
 
 
-def test_checks_stop_what_would_be_worth_nothing(rig: FieldRig, kept: Session) -> None:
+def test_failed_checks_stop_the_acquisition(rig: FieldRig, kept: Session) -> None:
     rig.camera.spoil = lambda number, pixels: pixels // 20
     run = rig.acquisition(kept)
     with pytest.raises(StateError, match=r"of full scale: expose more.*--checks 0"):
@@ -393,13 +391,13 @@ def test_looking_for_the_next_pose_ends_when_it_is_stopped(rig: FieldRig, kept: 
     assert len(looked) < 6
 
 
-def test_the_closed_loop_says_when_no_pose_helps(rig: FieldRig, kept: Session) -> None:
+def test_the_closed_loop_reports_when_no_pose_is_left(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept, rig.procedure())
     why = carry_out(run, plans.until(run, Goal("c", 1e-9, "mm"), FEW[:3], FEW[3:]))
     assert "no pose is left" in why
 
 
-def test_a_goal_for_what_is_not_estimated_is_told(rig: FieldRig, kept: Session) -> None:
+def test_a_goal_for_what_is_not_estimated_is_refused(rig: FieldRig, kept: Session) -> None:
     run = rig.acquisition(kept, rig.procedure())
     with pytest.raises(EstimationError, match="is not estimated; use c, x0, y0, K1"):
         carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))

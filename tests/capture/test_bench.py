@@ -134,12 +134,12 @@ def test_check_tells_every_failure_and_its_exit_status(
         assert run(["bench", "check", "--bench", str(path), "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
         assert document["failed"] == 0
-        told = {each["name"]: each["found"] for each in document["instruments"]}
-        assert told["scanner"]["identity"] == "Blue Robotics Ping360"
-        assert told["scanner"]["firmware"] == "3.1.1"
-        assert told["scanner"]["line"].startswith("200 samples")
-        assert told["table"]["tilt"] == "not homed"
-        assert told["oscilloscope"]["error"] == "none"
+        found = {each["name"]: each["found"] for each in document["instruments"]}
+        assert found["scanner"]["identity"] == "Blue Robotics Ping360"
+        assert found["scanner"]["firmware"] == "3.1.1"
+        assert found["scanner"]["line"].startswith("200 samples")
+        assert found["table"]["tilt"] == "not homed"
+        assert found["oscilloscope"]["error"] == "none"
         assert [each["name"] for each in document["instruments"]] == list(simulated.machines)
         for script in simulated.scripts.values():
             for number in range(40):

@@ -1,4 +1,4 @@
-"""One session at a time on a bench; who has it is told, and a killed owner holds nothing."""
+"""One session at a time on a bench; the error names the owner, and a killed owner holds nothing."""
 
 import os
 import signal
@@ -36,9 +36,9 @@ def test_a_bench_in_use_names_its_owner_and_is_free_when_that_is_killed(tmp_path
         lock = BenchLock(["/dev/ttyUSB0", "TCPIP::here"], "session monday", tmp_path)
         with pytest.raises(
             StateError, match=rf"session tuesday \(process {other.pid} of .* since 20"
-        ) as told:
+        ) as raised:
             lock.__enter__()
-        assert "wait, or stop that process" in str(told.value)
+        assert "wait, or stop that process" in str(raised.value)
         with BenchLock(["TCPIP::here"], "session monday", tmp_path):
             pass  # what had been taken before the refusal is free again
         os.kill(other.pid, signal.SIGKILL)
@@ -63,7 +63,7 @@ AS_ANOTHER = """
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
-def test_a_lock_of_another_user_is_told_and_taken_when_it_is_free() -> None:
+def test_a_lock_of_another_user_is_reported_and_taken_when_it_is_free() -> None:
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o755)
         folder = Path(name) / "locks"
@@ -86,13 +86,13 @@ def test_two_names_of_one_device_are_one_instrument(tmp_path: Path) -> None:
         BenchLock([str(tmp_path / "by-id")], "two", tmp_path / "locks").__enter__()
 
 
-def test_a_folder_of_locks_that_cannot_be_is_told(tmp_path: Path) -> None:
+def test_a_folder_of_locks_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StateError, match="cannot be locked"):
         BenchLock(["a"], "one", tmp_path / "file").__enter__()
 
 
-def test_benches_without_a_common_instrument_do_not_mind_each_other(tmp_path: Path) -> None:
+def test_benches_without_a_common_instrument_do_not_exclude_each_other(tmp_path: Path) -> None:
     with BenchLock(["a"], "one", tmp_path), BenchLock(["b"], "two", tmp_path):
         pass
     with BenchLock(["a", "a"], "one", tmp_path):

@@ -1,4 +1,4 @@
-"""Poses from tables, goals from words, and what frames say of focus, vibration and drift."""
+"""Poses from tables, goals from text, and checks of focus, vibration and drift."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: fl
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])
-def test_the_width_of_edges_is_told(sigma: float) -> None:
+def test_the_width_of_edges_is_measured(sigma: float) -> None:
     # Sampled at points: the scene has no pixels to integrate over. Curvature and noise leave a tenth.
     assert edge_sigma(scene(sigma=sigma)) == pytest.approx(sigma, abs=0.12 * sigma)
 
@@ -48,7 +48,7 @@ def test_a_shift_is_found_within_its_sigma(dx: float, dy: float, seed: int) -> N
     assert np.all(sigma < 0.01)
 
 
-def test_a_scene_without_edges_is_told_in_words_that_any_index_takes() -> None:
+def test_a_scene_without_edges_gives_a_fault_that_any_index_can_store() -> None:
     """JSON knows no infinity; PostgreSQL refuses it."""
     flat = [Frame(np.full((60, 60), 90, np.uint8), 255.0)] * 2
     found = readiness(flat)
@@ -73,7 +73,7 @@ def test_a_quiet_bench_is_ready() -> None:
         ([scene(level=0.1, seed=k) for k in range(3)], "expose more"),
     ],
 )
-def test_what_is_wrong_before_an_acquisition_is_told(frames: list[Frame], fault: str) -> None:
+def test_faults_before_an_acquisition_are_reported(frames: list[Frame], fault: str) -> None:
     assert fault in "; ".join(readiness(frames).faults)
 
 
@@ -84,7 +84,7 @@ def test_checks_need_two_frames_of_one_scene() -> None:
         readiness([scene(), Frame(np.zeros((9, 9), np.uint8), 255.0)])
 
 
-def test_limits_are_the_laboratorys() -> None:
+def test_limits_can_be_chosen() -> None:
     assert exposure_fault(scene(level=0.3)) == ""
     assert "expose more" in exposure_fault(scene(level=0.3), Limits(darkest=0.5))
 
@@ -108,7 +108,7 @@ def test_poses_of_a_table_are_read(tmp_path: Path) -> None:
         ("tilt\n1\n1\n", "line 3: duplicate pose 'tilt 1'"),
     ],
 )
-def test_a_table_that_is_none_is_told_with_its_line(tmp_path: Path, text: str, says: str) -> None:
+def test_an_invalid_table_of_poses_is_refused_with_its_line(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(text)
     with pytest.raises(FormatError, match=says):
@@ -135,6 +135,6 @@ def test_goals_are_read_in_their_units() -> None:
         "sigma_c < 1e999 um",
     ],
 )
-def test_what_is_no_goal_is_told(text: str) -> None:
+def test_invalid_goals_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 'sigma_c < 0\.5 um'"):
         Goal.parse(text)

@@ -70,7 +70,7 @@ def test_a_series_is_streamed_and_the_camera_set_back(kept: Session) -> None:
     frames = kept.frames(kind="frame")
     assert len(frames) == PLAN.count == len({frame.step for frame in frames})
     assert all(frame.verdict is not None and frame.verdict.ok for frame in frames)
-    # Light at growing exposures, then the dark at three of them; as the camera told them.
+    # Light at growing exposures, then the dark at three of them, as reported by the camera.
     exposures = {frame.step.rpartition(" ")[0]: frame.facts["exposure_us"] for frame in frames}
     light = [exposure for step, exposure in exposures.items() if step.startswith("light")]
     assert light == sorted(set(light))

@@ -132,7 +132,7 @@ def test_a_plan_of_ones_own_is_carried_out_and_resumed_as_it_was_begun(
         ("def plan(run):\n    return 1\n", [], "own.py: has no generator `plan(run, …)`"),
     ],
 )
-def test_a_plan_of_ones_own_that_cannot_be_is_told_in_one_line(
+def test_an_invalid_own_plan_is_reported_in_one_line(
     rig: FieldRig, capsys: pytest.CaptureFixture[str], text: str, options: list[str], says: str
 ) -> None:
     Path("own.py").write_text(text)
@@ -143,7 +143,7 @@ def test_a_plan_of_ones_own_that_cannot_be_is_told_in_one_line(
     assert not Path("archive").exists()
 
 
-def test_what_an_archive_cannot_do_is_told_in_one_line(
+def test_what_an_archive_cannot_do_is_reported_in_one_line(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert capture("frames", "--name", "a") == 0
@@ -191,8 +191,8 @@ def test_toml_names_options_as_the_command_line_does_and_may_hold_lists_and_tabl
     )
     Path("poses.csv").write_text("tilt\n0\n")
     assert capture("testfield", "--plan", "monday.toml", "--name", "monday") == 1
-    told, failed = capsys.readouterr()
-    assert '"event": "end", "status": "failed"' in told
+    out, failed = capsys.readouterr()
+    assert '"event": "end", "status": "failed"' in out
     assert "1 image" in failed  # of one nothing can be computed
     assert (rig.table.stands["tilt"], rig.table.stands["roll"]) == (7, 0.5)
     assert run(["archive", "show", "monday", "--json"]) == 0
@@ -207,9 +207,7 @@ def test_toml_names_options_as_the_command_line_does_and_may_hold_lists_and_tabl
     assert "none.json: cannot be read" in capsys.readouterr().err
 
 
-def test_a_session_that_is_resumed_heeds_no_other_options_and_says_so(
-    rig: FieldRig, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_cannot_be_changed_with_resume(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     assert capture("frames", "--count", "2", "--name", "a") == 0
     capsys.readouterr()
     assert capture("frames", "--resume", "--name", "a", "--count", "3") == 2
@@ -217,16 +215,14 @@ def test_a_session_that_is_resumed_heeds_no_other_options_and_says_so(
     assert rig.camera.exposures == 2
 
 
-def test_what_a_program_is_told_is_json_line_by_line(
-    rig: FieldRig, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_events_for_programs_are_json_lines(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     def strict(word: str) -> None:
         raise AssertionError(f"{word} is no JSON")
 
     rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 120)
     assert capture("frames", "--checks", "2", "--name", "a", "--json") == 1
-    told, failed = capsys.readouterr()
-    events = [json.loads(line, parse_constant=strict) for line in told.splitlines()]
+    out, failed = capsys.readouterr()
+    events = [json.loads(line, parse_constant=strict) for line in out.splitlines()]
     assert [event["event"] for event in events] == ["begin", "check", "end"]
     assert events[1]["edge_px"] is None
     assert events[-1]["status"] == "failed"
@@ -297,7 +293,7 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
         (["frames", "--archive", "poses.csv"], "cannot be created"),
     ],
 )
-def test_what_cannot_be_done_is_told_in_one_line(
+def test_what_cannot_be_done_is_reported_in_one_line(
     rig: FieldRig, capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
 ) -> None:
     assert capture(*arguments) in (1, 2)
@@ -361,7 +357,7 @@ def test_sections_are_those_of_the_scanner_that_is_named_and_the_session_keeps_t
     assert "2 frames   0 results  done       a" in capsys.readouterr().out
 
 
-def test_bad_frames_are_told_and_kept(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_frames_are_reported_and_stored(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.camera.spoil = lambda number, pixels: np.zeros_like(pixels) if number == 1 else pixels
     assert capture("frames", "--count", "2", "--retakes", "1", "--name", "a") == 0
     assert "0/2 00000: brightest pixels reach only 0 % of full scale: expose more" in capsys.readouterr().out

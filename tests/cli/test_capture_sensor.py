@@ -161,7 +161,7 @@ def test_a_session_that_was_interrupted_goes_on_where_it_stood(
     assert run(["capture", "sensor", "--resume"]) == 2
 
 
-def test_an_edge_that_cannot_be_measured_costs_the_sharpness_alone(
+def test_an_edge_that_cannot_be_measured_affects_the_sharpness_only(
     asked: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert capture("--edge", "--region", "0", "0", "20", "40", "--out", "sensor.json") == 1
@@ -171,7 +171,7 @@ def test_an_edge_that_cannot_be_measured_costs_the_sharpness_alone(
     assert "psf" not in Calibration.read(Path("sensor.json")).parameters
 
 
-def test_an_edge_that_fills_the_pixels_is_told(
+def test_a_saturated_edge_is_reported(
     asked: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LIGHT_OF_THE_EDGE", "40")
@@ -222,7 +222,7 @@ def test_the_correction_is_applied_before_a_reseau_is_measured(
                 "--sensor", str(tmp_path / "design.json")]) == 2  # fmt: skip
 
 
-def test_wrong_use_is_said(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_is_reported(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     for options in (["--camera", "none"], ["--bench", "none.toml"], ["--levels", "1"], ["--out", "no/where"]):
         assert capture(*options) == 2
         assert capsys.readouterr().err.count("\n") == 1

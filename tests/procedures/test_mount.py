@@ -1,4 +1,4 @@
-"""The axes of a table told from adjusted poses."""
+"""The mount of a turntable from adjusted poses."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_poses_of_any_mount_are_predicted(
         assert np.abs(pose.x0 - wanted.x0).max() < 1e-6
 
 
-def test_axes_that_turn_something_else_are_told() -> None:
+def test_axes_that_do_not_match_the_mount_are_refused() -> None:
     rng = np.random.default_rng(1)
     rotations = np.array([rotation_matrix(rng.normal(0, 1, 3)) for _ in POSITIONS])
     found = Mount.of(POSITIONS, rotations, np.zeros((len(POSITIONS), 3)))
@@ -49,7 +49,7 @@ def test_axes_that_turn_something_else_are_told() -> None:
 
 
 @pytest.mark.parametrize("missing", ["tilt", "roll"])
-def test_an_axis_that_did_not_move_does_no_harm(missing: str) -> None:
+def test_an_axis_that_did_not_move_is_harmless(missing: str) -> None:
     true = Mount(1, (1.0, 1.0, -1.0), 1.0, np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 900.0]), 0.0)
     positions = [{axis: v for axis, v in p.items() if axis != missing} for p in POSITIONS]
     poses = [true.pose(position) for position in positions]

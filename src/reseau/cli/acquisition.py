@@ -198,7 +198,7 @@ def _new(
 ) -> _Started:
     from .. import sessions
     from ..capture import Bench, BenchFile
-    from ..io import read_text
+    from ..io import parse_design, read_text
 
     texts = {}
     for role, path in inputs.items():
@@ -206,7 +206,7 @@ def _new(
             raise UsageError("is needed", where=f"--{Path(role).stem}")
         texts[role] = read_text(path)
         if Path(role).suffix == ".json":
-            sessions.read_design(texts[role], path)
+            parse_design(texts[role], path)
     path = where.bench or Path("bench.toml")
     text = read_text(path)
     bench = Bench(BenchFile.parse_toml(text, where=path))

@@ -29,7 +29,6 @@ from .common import (
     SensorFile,
     corrected,
     is_points,
-    parsed_design,
     progress,
     read_measurement,
     required,
@@ -105,13 +104,13 @@ def calibrate(
 ) -> None:
     """Calibrate a camera from photographs of a target, in one command."""
     workers = _processes(images, jobs)
-    from ..io import read_text
+    from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
 
     outputs(out, report)
     distance = positive(distance)
-    target, kind = parsed_design(read_text(design), design), component_kind(components)
+    target, kind = parse_design(read_text(design), design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
     level = level_of(eliminate, "--eliminate")
     options = _options(sigma, control, leave_out or [], reject, kind, level, workers)

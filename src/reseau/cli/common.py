@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
-    from ..io import ReseauDesign, ReseauMeasurement, TestfieldDesign
+    from ..io import ReseauMeasurement
 
 T = TypeVar("T")
 
@@ -89,14 +89,6 @@ def read_measurement(path: Path) -> ReseauMeasurement:
     if path.suffix.lower() == ".csv":
         return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
     return ReseauMeasurement.read(path)
-
-
-def parsed_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
-    """A design, told apart by its schema; `where` names it in messages."""
-    from ..io import ReseauDesign, TestfieldDesign
-
-    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
-    return kind.parse(text, where=where)
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:

@@ -16,7 +16,7 @@ from .frame import (
     MeasuredEdge,
 )
 from .measurement import MeasuredPoint, ReseauMeasurement
-from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign
+from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
 __all__ = [
     "CORNERS",
@@ -38,6 +38,7 @@ __all__ = [
     "Rings",
     "Strict",
     "TestfieldDesign",
+    "parse_design",
     "read_text",
     "write_whole",
 ]

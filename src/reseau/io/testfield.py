@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ..core.data import Array
+from .design import ReseauDesign
 from .document import Document, Strict
 
-__all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign"]
+__all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign", "parse_design"]
 
 TargetShape = Literal["square", "triangle", "cross", "circle"]
 SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
@@ -126,3 +127,21 @@ class TestfieldDesign(Document):
         """What the targets (n,) are: twice the number of their shape, one more where they are large."""
         shape = np.array([SHAPES.index(name) for name in self.targets.shape], dtype=np.intp)
         return 2 * shape + self.large
+
+
+def parse_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
+    """Read a design from JSON text, by its schema; `where` names it in messages.
+
+    Raises
+    ------
+    FormatError
+        If the text is not a design.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> type(parse_design(standard_reseau().to_json(), "reseau.json")).__name__
+    'ReseauDesign'
+    """
+    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
+    return kind.parse(text, where=where)

@@ -22,7 +22,7 @@ from .conducting import (
     rerun,
     resume,
 )
-from .kinds import KINDS, Reported, SessionKind, kind_of, own_plan, read_design
+from .kinds import KINDS, Reported, SessionKind, kind_of, own_plan
 from .parameters import (
     FramesParameters,
     OscilloscopeParameters,
@@ -53,7 +53,6 @@ __all__ = [
     "own_plan",
     "parameters_of",
     "procedure_of",
-    "read_design",
     "rerun",
     "resume",
 ]

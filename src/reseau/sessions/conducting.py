@@ -11,7 +11,8 @@ from ..calibration.document import Calibration
 from ..capture import Acquisition, Bench, BenchLock, Decision, Procedure, Rerun, Watch, carry_out
 from ..capture import rerun as rerun_with
 from ..core.errors import UsageError
-from .kinds import GENERATOR, Reported, kind_of, own_plan, read_design
+from ..io import parse_design
+from .kinds import GENERATOR, Reported, kind_of, own_plan
 from .parameters import OwnParameters, SessionParameters
 
 __all__ = [
@@ -74,7 +75,7 @@ def check(
         if each not in given:
             raise UsageError("missing input", where=f"{name}: {each}", do="pass its content in `inputs`")
         if Path(each).suffix == ".json":
-            read_design(given[each], each)
+            parse_design(given[each], each)
     if isinstance(found, OwnParameters):
         own_plan(given[GENERATOR], GENERATOR, found.set)
     if bench is not None:

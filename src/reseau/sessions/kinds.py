@@ -11,7 +11,7 @@ from ..archive import Session, Verdict
 from ..capture import Acquisition, Limits, Plan, Procedure, Step, plans, spread
 from ..core.data import Frame
 from ..core.errors import FormatError, UsageError
-from ..io import ReseauDesign, TestfieldDesign
+from ..io import ReseauDesign, parse_design
 from .parameters import (
     FramesParameters,
     OscilloscopeParameters,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
 
-__all__ = ["KINDS", "Reported", "SessionKind", "kind_of", "own_plan", "read_design"]
+__all__ = ["KINDS", "Reported", "SessionKind", "kind_of", "own_plan"]
 
 GENERATOR = "generator.py"
 """Input of a session of the plan `own`: the Python file with the generator."""
@@ -125,24 +125,6 @@ def kind_of(plan: str) -> SessionKind:
     return KINDS[plan]
 
 
-def read_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
-    """Read a design of either schema; `where` names it in messages.
-
-    Raises
-    ------
-    FormatError
-        If the text is not a design.
-
-    Examples
-    --------
-    >>> from reseau.designs import standard_reseau
-    >>> type(read_design(standard_reseau().to_json(), "reseau.json")).__name__
-    'ReseauDesign'
-    """
-    kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
-    return kind.parse(text, where=where)
-
-
 def own_plan(text: str, where: object, arguments: Mapping[str, Any] | None = None) -> Callable[..., Plan]:
     """Return the generator `plan(run, …)` of a Python file, which this function executes.
 
@@ -231,7 +213,7 @@ def _testfield_procedure(session: Session, given: TestfieldParameters) -> Testfi
     from ..procedures.target_measurement import measurer_of
     from ..procedures.testfield import TestfieldProcedure
 
-    design = read_design(session.input("design.json"), "design.json")
+    design = parse_design(session.input("design.json"), "design.json")
     # The poses and the goal have no influence on the result of given frames.
     options = {key: value for key, value in session.parameters.items() if key not in ("steps", "until")}
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
