@@ -152,7 +152,7 @@ def test_what_an_archive_cannot_do_is_reported_in_one_line(
     capsys.readouterr()
     for arguments, says in {
         ("show", "c"): "c: is not a session of this archive",
-        ("show", "a", "--out", "poses.csv"): "poses.csv: cannot be created (File exists); name another",
+        ("show", "a", "--out", "poses.csv"): "poses.csv: cannot be created (File exists); name a folder",
         ("show", "a", "--out", "none/deep"): "none/deep: cannot be created (No such file",
         ("rerun", "a"): "a: plan `frames` computes nothing",
         ("rerun", "b"): "b: has no results (status: failed)",
