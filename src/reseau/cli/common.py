@@ -77,18 +77,17 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
 
 
 def is_points(path: Path) -> bool:
-    """Whether a file holds image coordinates and not an image, by its name."""
-    return path.suffix.lower() in (".json", ".csv")
+    """Whether a file contains image coordinates; :func:`reseau.io.is_points`, imported when it is needed."""
+    from .. import io
+
+    return io.is_points(path)
 
 
 def read_measurement(path: Path) -> ReseauMeasurement:
-    """Image coordinates from a ``reseau-measurement/1`` file or a CSV ``id,x,y[,sx,sy]``."""
-    from ..core.provenance import sha256_of
-    from ..io import ReseauMeasurement
+    """Image coordinates of a file; :func:`reseau.io.read_measurement`, imported when it is needed."""
+    from .. import io
 
-    if path.suffix.lower() == ".csv":
-        return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
-    return ReseauMeasurement.read(path)
+    return io.read_measurement(path)
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:

@@ -16,6 +16,7 @@ from .frame import (
     MeasuredEdge,
 )
 from .measurement import MeasuredPoint, ReseauMeasurement
+from .reading import is_points, read_design, read_measurement
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
 __all__ = [
@@ -38,7 +39,10 @@ __all__ = [
     "Rings",
     "Strict",
     "TestfieldDesign",
+    "is_points",
     "parse_design",
+    "read_design",
+    "read_measurement",
     "read_text",
     "write_whole",
 ]

@@ -1,0 +1,509 @@
+"""The functions of ``import reseau``: from files, arrays or frames to results, one call each.
+
+Every function accepts what a user has at hand: paths, arrays of grey values, frames, image points. An
+argument of a wrong kind is a :class:`~reseau.core.errors.UsageError` that names it. A failed estimate
+is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required()`` raises instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bundle import Network, Result
+from .bundle import Options as AdjustmentOptions
+from .bundle import adjust_network as _adjust
+from .calibration import Calibration, InstrumentCorrection, SensorCorrection
+from .calibration import read_calibration as _read_calibration
+from .core.data import Frame, ImagePoints
+from .core.errors import UsageError
+from .core.failure import Failure
+from .exchange import read_network
+from .io import ReseauDesign, TestfieldDesign, is_points, read_measurement
+from .io import read_design as _read_design
+from .io.images import Channel, open_scan
+from .io.images import read_image as _read_image
+from .io.scans import scan_of
+from .measure import (
+    PinOptions,
+    ReseauOptions,
+    TestfieldOptions,
+    measure_pins,
+    measure_reseau,
+    measure_testfield,
+)
+from .measure.points import Measured
+from .procedures import oscilloscope as _procedure
+from .procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from .procedures.frame import FrameOptions, FrameResult, orient_scan
+from .procedures.measuring import measurer_of
+from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+
+__all__ = [
+    "Refined",
+    "adjust_network",
+    "calibrate",
+    "measure",
+    "orient",
+    "read_calibration",
+    "read_design",
+    "read_image",
+    "refine",
+]
+
+T = TypeVar("T")
+
+PathLike = str | Path
+ImageLike = PathLike | NDArray[Any] | Frame
+PhotoLike = ImageLike | ImagePoints
+DesignLike = PathLike | ReseauDesign | TestfieldDesign
+CalibrationLike = PathLike | Calibration
+
+
+def read_image(source: ImageLike, channel: Channel = "luma") -> Frame:
+    """Read an image as a frame of grey values.
+
+    Parameters
+    ----------
+    source : str, Path, ndarray (h, w) or Frame
+        An image file (PNG, JPEG, TIFF, BMP; 8 or 16 bit), an array of grey values, or a frame, which is
+        returned as it is.
+    channel : {"luma", "red", "green", "blue"}
+        What is taken of a colour image.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    ImageError
+        When it is no image that can be measured in.
+    UsageError
+        When `source` is of another kind.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import reseau
+    >>> reseau.read_image(np.zeros((480, 640), np.uint8))
+    <Frame: name frame, size 640 × 480 px, type uint8, full scale 255>
+    """
+    if isinstance(source, Frame):
+        return source
+    if isinstance(source, np.ndarray):
+        if source.dtype.kind not in "uf":
+            raise UsageError(
+                f"has grey values of type {source.dtype}",
+                where="source",
+                do="give unsigned integers or floats",
+            )
+        scale = (
+            float(np.iinfo(source.dtype).max) if source.dtype.kind == "u" else float(source.max(initial=1))
+        )
+        return Frame(source, scale)
+    return _read_image(_path(source, "source", "a path, an array or a Frame"), channel)
+
+
+def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign:
+    """Read the design of a target: ``reseau-design/1`` or ``testfield-design/1``.
+
+    Parameters
+    ----------
+    source : str, Path, ReseauDesign or TestfieldDesign
+        A file, or a design, which is returned as it is.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no design.
+
+    Examples
+    --------
+    >>> import reseau
+    >>> from reseau.designs import coded_sheet
+    >>> len(reseau.read_design(coded_sheet()).ids) > 50
+    True
+    """
+    if isinstance(source, ReseauDesign | TestfieldDesign):
+        return source
+    return _read_design(_path(source, "source", "a path or a design"))
+
+
+def read_calibration(source: CalibrationLike) -> Calibration:
+    """Read a calibration of any kind: camera, oscilloscope, film frame, sensor.
+
+    Parameters
+    ----------
+    source : str, Path or Calibration
+        A file, or a calibration, which is returned as it is.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no calibration.
+    """
+    if isinstance(source, Calibration):
+        return source
+    return _read_calibration(_path(source, "source", "a path or a Calibration"))
+
+
+def measure(
+    image: ImageLike,
+    design: DesignLike,
+    *,
+    options: ReseauOptions | TestfieldOptions | PinOptions | None = None,
+    sensor: CalibrationLike | None = None,
+    channel: Channel = "luma",
+) -> Measured | Failure:
+    """Measure the marks of a target in an image to sub-pixel image coordinates with covariances.
+
+    Parameters
+    ----------
+    image : str, Path, ndarray (h, w) or Frame
+        The image.
+    design : str, Path, ReseauDesign or TestfieldDesign
+        The target: a reseau, a sheet of disks, the rods of a test object, or a coded testfield.
+    options : ReseauOptions, TestfieldOptions or PinOptions, optional
+        Options of the measurement of this kind of target.
+    sensor : str, Path or Calibration, optional
+        Calibration of the sensor, applied first.
+    channel : {"luma", "red", "green", "blue"}
+        What is taken of a colour image.
+
+    Returns
+    -------
+    Measured or Failure
+        Image coordinates in pixels, `ok` and `why` of every mark; a failure when the target is not found.
+
+    Raises
+    ------
+    UsageError
+        When `options` are those of another kind of target.
+    """
+    target = read_design(design)
+    frame = _corrected(read_image(image, channel), sensor)
+    if isinstance(target, TestfieldDesign):
+        return measure_testfield(frame, target, _options(options, TestfieldOptions))
+    if target.mark.shape == "rod":
+        return measure_pins(frame, target, _options(options, PinOptions))
+    return measure_reseau(frame, target, _options(options, ReseauOptions))
+
+
+def calibrate(
+    images: Iterable[PhotoLike],
+    design: DesignLike,
+    *,
+    model: str | CameraOptions | None = None,
+    pitch_mm: float | None = None,
+    free: Sequence[str] = (),
+    size: tuple[int, int] | None = None,
+    options: CalibrationOptions | None = None,
+    sensor: CalibrationLike | None = None,
+    channel: Channel = "luma",
+) -> Calibrated | Failure:
+    """Calibrate a camera from photographs of a target.
+
+    Parameters
+    ----------
+    images : iterable of str, Path, ndarray, Frame or ImagePoints
+        Photographs of one size, or the coordinates measured in them.
+    design : str, Path, ReseauDesign or TestfieldDesign
+        The target.
+    model : str or CameraOptions, optional
+        Name of the camera model; by default ``brown`` where the pixel size is given, else ``opencv``.
+    pitch_mm : float, optional
+        Size of a pixel in millimetres.
+    free : sequence of str
+        Parameters to estimate; by default the usual ones of the model.
+    size : (int, int), optional
+        Width and height in pixels, where no photograph gives them.
+    options : CalibrationOptions, optional
+        Options of the adjustment.
+    sensor, channel
+        As for :func:`measure`.
+
+    Returns
+    -------
+    Calibrated or Failure
+        The calibration with everything it was made of; a failure when fewer than three images show the
+        target, or the adjustment has no solution.
+    """
+    photos = _several(images, "images")
+    target = read_design(design)
+    if not isinstance(model, CameraOptions):
+        pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
+        model = CameraOptions(model or "", tuple(free), pitch)
+
+    def photographs() -> Iterator[Frame | tuple[str, ImagePoints]]:
+        for number, image in enumerate(photos, start=1):
+            photo = _photo(image, channel)
+            if isinstance(photo, Frame):
+                named = isinstance(image, np.ndarray)
+                frame = Frame(photo.pixels, photo.full_scale, f"image {number}") if named else photo
+                yield _corrected(frame, sensor)
+            else:
+                name = Path(image).name if isinstance(image, str | Path) else f"image {number}"
+                yield name, photo
+
+    return calibrate_camera(photographs(), target, measurer_of(target), size, model, options)
+
+
+def orient(
+    scan: ImageLike,
+    *,
+    format_mm: tuple[float, float] | None = None,
+    dpi: float | None = None,
+    options: FrameOptions | None = None,
+) -> list[FrameResult]:
+    """Orient the film frames of a scan by their edges.
+
+    Parameters
+    ----------
+    scan : str, Path, ndarray (h, w) or (h, w, 3), or Frame
+        The scan; files are read in windows, so they may be large.
+    format_mm : (float, float), optional
+        Width and height of a frame in millimetres; by default the usual formats are tried.
+    dpi : float, optional
+        Resolution, where the file does not give it or gives it wrongly.
+    options : FrameOptions, optional
+        All options; instead of the two above.
+
+    Returns
+    -------
+    list of FrameResult
+        One for each frame; falsy ones are declined, with the reason in `why`.
+    """
+    if isinstance(scan, Frame):
+        opened = scan_of(scan.pixels, scan.name)
+    elif isinstance(scan, np.ndarray):
+        opened = scan_of(scan)
+    else:
+        opened = open_scan(_path(scan, "scan", "a path, an array or a Frame"))
+    if options is None:
+        options = FrameOptions(dpi=dpi) if format_mm is None else FrameOptions(formats=(format_mm,), dpi=dpi)
+    elif format_mm is not None or dpi is not None:
+        raise UsageError("cannot be given together with `format_mm` or `dpi`", where="options")
+    return orient_scan(opened, options)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """The oscilloscope procedure's results, one for each photograph that was given.
+
+    Parameters
+    ----------
+    photo_i : PhotoI or None
+        The camera's correction (group A).
+    photo_ii : PhotoII or None
+        The instrument's correction (group B).
+    photo_iii : tuple of PhotoIII
+        True coordinates of the body in each further photograph.
+    """
+
+    photo_i: PhotoI | None
+    photo_ii: PhotoII | None
+    photo_iii: tuple[PhotoIII, ...]
+
+
+def refine(
+    photo_i: PhotoLike | None = None,
+    reseau: DesignLike | None = None,
+    *,
+    photo_ii: PhotoLike | None = None,
+    test_object: DesignLike | None = None,
+    photo_iii: Iterable[PhotoLike] = (),
+    calibration: CalibrationLike | None = None,
+    check: Iterable[str] = (),
+    alpha: float = 0.05,
+) -> Refined | Failure:
+    """Correct photographs of an instrument's display for the errors of camera and instrument.
+
+    The oscilloscope procedure of Wishahy: PHOTO I shows a reseau alone, PHOTO II the section through a test
+    object behind it, PHOTO III that through a body of unknown points.
+
+    Parameters
+    ----------
+    photo_i : str, Path, ndarray, Frame or ImagePoints, optional
+        PHOTO I, or the coordinates of its marks; not with `calibration`.
+    reseau : str, Path or ReseauDesign, optional
+        The reseau; not with `calibration`, which contains it.
+    photo_ii : str, Path, ndarray, Frame or ImagePoints, optional
+        PHOTO II, together with `test_object`.
+    test_object : str, Path or ReseauDesign, optional
+        The rods of the test object.
+    photo_iii : iterable of str, Path, ndarray, Frame or ImagePoints
+        Photographs of bodies; they need PHOTO II or a calibration.
+    calibration : str, Path or Calibration, optional
+        A stored calibration of groups A and B, for PHOTO III.
+    check : iterable of str
+        Marks and rods that are held out for a check.
+    alpha : float
+        Level of the tests of coefficients.
+
+    Returns
+    -------
+    Refined or Failure
+        The result of each photograph; a failure when one of the targets is not found.
+
+    Raises
+    ------
+    UsageError
+        When arguments are missing or cannot be given together.
+    """
+    further = _several(photo_iii, "photo_iii")
+    _checked(photo_i, reseau, photo_ii, test_object, further, calibration)
+    held = tuple(check)
+    first: PhotoI | Failure | None = None
+    second: PhotoII | Failure | None = None
+    if calibration is not None:
+        instrument, grid, _ = InstrumentCorrection.from_calibration(read_calibration(calibration))
+    else:
+        assert photo_i is not None
+        assert reseau is not None
+        grid = _reseau_design(reseau, "reseau")
+        photo = _photo(photo_i, "luma")
+        first = _procedure.photo_i(photo, grid, alpha=alpha, check=held)
+        if isinstance(first, Failure):
+            return first
+        if photo_ii is None or test_object is None:
+            return Refined(first, None, ())
+        rods = _reseau_design(test_object, "test_object")
+        photo, marks = _split(_photo(photo_ii, "luma"), grid)
+        second = _procedure.photo_ii(photo, grid, rods, first.camera, marks=marks, alpha=alpha, check=held)
+        if isinstance(second, Failure):
+            return second
+        instrument = second.instrument
+    bodies = []
+    for image in further:
+        photo, marks = _split(_photo(image, "luma"), grid)
+        found = _procedure.photo_iii(photo, instrument, grid, marks=marks)
+        if isinstance(found, Failure):
+            return found
+        bodies.append(found)
+    assert not isinstance(first, Failure)
+    assert not isinstance(second, Failure)
+    return Refined(first, second, tuple(bodies))
+
+
+def adjust_network(network: PathLike | Network, options: AdjustmentOptions | None = None) -> Result | Failure:
+    """Adjust a network of images by the bundle method.
+
+    Parameters
+    ----------
+    network : str, Path or Network
+        A network, or its file: ``reseau-network/1``, or an export of PhotoModeler, BAL or COLMAP.
+    options : reseau.bundle.Options, optional
+        Options of the adjustment.
+
+    Returns
+    -------
+    Result or Failure
+        Cameras, images and points with their covariances; a failure that names what is not determined.
+    """
+    if not isinstance(network, Network):
+        network = read_network(_path(network, "network", "a path or a Network"))
+    return _adjust(network, options or AdjustmentOptions())
+
+
+def _checked(
+    photo_i: object,
+    reseau: object,
+    photo_ii: object,
+    test_object: object,
+    photo_iii: object,
+    calibration: object,
+) -> None:
+    """Refuse arguments of :func:`refine` that cannot be given together."""
+    if calibration is not None:
+        if any(given is not None for given in (photo_i, reseau, photo_ii, test_object)):
+            raise UsageError("contains PHOTO I and II", where="calibration", do="give `photo_iii` only")
+        return
+    if photo_i is None or reseau is None:
+        raise UsageError("needs `photo_i` and `reseau`, or `calibration`", where="refine")
+    if (photo_ii is None) != (test_object is None):
+        raise UsageError("`photo_ii` and `test_object` must be given together", where="refine")
+    if photo_ii is None and photo_iii:
+        raise UsageError("needs `photo_ii` and `test_object`", where="photo_iii")
+
+
+def _several(given: Iterable[PhotoLike], argument: str) -> tuple[PhotoLike, ...]:
+    """The argument as a tuple of photographs.
+
+    Raises
+    ------
+    UsageError
+        When it is a single one, or of another kind.
+    """
+    if isinstance(given, str | Path | np.ndarray | Frame | ImagePoints) or not isinstance(given, Iterable):
+        raise UsageError(f"is {_kind(given)}", where=argument, do="give a list of photographs")
+    return tuple(given)
+
+
+def _path(given: object, argument: str, expected: str) -> Path:
+    """The argument as a path.
+
+    Raises
+    ------
+    UsageError
+        When it is of another kind.
+    """
+    if isinstance(given, str | Path):
+        return Path(given)
+    raise UsageError(f"is {_kind(given)}", where=argument, do=f"give {expected}")
+
+
+def _kind(given: object) -> str:
+    return "None" if given is None else f"of type {type(given).__name__}"
+
+
+def _photo(image: PhotoLike, channel: Channel) -> Frame | ImagePoints:
+    """A photograph, or the coordinates measured in it."""
+    if isinstance(image, ImagePoints):
+        return image
+    if isinstance(image, Measured):
+        return image.points
+    if isinstance(image, str | Path) and is_points(image):
+        return read_measurement(image).image_points()
+    if not isinstance(image, str | Path | np.ndarray | Frame):
+        raise UsageError(
+            f"is {_kind(image)}", where="photograph", do="give a path, an array, a Frame or ImagePoints"
+        )
+    return read_image(image, channel)
+
+
+def _split(photo: Frame | ImagePoints, grid: ReseauDesign) -> tuple[Frame | ImagePoints, ImagePoints | None]:
+    """Coordinates without the marks of the reseau, and these; frames as they are."""
+    if isinstance(photo, Frame):
+        return photo, None
+    marks = np.isin(photo.names, grid.ids)
+    return photo.select(~marks), photo.select(marks) if marks.any() else None
+
+
+def _reseau_design(given: DesignLike, argument: str) -> ReseauDesign:
+    design = read_design(given)
+    if not isinstance(design, ReseauDesign):
+        raise UsageError("is the design of a testfield", where=argument, do="give a reseau-design/1")
+    return design
+
+
+def _corrected(frame: Frame, sensor: CalibrationLike | None) -> Frame:
+    """The frame corrected by the calibration of its sensor, where there is one."""
+    return (
+        frame
+        if sensor is None
+        else SensorCorrection.from_calibration(read_calibration(sensor)).correct(frame)
+    )
+
+
+def _options(given: object, kind: type[T]) -> T | None:
+    if given is None or isinstance(given, kind):
+        return given
+    raise UsageError(f"is {_kind(given)}", where="options", do=f"give {kind.__name__} for this target")

@@ -1,0 +1,53 @@
+"""Files whose kind is recognised by their content or suffix: designs, and image coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..core.provenance import sha256_of
+from .design import ReseauDesign
+from .document import read_text
+from .measurement import ReseauMeasurement
+from .testfield import TestfieldDesign, parse_design
+
+__all__ = ["is_points", "read_design", "read_measurement"]
+
+
+def read_design(path: Path | str) -> ReseauDesign | TestfieldDesign:
+    """Read the design of a target, of either schema.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is not a design.
+    """
+    return parse_design(read_text(Path(path)), where=path)
+
+
+def is_points(path: Path | str) -> bool:
+    """Return whether a file contains image coordinates rather than an image, by its suffix.
+
+    Examples
+    --------
+    >>> is_points("marks.json"), is_points("photo.tif")
+    (True, False)
+    """
+    return Path(path).suffix.lower() in (".json", ".csv")
+
+
+def read_measurement(path: Path | str) -> ReseauMeasurement:
+    """Read image coordinates: ``reseau-measurement/1``, or a CSV ``id,x,y[,sx,sy]``.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it contains no image coordinates.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return ReseauMeasurement.read_csv(path, sha256=sha256_of(path))
+    return ReseauMeasurement.read(path)
