@@ -40,9 +40,9 @@ from .measure import (
 from .measure.points import Measured
 from .procedures import oscilloscope as _procedure
 from .procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
-from .procedures.frame import FrameOptions, FrameResult, orient_scan
-from .procedures.measuring import measurer_of
+from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+from .procedures.target_measurement import measurer_of
 
 __all__ = [
     "Refined",
