@@ -103,7 +103,7 @@ def test_critical_values_are_those_of_the_tables():
 
 
 def within(count, trials, probability, sigmas=4.0):
-    """Whether a rate is the expected one, to so many standard deviations of the binomial distribution."""
+    """Whether a rate agrees with the expected one, within some standard deviations of a binomial variable."""
     spread = np.sqrt(trials * probability * (1 - probability))
     return abs(count - trials * probability) < sigmas * spread
 

@@ -1,4 +1,4 @@
-"""The tube: its corrections differentiated as told, lines and spot, and what it draws in which place."""
+"""The tube: derivatives of its corrections, lines and spot, and the positions of what it draws."""
 
 from __future__ import annotations
 
