@@ -125,7 +125,12 @@ class BatchAdjustment:
 
     Examples
     --------
-    See :func:`adjust_batch`.
+    >>> line = lambda x, rows: (x * [1.0, 2.0, 3.0], np.tile([[1.0], [2.0], [3.0]], (len(rows), 1, 1)))
+    >>> fit = adjust_batch(line, [[1.0], [1.0]], [[1.0, 2.0, 3.0], [2.1, 3.9, 6.0]])
+    >>> len(fit), fit.converged.tolist(), fit.redundancy.tolist()
+    (2, [True, True], [2, 2])
+    >>> fit.estimates[:, 0].round(3).tolist(), fit.sigma[:, 0].round(3).tolist()
+    ([1.0, 1.993], [0.0, 0.026])
     """
 
     estimates: Array

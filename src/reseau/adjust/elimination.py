@@ -38,7 +38,10 @@ class EliminationStep:
 
     Examples
     --------
-    See :func:`eliminate`.
+    >>> test = CoefficientTest("K3", "t", statistic=0.4, critical=1.98, p=0.69, significant=False)
+    >>> step = EliminationStep(test, parameters=8, sigma0_before=1.02, sigma0_after=1.01)
+    >>> step.name, step.test.p
+    ('K3', 0.69)
     """
 
     test: CoefficientTest
@@ -73,7 +76,13 @@ class Elimination:
 
     Examples
     --------
-    See :func:`eliminate`.
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> terms = np.arange(6.0)[:, None] ** [0, 1, 2]
+    >>> y = [0.1, 0.9, 2.1, 2.9, 4.1, 4.9]
+    >>> problem = GaussMarkov(lambda x: terms @ x, y, 0.1, Parameters("abc", [0.0] * 3), lambda x: terms)
+    >>> found = eliminate(problem, keep=["a"]).required()
+    >>> found.dropped, [test.name for test in found.kept], round(found.adjustment["b"], 3)
+    (('c',), ['b'], 0.983)
     """
 
     steps: tuple[EliminationStep, ...]

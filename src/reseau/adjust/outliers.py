@@ -46,7 +46,12 @@ class Robust(Generic[F]):
 
     Examples
     --------
-    See :func:`robust`.
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> y = [1.0, 1.1, 0.9, 1.0, 5.0]
+    >>> mean = GaussMarkov(lambda x: np.repeat(x, 5), y, 0.1, Parameters("m", [0.0]))
+    >>> found = robust(mean).required()
+    >>> round(found.adjustment["m"], 2), int(found.factors.argmin())
+    (1.03, 4)
     """
 
     adjustment: F
@@ -233,7 +238,14 @@ class Rejection(Generic[F]):
 
     Examples
     --------
-    See :func:`data_snooping`.
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> y = [1.0, 1.1, 0.9, 1.0, 5.0]
+    >>> mean = GaussMarkov(lambda x: np.repeat(x, 5), y, 0.1, Parameters("m", [0.0]))
+    >>> found = data_snooping(mean).required()
+    >>> found.rejected.tolist(), [step.index for step in found.steps], found.rounds
+    ([False, False, False, False, True], [(4,)], 2)
+    >>> round(found.adjustment["m"], 6)
+    1.0
     """
 
     adjustment: F

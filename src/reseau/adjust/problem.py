@@ -30,7 +30,12 @@ class Problem:
 
     Examples
     --------
-    See :class:`GaussMarkov` and :class:`GaussHelmert`.
+    >>> from reseau.adjust import GaussMarkov, Parameters
+    >>> mean = GaussMarkov(lambda x: np.repeat(x, 4), [1.0, 3.0, 2.0, 8.0], 1.0, Parameters("m", [0.0]))
+    >>> isinstance(mean, Problem), mean.size
+    (True, 4)
+    >>> round(mean.with_weights([1, 1, 1, 0]).adjusted().required()["m"], 6)
+    2.0
     """
 
     observations: Values

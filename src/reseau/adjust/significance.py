@@ -101,7 +101,9 @@ class NestedTest:
 
     Examples
     --------
-    See :func:`reseau.adjust.compare`.
+    >>> test = nested_test(increase=8.0, restrictions=2, cost=None, redundancy=10, alpha=0.05)
+    >>> test.distribution, round(test.critical, 2), test.significant
+    ('chi2', 5.99, True)
     """
 
     distribution: str

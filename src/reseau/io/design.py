@@ -14,7 +14,13 @@ __all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
 
 
 class Mark(Strict):
-    """What every mark of a design looks like, in the unit of the design."""
+    """What every mark of a design looks like, in the unit of the design.
+
+    Examples
+    --------
+    >>> Mark(shape="disk", size=2.0).line_width is None
+    True
+    """
 
     shape: Literal["cross", "disk", "square", "line-grid", "rod"]
     size: float | None = Field(default=None, gt=0)
@@ -22,7 +28,13 @@ class Mark(Strict):
 
 
 class DesignPoint(Strict):
-    """One mark of a design: coordinates in its plane, and where in the image it may be expected."""
+    """One mark of a design: coordinates in its plane, and where in the image it may be expected.
+
+    Examples
+    --------
+    >>> DesignPoint(id="A1", x=10.0, y=-5.0, sigma=0.002).nominal_px is None
+    True
+    """
 
     id: str = Field(min_length=1)
     x: float | None
@@ -41,6 +53,11 @@ class Rings(Strict):
     sectors : dict of str to tuple of (float, float)
         For each coded point the parts of its ring that are of the marks' polarity: from one angle to another,
         degrees from x towards y.
+
+    Examples
+    --------
+    >>> Rings(inner=3.0, outer=5.0, sectors={"A1": ((0.0, 90.0), (180.0, 270.0))}).sectors["A1"][0]
+    (0.0, 90.0)
     """
 
     inner: float = Field(gt=0)
@@ -58,7 +75,18 @@ class Rings(Strict):
 
 
 class ReseauDesign(Document):
-    """``reseau-design/1``: a reseau, a sheet of targets, or the rods of a test object."""
+    """``reseau-design/1``: a reseau, a sheet of targets, or the rods of a test object.
+
+    Examples
+    --------
+    >>> points = (DesignPoint(id="A", x=0.0, y=0.0), DesignPoint(id="B", x=10.0, y=0.0))
+    >>> cross = Mark(shape="cross", size=1.0, line_width=0.1)
+    >>> design = ReseauDesign(name="two", unit="mm", mark=cross, polarity="dark", points=points)
+    >>> design.ids, design.xy.tolist()
+    (('A', 'B'), [[0.0, 0.0], [10.0, 0.0]])
+    >>> ReseauDesign.parse(design.to_json(), where="two.json") == design
+    True
+    """
 
     SCHEMA: ClassVar[str] = "reseau-design/1"
     name: str

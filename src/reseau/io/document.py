@@ -17,7 +17,19 @@ __all__ = ["Document", "Strict", "read_text", "write_whole"]
 
 
 class Strict(BaseModel):
-    """A part of a document: no unknown key, no coercion of types, no NaN."""
+    """A part of a document: no unknown key, no coercion of types, no NaN.
+
+    Examples
+    --------
+    >>> class Point(Strict):
+    ...     x: float
+    >>> Point(x=1.5).x
+    1.5
+    >>> Point(x="1.5")
+    Traceback (most recent call last):
+        ...
+    pydantic_core._pydantic_core.ValidationError: 1 validation error for Point...
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
@@ -29,6 +41,14 @@ def read_text(path: Path) -> str:
     ------
     InputError
         When it cannot be read, is too large or is no UTF-8.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_whole(Path(folder) / "note.txt", "21 µm")
+    ...     read_text(Path(folder) / "note.txt")
+    '21 µm'
     """
     try:
         if path.stat().st_size > 1_000_000_000:
@@ -47,6 +67,14 @@ def write_whole(path: Path, content: str | bytes) -> None:
     ------
     InputError
         When the folder does not exist or cannot be written to.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_whole(Path(folder) / "note.txt", b"21")
+    ...     (Path(folder) / "note.txt").stat().st_size
+    2
     """
     data = content.encode("utf-8") if isinstance(content, str) else content
     draft = path.with_name(f".{path.name}.{os.getpid()}")
@@ -84,6 +112,19 @@ class Document(Strict):
     """A JSON file with a ``schema`` key first.
 
     Subclasses set `SCHEMA`, as in ``reseau-design/1``.
+
+    Examples
+    --------
+    >>> class Note(Document):
+    ...     SCHEMA = "note/1"
+    ...     text: str
+    >>> print(Note(text="clean the glass").to_json(), end="")
+    {
+     "schema": "note/1",
+     "text": "clean the glass"
+    }
+    >>> Note.parse('{"schema": "note/1", "text": "done"}', where="note.json").text
+    'done'
     """
 
     SCHEMA: ClassVar[str]

@@ -39,7 +39,14 @@ class CornerPositions(Strict):
 
 
 class FrameCorners(Document):
-    """``frame-corners/1``: the corners of a camera's frame as calibrated."""
+    """``frame-corners/1``: the corners of a camera's frame as calibrated.
+
+    Examples
+    --------
+    >>> frame = FrameCorners.from_xy([[-18, 12], [18, 12], [18, -12], [-18, -12]])
+    >>> frame.corners.ur, frame.xy().shape
+    ((18.0, 12.0), (4, 2))
+    """
 
     SCHEMA: ClassVar[str] = "frame-corners/1"
     unit: Literal["mm"] = "mm"
@@ -74,7 +81,13 @@ class FrameCorners(Document):
 
 
 class MeasuredCorner(Strict):
-    """A point in the scan, pixels, with its standard deviations and correlation."""
+    """A point in the scan, pixels, with its standard deviations and correlation.
+
+    Examples
+    --------
+    >>> MeasuredCorner.from_columns(np.array([10.5, 20.25]), np.diag([0.01, 0.04]))
+    MeasuredCorner(x=10.5, y=20.25, sx=0.1, sy=0.2, rho=0.0)
+    """
 
     x: float
     y: float
@@ -91,7 +104,13 @@ class MeasuredCorner(Strict):
 
 
 class MeasuredEdge(Strict):
-    """How well an edge was found: profiles used and rejected, their scatter, how far it bows."""
+    """How well an edge was found: profiles used and rejected, their scatter, how far it bows.
+
+    Examples
+    --------
+    >>> MeasuredEdge(found=True, points=200, rejected=3, rms_px=0.21, curvature_px=0.4).why
+    ''
+    """
 
     found: bool
     points: int
@@ -105,6 +124,13 @@ class FrameTransform(Strict):
     """Transformation of the scan to calibrated corners.
 
     `sigma_mm` and the parameters' sigmas are null where four corners leave no redundancy.
+
+    Examples
+    --------
+    >>> shift = {"a": {"value": 0.0212, "sigma": None}}
+    >>> left = {"ul": (0.001, -0.002)}
+    >>> FrameTransform(kind="affine", parameters=shift, residuals_mm=left, sigma_mm=None).kind
+    'affine'
     """
 
     kind: Literal["similarity", "affine", "projective", "bilinear"]
@@ -118,6 +144,15 @@ class FrameOrientation(Document):
 
     Of a frame that was declined the numbers are null. `angle_deg` is the direction of the photo x-axis, which
     runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
+
+    Examples
+    --------
+    >>> FrameOrientation(
+    ...     image="roll-07.tif", status="declined", why="the upper edge was not found", format_mm=None,
+    ...     channel=None, corners=None, principal_point=None, angle_deg=None, angle_sigma_deg=None,
+    ...     px_per_mm=None, edges={},
+    ... ).image_points()
+    ImagePoints(...)
     """
 
     SCHEMA: ClassVar[str] = "reseau-orientation/1"

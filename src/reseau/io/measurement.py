@@ -17,7 +17,15 @@ __all__ = ["MeasuredPoint", "ReseauMeasurement"]
 
 
 class MeasuredPoint(Strict):
-    """One mark as it was, or was not, measured; sigmas in pixels."""
+    """One mark as it was, or was not, measured; sigmas in pixels.
+
+    Examples
+    --------
+    >>> MeasuredPoint(id="A1", x=100.25, y=80.5, sx=0.02, sy=0.02, rho=0.0, ok=True).x
+    100.25
+    >>> MeasuredPoint(id="A2", ok=False, why="outside the image").x is None
+    True
+    """
 
     id: str
     x: float | None = None
@@ -30,7 +38,15 @@ class MeasuredPoint(Strict):
 
 
 class ReseauMeasurement(Document):
-    """``reseau-measurement/1``: image coordinates of marks, and why some have none."""
+    """``reseau-measurement/1``: image coordinates of marks, and why some have none.
+
+    Examples
+    --------
+    >>> points = ImagePoints.with_sigma(["A1", "A2"], [[100.25, 80.5], [130.0, 80.75]], 0.02)
+    >>> measured = ReseauMeasurement.from_image_points(points, image="photo.tif", sha256="")
+    >>> measured.found, measured.image_points().xy.tolist()
+    (2, [[100.25, 80.5], [130.0, 80.75]])
+    """
 
     SCHEMA: ClassVar[str] = "reseau-measurement/1"
     image: str

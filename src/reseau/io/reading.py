@@ -22,6 +22,15 @@ def read_design(path: Path | str) -> ReseauDesign | TestfieldDesign:
         When the file cannot be read.
     FormatError
         When it is not a design.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.designs import standard_reseau
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     standard_reseau().write(Path(folder) / "reseau.json")
+    ...     len(read_design(Path(folder) / "reseau.json").ids)
+    165
     """
     return parse_design(read_text(Path(path)), where=path)
 
@@ -46,6 +55,14 @@ def read_measurement(path: Path | str) -> ReseauMeasurement:
         When the file cannot be read.
     FormatError
         When it contains no image coordinates.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "marks.csv").write_text("\\n".join(["id,x,y", "A1,100.25,80.5"]))
+    ...     read_measurement(Path(folder) / "marks.csv").points[0].x
+    100.25
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":

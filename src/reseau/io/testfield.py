@@ -21,7 +21,16 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class FieldLines(Strict):
-    """The straight lines: their width, where they stand, and the rectangle that they fill."""
+    """The straight lines: their width, where they stand, and the rectangle that they fill.
+
+    Examples
+    --------
+    >>> lines = FieldLines(
+    ...     width=1.0, vertical_x=(0.0, 20.0, 40.0), horizontal_y=(0.0, 20.0), extent=(-5.0, -5.0, 45.0, 25.0)
+    ... )
+    >>> len(lines.vertical_x) - 1
+    2
+    """
 
     width: Positive
     vertical_x: Annotated[tuple[float, ...], Field(min_length=2)]
@@ -43,7 +52,17 @@ class FieldLines(Strict):
 
 
 class FieldTargets(Strict):
-    """The targets, in columns."""
+    """The targets, in columns.
+
+    Examples
+    --------
+    >>> targets = FieldTargets(
+    ...     id=("1", "2"), square=(1, 1), shape=("circle", "cross"), x=(5.0, 15.0), y=(5.0, 5.0),
+    ...     size=(3.0, 4.0), angle=(0.0, 0.0),
+    ... )
+    >>> targets.shape
+    ('circle', 'cross')
+    """
 
     id: tuple[Annotated[str, Field(min_length=1)], ...]
     square: tuple[Annotated[int, Field(ge=1)], ...]
@@ -70,6 +89,15 @@ class TestfieldDesign(Document):
     `size` is the side of a square and of an equilateral triangle, the tip-to-tip length of a cross, whose
     arms are a third of that wide, and the diameter of a circle; x, y its centroid. `angle` (degrees,
     counter-clockwise) turns it from upright: the triangle with its apex up.
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> design = coded_testfield()
+    >>> design.squares, len(design.centres), design.unit
+    ((8, 8), 64, 'mm')
+    >>> sorted(set(design.symbols.tolist()))[:3]
+    [0, 1, 2]
     """
 
     __test__: ClassVar[bool] = False  # not one for pytest, which collects what is named so

@@ -19,7 +19,13 @@ __all__ = ["Chain", "Identity", "Inverted", "Similarity"]
 
 @dataclass(frozen=True, eq=False)
 class Identity(PlaneMapping):
-    """The identity mapping; it has no parameters."""
+    """The identity mapping; it has no parameters.
+
+    Examples
+    --------
+    >>> Identity()([[1.0, 2.0]])
+    array([[1., 2.]])
+    """
 
     names: ClassVar[tuple[str, ...]] = ()
     values: Array = field(default_factory=lambda: np.zeros(0))
@@ -48,6 +54,12 @@ class Similarity(PlaneMapping):
         X0, Y0, a, b; default the identity.
     mirrored : bool
         Whether the sign of y is changed first, as between a plane with y down and one with y up.
+
+    Examples
+    --------
+    >>> system = Similarity.common_system([100.0, 50.0], [100.0, 150.0])
+    >>> system([[100.0, 150.0]]).round(6).tolist(), round(system.angle, 4)
+    ([[100.0, 0.0]], -1.5708)
     """
 
     names: ClassVar[tuple[str, ...]] = ("X0", "Y0", "a", "b")
@@ -132,6 +144,12 @@ class Inverted(PlaneMapping):
     ----------
     mapping : PlaneMapping
         The mapping f.
+
+    Examples
+    --------
+    >>> back = Inverted(Similarity([10.0, 0.0, 2.0, 0.0]))
+    >>> back([[12.0, 4.0]]), back.inverse([[1.0, 2.0]])
+    (array([[1., 2.]]), array([[12.,  4.]]))
     """
 
     mapping: PlaneMapping

@@ -61,6 +61,12 @@ def wong_display() -> RationalPolynomial:
 
     Parameters k0 … k3, h'1 and h'2 (−r², −r⁴ in X), h'3 and h'4 (r², r⁴ in Y), P0 … P4, m1, m2: 15 in all.
     With k2 = k3 = 0 it is Wishahy's eq. (6a, b).
+
+    Examples
+    --------
+    >>> display = wong_display().with_values({"k0": 0.02, "P0": 1.5})
+    >>> len(display.names), display([[10.0, 20.0]]).round(3)
+    (15, array([[11.7, 20.4]]))
     """
     decentering = {
         "h'1": {"X": _negative(_RADII[0])},
@@ -91,6 +97,12 @@ class DecenteredDisplay(PlaneMapping):
     ----------
     values : array_like (15,)
         k0 … k3, g1, g2, g3, theta (radians), P0 … P4, m1, m2; default the identity.
+
+    Examples
+    --------
+    >>> display = DecenteredDisplay().with_values({"g1": 1e-4, "theta": 0.0})
+    >>> display([[10.0, 20.0]]).round(3)
+    array([[10.  , 20.05]])
     """
 
     names: ClassVar[tuple[str, ...]] = (*_SYMMETRIC, "g1", "g2", "g3", "theta", *_ORIENTATION, *_BEAM)

@@ -41,6 +41,13 @@ class Derivatives(NamedTuple):
         Derivatives with respect to the point; rows are the mapped coordinates.
     d_parameters : ndarray (n, 2, u)
         Derivatives with respect to the parameters, in the order of their names.
+
+    Examples
+    --------
+    >>> from reseau.optics import Similarity
+    >>> value, d_xy, d_parameters = Similarity([1.0, 0.0, 2.0, 0.0]).derivatives([[3.0, 4.0]])
+    >>> value, d_xy.shape, d_parameters.shape
+    (array([[7., 8.]]), (1, 2, 2), (1, 2, 4))
     """
 
     value: Array
@@ -50,7 +57,14 @@ class Derivatives(NamedTuple):
 
 @runtime_checkable
 class Mapping(Protocol):
-    """Interface of a plane mapping; :class:`PlaneMapping` implements most of it."""
+    """Interface of a plane mapping; :class:`PlaneMapping` implements most of it.
+
+    Examples
+    --------
+    >>> from reseau.optics import Similarity
+    >>> isinstance(Similarity(), Mapping), isinstance(np.eye(2), Mapping)
+    (True, False)
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,6 +122,13 @@ class PlaneMapping(ABC):
     A subclass defines `names`, `values` and :meth:`derivatives`. It overrides :meth:`_value` and
     :meth:`_slope` where they are cheaper without the parameters, :meth:`_start` for a better start value of
     the inverse, and :meth:`one_to_one` where the region is known exactly.
+
+    Examples
+    --------
+    >>> from reseau.optics import Similarity
+    >>> doubled = Similarity().with_values({"a": 2.0})
+    >>> doubled([[1.0, 3.0]]), doubled.inverse([[2.0, 6.0]]), doubled.value_of("a")
+    (array([[2., 6.]]), array([[1., 3.]]), 2.0)
     """
 
     if TYPE_CHECKING:  # a subclass may define them as fields, which a property here would hide

@@ -57,7 +57,15 @@ def _coefficients(theta: Array) -> tuple[Array, Array, Array]:
 
 
 def rotation_matrix(r: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula.
+
+    Examples
+    --------
+    >>> rotation_matrix([0.0, 0.0, np.pi / 2]).round(6) + 0.0
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
     vectors = np.asarray(r, dtype=np.float64)
     theta = np.linalg.norm(vectors, axis=-1)[..., None, None]
     a, b, _ = _coefficients(theta)
@@ -84,6 +92,12 @@ def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
     -------
     ndarray (n, 3), ndarray (n, 3, 3)
         The rotated vectors and the derivatives.
+
+    Examples
+    --------
+    >>> value, slope = rotate([0.0, 0.0, np.pi / 2], [[1.0, 0.0, 0.0]])
+    >>> value.round(6) + 0.0, slope.shape
+    (array([[0., 1., 0.]]), (1, 3, 3))
     """
     rotation, x = np.asarray(r, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
     theta = np.linalg.norm(rotation, axis=-1)[..., None, None]
@@ -102,6 +116,11 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     ------
     UsageError
         When a matrix is not a rotation within 1e-6.
+
+    Examples
+    --------
+    >>> matrix_to_vector(rotation_matrix([0.1, -0.2, 0.3])).round(6)
+    array([ 0.1, -0.2,  0.3])
     """
     matrices = np.asarray(matrix, dtype=np.float64)
     flat = matrices.reshape(-1, 3, 3)
@@ -157,6 +176,13 @@ def angles_to_matrix(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Arra
     -------
     ndarray (..., 3, 3)
         Rotation matrices from object to camera.
+
+    Examples
+    --------
+    >>> angles_to_matrix(0.0, 0.0, 0.0) + 0.0
+    array([[ 1.,  0.,  0.],
+           [ 0., -1.,  0.],
+           [ 0.,  0., -1.]])
     """
     w, p, k = np.broadcast_arrays(*(np.asarray(angle, dtype=np.float64) for angle in (omega, phi, kappa)))
     sw, cw, sp, cp, sk, ck = np.sin(w), np.cos(w), np.sin(p), np.cos(p), np.sin(k), np.cos(k)
@@ -173,6 +199,11 @@ def matrix_to_angles(matrix: ArrayLike) -> Array:
     """Omega, phi, kappa (..., 3) in radians of matrices (..., 3, 3); see :func:`angles_to_matrix`.
 
     At φ = ±90° only a combination of ω and κ is determined: κ is set to zero.
+
+    Examples
+    --------
+    >>> matrix_to_angles(angles_to_matrix(0.1, -0.2, 0.3)).round(6)
+    array([ 0.1, -0.2,  0.3])
     """
     m = _VIEW @ np.asarray(matrix, dtype=np.float64)
     cos_phi = np.hypot(m[..., 0, 0], m[..., 1, 0])
@@ -193,6 +224,12 @@ class Pose:
         Rotation vectors of R, radians.
     x0 : ndarray (3,) or (n, 3)
         Projection centres, in the unit of object space.
+
+    Examples
+    --------
+    >>> pose = Pose.from_angles(0.0, 0.0, 0.0, [0.0, 0.0, 1000.0])
+    >>> pose([[100.0, 50.0, 0.0]]).round(6).tolist()
+    [[100.0, -50.0, 1000.0]]
     """
 
     rotation: Array
@@ -240,6 +277,15 @@ class Projection(NamedTuple):
         Derivatives with respect to the object point.
     d_camera : ndarray (n, 2, u)
         Derivatives with respect to the camera's parameters.
+
+    Examples
+    --------
+    See :func:`project`:
+
+    >>> from reseau.optics import Identity
+    >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), [[1.0, 2.0, -4.0]])
+    >>> isinstance(seen, Projection), bool(np.isnan(seen.xy).all())
+    (True, True)
     """
 
     xy: Array
@@ -264,6 +310,13 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     -------
     Projection
         Image points and derivatives, NaN where a point is not in front of its camera.
+
+    Examples
+    --------
+    >>> from reseau.optics import Identity
+    >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, -6.0]), [[1.0, 2.0, 4.0]])
+    >>> seen.xy, seen.d_pose.shape, seen.d_point.shape, seen.d_camera.shape
+    (array([[0.1, 0.2]]), (1, 2, 6), (1, 2, 3), (1, 2, 0))
     """
     object_points = np.asarray(points, dtype=np.float64)
     if object_points.ndim != 2 or object_points.shape[1] != 3:

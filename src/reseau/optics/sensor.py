@@ -22,12 +22,24 @@ __all__ = ["Sensor", "illumination", "jpeg", "sigma_of_snr", "snr_db"]
 
 
 def snr_db(sigma: float, full_scale: float = 255.0) -> float:
-    """Signal-to-noise ratio in dB of a noise of standard deviation `sigma` grey values: 20·log10(255/σ)."""
+    """Signal-to-noise ratio in dB of a noise of standard deviation `sigma` grey values: 20·log10(255/σ).
+
+    Examples
+    --------
+    >>> round(snr_db(2.55), 6)
+    40.0
+    """
     return float(20 * np.log10(full_scale / sigma))
 
 
 def sigma_of_snr(snr: float, full_scale: float = 255.0) -> float:
-    """Standard deviation in grey values of a signal-to-noise ratio in dB; see :func:`snr_db`."""
+    """Standard deviation in grey values of a signal-to-noise ratio in dB; see :func:`snr_db`.
+
+    Examples
+    --------
+    >>> round(sigma_of_snr(40.0), 6)
+    2.55
+    """
     return float(full_scale / 10 ** (snr / 20))
 
 
@@ -58,6 +70,15 @@ class Sensor:
     ------
     UsageError
         When a value is not possible.
+
+    Examples
+    --------
+    >>> sensor = Sensor(width=6, height=4, bits=12, gain=10.0, read_noise=2.0)
+    >>> frame = sensor.expose(np.full((4, 6), 1000.0), np.random.default_rng(1))
+    >>> frame.shape, frame.dtype, sensor.full_scale
+    ((4, 6), dtype('uint16'), 4095.0)
+    >>> sensor.variance(np.full((4, 6), 1000.0))[0, 0].round(3).item()
+    104.083
     """
 
     width: int
@@ -162,6 +183,12 @@ def jpeg(pixels: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     ------
     UsageError
         When the image is not grey with 8 bits, or the quality is not possible.
+
+    Examples
+    --------
+    >>> ramp = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (8, 1))
+    >>> jpeg(ramp, 90).shape
+    (8, 64)
     """
     if pixels.dtype != np.uint8 or pixels.ndim != 2 or not 1 <= quality <= 100:
         raise UsageError(
@@ -207,6 +234,11 @@ def illumination(
     ------
     UsageError
         When a part of the image is without light.
+
+    Examples
+    --------
+    >>> illumination(5, 3, gradient=(0.2, 0.0))[1].round(2)
+    array([0.8, 0.9, 1. , 1.1, 1.2])
     """
     half = np.array([(width - 1) / 2, (height - 1) / 2])
     x = (np.arange(width) - half[0])[None, :] / half.max()

@@ -91,6 +91,15 @@ class Causes:
         conditions together.
     conditions : tuple of ConditionTest
         Each condition on its own.
+
+    Examples
+    --------
+    >>> values = np.array([float(name in ("A1", "B1")) for name in COEFFICIENTS])
+    >>> causes = physical_causes(COEFFICIENTS, values + 1e-3, 1e-4 * np.eye(16))
+    >>> isinstance(causes, Causes), causes.adjustment.redundancy
+    (True, 3)
+    >>> [test.condition for test in causes.conditions if test.holds]
+    ['A6 = B6', 'A4 = B3 + A5', 'B4 = A3 + B5']
     """
 
     adjustment: Adjustment

@@ -54,6 +54,12 @@ class Registration:
         Probability of a difference from the identity at least as large when nothing has moved.
     moved : bool
         Whether the camera has moved: significantly at 0.001, and by more than 0.05 px.
+
+    Examples
+    --------
+    >>> still = Registration(Similarity(), 25, 1.02, left_px=0.02, displacement_px=0.01, p=0.6, moved=False)
+    >>> still.similar, still.apply(ImagePoints.with_sigma(["P"], [[100.0, 80.0]], 0.05)).xy.tolist()
+    (True, [[100.0, 80.0]])
     """
 
     system: Similarity | SmoothField

@@ -49,6 +49,15 @@ class StandardTest:
         Whether the rods were taken to be those of the stored calibration.
     alpha : float
         Level.
+
+    Examples
+    --------
+    >>> test = StandardTest(
+    ...     ("R1", "R2"), np.array([[0.1, 0.0], [0.3, 0.4]]), np.full((2, 2), 0.2), 7.25, 4, 9.49, 0.12,
+    ...     np.array([0.2, 0.2]), np.array([0.14, 0.14]), 0.13, 0.26, same_object=True, alpha=0.05,
+    ... )
+    >>> test.holds, test.largest
+    (True, ('R2', 0.5))
     """
 
     names: tuple[str, ...]

@@ -28,6 +28,13 @@ class Level:
         Number of frames, at least two.
     mean, variance : ndarray (height, width)
         Mean and variance of each pixel over the frames, corrected for changes of whole frames (lamp flicker).
+
+    Examples
+    --------
+    >>> frames = [np.full((2, 3), 10) + step for step in (np.eye(2, 3), -np.eye(2, 3))]
+    >>> level = Level.of(1000.0, frames)
+    >>> level.count, level.mean.shape, float(level.mean.mean()) > 10.0
+    (2, (2, 3), True)
     """
 
     exposure_us: float
@@ -57,6 +64,15 @@ class LevelSums:
     ----------
     exposure_us : float
         Exposure time.
+
+    Examples
+    --------
+    >>> sums = LevelSums(1000.0)
+    >>> for grey in (9, 11, 10):
+    ...     sums.add(np.array([[grey, 10], [10, 20 - grey]]))
+    >>> level = sums.level()
+    >>> level.count, round(float(level.variance[0, 0]), 2)
+    (3, 1.33)
     """
 
     def __init__(self, exposure_us: float) -> None:
@@ -118,6 +134,15 @@ class SensorSeries:
     ------
     UsageError
         When either is missing, or frames differ in size.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us, signal):
+    ...     return Level.of(exposure_us, 10 + signal + rng.poisson(signal, (4, 8, 8)) - signal)
+    >>> series = SensorSeries((level(10, 0),), tuple(level(t, t) for t in (40, 10, 20)), full_scale=255.0)
+    >>> series.shape, [each.exposure_us for each in series.bright]
+    ((8, 8), [10, 20, 40])
     """
 
     dark: tuple[Level, ...]
