@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import ResultDocument
+from reseau.bundle import ResultDocument, adjust_network, calibration_of
+from reseau.exchange import read_network
+from reseau.io import FrameOrientation
 from reseau.io.network import Network1
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import Pose, matrix_to_vector, project
@@ -250,3 +252,53 @@ def test_the_document_is_read_back_with_its_provenance(
     assert list(older)[-1] == "provenance"
     del older["provenance"], older["warning_codes"]
     assert ResultDocument.parse(json.dumps(older), where="older").to_dict() == older
+
+
+def test_a_calibration_on_the_command_line_replaces_the_camera_of_the_network(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    path, result = network(), tmp_path / "result.json"
+    assert reseau("bundle", path, "-o", tmp_path / "first.json")[0] == 0
+    calibration = calibration_of(
+        adjust_network(read_network(path)).required(), "cam", name="cam of an earlier block"
+    )
+    calibration.write(tmp_path / "cam.json")
+    status, _, err = reseau("bundle", path, "--camera", f"cam={tmp_path / 'cam.json'}", "-o", result)
+    assert (status, err) == (0, "")
+    first, again = (ResultDocument.read(tmp_path / name) for name in ("first.json", "result.json"))
+    assert again.redundancy == first.redundancy + 4
+    assert again.cameras[0].correlation.names == ("c", "x0", "y0", "K1")
+    for name in ("c", "x0", "y0", "K1"):
+        assert 0 < again.cameras[0].parameters[name].sigma < first.cameras[0].parameters[name].sigma
+    assert again.provenance is not None
+    assert list(again.provenance["inputs"]) == ["cam.json", "network.json"]
+
+
+def test_a_film_frame_on_the_command_line_gives_pixel_size_and_principal_point(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    corner = {"sx": 0.2, "sy": 0.2, "rho": 0.0}
+    at = {"ul": (21.5, 19.5), "ur": (621.5, 19.5), "lr": (621.5, 459.5), "ll": (21.5, 459.5)}
+    frame = FrameOrientation.model_validate({
+        "image": "scan.tif", "status": "oriented", "why": "", "format_mm": (6.0, 4.4), "channel": "grey",
+        "corners": {name: corner | {"x": x, "y": y} for name, (x, y) in at.items()},
+        "principal_point": corner | {"x": 321.5, "y": 239.5}, "angle_deg": 0.0, "angle_sigma_deg": 0.01,
+        "px_per_mm": (100.0, 100.0), "edges": {}})  # fmt: skip
+    frame.write(tmp_path / "frame.json")
+    result = tmp_path / "result.json"
+    status, _, err = reseau("bundle", network(), "--camera", f"cam={tmp_path / 'frame.json'}", "-o", result)
+    assert (status, err) == (0, "")
+    camera = ResultDocument.read(result).cameras[0]
+    assert camera.correlation.names == ("c", "x0", "y0", "K1")
+    for name, true in (("c", 8.0), ("x0", 0.02), ("y0", 0.0)):
+        assert abs(camera.parameters[name].value - true) < 4 * camera.parameters[name].sigma
+    assert camera.parameters["x0"].sigma < 0.002 * 1.5
+
+
+@pytest.mark.parametrize("given", ["cam.json", "=cam.json", "cam="])
+def test_a_camera_without_id_or_file_is_refused(
+    given: str, reseau: Run, network: Callable[..., Path]
+) -> None:
+    status, out, err = reseau("bundle", network(), "--camera", given)
+    assert (status, out) == (2, "")
+    assert "ID=calibration.json" in err

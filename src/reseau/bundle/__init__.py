@@ -38,6 +38,7 @@ from .network import (
     Stage,
     calibrated_camera,
     example_network,
+    film_camera,
 )
 from .solver import Approximate, BundleFit, BundleProblem, approximate
 
@@ -72,6 +73,7 @@ __all__ = [
     "eliminate_parameters",
     "estimate_components",
     "example_network",
+    "film_camera",
     "model_search_entries",
     "problem_of",
     "projection_field_at",

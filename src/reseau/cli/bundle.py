@@ -43,7 +43,10 @@ def bundle(
     ] = False,
     camera: Annotated[
         list[str] | None,
-        typer.Option(help="Calibration of a camera of the network, as ID=calibration.json; repeatable."),
+        typer.Option(
+            help="Calibration of a camera of the network, or orientation of its film frame, "
+            "as ID=calibration.json; repeatable."
+        ),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 
-from ..bundle import Network, calibrated_camera
+from ..bundle import Camera, Network, calibrated_camera, film_camera
 from ..calibration import read_calibration
-from ..core.errors import FormatError, InputError
-from ..io import read_text
-from ..io.network import CalibratedCameraEntry, Network1
+from ..core.errors import FormatError, InputError, UsageError
+from ..io import FrameOrientation, read_text
+from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from .bal import read_bal
 from .colmap import read_colmap
 from .photomodeler import read_photomodeler
@@ -27,16 +27,18 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
         ``reseau-network/1``, or a file that :func:`read_foreign` reads.
     calibrations : mapping of str to path, optional
         Calibration files by the id of a camera, in place of its entry in the network. Their parameters are
-        observations with their joint covariance.
+        observations with their joint covariance. The orientation of a film frame replaces pixel size and
+        principal point of the entry; its other parameters stay.
 
     Raises
     ------
     InputError
         When a file cannot be read.
     FormatError
-        When the file is no network, or a calibration is none.
+        When the file is not a network, or a calibration is not one.
     UsageError
-        When a calibration is given for a camera that the network does not have.
+        When a calibration is given for a camera that the network does not have, is not that of a camera or a
+        film frame, or the principal distance of a camera on film is not known.
 
     Examples
     --------
@@ -47,19 +49,60 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
     path, given = Path(path), dict(calibrations or {})
     if path.is_dir() or path.suffix.lower() != ".json":
         network = read_foreign(path)
-        return network.with_cameras(
-            {name: calibrated_camera(name, read_calibration(file)) for name, file in given.items()}
-        )
+        # Where a pixel has no size, the principal distance is in pixels.
+        known = {camera.id: camera for camera in network.cameras}
+        with_size = {name: camera for name, camera in known.items() if camera.pitch_mm != (1.0, 1.0)}
+        return network.with_cameras(_chosen(given, set(known), with_size))
     document = Network1.read(path)
+    with_size = {
+        entry.id: Camera.from_entry(entry) for entry in document.cameras if isinstance(entry, CameraEntry)
+    }
     cameras = {
-        entry.id: calibrated_camera(
-            entry.id, read_calibration(path.parent / entry.calibration), held=entry.use == "held"
+        entry.id: _from_file(
+            entry.id,
+            path.parent / entry.calibration,
+            with_size.get(entry.id),
+            held=entry.use == "held",
+            film=isinstance(entry, FilmCameraEntry),
         )
         for entry in document.cameras
-        if isinstance(entry, CalibratedCameraEntry) and entry.id not in given
+        if isinstance(entry, CalibratedCameraEntry | FilmCameraEntry) and entry.id not in given
     }
-    cameras |= {name: calibrated_camera(name, read_calibration(file)) for name, file in given.items()}
+    cameras |= _chosen(given, {entry.id for entry in document.cameras}, with_size)
     return Network.from_document(document, cameras)
+
+
+def _chosen(
+    given: Mapping[str, Path | str], ids: Set[str], with_size: Mapping[str, Camera]
+) -> dict[str, Camera]:
+    """Cameras from the calibration files that the caller gives."""
+    for name in given:
+        if name not in ids:
+            raise UsageError("is no camera of the network", where=name)
+    return {name: _from_file(name, Path(file), with_size.get(name)) for name, file in given.items()}
+
+
+def _from_file(
+    name: str, file: Path, entry: Camera | None, *, held: bool = False, film: bool = False
+) -> Camera:
+    """A camera from a calibration file; `entry` gives a film camera its principal distance."""
+    calibration = read_calibration(file)
+    if calibration.kind != "film_frame":
+        if film and calibration.kind == "camera":
+            raise UsageError(
+                f"{file.name} is a calibration of a camera, not of a film frame",
+                where=f"camera {name}",
+                do="leave out all keys but id, calibration and use",
+            )
+        return calibrated_camera(name, calibration, held=held)
+    if entry is None:
+        raise UsageError(
+            f"{file.name} is a film frame and does not give the principal distance",
+            where=f"camera {name}",
+            do="give width, height and parameters with c in mm in the network",
+        )
+    oriented = json.loads(read_text(file))["schema"] == FrameOrientation.SCHEMA
+    return film_camera(entry, FrameOrientation.read(file) if oriented else calibration, held=held)
 
 
 def calibration_files(path: Path | str) -> tuple[Path, ...]:

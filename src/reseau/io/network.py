@@ -16,6 +16,7 @@ __all__ = [
     "CalibratedCameraEntry",
     "CameraEntry",
     "DistanceColumns",
+    "FilmCameraEntry",
     "ImageColumns",
     "Network1",
     "ObservationColumns",
@@ -66,6 +67,11 @@ class CameraEntry(Strict):
         return _known(name, [model.name for model in camera_models()])
 
     @property
+    def on_film(self) -> bool:
+        """Whether size of the pixels and principal point are those of a film frame's orientation."""
+        return False
+
+    @property
     def options(self) -> dict[str, Any]:
         """Options of the model that the entry gives."""
         given = {option.name: getattr(self, option.name, None) for option in camera_model(self.model).options}
@@ -76,7 +82,7 @@ class CameraEntry(Strict):
         model, who = camera_model(self.model), f"camera {self.id!r}"
         if self.pitch_mm is not None and min(self.pitch_mm) <= 0:
             raise ValueError(f"{who}: `pitch_mm` must be above zero")
-        needed = ["pitch_mm"] if model.needs_pitch else []
+        needed = ["pitch_mm"] if model.needs_pitch and not self.on_film else []
         for key in [*needed, *(option.name for option in model.options if option.required)]:
             if getattr(self, key, None) is None:
                 raise ValueError(f"{who}: missing key `{key}`")
@@ -129,13 +135,54 @@ class CalibratedCameraEntry(Strict):
         return
 
 
+class FilmCameraEntry(CameraEntry):
+    """A camera on film: pixel size and principal point are those of a scanned frame's orientation.
+
+    `calibration` is the path of a ``reseau-orientation/1``, or of the ``reseau-calibration/1`` of a film
+    frame, relative to the network file; `width` and `height` are the pixels of the scan. With `use`
+    "observed" the principal point is an observation with its covariance, with "held" it is held. All other
+    parameters are given as for any camera.
+    """
+
+    model: str = "brown"
+    side: Literal["image", "object"] | None = "object"
+    calibration: str = Field(min_length=1)
+    use: Literal["observed", "held"] = "observed"
+
+    @property
+    def on_film(self) -> bool:
+        """Whether size of the pixels and principal point are those of a film frame's orientation."""
+        return True
+
+    @model_validator(mode="after")
+    def _of_the_frame(self) -> Self:
+        model, who = camera_model(self.model), f"camera {self.id!r}"
+        if not model.needs_pitch:
+            raise ValueError(
+                f"{who}: the model {self.model!r} has no size of a pixel to take from a film frame"
+            )
+        if self.pitch_mm is not None:
+            raise ValueError(f"{who}: `pitch_mm` is that of the film frame: leave it out")
+        for name in model.of_role("centre"):
+            if name in {*self.parameters, *self.free, *(self.sigma or {})}:
+                raise ValueError(f"{who}: {name!r} is that of the film frame: leave it out")
+        return self
+
+
 def _kind_of_camera(entry: Any) -> str:
-    given = "calibration" in entry if isinstance(entry, dict) else isinstance(entry, CalibratedCameraEntry)
-    return "<calibrated>" if given else "<camera>"
+    if not isinstance(entry, dict):
+        if isinstance(entry, FilmCameraEntry):
+            return "<film>"
+        return "<calibrated>" if isinstance(entry, CalibratedCameraEntry) else "<camera>"
+    if "calibration" not in entry:
+        return "<camera>"
+    return "<film>" if "parameters" in entry or {"width", "height"} <= set(entry) else "<calibrated>"
 
 
 AnyCamera = Annotated[
-    Annotated[CameraEntry, Tag("<camera>")] | Annotated[CalibratedCameraEntry, Tag("<calibrated>")],
+    Annotated[CameraEntry, Tag("<camera>")]
+    | Annotated[CalibratedCameraEntry, Tag("<calibrated>")]
+    | Annotated[FilmCameraEntry, Tag("<film>")],
     Discriminator(_kind_of_camera),
 ]
 

@@ -1,6 +1,6 @@
 """What is adjusted: cameras, images, points and their observations, in columns."""
 
-from .calibrated import calibrated_camera
+from .calibrated import calibrated_camera, film_camera
 from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network, Usable, finite, usable
 from .stage import Stage, StageValues, perpendicular
@@ -15,6 +15,7 @@ __all__ = [
     "Usable",
     "calibrated_camera",
     "example_network",
+    "film_camera",
     "finite",
     "perpendicular",
     "usable",

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...io.network import CalibratedCameraEntry, CameraEntry, Network1
+from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
 from ...optics.cameras import distortion_names
 from .stage import Stage
@@ -543,7 +543,7 @@ def finite(rows: Array) -> Mask:
 def _camera(entry: CameraEntry | CalibratedCameraEntry, calibrated: Mapping[str, Camera]) -> Camera:
     if entry.id in calibrated:
         return calibrated[entry.id]
-    if isinstance(entry, CalibratedCameraEntry):
+    if isinstance(entry, CalibratedCameraEntry | FilmCameraEntry):
         raise UsageError(
             f"needs its calibration {entry.calibration}",
             where=f"camera {entry.id}",
