@@ -269,7 +269,7 @@ def test_a_frame_is_corrected_for_its_sensor(sensor: Path, tmp_path: Path, resea
 def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, reseau: Run) -> None:
     (tmp_path / "p.csv").write_text("id,x,y\na,1,1\n")
     write_image(tmp_path / "large.png", np.zeros((50, 50), np.uint8))
-    for source, said in (("p.csv", "moves no points"), ("large.png", "has 50×50 pixels")):
+    for source, said in (("p.csv", "corrects images, not points"), ("large.png", "has 50×50 pixels")):
         status, _, err = reseau("apply", sensor, tmp_path / source)
         assert status == 2
         assert said in err
@@ -281,8 +281,8 @@ def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, r
     [
         (("--object",), "--object: needs a calibration of an oscilloscope, not of a camera"),
         (("--exposure-ms", 5), "--exposure-ms: needs a calibration of a sensor, not of a camera"),
-        (("--fov", "wide"), "--fov: is 'wide'; write keep, all or degrees"),
-        (("--scale", 0), "--scale: 0 is not above zero"),
+        (("--fov", "wide"), "--fov: cannot interpret 'wide'; write keep, all or an angle in degrees"),
+        (("--scale", 0), "--scale: 0 is not positive"),
         (("--directions",), "--directions: applies to points only"),
     ],
 )

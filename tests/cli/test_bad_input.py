@@ -136,7 +136,7 @@ def test_fewer_marks_than_parameters_is_a_failure(
         (["measure", "reseau"], "Missing argument"),
         (["measure", "reseau", "a.png"], "design"),
         (["measure", "reseau", "a.png", "-d", "d.json", "--out", "a.bmp"], "use .json, .csv"),
-        (["measure", "reseau", "a.png", "-d", "d.json", "--out", "none/a.json"], "no such folder"),
+        (["measure", "reseau", "a.png", "-d", "d.json", "--out", "none/a.json"], "folder does not exist"),
         (["design", "reseau", "--columns", "many"], "'--columns'"),
         (["design", "reseau", "--columns", "1"], "1 × 11 marks"),
         (["design", "reseau", "--svg", "a.png"], "use .svg"),
@@ -162,7 +162,7 @@ def test_wrong_use_is_one_line_with_status_two(
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda c: c | {"model": "brown"}, "is no calibration"),
+        (lambda c: c | {"model": "brown"}, "`model`: is not the model of a calibration"),
         (lambda c: c | {"model": c["model"] | {"mapping": {}}}, "missing key `terms`"),
         (lambda c: c | {"parameters": {}, "covariance": {"names": [], "matrix": []}}, ""),
         (lambda c: {k: v for k, v in c.items() if k != "sigma0"}, "missing key `sigma0`"),

@@ -77,7 +77,7 @@ def test_a_testfield_from_poses_to_a_calibration_that_can_be_rerun(
     with zipfile.ZipFile("monday.zip") as made:
         assert sum(name.endswith(".tif") for name in made.namelist()) == 8  # three were checks
     assert run(["archive", "verify"]) == 0
-    assert "sound" in capsys.readouterr().out
+    assert "intact" in capsys.readouterr().out
     file = next(Path("archive/objects").rglob("*.tif"))
     file.write_bytes(file.read_bytes()[:-1] + b"?")
     assert run(["archive", "verify"]) == 1
@@ -127,7 +127,7 @@ def test_a_plan_of_ones_own_is_carried_out_and_resumed_as_it_was_begun(
             "own.py: does not accept the arguments (got",
         ),
         (OWN, [], "own.py: does not accept the arguments (missing a required argument: 'tilts')"),
-        (OWN, ["--set", "tilts"], "--set: is 'tilts'; write it like tilt=30"),
+        (OWN, ["--set", "tilts"], "--set: cannot interpret 'tilts'; write name=value, as tilt=30"),
         ("def plan(run:\n", [], "own.py: line 1 is not Python"),
         ("def plan(run):\n    return 1\n", [], "own.py: has no generator `plan(run, …)`"),
     ],
@@ -156,7 +156,7 @@ def test_what_an_archive_cannot_do_is_reported_in_one_line(
         ("show", "a", "--out", "none/deep"): "none/deep: cannot be created (No such file",
         ("rerun", "a"): "a: plan `frames` computes nothing",
         ("rerun", "b"): "b: has no results (status: failed)",
-        ("export", "a", "--out", "a.tar"): "a.tar: ends in '.tar'; use .zip",
+        ("export", "a", "--out", "a.tar"): "a.tar: has the suffix '.tar'; use .zip",
         ("list", "--archive", "none"): "is not an archive",
     }.items():
         assert run(["archive", *arguments]) in (1, 2)
@@ -211,7 +211,7 @@ def test_options_cannot_be_changed_with_resume(rig: FieldRig, capsys: pytest.Cap
     assert capture("frames", "--count", "2", "--name", "a") == 0
     capsys.readouterr()
     assert capture("frames", "--resume", "--name", "a", "--count", "3") == 2
-    assert capsys.readouterr().err == "reseau: --count: cannot be changed with --resume; leave it out\n"
+    assert capsys.readouterr().err == "reseau: --count: cannot be changed with --resume; omit it\n"
     assert rig.camera.exposures == 2
 
 
@@ -267,14 +267,14 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["testfield"], "--design: is needed"),
+        (["testfield"], "--design: is missing"),
         (["testfield", "--design", "none.json"], "none.json: cannot be read"),
         (["testfield", "--design", "bench.toml"], "bench.toml: is no"),
         (["frames", "--bench", "none.toml"], "none.toml: cannot be read"),
         (["frames", "--name", "a/b"], "is not a valid name of a session"),
         (["frames", "--resume"], "is not an archive"),
         (["testfield", *TESTFIELD, "--until", "c < 1"], "is not a goal"),
-        (["testfield", *TESTFIELD, "--park", "tilt"], "--park: is 'tilt'"),
+        (["testfield", *TESTFIELD, "--park", "tilt"], "--park: cannot interpret 'tilt'"),
         (["testfield", *TESTFIELD, "--park", "z=0"], "park: the table has no axis z; use tilt, roll"),
         (
             ["testfield", *TESTFIELD, "--park", "roll=400"],

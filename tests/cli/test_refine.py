@@ -85,7 +85,7 @@ def test_three_photographs_give_true_coordinates_and_a_calibration(bench, tmp_pa
         assert abs(true[name][1] - y) < 0.03
         assert 0.001 < true[name][2] < 0.03
     said = capsys.readouterr().out
-    assert "A6 = B6 holds" in said
+    assert "A6 = B6 is satisfied" in said
     assert "note" not in said
 
 
@@ -111,7 +111,7 @@ def test_stored_coefficients_are_held_against_a_new_photo_ii(bench, tmp_path, ca
     )
     capsys.readouterr()
     assert _run({"--calibration": tmp_path / "k.json", "--photo-ii": anew}) == 0
-    assert "the same.csv: the coefficients still hold" in capsys.readouterr().out
+    assert "the same.csv: the coefficients are still valid" in capsys.readouterr().out
     assert _run({"--calibration": tmp_path / "k.json", "--photo-ii": shifted}, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert not document["holds"]

@@ -123,7 +123,12 @@ Model = Annotated[
     | Annotated[CameraModel, Tag("camera")]
     | Annotated[FilmFrameModel, Tag("film_frame")]
     | Annotated[SensorModel, Tag("sensor")],
-    Discriminator(_tag),
+    Discriminator(
+        _tag,
+        custom_error_type="model",
+        custom_error_message="is not the model of a calibration",
+        custom_error_context={},
+    ),
 ]
 
 _READERS: dict[str, Callable[[Calibration], CalibratedMapping]] = {}

@@ -36,7 +36,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="reseau",
-    help="Calibration of measuring cameras and imaging instruments.",
+    help="Calibrate measuring cameras and imaging instruments.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -59,8 +59,8 @@ app.command()(calibrate.calibrate)
 app.command()(bundle_compare.compare)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         typer.echo(f"reseau {__version__}")
         raise typer.Exit
 
@@ -71,7 +71,7 @@ def _options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Calibration of measuring cameras and imaging instruments."""
+    """Calibrate measuring cameras and imaging instruments."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -92,7 +92,7 @@ def run(arguments: list[str] | None = None) -> int:
         return _report(str(package), package.exit_status)
     except KeyboardInterrupt:
         return _report("interrupted", 130)
-    except BrokenPipeError:  # the reader of the output has closed it
+    except BrokenPipeError:  # the program that reads the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What the commands of `reseau capture` share: options, and conducting a new or resumed session."""
+"""Shared by the commands of `reseau capture`: options, and execution of a new or resumed session."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
 
 
 def _as_text(value: Any, several: bool) -> Any:
-    """A list or table of TOML in the form of the command line: 0,50 and tilt=0,roll=0, or one by one."""
+    """Convert a list or table of TOML to the form of the command line: 0,50 and tilt=0,roll=0, or a list."""
     if isinstance(value, Mapping):
         value = [f"{key}={json.dumps(each, default=str)}" for key, each in value.items()]
     return ",".join(str(each) for each in value) if isinstance(value, list) and not several else value
@@ -75,14 +75,15 @@ class Where:
         None
     )
     name: Annotated[
-        str, typer.Option("--name", "-n", help="Name of the session. Default: plan and time.")
+        str, typer.Option("--name", "-n", help="Name of the session. Default: plan and time (UTC).")
     ] = ""
     resume: Annotated[
-        bool, typer.Option("--resume", help="Resume a session that is not done, with its original options.")
+        bool,
+        typer.Option("--resume", help="Resume a session that is not complete, with its original options."),
     ] = False
     plan: Annotated[
         Path | None,
-        typer.Option("--plan", is_eager=True, callback=_from_toml, help="TOML file with options."),
+        typer.Option("--plan", is_eager=True, callback=_from_toml, help="TOML file with values of options."),
     ] = None
     as_json: Annotated[bool, typer.Option("--json", help="Write each event as a line of JSON.")] = False
 
@@ -93,7 +94,7 @@ def in_session(*also_resumed: str) -> Callable[[Callable[..., None]], Callable[.
     Parameters
     ----------
     also_resumed : str
-        Options of the command that can be used with ``--resume``; all others are those of the session.
+        Options of the command that can be used with ``--resume``; the session determines all others.
     """
     hints = get_type_hints(Where, include_extras=True)
     common = [
@@ -128,7 +129,7 @@ def _refuse(context: typer.Context, options: set[str]) -> None:
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
         if parameter.name in options and source is not None and source.name == "COMMANDLINE":
-            raise UsageError("cannot be changed with --resume", where=parameter.opts[0], do="leave it out")
+            raise UsageError("cannot be changed with --resume", where=parameter.opts[0], do="omit it")
 
 
 def ask_operator(request: str) -> None:
@@ -149,7 +150,7 @@ def conduct(
 ) -> None:
     """Begin or resume a session, carry it out, and print its outcome.
 
-    All that can be checked is checked before the session begins, because an archive keeps every session.
+    Everything is checked before the session begins, because sessions cannot be deleted from an archive.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def conduct(
     operator : callable
         Carries out requests to the operator.
     afterwards : callable
-        Called with a session that is done.
+        Called with a complete session.
     """
     from .. import sessions
 
@@ -175,8 +176,8 @@ def conduct(
             session = begin()
             given = sessions.parameters_of(session)
             with Display(where.as_json, given.expected, plan == "scan", given.units) as display:
-                begun = {"session": session.name, "archive": where.archive, "poses": given.expected}
-                display.watch("begin", begun)
+                facts = {"session": session.name, "archive": where.archive, "poses": given.expected}
+                display.watch("begin", facts)
                 why = sessions.capture(
                     session, bench, watch=display.watch, operator=display.aside(operator),
                     paused=display.aside(_paused),
@@ -203,7 +204,7 @@ def _new(
     texts = {}
     for role, path in inputs.items():
         if path is None:
-            raise UsageError("is needed", where=f"--{Path(role).stem}")
+            raise UsageError("is missing", where=f"--{Path(role).stem}", do="give the file")
         texts[role] = read_text(path)
         if Path(role).suffix == ".json":
             parse_design(texts[role], path)
@@ -233,7 +234,7 @@ def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Started:
 
 
 def _conclude(where: Where, session: Session, why: str | None) -> None:
-    """Print how a session ended; a goal that was not reached is a failure."""
+    """Print the outcome of a session; exit with 1 if it is incomplete or its goal was not reached."""
     if session.status != "done":
         message = f"{session.name}: stopped; resume with `--resume --name {session.name}`"
     elif why:
@@ -254,7 +255,7 @@ def _conclude(where: Where, session: Session, why: str | None) -> None:
 
 
 def _paused() -> Decision:
-    """Ask what to do with an interrupted session; without a terminal it stops and can be resumed."""
+    """Ask how to continue an interrupted session; without a terminal, stop it."""
     if not sys.stdin.isatty():
         return "stop"
     answers: dict[str, Decision] = {"r": "resume", "s": "stop", "a": "abort"}

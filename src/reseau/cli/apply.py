@@ -1,4 +1,4 @@
-"""`reseau apply`: correct points, images, scans or frames by a calibration of any kind."""
+"""`reseau apply`: correct points, images, scans or frames with a calibration of any kind."""
 
 from __future__ import annotations
 
@@ -48,38 +48,43 @@ def apply(
     scale: Annotated[
         float | None,
         typer.Option(
-            help="Pixels per unit of the corrected image: per mm; of a camera, per pixel of the image. "
-            "Default: as in the image."
+            help="Resolution of the corrected image: pixels per mm, or for a camera per pixel of the image. "
+            "Default: that of the image."
         ),
     ] = None,
     fov: Annotated[
         str,
         typer.Option(
             help="Field of view of an undistorted image: keep (size and scale of the image), "
-            "all (every pixel of it), or degrees across."
+            "all (every pixel of the image), or the horizontal angle in degrees."
         ),
     ] = "keep",
     directions: Annotated[
-        bool, typer.Option("--directions", help="Write points of a camera as directions x/z, y/z.")
+        bool,
+        typer.Option(
+            "--directions", help="Write points of a camera as directions x/z, y/z instead of pixels."
+        ),
     ] = False,
     object_system: Annotated[
-        bool, typer.Option("--object", help="Write points of an oscilloscope in the system of its object.")
+        bool,
+        typer.Option("--object", help="Write points of an oscilloscope in the object coordinate system."),
     ] = False,
     exposure_ms: Annotated[
-        float | None, typer.Option(min=0.0, help="Exposure time of the frame; default: as calibrated.")
+        float | None,
+        typer.Option(min=0.0, help="Exposure time of the frame (ms). Default: that of the calibration."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Apply a calibration to points or to an image.
 
-    Points are corrected, with covariances that contain those of the points and of the calibration. Images are
-    resampled: without distortion (camera), in the system of the reseau (oscilloscope), in millimetres of the
-    frame (film frame); or their grey values are corrected (sensor).
+    Corrected points have covariances that include those of the points and of the calibration. Images are
+    resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
+    the frame (film frame). With the calibration of a sensor, the grey values are corrected.
     """
     from ..calibration import SensorCorrection, read_calibration
 
     if scale is not None and not scale > 0:
-        raise UsageError(f"{scale:g} is not above zero", where="--scale")
+        raise UsageError(f"{scale:g} is not positive", where="--scale")
     stored, view = read_calibration(calibration), _view(fov)
     _only(stored.kind, "camera", {"--fov": fov != "keep", "--directions": directions})
     _only(stored.kind, "oscilloscope", {"--object": object_system})
@@ -95,42 +100,44 @@ def apply(
         _image(stored, mapping, calibration, source, out, view, scale, as_json)
 
 
-def _only(kind: str, belongs: str, given: dict[str, bool]) -> None:
-    """Refuse options that belong to another kind of calibration.
+def _only(kind: str, required: str, options: dict[str, bool]) -> None:
+    """Refuse options that need another kind of calibration.
 
     Raises
     ------
     UsageError
-        With the option.
+        If such an option is used.
     """
-    for name, used in given.items():
-        if used and kind != belongs:
-            raise UsageError(f"needs a calibration of {_OF[belongs]}, not of {_OF[kind]}", where=name)
+    for name, used in options.items():
+        if used and kind != required:
+            raise UsageError(f"needs a calibration of {_OF[required]}, not of {_OF[kind]}", where=name)
 
 
 def _view(text: str) -> View:
-    """The field of view.
+    """Parse the field of view.
 
     Raises
     ------
     UsageError
-        When it is none.
+        If it is invalid.
     """
     if text in ("keep", "all"):
         return cast(View, text)
     try:
         return float(text.removesuffix("°"))
     except ValueError:
-        raise UsageError(f"is {text!r}", where="--fov", do="write keep, all or degrees") from None
+        raise UsageError(
+            f"cannot interpret {text!r}", where="--fov", do="write keep, all or an angle in degrees"
+        ) from None
 
 
 def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
-    """The mapping; of an oscilloscope group A alone, unless the system of its object is wanted.
+    """Return the mapping; for an oscilloscope only group A, unless object coordinates are requested.
 
     Raises
     ------
     UsageError
-        When the calibration has no group B.
+        If the calibration has no group B.
     """
     from ..calibration import InstrumentCorrection
 
@@ -139,7 +146,9 @@ def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
         return mapping if object_system else mapping.camera
     if object_system:
         raise UsageError(
-            "needs a calibration with group B", where="--object", do="make it with --photo-ii and --object"
+            "needs a calibration with group B",
+            where="--object",
+            do="calibrate with reseau refine --photo-ii and --object",
         )
     return mapping
 
@@ -147,7 +156,7 @@ def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
 def _raster(
     mapping: CalibratedMapping, size: tuple[int, int], view: View, scale: float | None
 ) -> CorrectedImage:
-    """The raster of the corrected image."""
+    """Return the raster of the corrected image."""
     from ..calibration import CameraCorrection, CameraMapping, CorrectedImage, FilmFrameMapping
 
     if isinstance(mapping, CameraMapping):
@@ -166,13 +175,13 @@ def _points(
     view: View | None,
     scale: float | None,
 ) -> None:
-    """Correct points; those of a camera as pixels of the undistorted image, or as directions without view."""
+    """Correct points; for a camera, to pixels of the undistorted image, or without view to directions."""
     from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
     from ..io import write_whole
 
     if "points" not in mapping.applies_to:
-        raise UsageError("of a sensor moves no points", where="calibration", do="give an image")
+        raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
     measured = read_measurement(source).image_points()
     points, why = mapping.apply(measured), mapping.why_not(measured)
@@ -201,7 +210,7 @@ def _points(
 
 
 def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
-    """Directions as pixels of the undistorted image."""
+    """Convert directions to pixels of the undistorted image."""
     import numpy as np
 
     from ..core.data import ImagePoints
@@ -211,14 +220,14 @@ def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
 
 
 def _nullable(table: dict[str, list[Any]]) -> dict[str, list[Any]]:
-    """Columns with null for the numbers of points that have no place."""
+    """Replace NaN by None, for points without a position."""
     return {
         key: [None if isinstance(v, float) and v != v else v for v in column] for key, column in table.items()
     }
 
 
 def _warn(names: tuple[str, ...], why: tuple[str, ...]) -> None:
-    """Warn of points outside the validity: of the first ones, and of the number of the others."""
+    """Warn of points outside the validity: the first ones, and the number of the others."""
     found = [f"point {name} {reason}" for name, reason in zip(names, why, strict=True) if reason]
     if len(found) > 3:
         found = [*found[:2], f"{len(found) - 2} more points are outside the validity, see the column `why`"]
@@ -236,7 +245,7 @@ def _image(
     scale: float | None,
     as_json: bool,
 ) -> None:
-    """Resample an image; that of a camera gets the parameters of its pinhole camera in a file beside it."""
+    """Resample an image; for a camera, also write the parameters of the pinhole camera of the result."""
     from ..calibration import undistorted_camera, write_corrected
     from ..core.provenance import Provenance, canonical_json, sha256_of
 
@@ -273,7 +282,7 @@ def _image(
 
 
 def _planes(source: Path, *, colours: bool) -> tuple[Any, ...]:
-    """The channels of an image, each (height, width); grey values alone where colours are not wanted."""
+    """Return the channels of an image, each (height, width); with `colours` false, only its grey values."""
     from ..calibration.raster import planes_of
     from ..io.images import open_scan, read_image
 

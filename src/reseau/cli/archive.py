@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="List, show, verify, export and rerun archived sessions.")
+app = typer.Typer(no_args_is_help=True, help="List, show, verify, export and recompute archived sessions.")
 
 
 @app.command("list")
@@ -56,17 +56,17 @@ def show(
     from ..core.provenance import canonical_json
 
     with open_archive(archive, objects) as found:
-        kept = found.session(session)
+        stored = found.session(session)
         if out is not None:
-            kept.write_results(out)
+            stored.write_results(out)
         if as_json:
-            say(canonical_json(describe(kept)))
+            say(canonical_json(describe(stored)))
             return
-        begun = f"{kept.begun:%Y-%m-%d %H:%M:%S}Z"
-        say(f"{kept.name}: plan {kept.plan}, begun {begun} with {kept.software}, {kept.status}\n")
-        for frame in kept.frames():
+        start = f"{stored.begun:%Y-%m-%d %H:%M:%S}Z"
+        say(f"{stored.name}: plan {stored.plan}, started {start} with {stored.software}, {stored.status}\n")
+        for frame in stored.frames():
             say(f"  {frame.sha256[:12]}  {_verdict(frame):<8} {frame.name}\n")
-        for made in kept.results():
+        for made in stored.results():
             origin = f"from {len(made.inputs)} files, by {made.software}"
             say(f"  {made.sha256[:12]}  result   {made.name}, {origin}\n")
 
@@ -79,7 +79,7 @@ def _verdict(frame: ArchivedFrame) -> str:
 
 @app.command()
 def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
-    """Read every file again and compare it with its SHA-256."""
+    """Read every file, and compare its SHA-256 with the index."""
     from ..archive import verify as verified
     from ..core.provenance import canonical_json
 
@@ -88,7 +88,7 @@ def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_j
     if as_json:
         say(canonical_json({"schema": "reseau-verified/1", **vars(result), "sound": bool(result)}))
     else:
-        say(f"{result.files} files, {result.size / 1e6:.1f} MB: {'sound' if result else 'damaged'}\n")
+        say(f"{result.files} files, {result.size / 1e6:.1f} MB: {'intact' if result else 'damaged'}\n")
         say("".join(f"  {line}\n" for line in result.damaged))
         if result.unknown:
             say(f"{len(result.unknown)} unindexed files left by killed processes (harmless)\n")
@@ -102,7 +102,7 @@ def export(
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
 ) -> None:
-    """Export a session to a zip file: frames, results, and a table of contents."""
+    """Export a session to a zip file: frames, results and a table of contents."""
     from ..archive import export as exported
 
     suffix_of(writable(out), (".zip",))
@@ -118,7 +118,7 @@ def rerun(
     objects: ObjectsPlace = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute the results of a session again, and compare them byte for byte."""
+    """Recompute the results of a session from its frames, and compare them byte for byte."""
     from .. import sessions
     from ..core.provenance import canonical_json
 

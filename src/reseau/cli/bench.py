@@ -19,7 +19,7 @@ BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")]
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """Search for instruments (cameras, VISA, serial ports), and list the installed drivers."""
+    """Search for cameras, VISA instruments and serial ports, and list the installed drivers."""
     from ..capture import drivers, found_instruments
     from ..core.provenance import canonical_json
 
@@ -41,7 +41,7 @@ def list_(as_json: AsJson = False) -> None:
 @app.command()
 def check(
     bench: BenchPath = Path("bench.toml"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="Deadline for each instrument (s).")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Time limit for each instrument (s).")] = 10.0,
     as_json: AsJson = False,
 ) -> None:
     """Connect all instruments and run their self-tests; list all failures."""
@@ -76,21 +76,19 @@ def check(
 def sim(
     out: Out = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated world.")] = 0,
-    table: Annotated[str, typer.Option(help="Controllers of the turntable: zaber, smc100.")] = "zaber",
-    family: Annotated[
-        str, typer.Option(help="Family of the oscilloscope: keysight, rigol-1000z, …")
-    ] = "keysight",
+    table: Annotated[str, typer.Option(help="Controller of the turntable: zaber or smc100.")] = "zaber",
+    family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
     camera: Annotated[
-        str, typer.Option(help="Scene of the camera: screen, testfield. Default: no camera.")
+        str, typer.Option(help="Scene of the camera: screen or testfield. Default: no camera.")
     ] = "",
     repeatable: Annotated[
         bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
     ] = False,
     flat: Annotated[
         bool,
-        typer.Option("--flat", help="Plane testfield. Default: bent in its mount, as in the paper."),
+        typer.Option("--flat", help="Plane testfield. Default: bent by its mount, as in the paper."),
     ] = False,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Serving time (s); 0: until interrupted.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Running time (s); 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print a bench.toml for them."""
     import threading

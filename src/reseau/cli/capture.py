@@ -18,20 +18,23 @@ __all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Acquire frames on a bench. Each frame is in the archive before the next one is taken.",
+    help="Acquire frames on a bench. Each frame is archived before the next exposure.",
 )
 
-Average = Annotated[int, typer.Option(min=1, help="Exposures averaged to a frame.")]
+Average = Annotated[int, typer.Option(min=1, help="Number of exposures averaged to one frame.")]
 Checks = Annotated[
-    int, typer.Option(min=0, help="Frames for the checks before the first frame; 0: no checks.")
+    int, typer.Option(min=0, help="Number of frames for the checks before the acquisition; 0: no checks.")
 ]
 Retakes = Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")]
-HeightSigma = Annotated[float, typer.Option(min=1e-9, help="Standard deviation of a height (mm), with z.")]
+HeightSigma = Annotated[
+    float, typer.Option(min=1e-9, help="Standard deviation of a height (mm); used with --heights.")
+]
 AxisSigma = Annotated[
-    float, typer.Option(min=1e-6, help="Standard deviation of z against the normal of the board (mrad).")
+    float,
+    typer.Option(min=1e-6, help="Standard deviation of the angle between z and the board normal (mrad)."),
 ]
 FieldSigma = Annotated[
-    float, typer.Option(min=1e-9, help="Standard deviation of the coordinates of the design (mm), with z.")
+    float, typer.Option(min=1e-9, help="Standard deviation of design coordinates (mm); used with --heights.")
 ]
 Pitch = Annotated[float | None, typer.Option(min=1e-6, help="Pixel size (mm); selects Brown's model.")]
 Poses = Annotated[
@@ -54,28 +57,34 @@ def coded_field(
     ] = None,
     poses: Poses = None,
     heights: Annotated[
-        str, typer.Option(help="Heights of the board (mm), as 0,50,100; each pose at each height.")
+        str, typer.Option(help="Heights of the board (mm), as 0,50,100; record each pose at each height.")
     ] = "",
     height_sigma: HeightSigma = 0.01,
     axis_sigma: AxisSigma = 10.0,
     field_sigma: FieldSigma = 0.05,
-    until: Annotated[str, typer.Option(help="Choose poses until this goal, as 'sigma_c < 0.5 um'.")] = "",
-    first: Annotated[int, typer.Option(min=4, help="Poses taken before poses are chosen.")] = 5,
+    until: Annotated[
+        str, typer.Option(help="Choose poses until a goal is reached, as 'sigma_c < 0.5 um'.")
+    ] = "",
+    first: Annotated[
+        int, typer.Option(min=4, help="With --until: number of poses before the first chosen one.")
+    ] = 5,
     pitch: Pitch = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
     row_jitter: Annotated[float, typer.Option(min=0, help="Row jitter of the sensor (px).")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of a pixel.")] = 1.0,
+    fill: Annotated[
+        float, typer.Option(min=0, max=1, help="Light-sensitive fraction of the pixel pitch.")
+    ] = 1.0,
     average: Average = 1,
     checks: Checks = 3,
     retakes: Retakes = 2,
     home: Annotated[
-        bool, typer.Option("--home", help="Home axes without a reference first. The axes will move.")
+        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
     ] = False,
     park: Annotated[
         str, typer.Option(help="Final position of the table, as tilt=0,roll=0. Default: the last pose.")
     ] = "",
     retreat: Annotated[
-        str, typer.Option(help="Position after an abort or error. Default: where the table stopped.")
+        str, typer.Option(help="Position after an abort or an error. Default: no movement.")
     ] = "",
     camera: CameraName = None,
     table: TableName = None,
@@ -111,7 +120,7 @@ def oscilloscope(
     where: Where,
     reseau: Annotated[Path | None, typer.Option("--reseau", "-r", help="Design of the reseau.")] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="Design of the test object.")] = None,
-    body: Annotated[bool, typer.Option("--body/--no-body", help="Whether to take PHOTO III.")] = True,
+    body: Annotated[bool, typer.Option("--body/--no-body", help="Take PHOTO III.")] = True,
     average: Average = 1,
     checks: Checks = 0,
     retakes: Retakes = 2,
@@ -134,7 +143,7 @@ def scan(
     scanner: ScannerName = None,
     scope: ScopeName = None,
 ) -> None:
-    """Take sections with the ultrasonic scanner, each with the screenshot of the oscilloscope if present."""
+    """Take sections with the ultrasonic scanner, and screenshots if there is an oscilloscope."""
     how = {"count": count, "retakes": 0, "park": {}, "scanner": scanner, "oscilloscope": scope}
     conduct(where, "scan", lambda bench: how)
 
@@ -149,7 +158,7 @@ def frames(
     retakes: Retakes = 0,
     camera: CameraName = None,
 ) -> None:
-    """Take frames one after the other."""
+    """Take frames with a camera."""
     how: dict[str, Any] = {"count": count, "average": average, "checks": checks, "retakes": retakes}
     how |= {"park": {}, "camera": camera}
     conduct(where, "frames", lambda bench: how)
@@ -159,13 +168,17 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(",") if part.strip())
     except ValueError:
-        raise UsageError(f"is {text!r}", where=option, do="write numbers, as 0,50,100") from None
+        raise UsageError(
+            f"cannot interpret {text!r}", where=option, do="write numbers, as 0,50,100"
+        ) from None
 
 
 def _position(text: str, option: str) -> dict[str, float]:
-    """A position written as ``tilt=0,roll=0``."""
+    """Parse a position such as ``tilt=0,roll=0``."""
     try:
         pairs = [part.split("=") for part in text.split(",") if part.strip()]
         return {axis.strip(): float(value) for axis, value in pairs}
     except ValueError:
-        raise UsageError(f"is {text!r}", where=option, do="write it like tilt=0,roll=0") from None
+        raise UsageError(
+            f"cannot interpret {text!r}", where=option, do="write axis=value, as tilt=0,roll=0"
+        ) from None

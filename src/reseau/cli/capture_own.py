@@ -1,4 +1,4 @@
-"""`reseau capture own`: carry out a plan that the user wrote in a Python file."""
+"""`reseau capture own`: carry out a plan from a Python file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def own(
         Path | None, typer.Option("--generator", "-g", help="Python file with a generator `plan(run, …)`.")
     ] = None,
     given: Annotated[
-        list[str] | None, typer.Option("--set", help="Argument of the plan, as tilt=30; may be repeated.")
+        list[str] | None, typer.Option("--set", help="Argument of the plan, as tilt=30; repeatable.")
     ] = None,
     retakes: Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")] = 0,
     camera: CameraName = None,
@@ -38,10 +38,10 @@ def own(
 
 
 def _value(text: str) -> tuple[str, Any]:
-    """Name and value of an argument: a TOML value (number, list …), else text."""
+    """Parse an argument: its name, and its value in TOML (number, list …) or as text."""
     name, equals, value = text.partition("=")
     if not equals or not name.isidentifier():
-        raise UsageError(f"is {text!r}", where="--set", do="write it like tilt=30")
+        raise UsageError(f"cannot interpret {text!r}", where="--set", do="write name=value, as tilt=30")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:

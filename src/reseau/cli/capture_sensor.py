@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .acquisition import CameraName, Where, ask_operator, conduct, in_session
-from .common import say, writable
+from .common import probability, say, writable
 
 if TYPE_CHECKING:
     from ..archive import Session
@@ -24,22 +24,21 @@ __all__ = ["sensor"]
 def sensor(
     where: Where,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Calibration file to write as well.")
+        Path | None,
+        typer.Option("--out", "-o", help="File to write the calibration to, in addition to the archive."),
     ] = None,
     camera: CameraName = None,
-    levels: Annotated[int, typer.Option(min=5, help="Number of exposures in light.")] = 14,
-    frames: Annotated[int, typer.Option(min=2, help="Frames of each exposure.")] = 8,
-    longest_ms: Annotated[float, typer.Option(min=0.2, help="Longest exposure (ms).")] = 1000.0,
-    edge: Annotated[
-        bool, typer.Option("--edge", help="Measure the MTF as well, with a slanted edge.")
-    ] = False,
+    levels: Annotated[int, typer.Option(min=5, help="Number of exposure times in light.")] = 14,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames for each exposure time.")] = 8,
+    longest_ms: Annotated[float, typer.Option(min=0.2, help="Longest exposure time (ms).")] = 1000.0,
+    edge: Annotated[bool, typer.Option("--edge", help="Also measure the MTF, with a slanted edge.")] = False,
     region: Annotated[
         tuple[int, int, int, int] | None, typer.Option(help="Region of the edge: left top width height (px).")
     ] = None,
     retakes: Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")] = 2,
     yes: Annotated[bool, typer.Option("--yes", help="Do not prompt.")] = False,
 ) -> None:
-    """Calibrate a camera's sensor: dark, flat, linearity, noise and gain, full well, defects, sharpness."""
+    """Calibrate a camera's sensor: dark signal, response, linearity, noise, gain, full well, defects, MTF."""
     if out is not None:
         writable(out)
 
@@ -64,7 +63,7 @@ def _print_request(request: str) -> None:
 
 
 def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
-    """Print the calibration, and write it if a file was named.
+    """Print the calibration, and write it if `out` is given.
 
     Raises
     ------
@@ -85,7 +84,7 @@ def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
     else:
         say(_lines(found) + (f"{out}\n" if out is not None else ""))
     if getattr(parameters_of(session), "edge_us", None) is not None and "psf" not in found.parameters:
-        raise EstimationError(found.validity.get("edge", "has no good frame"), where="edge")
+        raise EstimationError(found.validity.get("edge", "no usable frame"), where="edge")
 
 
 def _lines(found: Calibration) -> str:
@@ -109,5 +108,4 @@ def _lines(found: Calibration) -> str:
 
 def _verdict(test: dict[str, Any]) -> str:
     """Outcome of a test of the edge."""
-    likely = f"p = {test['p']:.2g}" if test["p"] >= 5e-4 else "p < 0.001"
-    return f"{'accepted' if test['passed'] else 'rejected'} ({likely})"
+    return f"{'accepted' if test['passed'] else 'rejected'} ({probability(test['p'])})"

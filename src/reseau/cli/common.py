@@ -1,4 +1,4 @@
-"""What several commands need: files in, results out, progress."""
+"""Shared by the commands: options, input and output files, progress bars, numbers as text."""
 
 from __future__ import annotations
 
@@ -38,38 +38,38 @@ SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
 
 SensorFile = Annotated[
     Path | None,
-    typer.Option("--sensor", help="Calibration of the sensor, applied before anything is measured."),
+    typer.Option("--sensor", help="Calibration of the sensor; correct images with it before measuring."),
 ]
 
 
 def corrected(frame: Frame, sensor: Path | None) -> Frame:
-    """The frame freed of what its sensor did to it, by a calibration of `reseau capture sensor`.
+    """Return the frame, corrected with a calibration of `reseau capture sensor` if one is given.
 
     Raises
     ------
     FormatError
-        When the file is none of a sensor.
+        If the file is not a calibration of a sensor.
     UsageError
-        When it is one of another sensor.
+        If the size of the frame is not that of the sensor.
     """
     return frame if sensor is None else _sensor_correction(sensor).correct(frame)
 
 
 @cache
 def _sensor_correction(path: Path) -> SensorCorrection:
-    """Read once for all frames of a command."""
+    """Read the calibration once for all frames of a command."""
     from ..calibration import Calibration, SensorCorrection
 
     return SensorCorrection.from_calibration(Calibration.read(path))
 
 
 def open_archive(place: str, objects: str | None, *, create: bool = False) -> Archive:
-    """Open the archive at a place.
+    """Open an archive.
 
     Raises
     ------
     ArchiveError
-        If there is none, or it cannot be used.
+        If it does not exist or cannot be used.
     """
     from ..archive import Archive
 
@@ -77,33 +77,33 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
 
 
 def is_points(path: Path) -> bool:
-    """Whether a file contains image coordinates; :func:`reseau.io.is_points`, imported when it is needed."""
+    """Whether a file contains image coordinates; :func:`reseau.io.is_points`, imported on use."""
     from .. import io
 
     return io.is_points(path)
 
 
 def read_measurement(path: Path) -> ReseauMeasurement:
-    """Image coordinates of a file; :func:`reseau.io.read_measurement`, imported when it is needed."""
+    """Read image coordinates from a file; :func:`reseau.io.read_measurement`, imported on use."""
     from .. import io
 
     return io.read_measurement(path)
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:
-    """An image, or the image coordinates that were measured in one."""
+    """Read an image, or image coordinates."""
     from ..io.images import read_image
 
     return read_measurement(path).image_points() if is_points(path) else read_image(path)
 
 
 def required(found: T | Failure, where: object) -> T:
-    """The estimate; or its failure as an error that names the file it is about.
+    """Return the estimate, or raise its failure as an error that names a file.
 
     Raises
     ------
     EstimationError
-        When there is no estimate.
+        If there is no estimate.
     """
     from ..core.failure import Failure
 
@@ -113,36 +113,40 @@ def required(found: T | Failure, where: object) -> T:
 
 
 def writable(path: Path) -> Path:
-    """The path, when a file can be written there; asked before the work begins.
+    """Return the path if a file can be written there; called before the computation.
 
     Raises
     ------
     InputError
-        When the folder does not exist.
+        If the folder does not exist.
     """
     if not path.parent.is_dir():
-        raise InputError("has no such folder", where=path, do="create it first")
+        raise InputError("its folder does not exist", where=path, do="create the folder first")
     if path.is_dir():
-        raise InputError("is a folder", where=path, do="name a file")
+        raise InputError("is a folder", where=path, do="give the name of a file")
     return path
 
 
 def suffix_of(path: Path, allowed: tuple[str, ...]) -> str:
-    """The suffix of an output file, one of those allowed.
+    """Return the suffix of an output file.
 
     Raises
     ------
     UsageError
-        When it is none of them.
+        If the suffix is not allowed.
     """
     suffix = path.suffix.lower()
     if suffix not in allowed:
-        raise UsageError(f"ends in {suffix or 'nothing'!r}", where=path, do=f"use {', '.join(allowed)}")
+        raise UsageError(
+            f"has the suffix {suffix!r}" if suffix else "has no suffix",
+            where=path,
+            do=f"use {', '.join(allowed)}",
+        )
     return suffix
 
 
 def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, Any]:
-    """Points in columns, as `--json` gives them."""
+    """Return points in columns, as `--json` prints them."""
     s = points.sigma
     table = {
         "id": list(points.names),
@@ -155,6 +159,17 @@ def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, An
     return {"schema": "reseau-points/1", "unit": unit, "system": system, "points": table}
 
 
+def probability(p: float) -> str:
+    """A probability as text, to two digits.
+
+    Examples
+    --------
+    >>> probability(0.0314), probability(1e-9)
+    ('p = 0.031', 'p < 0.001')
+    """
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
 def say(text: str) -> None:
     """Write to standard output."""
     sys.stdout.write(text)
@@ -162,7 +177,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def progress(title: str, steps: int) -> Iterator[Any]:
-    """Show a bar on standard error where that is a terminal; yields a function to call after each step."""
+    """Show a progress bar on standard error if it is a terminal; yield a function to call after each step."""
     if not sys.stderr.isatty():
         yield lambda description=None: None
         return

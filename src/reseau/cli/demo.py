@@ -20,7 +20,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same bytes.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Capture, correct and adjust on a simulated bench over its real protocols; compare with the truth."""
+    """Capture, correct and adjust on a simulated bench with real protocols; compare with the true values."""
     from ..core.provenance import canonical_json
     from ..report.summary import comparison_table
     from ..sessions.demo import STEPS, run_demo
@@ -36,7 +36,7 @@ def demo(
 
 
 def _camera_table(field: TestfieldSession) -> str:
-    """Parameters of the camera with their errors, one line for each."""
+    """Parameters of the camera with their errors, one line each."""
     from ..core.numbers import measured
     from ..optics.cameras import unit_of
 

@@ -36,11 +36,11 @@ class Polarity(StrEnum):
     BRIGHT = "bright"
 
 
-Svg = Annotated[Path | None, typer.Option("--svg", help="Drawing to write, SVG.")]
-Pdf = Annotated[Path | None, typer.Option("--pdf", help="Drawing to write, PDF.")]
+Svg = Annotated[Path | None, typer.Option("--svg", help="SVG drawing to write.")]
+Pdf = Annotated[Path | None, typer.Option("--pdf", help="PDF drawing to write.")]
 Design = Annotated[
     Path | None,
-    typer.Option("--json", "--out", "-o", help="Design to write, JSON; - for standard output."),
+    typer.Option("--json", "--out", "-o", help="JSON design to write; - for standard output."),
 ]
 
 
@@ -51,15 +51,18 @@ def _targets() -> None:
 
 @app.command()
 def reseau(
-    columns: Annotated[int, typer.Option(help="Marks in a row.")] = 15,
-    rows: Annotated[int, typer.Option(help="Marks in a column.")] = 11,
-    pitch: Annotated[float, typer.Option(help="Distance of neighbouring marks, mm.")] = 10.0,
+    columns: Annotated[int, typer.Option(help="Number of marks in a row.")] = 15,
+    rows: Annotated[int, typer.Option(help="Number of marks in a column.")] = 11,
+    pitch: Annotated[float, typer.Option(help="Distance between neighbouring marks (mm).")] = 10.0,
     shape: Annotated[Shape, typer.Option(help="Shape of a mark.")] = Shape.LINES,
-    size: Annotated[float | None, typer.Option(help="Size of a mark, mm; not used for lines.")] = None,
-    line_width: Annotated[float, typer.Option(help="Width of the lines of a cross or grid, mm.")] = 0.3,
+    size: Annotated[
+        float | None,
+        typer.Option(help="Size of a mark (mm); not used for a line grid. Default: a fraction of --pitch."),
+    ] = None,
+    line_width: Annotated[float, typer.Option(help="Line width of a cross or line grid (mm).")] = 0.3,
     polarity: Annotated[Polarity, typer.Option(help="Dark or bright marks.")] = Polarity.DARK,
-    origin: Annotated[str | None, typer.Option(help="Mark O of the common system.")] = None,
-    axis: Annotated[str | None, typer.Option(help="Mark S on its x-axis.")] = None,
+    origin: Annotated[str | None, typer.Option(help="Mark O, the origin of the common system.")] = None,
+    axis: Annotated[str | None, typer.Option(help="Mark S, on the x-axis of the common system.")] = None,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "reseau",
     svg: Svg = None,
     pdf: Pdf = None,
@@ -86,11 +89,11 @@ def reseau(
 
 @app.command()
 def sheet(
-    columns: Annotated[int, typer.Option(help="Disks in a row.")] = 10,
-    rows: Annotated[int, typer.Option(help="Disks in a column.")] = 10,
-    pitch: Annotated[float, typer.Option(help="Distance of neighbouring disks, mm.")] = 25.0,
+    columns: Annotated[int, typer.Option(help="Number of disks in a row.")] = 10,
+    rows: Annotated[int, typer.Option(help="Number of disks in a column.")] = 10,
+    pitch: Annotated[float, typer.Option(help="Distance between neighbouring disks (mm).")] = 25.0,
     size: Annotated[
-        float | None, typer.Option(help="Diameter of a disk, mm; by default 0.22 pitches.")
+        float | None, typer.Option(help="Diameter of a disk (mm). Default: 0.22 times --pitch.")
     ] = None,
     polarity: Annotated[Polarity, typer.Option(help="Dark or bright disks.")] = Polarity.DARK,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "sheet",
@@ -107,21 +110,24 @@ def sheet(
 
 @app.command("testfield")
 def coded_field(
-    columns: Annotated[int, typer.Option(help="Squares in a row.")] = 8,
-    rows: Annotated[int, typer.Option(help="Squares in a column.")] = 8,
-    pitch: Annotated[float, typer.Option(help="Distance of the lines, mm.")] = 125.0,
-    line_width: Annotated[float, typer.Option(help="Width of the lines, mm.")] = 2.0,
+    columns: Annotated[int, typer.Option(help="Number of squares in a row.")] = 8,
+    rows: Annotated[int, typer.Option(help="Number of squares in a column.")] = 8,
+    pitch: Annotated[float, typer.Option(help="Distance between the lines (mm).")] = 125.0,
+    line_width: Annotated[float, typer.Option(help="Width of the lines (mm).")] = 2.0,
     small: Annotated[
         tuple[float, float, float, float],
-        typer.Option(help="Small squares, triangles, crosses, circles, mm."),
+        typer.Option(help="Sizes of small squares, triangles, crosses and circles (mm)."),
     ] = (9.0, 13.0, 15.0, 12.0),
-    large: Annotated[tuple[float, float, float, float], typer.Option(help="The same, large, mm.")] = (
+    large: Annotated[
+        tuple[float, float, float, float],
+        typer.Option(help="Sizes of large squares, triangles, crosses and circles (mm)."),
+    ] = (
         17.0,
         25.0,
         25.0,
         22.0,
     ),
-    spread: Annotated[float, typer.Option(help="Distance of targets in a square, mm.")] = 30.0,
+    spread: Annotated[float, typer.Option(help="Distance between targets in a square (mm).")] = 30.0,
     turn_seed: Annotated[
         int | None, typer.Option(help="Rotate each target by an angle drawn from this seed.")
     ] = None,

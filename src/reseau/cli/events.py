@@ -1,4 +1,4 @@
-"""Display of an acquisition: lines, with a progress bar on a terminal; or JSON lines for programs."""
+"""Display of an acquisition: text lines with a progress bar, or JSON lines for programs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Display:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
 
-            # On a narrow terminal the end of the text is cut off.
+            # A narrow terminal shows only the start of the text.
             rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
             text = TextColumn("{task.description}", table_column=rest)
             columns = BarColumn(bar_width=12), MofNCompleteColumn(), TimeRemainingColumn(), text
@@ -106,7 +106,7 @@ class Display:
         return self._sections and facts.get("kind") == "scan"
 
     def _line(self, kind: str, facts: dict[str, Any]) -> str:
-        """The line for an event; empty if it has none."""
+        """Return the line for an event, or an empty string."""
         if kind == "begin":
             return f"session {facts['session']}"
         if kind == "frame":

@@ -53,9 +53,9 @@ def reseau(
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the reseau.")],
     out: Out = None,
     mark_px: Annotated[
-        float | None, typer.Option(help="Size of a mark in pixels (for a grid: width of its lines).")
+        float | None, typer.Option(help="Size of a mark (px); for a grid, the width of its lines.")
     ] = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
     channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
     sensor: SensorFile = None,
     as_json: AsJson = False,
@@ -85,12 +85,16 @@ def pins(
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the test object's rods.")],
     out: Out = None,
     also: Annotated[
-        list[Path] | None, typer.Option(help="Other image of the sequence; static spots are rejected.")
+        list[Path] | None,
+        typer.Option(help="Other image of the sequence, to reject static spots; repeatable."),
     ] = None,
     max_length_px: Annotated[
-        float | None, typer.Option(min=1, help="Maximum length of an echo, pixels.")
+        float | None,
+        typer.Option(min=1, help="Maximum length of an echo (px). Default: 6 % of the frame diagonal."),
     ] = None,
-    max_rotation: Annotated[float, typer.Option(help="Largest rotation of the test object, degrees.")] = 12.0,
+    max_rotation: Annotated[
+        float, typer.Option(help="Maximum rotation of the test object (degrees).")
+    ] = 12.0,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -120,9 +124,9 @@ def coded_field(
     image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield.")],
     out: Out = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
     fill: Annotated[
-        float, typer.Option(min=0, max=1, help="Light-sensitive share of the pixel pitch.")
+        float, typer.Option(min=0, max=1, help="Light-sensitive fraction of the pixel pitch.")
     ] = 1.0,
     sensor: SensorFile = None,
     as_json: AsJson = False,
@@ -143,7 +147,9 @@ def coded_field(
             options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
             result = required(measure_testfield(frame, target, options), image)
         found, rms = result.measurement(), result.rms()
-    _deliver(image, found, out, suffix, as_json, rms, "targets", spread="deviation from their mapping")
+    _deliver(
+        image, found, out, suffix, as_json, rms, "targets", spread="deviations from the mapping of the field"
+    )
 
 
 def _suffix(out: Path | None) -> str:
@@ -160,7 +166,7 @@ def _deliver(
     rms: Array | None,
     marks: str,
     notes: tuple[Remark, ...] = (),
-    spread: str = "leave-one-out",
+    spread: str = "leave-one-out deviations",
 ) -> None:
     """Write the measurement to its file, and report what was measured."""
     from ..io import write_whole
@@ -171,8 +177,8 @@ def _deliver(
         say(found.to_json())
         return
     say(f"{image.name}: {found.found} of {found.expected} {marks} measured\n")
-    if rms is not None and rms[0] == rms[0]:  # NaN if too few were measured
-        say(f"{spread} rms {rms[0]:.3f} px in x, {rms[1]:.3f} px in y\n")
+    if rms is not None and rms[0] == rms[0]:  # NaN if too few points were measured
+        say(f"{spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)\n")
     for point in found.points:
         if not point.ok:
             say(f"  {point.id}: {point.why}\n")

@@ -61,7 +61,7 @@ class _Done:
 def orient(
     images: Annotated[list[Path], typer.Argument(help="Scans of film frames: TIFF, PNG, JPEG, BMP.")],
     frame: Annotated[
-        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56; default: the usual ones are tried.")
+        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56. Default: try the usual formats.")
     ] = None,
     corners: Annotated[
         Path | None, typer.Option("--corners", "-c", help="Calibrated corners (frame-corners/1).")
@@ -70,27 +70,28 @@ def orient(
         Transform, typer.Option(help="Transformation to the calibrated corners.")
     ] = Transform.affine,
     dpi: Annotated[
-        float | None, typer.Option(min=10, help="Resolution of the scan, if that in the file is wrong.")
+        float | None,
+        typer.Option(min=10, help="Resolution of the scan (dots per inch), if that in the file is wrong."),
     ] = None,
     near: Annotated[
-        str | None, typer.Option(help="Approximate position of the frame: left,top,right,bottom in pixels.")
+        str | None, typer.Option(help="Approximate position of the frame: left,top,right,bottom (px).")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to.")] = None,
-    marked: Annotated[bool, typer.Option(help="Write copies with the corners marked.")] = True,
-    roll: Annotated[bool, typer.Option(help="Use what the frames of a roll have in common.")] = True,
+    marked: Annotated[bool, typer.Option(help="Write copies of the scans with marked corners.")] = True,
+    roll: Annotated[bool, typer.Option(help="Use the common shape of the frames of a roll.")] = True,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
+        int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")
     ] = None,
     as_json: AsJson = False,
 ) -> int:
     """Orient scanned film frames by their four edges.
 
-    `reseau apply` uses each document as a calibration of its scan.
+    The JSON document of a frame is the calibration of its scan for `reseau apply`.
     """
     from ..io import FrameCorners
 
     if corners is not None:
-        FrameCorners.read(corners)  # reports a mistake in it before the work begins
+        FrameCorners.read(corners)  # an invalid file is reported before the computation
     box = _numbers(near)
     _format(frame)
     if out is not None:
@@ -112,7 +113,7 @@ def orient(
 
 
 def _names(images: list[Path]) -> list[str]:
-    """Stems of the outputs: those of the files, numbered where two are alike."""
+    """Stems of the outputs: those of the input files, numbered if several are equal."""
     stems = [path.stem for path in images]
     return [
         stem if stems.count(stem) == 1 else f"{stem}-{stems[: i + 1].count(stem)}"
@@ -123,12 +124,13 @@ def _names(images: list[Path]) -> list[str]:
 def _numbers(text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
+    do = "write left,top,right,bottom in pixels"
     try:
         left, top, right, bottom = (float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"is {text!r}", where="--near", do="say left,top,right,bottom") from None
+        raise UsageError(f"cannot interpret {text!r}", where="--near", do=do) from None
     if not (left < right and top < bottom):
-        raise UsageError("has no area", where="--near", do="say left,top,right,bottom")
+        raise UsageError(f"the area of {text!r} is empty", where="--near", do=do)
     return left, top, right, bottom
 
 
@@ -140,7 +142,9 @@ def _format(text: str | None) -> tuple[float, float] | None:
         if not 1 < min(width, height) <= max(width, height) < 400:
             raise ValueError
     except ValueError:
-        raise UsageError(f"is {text!r}", where="--frame", do="say width x height in mm, as 36x24") from None
+        raise UsageError(
+            f"cannot interpret {text!r}", where="--frame", do="write width x height in mm, as 36x24"
+        ) from None
     return width, height
 
 
@@ -166,7 +170,7 @@ def _options(job: _Job) -> FrameOptions:
 
 
 def _run(job: _Job, before: _Done | None = None) -> _Done:
-    """Orient the frames of one image and write the results; runs in a process of its own."""
+    """Orient the frames of one image and write the results, in a worker process."""
     from ..io import FrameCorners
     from ..io.images import open_scan
     from ..procedures.film_frame import orient_scan, orientation_of, reorient_scan
@@ -190,7 +194,7 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
 
 
 def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
-    """Write JSON, CSV, picture and marked copy; last the provenance, by which an interrupted run resumes."""
+    """Write JSON, CSV, picture and marked copy; write the provenance last: it marks the image as done."""
     from ..core.provenance import canonical_json
     from ..io import write_whole
     from ..io.images import write_image
@@ -228,7 +232,7 @@ def _csv(document: FrameOrientation) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _kept(job: _Job) -> _Done | None:
+def _earlier(job: _Job) -> _Done | None:
     """Result of an earlier run for the same image with the same options."""
     import json
 
@@ -249,10 +253,10 @@ def _kept(job: _Job) -> _Done | None:
 
 
 def _all(work: list[_Job], jobs: int | None) -> Iterator[_Done]:
-    """Orient all images, several at a time; results in their order."""
+    """Orient all images in parallel; yield the results in their order."""
     from concurrent.futures import ProcessPoolExecutor
 
-    kept = [_kept(job) for job in work]
+    kept = [_earlier(job) for job in work]
     rest = [job for job, done in zip(work, kept, strict=True) if done is None]
     count = min(jobs or os.cpu_count() or 1, max(len(rest), 1))
     with progress("orienting frames", len(work)) as step:
@@ -276,7 +280,7 @@ def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iter
 
 
 def _common(done: dict[str, _Done]) -> Roll | None:
-    """Common properties of the frames, if there are enough of them."""
+    """Common shape of the frames, or None if there are too few."""
     from ..core.failure import Failure
     from ..procedures.film_frame import roll_of
 
@@ -285,7 +289,7 @@ def _common(done: dict[str, _Done]) -> Roll | None:
 
 
 def _again(work: list[_Job], done: dict[str, _Done], roll: Roll, jobs: int | None) -> None:
-    """Orient doubtful frames again, with the properties of the roll."""
+    """Orient frames that were not fully oriented again, with the shape of the roll."""
     from dataclasses import replace
 
     for job in work:
@@ -323,8 +327,9 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
                 say(_line(document))
         if roll is not None:
             sx, sy = roll.corners.sigma or (0.0, 0.0)
-            say(f"roll: {roll.frames} frames, scatter of a corner {1000 * roll.scatter_mm[0]:.1f} and ")
-            say(f"{1000 * roll.scatter_mm[1]:.1f} µm, calibrated corners ± {1000 * max(sx, sy):.1f} µm\n")
+            x, y = (1000 * scatter for scatter in roll.scatter_mm)
+            say(f"roll: {roll.frames} frames, scatter of corners {x:.2g} µm in x, {y:.2g} µm in y, ")
+            say(f"calibrated corners ± {1000 * max(sx, sy):.2g} µm\n")
     if failed and len(failed) == len(work):
         raise InputError(failed[0] if len(failed) == 1 else f"{failed[0]} (and {len(failed) - 1} more)")
     for line in failed:
@@ -332,16 +337,20 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
 
 
 def _line(document: FrameOrientation) -> str:
-    """One line about a frame."""
+    """Describe a frame in one line."""
+    from ..core.numbers import measured
+
     if document.corners is None or document.principal_point is None:
         return f"{document.image}: declined: {document.why}\n"
     largest = max(max(c.sx, c.sy) for c in document.corners.values())
-    pp, angle = document.principal_point, document.angle_deg or 0.0
-    text = f"{document.image}: {document.status}, principal point {pp.x:.2f} {pp.y:.2f}, angle {angle:.3f}°"
-    text += f", corners ± {largest:.2f} px at most"
+    pp = document.principal_point
+    text = f"{document.image}: {document.status}, principal point x {measured(pp.x, pp.sx, 'px')}, "
+    text += f"y {measured(pp.y, pp.sy, 'px')}, "
+    text += f"angle {measured(document.angle_deg or 0.0, document.angle_sigma_deg, 'deg')}"
+    text += f", corners ± {largest:.2g} px at most"
     if document.transform is not None and document.transform.sigma_mm is not None:
         sx, sy = document.transform.sigma_mm
-        text += f", {document.transform.kind} σX {sx:.4f} σY {sy:.4f} mm"
+        text += f", {document.transform.kind}: residuals {sx:.2g} mm in X, {sy:.2g} mm in Y"
     elif document.transform is not None:
-        text += f", {document.transform.kind} without residuals (8 parameters of 4 corners)"
+        text += f", {document.transform.kind}: no residuals (8 parameters from 4 corners)"
     return text + (f" ({document.why})" if document.why else "") + "\n"

@@ -15,12 +15,16 @@ Box = tuple[float, float, float, float]
 
 
 def perforations(
-    scan: Annotated[Path, typer.Argument(help="Scan of 35 mm film, film from top to bottom.")],
+    scan: Annotated[Path, typer.Argument(help="Scan of 35 mm film that runs from top to bottom.")],
     left: Annotated[
         Box,
-        typer.Option(help="Left row, first perforation, approximately: left top right bottom (px)."),
+        typer.Option(
+            help="Approximate edges of the first perforation of the left row: left top right bottom (px)."
+        ),
     ],
-    right: Annotated[Box, typer.Option(help="Right row, likewise.")],
+    right: Annotated[
+        Box, typer.Option(help="Approximate edges of the first perforation of the right row (px).")
+    ],
     pitch: Annotated[float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")],
     count: Annotated[int, typer.Option(min=2, help="Number of perforations in a row.")],
     channel: Annotated[
@@ -46,7 +50,7 @@ def perforations(
     name = channel or opened.channels[-1]
     if name not in opened.channels:
         do = f"use {', '.join(opened.channels)}"
-        raise UsageError(f"the scan has no channel {name}", where="--channel", do=do)
+        raise UsageError(f"the scan has no channel {name!r}", where="--channel", do=do)
     rows = [np.array([*box, pitch]) for box in (left, right)]
     plane = required(film_plane(opened, rows, count, channel=opened.channels.index(name), reach=reach), scan)
     found = film_scale(plane)

@@ -14,6 +14,7 @@ from .common import (
     Out,
     is_points,
     points_document,
+    probability,
     progress,
     read_measurement,
     read_photo,
@@ -35,7 +36,7 @@ __all__ = ["refine"]
 
 @dataclass(frozen=True)
 class _Files:
-    """The files of a run, and its options."""
+    """The input files and options of a run."""
 
     photo_i: Path | None
     photo_ii: Path | None
@@ -48,7 +49,7 @@ class _Files:
     alpha: float
 
     def provenance(self) -> Provenance:
-        """Inputs by hash, and the options."""
+        """Hashes of the inputs, and the options."""
         from ..core.provenance import Provenance, sha256_of
 
         named = (self.photo_i, self.photo_ii, self.reseau, self.test_object, self.calibration, self.points)
@@ -57,11 +58,11 @@ class _Files:
         return Provenance(inputs, {"alpha": self.alpha, "check": list(self.check)})
 
     def photographs(self) -> list[Path]:
-        """The photographs that were given, in their order."""
+        """The photographs in their order."""
         return [path for path in (self.photo_i, self.photo_ii, *self.photo_iii) if path is not None]
 
     def frames(self) -> list[Frame | None]:
-        """The photographs in their order; None for one that is given as coordinates."""
+        """The photographs in their order; None for coordinates."""
         from ..io.images import read_image
 
         paths = (self.photo_i, self.photo_ii, *self.photo_iii)
@@ -72,28 +73,31 @@ def refine(
     photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
     photo_ii: Annotated[
         Path | None,
-        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, to test that."),
+        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, test it."),
     ] = None,
-    photo_iii: Annotated[list[Path] | None, typer.Option(help="PHOTO III: the body to measure.")] = None,
+    photo_iii: Annotated[
+        list[Path] | None, typer.Option(help="PHOTO III: the body to measure; repeatable.")
+    ] = None,
     reseau: Annotated[Path | None, typer.Option(help="Design of the reseau.")] = None,
     test_object: Annotated[
         Path | None, typer.Option("--object", help="Design of the test object: its rods.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Stored calibration, for PHOTO III or to be tested.")
+        Path | None, typer.Option(help="Stored calibration: apply it to PHOTO III, or test it with PHOTO II.")
     ] = None,
     points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
     out: Out = None,
-    true: Annotated[Path | None, typer.Option(help="True coordinates to write (CSV, JSON).")] = None,
-    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    true: Annotated[Path | None, typer.Option(help="File to write true coordinates to (CSV, JSON).")] = None,
+    report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
     alpha: Annotated[float, typer.Option(help="Significance level of the tests of the coefficients.")] = 0.05,
-    check: Annotated[str, typer.Option(help="Marks and rods to hold out for a check: A1,B2,…")] = "",
+    check: Annotated[str, typer.Option(help="Marks and rods used only as check points, as A1,B2.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Correct oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
 
     Each photograph is an image, or a file with the coordinates of its marks, rods and points, which are
-    identified by their names. With --calibration, --out is the result: true coordinates and the test.
+    identified by their names. With --calibration, --out contains the true coordinates and the test;
+    otherwise it contains the calibration.
     """
     from ..core.threads import one_thread
 
@@ -105,7 +109,7 @@ def refine(
     for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
         if path is not None:
             suffix_of(writable(path), suffixes)
-    with one_thread():  # the same sums however many processors there are
+    with one_thread():  # results do not depend on the number of processors
         if calibration is not None:
             _by_calibration(files, calibration, out, true, report, as_json)
         else:
@@ -118,7 +122,7 @@ def _checked(files: _Files) -> None:
     Raises
     ------
     UsageError
-        With what is missing or too much.
+        If an option is missing or superfluous.
     """
     from ..core.errors import UsageError
 
@@ -145,7 +149,7 @@ def _checked(files: _Files) -> None:
 def _by_photographs(
     files: _Files, out: Path | None, true: Path | None, report: Path | None, as_json: bool
 ) -> None:
-    """PHOTO I, and PHOTO II and III where they are given."""
+    """Correct PHOTO I, and PHOTO II and III if given."""
     from ..core.data import Frame
     from ..core.errors import UsageError
     from ..io import ReseauDesign, write_whole
@@ -158,7 +162,7 @@ def _by_photographs(
     known = set(design.ids) | set(() if rods is None else rods.ids)
     unknown = [name for name in files.check if name not in known]
     if unknown:
-        raise UsageError(f"names {unknown[0]!r}, which is none of the marks", where="--check")
+        raise UsageError(f"{unknown[0]!r} is neither a mark nor a rod", where="--check")
     steps = 1 + (files.photo_ii is not None) + len(files.photo_iii)
     photo = read_photo(files.photo_i)
     with progress("correcting", steps) as step:
@@ -200,7 +204,7 @@ def _by_photographs(
 
 
 def _split(points: ImagePoints, design: ReseauDesign) -> tuple[ImagePoints | None, ImagePoints]:
-    """Points that are marks of the reseau, and the others."""
+    """Split points into marks of the reseau and others."""
     import numpy as np
 
     marks = np.isin(points.names, design.ids)
@@ -245,7 +249,7 @@ def _by_calibration(
     report: Path | None,
     as_json: bool,
 ) -> None:
-    """True coordinates by a stored calibration."""
+    """Apply or test a stored calibration."""
     from ..calibration import InstrumentCorrection, read_calibration
     from ..core.provenance import canonical_json
     from ..io import ReseauDesign, write_whole
@@ -297,7 +301,7 @@ def _by_calibration(
 def _again(
     files: _Files, path: Path, instrument: InstrumentCorrection, design: ReseauDesign, rods: ReseauDesign
 ) -> StillStandard:
-    """Test the stored coefficients by a new PHOTO II; --object names another test object."""
+    """Test the stored coefficients with a new PHOTO II; --object names another test object."""
     from ..core.data import ImagePoints
     from ..io import ReseauDesign
     from ..procedures.oscilloscope import still_standard_in
@@ -336,17 +340,24 @@ def _standard(path: Path, again: StillStandard) -> dict[str, Any]:
 
 
 def _say_again(path: Path, again: StillStandard, unit: str) -> None:
+    import numpy as np
+
+    from ..core.numbers import measured
+
     test = again.test
-    verdict = "still hold" if test.holds else "no longer hold"
+    verdict = "are still valid" if test.holds else "are no longer valid"
     rod, length = test.largest
+    at = test.names.index(rod)
+    direction = test.change[at] / length if length > 0 else np.full(2, np.sqrt(0.5))
+    largest = measured(length, float(np.linalg.norm(direction * test.sigma[at])), unit)
     say(f"{path.name}: the coefficients {verdict} (χ² = {test.statistic:.1f}, {test.degrees} degrees of ")
-    say(f"freedom, p = {test.p:.3f}); largest change {length:.3g} {unit} at rod {rod}\n")
+    say(f"freedom, {probability(test.p)}); largest change {largest} at rod {rod}\n")
     for note in again.notes:
         say(f"  note: {note}\n")
 
 
 def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str | None) -> None:
-    """Write true coordinates; of several photographs the names get that of their photograph before them."""
+    """Write true coordinates; with several photographs, names have that of their photograph as prefix."""
     from ..core.data import ImagePoints
     from ..core.provenance import canonical_json
     from ..io import write_whole
@@ -368,28 +379,35 @@ def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str
 
 def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
     fit = first.camera.fit
-    rms = (fit.residuals**2).mean(axis=0) ** 0.5 if fit else (0.0, 0.0)
-    say(f"{path.name}: {len(first.points)} marks, {len(first.camera.model.names)} coefficients kept\n")
-    say(f"residuals {rms[0]:.4f} {design.unit} in x, {rms[1]:.4f} {design.unit} in y (rms)\n")
+    say(f"{path.name}: {len(first.points)} marks, {len(first.camera.model.names)} significant coefficients\n")
+    if fit is not None:
+        x, y = (fit.residuals**2).mean(axis=0) ** 0.5
+        say(f"  residuals {x:.2g} {design.unit} in x, {y:.2g} {design.unit} in y (rms)\n")
 
 
 def _say_second(path: Path, second: PhotoII) -> None:
     instrument = second.instrument
     fit, (along, across) = instrument.fit, instrument.plane.scale
     insignificant = () if fit is None else fit.elimination.dropped
-    say(f"{path.name}: {len(second.pins)} rods, λ = {along:.5f}, {across:.5f}\n")
+    say(f"{path.name}: {len(second.pins)} rods, scales λ1 = {along:.4f}, λ2 = {across:.4f}\n")
     if insignificant:
         say(f"  not significant: {', '.join(insignificant)}\n")
     if second.causes is not None:
         for test in second.causes.conditions:
-            verdict = "holds" if test.holds else "does not hold"
-            say(f"  {test.condition} {verdict} (χ² = {test.statistic:.2f}, p = {test.p:.3f})\n")
+            verdict = "is satisfied" if test.holds else "is not satisfied"
+            say(f"  {test.condition} {verdict} (χ² = {test.statistic:.2f}, {probability(test.p)})\n")
     if fit is not None and fit.displays is not None:
-        better = {"first": "the polynomials explain", "second": "Wong's model explains"}
-        verdict = better.get(fit.displays.verdict, "neither the polynomials nor Wong's model explains")
-        say(f"  {verdict} the rods better (p = {fit.displays.p:.3f})\n")
+        better = {
+            "first": "the polynomials predict the rods better than Wong's model",
+            "second": "Wong's model predicts the rods better than the polynomials",
+        }
+        verdict = better.get(
+            fit.displays.verdict, "no significant difference between the polynomials and Wong's model"
+        )
+        say(f"  {verdict} ({probability(fit.displays.p)})\n")
     if fit is not None and fit.local is not None and instrument.local is not None:
-        say(f"  a local model is subtracted: the residuals are not noise (p = {fit.local.need.min():.3f})\n")
+        level = probability(float(fit.local.need.min()))
+        say(f"  residuals are correlated ({level}): corrected with a local model\n")
     for note in second.notes:
         say(f"  note: {note}\n")
 
