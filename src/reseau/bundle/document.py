@@ -14,7 +14,7 @@ from ..core.data import Array
 from ..core.provenance import Provenance
 from ..io import Document, Strict
 from .diagnostics import Result, sigma_between_images
-from .network import finite
+from .network.network import finite
 
 __all__ = ["ResultDocument", "model_search_entries"]
 

@@ -1,6 +1,6 @@
 """Diagnostics of an adjusted network: result, residual patterns, uncertainty over the image, checks."""
 
-from .checks import checks, listed
+from .checks import checks
 from .control_check import doubtful_control
 from .estimates import CameraEstimate, ImageEstimates, PointEstimates
 from .fields import camera_mapping, projection_field_at
@@ -21,7 +21,6 @@ __all__ = [
     "checks",
     "common_pattern",
     "doubtful_control",
-    "listed",
     "projection_field_at",
     "sigma_between_images",
 ]

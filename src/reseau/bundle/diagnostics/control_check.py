@@ -8,8 +8,12 @@ from itertools import combinations, islice
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ..network import Network, finite
-from ..solver import BundleFit, BundleProblem, Unknowns, Values, approximate, similarity_onto
+from ..network import Network
+from ..network.network import finite
+from ..solver import BundleFit, BundleProblem, approximate
+from ..solver.datum import similarity_onto
+from ..solver.unknowns import Unknowns
+from ..solver.values import Values
 
 __all__ = ["doubtful_control"]
 

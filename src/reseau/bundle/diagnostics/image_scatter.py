@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.data import Array
-from ..solver import SEGMENTS
+from ..solver.normal import SEGMENTS
 from .result import Result
 
 __all__ = ["sigma_between_images"]

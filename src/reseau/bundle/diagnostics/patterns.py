@@ -25,7 +25,7 @@ import scipy.special
 
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
-from ..solver import SEGMENTS
+from ..solver.normal import SEGMENTS
 from .result import Result
 
 __all__ = ["CommonPattern", "by_place", "by_point", "common_pattern"]

@@ -12,9 +12,13 @@ from ...adjust import data_snooping, robust
 from ...adjust.outliers import SnoopingStep
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
-from ..diagnostics import Result, checks, doubtful_control, listed
-from ..network import Network, finite
-from ..solver import BundleFit, BundleProblem, Unknowns, Values, approximate
+from ..diagnostics import Result, checks, doubtful_control
+from ..diagnostics.checks import listed
+from ..network import Network
+from ..network.network import finite
+from ..solver import BundleFit, BundleProblem, approximate
+from ..solver.unknowns import Unknowns
+from ..solver.values import Values
 
 __all__ = ["Options", "adjust_network", "problem_of"]
 

@@ -2,8 +2,8 @@
 
 from .calibrated import calibrated_camera, film_camera
 from .example import example_network
-from .network import Additional, Camera, ControlPoints, Network, Usable, finite, usable
-from .stage import Stage, StageValues, perpendicular
+from .network import Additional, Camera, ControlPoints, Network
+from .stage import Stage
 
 __all__ = [
     "Additional",
@@ -11,12 +11,7 @@ __all__ = [
     "ControlPoints",
     "Network",
     "Stage",
-    "StageValues",
-    "Usable",
     "calibrated_camera",
     "example_network",
     "film_camera",
-    "finite",
-    "perpendicular",
-    "usable",
 ]

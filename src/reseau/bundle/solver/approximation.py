@@ -10,7 +10,8 @@ import scipy.sparse
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Remark
 from ...optics.poses import rotation_matrix
-from ..network import Network, finite
+from ..network import Network
+from ..network.network import finite
 from .datum import similarity_onto
 from .spatial import directions, intersect, relative_orientation, resect
 from .values import Values

@@ -10,7 +10,8 @@ import scipy.linalg
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
-from ..network import Camera, Network, perpendicular
+from ..network import Camera, Network
+from ..network.stage import perpendicular
 from .values import Values
 
 __all__ = ["OtherObservations"]

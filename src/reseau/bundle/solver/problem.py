@@ -18,7 +18,8 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
-from ..network import Network, Usable, finite, usable
+from ..network import Network
+from ..network.network import Usable, finite, usable
 from .arrow import Singular
 from .datum import Freedom, freedom_of, held_minimally, similarity_onto
 from .iteration import Iterated, iterate

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ..network import Stage, StageValues, perpendicular
+from ..network import Stage
+from ..network.stage import StageValues, perpendicular
 from .unknowns import Unknowns
 
 __all__ = ["Constrained", "StageConstraints"]

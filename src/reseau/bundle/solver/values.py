@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.data import Array, Rows
 from ...optics.poses import rotation_matrix
-from ..network import StageValues
+from ..network.stage import StageValues
 from .imaging import Orientation
 from .stage_constraints import StageConstraints
 from .unknowns import Unknowns
