@@ -31,6 +31,15 @@ def read_bal(path: Path | str) -> Network:
         When it cannot be read.
     FormatError
         When it holds other than the numbers its first line promises.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "block.bal"
+    ...     _ = path.write_text("1 1 1  0 0 10.0 20.0  0 0 0 0 0 0 800 0 0  0.1 0.2 -8")
+    ...     read_bal(path)
+    <Network: 1 camera, 1 image, 1 point, 1 image point, datum free>
     """
     path = Path(path)
     words = read_text(path).split()

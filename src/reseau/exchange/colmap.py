@@ -33,7 +33,7 @@ _MODELS = {
 
 
 def read_colmap(folder: Path | str) -> Network:
-    """A network from a folder of COLMAP's text files.
+    r"""A network from a folder of COLMAP's text files.
 
     Principal distance and distortion are free, the principal point is held, as COLMAP does by itself; image
     coordinates get a standard deviation of one pixel.
@@ -44,6 +44,18 @@ def read_colmap(folder: Path | str) -> Network:
         When a file cannot be read.
     FormatError
         When a line is not what it should be; the message names it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as name:
+    ...     folder = Path(name)
+    ...     _ = (folder / "cameras.txt").write_text("1 SIMPLE_RADIAL 640 480 800 320 240 0.01")
+    ...     _ = (folder / "images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n320.5 240.5 7")
+    ...     _ = (folder / "points3D.txt").write_text("7 0 0 0 255 255 255 0.1")
+    ...     network = read_colmap(folder)
+    >>> network.cameras[0].free, network.x0[0, 2], network.xy
+    (('c', 'K1'), np.float64(-5.0), array([[320., 240.]]))
     """
     folder = Path(folder)
     cameras: dict[str, Camera] = {}

@@ -17,7 +17,7 @@ _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
 
 def read_control(path: Path | str) -> ControlPoints:
-    """Control points from a CSV ``id,x,y,z[,sx,sy,sz]`` with a header.
+    r"""Control points from a CSV ``id,x,y,z[,sx,sy,sz]`` with a header.
 
     Without columns of standard deviations all coordinates are held, as with a standard deviation of 0. A
     field that is empty leaves its coordinate free.
@@ -33,6 +33,17 @@ def read_control(path: Path | str) -> ControlPoints:
         When it cannot be read.
     FormatError
         When it is no such table, names a point twice, or holds what is no number or a negative sigma.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "control.csv"
+    ...     _ = path.write_text("id,x,y,z,sx,sy,sz\nA,0,0,0,0,0,0\nB,100,0,,0.1,0.1,\n")
+    ...     control = read_control(path)
+    >>> control.names, control.sigma
+    (('A', 'B'), array([[0. , 0. , 0. ],
+           [0.1, 0.1, nan]]))
     """
     path = Path(path)
     lines = [line for line in csv.reader(read_text(path).splitlines()) if any(word.strip() for word in line)]

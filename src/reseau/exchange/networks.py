@@ -121,7 +121,7 @@ def calibration_files(path: Path | str) -> tuple[Path, ...]:
 
 
 def read_foreign(path: Path | str) -> Network:
-    """A network of another program, told apart by what the file holds.
+    r"""A network of another program, told apart by what the file holds.
 
     Parameters
     ----------
@@ -134,6 +134,15 @@ def read_foreign(path: Path | str) -> Network:
         When it cannot be read.
     FormatError
         When it is none of these.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "block.txt"
+    ...     _ = path.write_text("1 1 1\n0 0 10.0 20.0\n0 0 0 0 0 0 800 0 0\n0.1 0.2 -8\n")
+    ...     read_foreign(path)
+    <Network: 1 camera, 1 image, 1 point, 1 image point, datum free>
     """
     path = Path(path)
     if path.is_dir():

@@ -26,7 +26,7 @@ _FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 
 
 def read_photomodeler(path: Path | str) -> Network:
-    """A network from PhotoModeler's text export.
+    r"""A network from PhotoModeler's text export.
 
     Images whose cameras agree to the printed digits share one.
 
@@ -36,6 +36,20 @@ def read_photomodeler(path: Path | str) -> Network:
         When it cannot be read.
     FormatError
         When a line is not what it should be; the message names it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> camera = "35.0 18.0 12.0 36.0 24.0 0 0 0 0 0"
+    >>> lines = ["title", "1e-6 20 3600 2400", "1", camera, "1 0 0 0 0 0 0 0 0 0 0", "0 a.jpg",
+    ...          "0 0 0 1000 0 0 0", "0 0 0 0 0 0 0", f"1 {camera}", "1 0 0 0 0 0 0 0 0 0 0", "",
+    ...          "7 0 0 0 1 1 1", "", "0 7 1800.5 1200.5 0.1 0.1"]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "block.txt"
+    ...     _ = path.write_text("\n".join(lines))
+    ...     network = read_photomodeler(path)
+    >>> network.images, network.cameras[0].pitch_mm, network.xy
+    (('1',), (0.01, 0.01), array([[1800., 1200.]]))
     """
     path = Path(path)
     lines = _Lines(path)

@@ -102,7 +102,15 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
 
 
 def checks(result: Result) -> list[Remark]:
-    """Correlations, weak points, uncovered corners, test values, and the global test."""
+    """Correlations, weak points, uncovered corners, test values, and the global test.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> [remark.code.value for remark in checks(result)]
+    ['coverage']
+    """
     network, fit = result.network, result.fit
     return [
         *gaps(network, fit),

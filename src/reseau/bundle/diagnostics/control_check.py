@@ -33,6 +33,15 @@ def doubtful_control(network: Network) -> str:
     ----------
     network : Network
         With four control points at least whose three coordinates are known.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> network = example_network()
+    >>> xyz = network.xyz.copy()
+    >>> xyz[[0, 19]] = xyz[[19, 0]]
+    >>> doubtful_control(replace(network, xyz=xyz, sigma=np.zeros((20, 3)), datum="control"))
+    'the coordinates of control points p0 and p19 look exchanged'
     """
     rows = np.flatnonzero(finite(network.xyz) & ~np.isnan(network.sigma).any(axis=1) & (network.rays > 1))
     if len(rows) < _LEAST:

@@ -29,6 +29,14 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
     ------
     UsageError
         When there is no such set, or several and none is named.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> camera = camera_mapping(result, 0)
+    >>> camera.names, camera.width
+    (('c', 'x0', 'y0', 'K1'), 640)
     """
     camera = result.network.cameras[c]
     names, columns, values = own_columns(result, c, additional)
@@ -86,6 +94,15 @@ def projection_field_at(
     by the estimate of it: dp = mean(δᵢ × p − Rᵢ dX0ᵢ). What the errors of all poses together make up for in
     those of the interior orientation does not count; their joint covariance is used (Kogan, *mrcal*:
     projection uncertainty by the mean of p over the frames). It is in the datum of the network.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> projection_field_at(result, 0, 4.0, across=3, down=3).sigma.round(2)
+    array([[0.18, 0.02, 0.18],
+           [0.08, 0.01, 0.08],
+           [0.18, 0.02, 0.18]])
     """
     if not distance > 0:
         raise UsageError(f"{distance:g} is not above zero", where="distance")

@@ -39,6 +39,13 @@ def sigma_between_images(result: Result, c: int) -> Array:
     -----
     The residuals of an image are too small by what its own unknowns take up of them: its part is divided by
     its mean redundancy number, and the whole multiplied by m/(m − 1) of m images.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> (sigma_between_images(result, 0) / result.camera(0).sigma).round(1)
+    array([1.8, ...])
     """
     network, fit = result.network, result.fit
     _, columns, _ = result.camera_columns(c)

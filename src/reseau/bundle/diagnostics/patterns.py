@@ -62,6 +62,14 @@ class CommonPattern:
     rms : float
         Root mean square of the shifts per coordinate without what noise makes of them, px, as far as they are
         of one size everywhere; 0 where noise makes more.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> pattern = common_pattern(result, by_place(result, 0, 2, 2))
+    >>> pattern.count, pattern.degrees, pattern.p > 0.05
+    (array([41, 40, 39, 40]), (6, 209), True)
     """
 
     key: Rows
@@ -104,6 +112,13 @@ def by_point(result: Result, kinds: Sequence[str | None]) -> Rows:
     -------
     ndarray of int (n,)
         Class of each image point, −1 for none.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> by_point(result, ["front"] * 4 + [None] * 4)[[0, 1, 20, 159]]
+    array([ 0,  1,  0, -1])
     """
     network = result.network
     names = {kind: k for k, kind in enumerate(dict.fromkeys(kind for kind in kinds if kind is not None))}
@@ -129,6 +144,13 @@ def by_place(result: Result, camera: int, across: int = 12, down: int | None = N
     -------
     ndarray of int (n,)
         Class of each image point, −1 for those of other cameras.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> np.bincount(by_place(result, 0, across=2, down=2))
+    array([41, 40, 39, 40])
     """
     network, entry = result.network, result.network.cameras[camera]
     down = max(1, round(across * entry.height / entry.width)) if down is None else down
@@ -154,6 +176,14 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     ------
     UsageError
         When no class has two image points, or there are too many classes.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> pattern = common_pattern(result, by_place(result, 0, 2, 2))
+    >>> pattern.shift.shape, pattern.rms < 0.01
+    ((4, 2), True)
     """
     fit, network = result.fit, result.network
     linear, unknowns = fit.linear, fit.unknowns

@@ -40,6 +40,12 @@ class Eliminated:
         Its test before it was dropped.
     sigma0 : float
         Standard deviation of unit weight without it.
+
+    Examples
+    --------
+    >>> step = Eliminated("camera", ratio_test("K2", 1.3, 1.0, 215), 1.01)
+    >>> step.test.name, step.test.significant
+    ('K2', False)
     """
 
     camera: str

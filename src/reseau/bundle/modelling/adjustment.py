@@ -51,6 +51,12 @@ class Options:
         Relative offset at which the iteration has converged.
     watch : callable, optional
         Told the number of corrections and vᵀPv after each.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> adjust_network(example_network(), Options(max_iterations=20)).fit.iterations < 20
+    True
     """
 
     outliers: Literal["keep", "reject"] = "keep"
@@ -68,7 +74,15 @@ class Options:
 
 
 def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[Remark, ...]]:
-    """The network with approximate values, as a problem of :mod:`reseau.adjust`; and notes about them."""
+    """The network with approximate values, as a problem of :mod:`reseau.adjust`; and notes about them.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> problem, notes = problem_of(example_network())
+    >>> len(problem.observations), notes
+    (320, ())
+    """
     options = options or Options()
     found = approximate(network)
     unknowns = Unknowns.of(network, finite(found.x0))
@@ -101,6 +115,15 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     -----
     Self-calibrating bundle adjustment (Brown 1971; Förstner & Wrobel 2016, ch. 15); see
     ``docs/mathematics/bundle.md``.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> result = adjust_network(example_network())
+    >>> result.cameras["camera"]
+    <CameraEstimate: camera, c 8.00... mm, ...>
+    >>> adjust_network(replace(example_network(), datum="control")).code.value
+    'no-datum'
     """
     options = options or Options()
     problem, notes = problem_of(network, options)

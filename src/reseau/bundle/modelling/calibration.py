@@ -41,6 +41,14 @@ def calibration_of(
     ------
     UsageError
         When there is no such camera, or nothing of it was estimated.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> calibration = calibration_of(result, "camera", name="front")
+    >>> calibration.kind, calibration.covariance.names
+    ('camera', ('c', 'x0', 'y0', 'K1'))
     """
     ids = [entry.id for entry in result.network.cameras]
     if camera not in ids:

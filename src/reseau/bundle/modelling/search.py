@@ -55,6 +55,13 @@ def search_model(
     Result or Failure
         The result says how its model was found. A failure when an adjustment fails, or the components do not
         converge.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> result = search_model(example_network(), components="axes")
+    >>> result.components.names, result.components.factors.round(2)
+    (('x', 'y'), array([0.93, 1.08]))
     """
     found = None
     if components is not None:
@@ -106,6 +113,13 @@ def estimate_components(
     -------
     VarianceComponents or Failure
         See :func:`reseau.adjust.variance_components`; what else was observed keeps its standard deviation.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> found = estimate_components(example_network(), "axes")
+    >>> found.factors.round(2), found.sigma.round(2)
+    (array([0.93, 1.08]), array([0.06, 0.07]))
     """
     problem, _ = problem_of(network, options)
     n = len(network.xy)
@@ -142,7 +156,16 @@ def _kinds(network: Network) -> dict[Kind, Callable[[], dict[str, Mask]]]:
 
 
 def reweighted(network: Network, found: VarianceComponents[BundleFit], kind: Kind) -> Network:
-    """The network with standard deviations multiplied by the factors found; correlations stay."""
+    """The network with standard deviations multiplied by the factors found; correlations stay.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> network = example_network()
+    >>> found = estimate_components(network, "axes")
+    >>> np.sqrt(np.diag(reweighted(network, found, "axes").cov[0])).round(3)
+    array([0.046, 0.054])
+    """
     factor = np.ones(network.xy.shape)
     known = dict(zip(found.names, found.factors.tolist(), strict=True))
     for name, mask in _kinds(network)[kind]().items():
@@ -162,6 +185,13 @@ class Selection:
         Its adjustment.
     steps : tuple of Eliminated
         In the order in which they were dropped.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> selection = eliminate_parameters(example_network())
+    >>> bool(selection), selection.steps
+    (True, ())
     """
 
     network: Network
@@ -192,6 +222,15 @@ def eliminate_parameters(
     -------
     Selection or Failure
         A failure when an adjustment fails.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> network = example_network()
+    >>> camera = replace(network.cameras[0], free=("c", "x0", "y0", "K1", "K2"))
+    >>> selection = eliminate_parameters(replace(network, cameras=(camera,)))
+    >>> [step.test.name for step in selection.steps], selection.network.cameras[0].free
+    (['K2'], ('c', 'x0', 'y0', 'K1'))
     """
     steps: list[Eliminated] = []
     result = adjust_network(network, options)
@@ -251,6 +290,12 @@ def cross_validation(
     ------
     UsageError
         For less than two folds.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> round(cross_validation(example_network(), folds=4), 1)
+    1.3
     """
     if folds < 2:
         raise UsageError(f"{folds} folds leave nothing to adjust", where="cross_validation")

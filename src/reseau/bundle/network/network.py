@@ -476,6 +476,13 @@ class ControlPoints:
         Coordinates.
     sigma : ndarray (k, 3)
         0 holds a coordinate, NaN leaves it free, otherwise it is an observation.
+
+    Examples
+    --------
+    >>> xyz = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    >>> control = ControlPoints(("A", "B"), xyz, np.array([[0.0, 0.0, 0.0], [0.1, 0.1, np.nan]]))
+    >>> (control.sigma == 0).sum(axis=1), np.isnan(control.sigma).sum(axis=1)
+    (array([3, 0]), array([0, 1]))
     """
 
     names: tuple[str, ...]

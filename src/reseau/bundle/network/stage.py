@@ -48,6 +48,15 @@ class Stage:
         Nominal direction of the axis in the system of the field.
     axis_sigma : float
         Standard deviation of each of the two angles between the axis and its nominal direction, rad.
+
+    Examples
+    --------
+    >>> stage = Stage(np.array([0, 0]), np.array([0.0, 10.0]), 0.01, np.array([0.0, 0.0, 1.0]), 1e-3)
+    >>> x0 = np.array([[0.0, 0.0, 500.0], [0.3, 0.1, 489.0]])
+    >>> _, _, x0 = stage.approximate(np.tile(np.eye(3), (2, 1, 1)), x0)
+    >>> x0
+    array([[  0.,   0., 500.],
+           [  0.,   0., 490.]])
     """
 
     pose: Rows

@@ -41,6 +41,13 @@ class Approximate:
         Points, NaN likewise.
     notes : tuple of Remark
         How they were found, where that matters.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> found = approximate(example_network())
+    >>> found.rotation.shape, found.x0.shape, found.notes
+    ((8, 3, 3), (8, 3), ())
     """
 
     rotation: Array
@@ -63,6 +70,12 @@ def approximate(network: Network) -> Approximate:
         Poses as given, or by resection from known points and points intersected before, or, where nothing is
         known, grown from the pair of images with the most points at the best angles and carried onto the
         control by a similarity.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> np.abs(approximate(example_network()).x0[0].round(2))
+    array([2.2, 0. , 4. ])
     """
     return _Block(network).grown()
 

@@ -69,6 +69,13 @@ class BundleProblem:
         Told the number of corrections and vᵀPv after each.
     rounds : int
         How often points have been left out that ran off to infinity.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network, problem_of
+    >>> problem, _ = problem_of(example_network())
+    >>> len(problem.observations), bool(problem.adjusted())
+    (320, True)
     """
 
     network: Network
@@ -206,6 +213,14 @@ class BundleFit(Fitted):
         Observations, unknowns before datum constraints, datum constraints.
     datum : ndarray of bool (p,), optional
         Points over which inner constraints hold: those chosen, or all but the weak ones.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network, problem_of
+    >>> problem, _ = problem_of(example_network())
+    >>> fit = problem.adjusted()
+    >>> fit.counts, fit.redundancy, round(fit.sigma0, 3)
+    ((320, 112, 7), 215, 1.005)
     """
 
     problem: BundleProblem
