@@ -42,6 +42,12 @@ class Video:
         Where on an ideal screen its samples and lines belong (mm, y up).
     signal : ndarray (lines, samples)
         Brightness: 0 is black, 1 the brightest that is meant.
+
+    Examples
+    --------
+    >>> video = Video(np.linspace(-40.0, 40.0, 5), np.linspace(30.0, -30.0, 4), np.zeros((4, 5), np.float32))
+    >>> video.signal.shape == (len(video.y), len(video.x))
+    True
     """
 
     x: Array

@@ -9,7 +9,7 @@ from reseau.core.errors import SettingError
 from ..link import Link
 from .dialects import DIALECTS, Dialect, dialect_of
 from .scope import Oscilloscope, OscilloscopeSettings
-from .visa import resources, scpi_link
+from .visa import scpi_link
 
 __all__ = [
     "DIALECTS",
@@ -18,7 +18,6 @@ __all__ = [
     "OscilloscopeSettings",
     "dialect_of",
     "oscilloscope",
-    "resources",
 ]
 
 

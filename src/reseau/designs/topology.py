@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import UsageError
+from ..core.failure import Code
 from ..io import TestfieldDesign
 
 __all__ = ["HIDDEN", "Decoded", "TopologicalCode"]
@@ -91,6 +92,8 @@ class Decoded:
         Number of targets that are not visible.
     why : str
         Reason why it was not identified; empty otherwise.
+    code : Code or None
+        The same for programs: HIDDEN or INCONSISTENT.
 
     Examples
     --------
@@ -104,9 +107,10 @@ class Decoded:
     corrections: int = 0
     hidden: int = 0
     why: str = ""
+    code: Code | None = None
 
     def __bool__(self) -> bool:
-        return not self.why
+        return self.code is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +130,7 @@ class TopologicalCode:
     >>> seen = np.rot90(code.clusters[22].reshape(4, 4)).copy()
     >>> seen[0, :2], seen[3, 3] = HIDDEN, (seen[3, 3] + 1) % 8
     >>> code.decode(seen)
-    Decoded(square=23, quarter_turns=1, mirrored=False, corrections=1, hidden=2, why='')
+    Decoded(square=23, quarter_turns=1, mirrored=False, corrections=1, hidden=2, why='', code=None)
     """
 
     clusters: Symbols
@@ -195,9 +199,10 @@ class TopologicalCode:
         if 2 * corrections + hidden >= self.distance:
             # Within half the distance there is at most one word; beyond it there may be two, or none.
             why = f"{corrections} of its {_PLACES - hidden} visible targets fit no square of the design"
+            code = Code.INCONSISTENT
             if not corrections:
-                why = f"{hidden} of its targets are hidden"
-            return Decoded(corrections=corrections, hidden=hidden, why=why)
+                why, code = f"{hidden} of its targets are hidden", Code.HIDDEN
+            return Decoded(corrections=corrections, hidden=hidden, why=why, code=code)
         return Decoded(square + 1, way % 4, way >= 4, corrections, hidden)
 
 

@@ -86,6 +86,15 @@ def fit_mapping(
 
     A rational polynomial needs no approximate values: the adjustment starts from a linear solution if that
     fits better than the given values.
+
+    Examples
+    --------
+    >>> from reseau.optics import Similarity
+    >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
+    >>> points = ImagePoints.with_sigma("abcd", square, 0.01)
+    >>> fit = fit_mapping(Similarity(), points, 2 * square + 1).required()
+    >>> round(fit["X0"], 6), round(fit["a"], 6), fit.redundancy
+    (1.0, 2.0, 4)
     """
     shortage = _shortage(model, points)
     if shortage is not None:
@@ -116,6 +125,14 @@ def reduce_mapping(
         Parameters that are never dropped.
     options : Options, optional
         Options of the adjustment.
+
+    Examples
+    --------
+    >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [5.0, 5.0]])
+    >>> points = ImagePoints.with_sigma("abcde", square, 0.01)
+    >>> found = reduce_mapping(RationalPolynomial.affine(), points, square * [2.0, 3.0]).required()
+    >>> sorted(found.dropped), round(found.adjustment["a1"], 6)
+    (['a2', 'b1', 'c1', 'c2'], 2.0)
     """
     shortage = _shortage(model, points)
     if shortage is not None:

@@ -46,6 +46,18 @@ class CorrectionFit:
     local : SmoothField or None
         What the model leaves, as a smooth field; `local.need` is the probability, per axis, of a field as
         large from white noise alone. None with fewer than 20 marks.
+
+    Examples
+    --------
+    See :func:`correct_camera`:
+
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(4, 4, 10.0, Mark(shape="disk", size=1.0))
+    >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> fit = correct_camera(seen, reseau, model=RationalPolynomial.affine(), check=["A1"]).required().fit
+    >>> fit.check.names, bool(abs(fit.residuals).max() < 1e-6), len(fit.tests())
+    (('A1',), True, 4)
     """
 
     elimination: Elimination
@@ -79,6 +91,16 @@ class FittedCamera(CameraCorrection):
     ----------
     fit : CorrectionFit, optional
         How the model was fitted.
+
+    Examples
+    --------
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(4, 4, 10.0, Mark(shape="disk", size=1.0))
+    >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> camera = correct_camera(seen, reseau, model=RationalPolynomial.affine()).required()
+    >>> len(camera.apply(seen)), camera.fit.adjustment.redundancy
+    (16, 30)
     """
 
     fit: CorrectionFit | None = None
@@ -127,8 +149,9 @@ def correct_camera(
 
     Examples
     --------
-    >>> from reseau.designs import standard_reseau
-    >>> reseau = standard_reseau()
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(5, 5, 15.0, Mark(shape="disk", size=1.0))
     >>> bent = reseau.xy * (1 + 1e-6 * (reseau.xy**2).sum(axis=1, keepdims=True))
     >>> seen = bent * [9.0, -9.0] + [800.0, 600.0]
     >>> camera = correct_camera(ImagePoints.with_sigma(reseau.ids, seen, 0.01), reseau, trials=0).required()

@@ -62,6 +62,18 @@ class InstrumentFit:
     displays : Rivalry or None
         The polynomials (first) beside Wong's display model (second), both with all their coefficients; None
         where there are too few rods for them.
+
+    Examples
+    --------
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.refine import correct_camera
+    >>> rods = regular_reseau(4, 4, 15.0, Mark(shape="disk", size=0.75))
+    >>> images = ImagePoints.with_sigma(rods.ids, rods.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> camera = correct_camera(images, rods, model=RationalPolynomial.affine()).required()
+    >>> fit = correct_instrument(images, rods, camera).required().fit
+    >>> fit.adjustment.redundancy, len(fit.points), fit.local is None
+    (16, 16, True)
     """
 
     elimination: Elimination
@@ -91,6 +103,18 @@ class FittedInstrument(InstrumentCorrection):
     ----------
     fit : InstrumentFit, optional
         How the model was fitted.
+
+    Examples
+    --------
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.refine import correct_camera
+    >>> rods = regular_reseau(4, 4, 15.0, Mark(shape="disk", size=0.75))
+    >>> images = ImagePoints.with_sigma(rods.ids, rods.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> camera = correct_camera(images, rods, model=RationalPolynomial.affine()).required()
+    >>> instrument = correct_instrument(images, rods, camera).required()
+    >>> bool(abs(instrument.apply(images).xy - rods.xy).max() < 1e-6), instrument.fit is None
+    (True, False)
     """
 
     fit: InstrumentFit | None = None
@@ -135,12 +159,12 @@ def correct_instrument(
 
     Examples
     --------
-    >>> from reseau.designs import regular_reseau, standard_reseau
+    >>> from reseau.designs import regular_reseau
     >>> from reseau.io import Mark
     >>> from reseau.refine import correct_camera
-    >>> reseau, rods = standard_reseau(), regular_reseau(6, 5, 15.0, Mark(shape="disk", size=0.75))
+    >>> reseau, rods = (regular_reseau(5, 4, 15.0, Mark(shape="disk", size=1.0)) for _ in range(2))
     >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
-    >>> camera = correct_camera(seen, reseau, trials=0).required()
+    >>> camera = correct_camera(seen, reseau, model=RationalPolynomial.affine()).required()
     >>> images = ImagePoints.with_sigma(rods.ids, rods.xy * [9.1, -9.2] + [790.0, 610.0], 0.01)
     >>> instrument = correct_instrument(images, rods, camera, trials=0).required()
     >>> bool(abs(instrument.apply(images).xy - rods.xy).max() < 1e-6)

@@ -103,11 +103,12 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
 
     Examples
     --------
-    >>> from reseau.designs import standard_reseau
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
     >>> from reseau.refine import correct_camera
-    >>> reseau = standard_reseau()
+    >>> reseau = regular_reseau(5, 4, 15.0, Mark(shape="disk", size=1.0))
     >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
-    >>> camera = correct_camera(seen, reseau, trials=0).required()
+    >>> camera = correct_camera(seen, reseau, model=RationalPolynomial.affine()).required()
     >>> moved = register(ImagePoints(seen.names, seen.xy + [0.8, -0.5], seen.cov), reseau, camera)
     >>> moved.moved, round(moved.displacement_px, 2)
     (True, 0.94)

@@ -71,6 +71,19 @@ def oscilloscope_report(
     ------
     UsageError
         When a correction was read from a file and has no residuals, or a photograph lacks those before it.
+
+    Examples
+    --------
+    >>> from reseau.core.data import ImagePoints
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.optics import RationalPolynomial
+    >>> from reseau.procedures.oscilloscope import photo_i
+    >>> reseau = regular_reseau(4, 4, 10.0, Mark(shape="disk", size=1.0))
+    >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
+    >>> first = photo_i(seen, reseau, model=RationalPolynomial.affine()).required()
+    >>> "<h1>Scope 7</h1>" in oscilloscope_report(first, reseau, title="Scope 7")
+    True
     """
     if (second is None) != (test_object is None):
         raise UsageError("needs its test object, and the test object needs PHOTO II", where="PHOTO II")
@@ -124,6 +137,14 @@ def applied_report(
     -------
     str
         An HTML page without any external resource and without clock times.
+
+    Examples
+    --------
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> rods = regular_reseau(4, 4, 10.0, Mark(shape="rod", size=1.0))
+    >>> "<h1>Scope 7</h1>" in applied_report(rods, title="Scope 7")
+    True
     """
     pictures = [frame for _, frame in zip_longest(range(len(third)), frames)]
     return rendered(

@@ -353,6 +353,16 @@ class FreeCurve:
         Parameters of the Gaussian edge; see :func:`~reseau.sensor.edge.fit_gaussian`.
     limit : float
         Frequency (cycles per pixel) up to which the distances of the pixels resolve the curve.
+
+    Examples
+    --------
+    >>> from scipy.special import ndtr
+    >>> y, x = np.mgrid[-12:12, -12:12]
+    >>> pixels = EdgePixels.of(40 + 150 * ndtr((x - 0.1 * y) / 0.9), np.ones((24, 24), dtype=bool))
+    >>> curve = fit_free(pixels, np.array([12.0, 0.1, 0.0, 40.0, 190.0, 0.9]))
+    >>> modulation, sigma = curve.mtf(np.array([0.0, 0.25]))
+    >>> modulation.round(2).tolist(), curve.limit
+    ([1.0, 0.37], 1.0)
     """
 
     fit: Adjustment
@@ -555,6 +565,16 @@ class EdgeSpread:
         Test of whether more than the Gaussian is needed; significant if it does not describe the edge.
     bent : CoefficientTest or None
         Test of whether the edge is curved.
+
+    Examples
+    --------
+    >>> from scipy.special import ndtr
+    >>> y, x = np.mgrid[-12:12, -12:12]
+    >>> pixels = EdgePixels.of(40 + 150 * ndtr((x - 0.1 * y) / 0.9), np.ones((24, 24), dtype=bool))
+    >>> fit = fit_gaussian(pixels, np.array([12.0, 0.1, 0.0, 40.0, 190.0, 0.8]), np.inf)
+    >>> edge = EdgeSpread(fit.required(), Failure("not measured", Code.TOO_SMALL))
+    >>> round(edge.fit["psf"], 2), round(float(np.rad2deg(edge.angle)), 1), round(edge.mtf50[0], 2)
+    (0.85, 5.7, 0.21)
     """
 
     fit: Adjustment

@@ -36,6 +36,18 @@ def estimate_fields(series: SensorSeries) -> Fields:
     -------
     Fields
         The properties of each pixel.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us):
+    ...     frames = 20 + 0.2 * exposure_us + rng.normal(0, 2, (8, 16, 16))
+    ...     frames[:, 3, 5] += 50.0  # a hot pixel
+    ...     return Level.of(exposure_us, frames)
+    >>> bright = tuple(level(exposure_us) for exposure_us in (100.0, 200.0, 300.0))
+    >>> fields = estimate_fields(SensorSeries((level(0.0),), bright, full_scale=255.0))
+    >>> bool(fields.defects[3, 5]), round(float(fields.bias.mean()))
+    (True, 20)
     """
     bias, current = _dark_lines(series.dark)
     bright = [level for level in series.bright if level.mean.mean() < _BRIGHTEST * series.full_scale]

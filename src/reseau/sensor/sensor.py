@@ -42,6 +42,20 @@ class SensorResult:
         Longest unsaturated exposure time.
     edge : EdgeSpread or Failure, optional
         Sharpness; a failure if no edge could be measured.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us):
+    ...     light = rng.poisson(2.0 * exposure_us, (8, 16, 16)) / 10
+    ...     return Level.of(exposure_us, np.rint(20 + light + rng.normal(0, 2, light.shape)))
+    >>> bright = tuple(level(exposure_us) for exposure_us in (100.0, 200.0, 300.0, 400.0, 500.0))
+    >>> result = calibrate_sensor(SensorSeries((level(0.0),), bright, full_scale=255.0))
+    >>> gain = result.quantities()["gain"]
+    >>> round(gain.value, 1), round(gain.sigma, 1), gain.unit
+    (10.5, 0.4, 'e-/DN')
+    >>> result.exposure_us, result.validity()["size"]
+    (500.0, [16, 16])
     """
 
     fields: Fields
@@ -174,6 +188,19 @@ def calibrate_sensor(series: SensorSeries) -> SensorResult:
     ------
     EstimationError
         When gain and noise cannot be determined.
+
+    Examples
+    --------
+    Frames of a sensor with a gain of 10 electrons per grey value and a read noise of 2 grey values:
+
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us):
+    ...     light = rng.poisson(2.0 * exposure_us, (8, 16, 16)) / 10
+    ...     return Level.of(exposure_us, np.rint(20 + light + rng.normal(0, 2, light.shape)))
+    >>> bright = tuple(level(exposure_us) for exposure_us in (100.0, 200.0, 300.0, 400.0, 500.0))
+    >>> fit = calibrate_sensor(SensorSeries((level(0.0),), bright, full_scale=255.0)).transfer.fit
+    >>> bool(abs(fit["gain"] - 10) < 3 * fit.sigma_of("gain")), round(fit["read_noise"], 1)
+    (True, 2.0)
     """
     fields = estimate_fields(series)
     curve = curve_of(series, fields)
@@ -203,6 +230,20 @@ def with_edge(
     -------
     SensorResult
         The calibration with the edge.
+
+    Examples
+    --------
+    >>> from scipy.special import ndtr
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us, share=np.ones((24, 24))):
+    ...     light = rng.poisson(2.0 * exposure_us * share, (8, 24, 24)) / 10
+    ...     return Level.of(exposure_us, np.rint(20 + light + rng.normal(0, 2, light.shape)))
+    >>> bright = tuple(level(exposure_us) for exposure_us in (100.0, 200.0, 300.0, 400.0))
+    >>> result = calibrate_sensor(SensorSeries((level(0.0),), bright, full_scale=255.0))
+    >>> y, x = np.mgrid[-12:12, -12:12]
+    >>> found = with_edge(result, level(400.0, 0.2 + 0.8 * ndtr((x - 0.1 * y) / 0.9)))
+    >>> bool(abs(found.edge.fit["psf"] - 0.9) < 0.1)
+    True
     """
     frame = Frame(edge.mean, result.full_scale, "edge")
     corrected = result.correction.correct(frame, edge.exposure_us)

@@ -108,6 +108,15 @@ class Linearity:
         Full scale used for u.
     worst : float
         Largest deviation of a level from the straight line, relative to its signal.
+
+    Examples
+    --------
+    >>> signal, times = np.array([20.0, 40.0, 60.0, 80.0]), np.array([100.0, 200.0, 300.0, 400.0])
+    >>> sigma, bright = np.full(4, 0.05), np.ones(4, dtype=bool)
+    >>> curve = Curve(times, signal, signal / 10 + 4, sigma, np.full(4, 0.1), bright, bright, None)
+    >>> found = fit_linearity(curve, 255.0)
+    >>> found.worst < 1e-6, found.straight(np.array([50.0]))[0].round(6)
+    (True, array([50.]))
     """
 
     fit: Adjustment
@@ -134,6 +143,16 @@ def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
     -------
     Linearity or Failure
         A failure with fewer than four levels.
+
+    Examples
+    --------
+    >>> times = np.array([100.0, 200.0, 300.0, 400.0, 500.0])
+    >>> light = 0.2 * times
+    >>> signal, bright = light * (1 - 0.1 * light / 255), np.ones(5, dtype=bool)
+    >>> curve = Curve(times, signal, light / 10 + 4, np.full(5, 0.05), np.full(5, 0.1), bright, bright, None)
+    >>> found = fit_linearity(curve, 255.0)
+    >>> round(found.fit["b2"], 2), found.straight(signal)[0].round(1)
+    (0.1, array([ 20.,  40.,  60.,  80., 100.]))
     """
     use = curve.bright & curve.usable & (curve.exposure_us > 0)
     signal, times = curve.signal[use][:, None], curve.exposure_us[use][:, None]
@@ -176,6 +195,16 @@ class PhotonTransfer:
         The curve it was fitted to.
     saturation : float or None
         Linearised signal at saturation; None if no level is saturated.
+
+    Examples
+    --------
+    >>> signal, bright = np.array([0.0, 50.0, 100.0, 150.0]), np.array([False, True, True, True])
+    >>> sigma, variance = np.full(4, 0.05), 2.0**2 + 1 / 12 + signal / 10
+    >>> usable = np.ones(4, dtype=bool)
+    >>> curve = Curve(2 * signal, signal, variance, sigma, np.full(4, 0.1), bright, usable, 235.0)
+    >>> well, well_sigma = fit_transfer(curve).full_well
+    >>> round(well), round(well_sigma)
+    (2350, 21)
     """
 
     fit: Adjustment
@@ -207,6 +236,16 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
     -------
     PhotonTransfer or Failure
         A failure with too few levels, or if the variance does not increase with the light.
+
+    Examples
+    --------
+    >>> signal, bright = np.array([0.0, 50.0, 100.0, 150.0]), np.array([False, True, True, True])
+    >>> sigma, variance = np.full(4, 0.05), 2.0**2 + 1 / 12 + signal / 10
+    >>> usable = np.ones(4, dtype=bool)
+    >>> curve = Curve(2 * signal, signal, variance, sigma, np.full(4, 0.1), bright, usable, None)
+    >>> found = fit_transfer(curve)
+    >>> round(found.fit["gain"], 3), round(found.fit["read_noise"], 3), found.full_well
+    (10.0, 2.0, None)
     """
     use = curve.usable
     signal, variance = curve.signal[use], curve.variance[use]

@@ -100,6 +100,13 @@ class FrameResult:
         Result for each edge.
     code : Code or None
         Reason for a declined or incomplete frame, or a remark on it, for programs.
+
+    Examples
+    --------
+    >>> edges = {"upper": MeasuredEdge(found=False, points=0, rejected=0, rms_px=None, curvature_px=None)}
+    >>> found = FrameResult("07.tif", "declined", "of one tone", None, None, None, edges, Code.LOW_CONTRAST)
+    >>> bool(found), found.document().why
+    (False, 'of one tone')
     """
 
     image: str
@@ -169,6 +176,20 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     -------
     list of FrameResult
         One result for each frame, in reading order; a declined one if no frame was found.
+
+    Examples
+    --------
+    A frame of 36 mm × 24 mm, brighter than the film around it:
+
+    >>> from reseau.io.scans import scan_of
+    >>> from reseau.optics.formation import draw, rectangles
+    >>> frame = draw(rectangles(np.array([[19.5, 19.5, 163.5, 115.5]]), 0.5), (136, 184), 1.0)
+    >>> grey = 60 + 120 * frame + np.random.default_rng(0).normal(0, 2, frame.shape)
+    >>> near = np.array([[20.0, 20.0], [163.0, 20.0], [163.0, 115.0], [20.0, 115.0]])
+    >>> options = FrameOptions(formats=((36.0, 24.0),), near=near)
+    >>> (found,) = orient_frames(scan_of(grey.astype(np.uint8)), options)
+    >>> found.status, bool(abs(found.lines.corners[0] - 19.5).max() < 0.1)
+    ('oriented', True)
     """
     options = options or FrameOptions()
     guesses, reduction = _found(scan, options)

@@ -55,6 +55,14 @@ class FilmPlane:
         Positions of the edges of perforations, pixels.
     rms_px : float
         Rms of the residuals.
+
+    Examples
+    --------
+    >>> values = np.array([15.0, 0.0, 0.0, 0.0, 15.0, 0.0, 0.0, 0.0, 0.0])
+    >>> centre = np.array([100.0, 80.0])
+    >>> plane = FilmPlane(values, np.zeros((9, 9)), centre, 100.0, np.zeros((24, 2)), rms_px=0.02)
+    >>> plane.to_mm(np.array([[100.0, 80.0], [200.0, 80.0]])).tolist(), plane.edges
+    ([[0.0, 0.0], [15.0, 0.0]], 24)
     """
 
     values: Array
@@ -120,6 +128,23 @@ def film_plane(
     -------
     FilmPlane or Failure
         A failure if too few edges of perforations are found.
+
+    Examples
+    --------
+    Six perforations on each side, 30 px apart:
+
+    >>> from reseau.io.scans import scan_of
+    >>> from reseau.optics.formation import draw, rectangles
+    >>> scale = 30 / PITCH_MM
+    >>> centres = np.array([(x, y) for x in (25.3, 25.3 + 28.17 * scale) for y in range(25, 205, 30)])
+    >>> half = np.array([2.79, 1.98]) / 2 * scale
+    >>> boxes = np.hstack([centres - half, centres + half])
+    >>> light, rim = (draw(rectangles(boxes + grow, 0.5), (205, 228), 1.0) for grow in (0, [-3, -3, 3, 3]))
+    >>> grey = 80 + 150 * light - 60 * rim + np.random.default_rng(0).normal(0, 2, light.shape)
+    >>> rows = [np.array([*boxes[k] + 0.7, 30.0]) for k in (0, 6)]
+    >>> plane = film_plane(scan_of(grey.astype(np.uint8)), rows, 6, channel=0, reach=3.0)
+    >>> plane.edges, np.diff(plane.to_mm(centres[[0, 6]]), axis=0).round(1)
+    (48, array([[28.2,  0. ]]))
     """
     places, axes, targets, signs = [], [], [], []
     for side, (left, top, right, bottom, pitch) in zip((-1, 1), rows, strict=True):
@@ -162,6 +187,16 @@ def edge_of(scan: Scan, start: Array, stop: Array, channel: int, reach: float = 
     """Points (50, 2) of an edge of a frame near another one, with the picture on its right as seen.
 
     `start` and `stop` are pixels (2,); film is darker, and is searched up to twice the `reach` beyond.
+
+    Examples
+    --------
+    >>> from reseau.io.scans import scan_of
+    >>> from reseau.optics.formation import draw, rectangles
+    >>> light = draw(rectangles(np.array([[20.2, -20.0, 80.0, 60.0]]), 0.5), (40, 60), 1.0)
+    >>> grey = 50 + 100 * light + np.random.default_rng(0).normal(0, 1, light.shape)
+    >>> start, stop = np.array([21.0, 36.0]), np.array([21.0, 4.0])
+    >>> edge_of(scan_of(grey.astype(np.uint8)), start, stop, channel=0, reach=5.0).mean(axis=0).round(1)
+    array([20.2, 20. ])
     """
     band = read_band(scan, start, stop, 3 * reach, 3 * reach)
     found = measure_profiles(band, channel, 1, reach, reach)

@@ -1,5 +1,4 @@
-"""The camera of a roll of film from the corners of its frames: photo-coordinates, calibrated corners,
-transforms."""
+"""The camera of a roll of film from the corners of its frames: calibrated corners, transformations."""
 
 from __future__ import annotations
 
@@ -9,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from ...calibration.film import photo_coordinates
 from ...core.data import Array, ImagePoints
 from ...core.failure import Code, Failure
 from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
@@ -17,7 +17,7 @@ from ..fitting import fit_mapping
 from .lines import FrameShape, shape_of
 from .orientation import FrameOptions, FrameResult
 
-__all__ = ["KINDS", "Roll", "photo_coordinates", "roll_of", "transformed"]
+__all__ = ["KINDS", "Roll", "roll_of", "transformed"]
 
 Kind = Literal["similarity", "affine", "projective", "bilinear"]
 
@@ -44,6 +44,13 @@ class Roll:
         Number of frames used.
     scatter_mm : (float, float)
         Standard deviation of one frame's corners about the mean.
+
+    Examples
+    --------
+    >>> corners = FrameCorners.from_xy([[-18, 12], [18, 12], [18, -12], [-18, -12]], sigma=(0.003, 0.003))
+    >>> roll = Roll(corners, FrameShape(36.0, 24.0), px_per_mm=94.5, frames=12, scatter_mm=(0.01, 0.01))
+    >>> round(roll.options(FrameOptions()).dpi)
+    2400
     """
 
     corners: FrameCorners
@@ -56,28 +63,6 @@ class Roll:
         """Options for orienting other frames of this roll."""
         dpi = self.px_per_mm * 25.4
         return FrameOptions((), dpi, before.near, max_tilt_deg=before.max_tilt_deg, shape=self.shape)
-
-
-def photo_coordinates(corners: Array, px_per_mm: tuple[float, float]) -> Array:
-    """Corners (4, 2) in millimetres: origin at the intersection of the diagonals, x along the lower edge.
-
-    The y-axis points to the upper edge, also for a scan from the wrong side (Cruz et al., fig. 1).
-
-    Parameters
-    ----------
-    corners : ndarray (4, 2)
-        ul, ur, lr, ll in pixels.
-    px_per_mm : (float, float)
-        Scale along x and along y of the frame.
-    """
-    ul, ur, lr, ll = corners
-    crossing = np.cross(np.cross([*ul, 1.0], [*lr, 1.0]), np.cross([*ur, 1.0], [*ll, 1.0]))
-    along = (lr - ll) / np.hypot(*(lr - ll))
-    up = np.array([along[1], -along[0]])
-    if (ul - ll) @ up < 0:
-        up = -up
-    rest = corners - crossing[:2] / crossing[2]
-    return np.stack([rest @ along / px_per_mm[0], rest @ up / px_per_mm[1]], axis=1)
 
 
 def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -> FrameTransform | Failure:
@@ -98,11 +83,26 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
     -------
     FrameTransform or Failure
         A failure if the frame was declined.
+
+    Examples
+    --------
+    >>> from reseau.io import MeasuredCorner
+    >>> places = ((20.0, 20.0), (164.0, 20.0), (164.0, 116.0), (20.0, 116.0))
+    >>> corners = [MeasuredCorner(x=x, y=y, sx=0.1, sy=0.1, rho=0.0) for x, y in places]
+    >>> found = FrameOrientation(
+    ...     image="roll-07.tif", status="oriented", why="", format_mm=(36.0, 24.0), channel="grey", edges={},
+    ...     corners=dict(zip(CORNERS, corners)), principal_point=corners[0], angle_deg=0.0,
+    ...     angle_sigma_deg=0.1, px_per_mm=(4.0, 4.0),
+    ... )
+    >>> calibrated = FrameCorners.from_xy([[-18.2, 12], [18.2, 12], [18.2, -12], [-18.2, -12]])
+    >>> transform = transformed(found, calibrated, "affine")
+    >>> round(transform.parameters["a1"]["value"], 4), round(transform.sigma_mm[0], 6)
+    (1.0111, 0.0)
     """
     points = found.image_points()
     if not len(points) or found.px_per_mm is None:
         return Failure("a declined frame has no corners to transform", Code.DECLINED)
-    xy = photo_coordinates(points.xy, found.px_per_mm)
+    xy = photo_coordinates(points.xy, points.xy, found.px_per_mm)
     model = {
         "similarity": RationalPolynomial.similarity,
         "affine": RationalPolynomial.affine,
@@ -143,6 +143,12 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     -------
     Roll or Failure
         A failure if fewer than four frames are oriented.
+
+    Examples
+    --------
+    >>> found = roll_of([])
+    >>> bool(found), found.code
+    (False, <Code.TOO_FEW_IMAGES: 'too-few-images'>)
     """
     sure = [r for r in results if r.status == "oriented" and r.lines is not None]
     lying = [r.format_mm for r in sure]
@@ -156,7 +162,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     corners = np.array([r.lines.corners for r in sure if r.lines is not None])
     scale = np.array([np.mean(r.px_per_mm or (1.0, 1.0)) for r in sure])
     known = scale if dpi is None else np.full(len(sure), dpi / 25.4)
-    placed = np.array([photo_coordinates(c, (s, s)) for c, s in zip(corners, known, strict=True)])
+    placed = np.array([photo_coordinates(c, c, (s, s)) for c, s in zip(corners, known, strict=True)])
     keep = np.ones(len(sure), dtype=bool)
     for _ in range(3):
         placed = _turned(placed, placed[keep].mean(axis=0))
@@ -166,7 +172,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
         keep = np.abs(left).max(axis=(1, 2)) < max(5 * spread, 1e-6)
     n = int(keep.sum())
     mean, scatter = placed[keep].mean(axis=0), np.sqrt((left[keep] ** 2).sum(axis=(0, 1)) / (4 * (n - 1)))
-    mean = photo_coordinates(mean * [1.0, -1.0], (1.0, 1.0))
+    mean = photo_coordinates(mean * [1.0, -1.0], mean * [1.0, -1.0], (1.0, 1.0))
     shapes = np.array([shape_of(c, nominal) for c in corners[keep]])
     own = shapes.std(axis=0, ddof=1)
     deviation = tuple(float(v) for v in shapes.mean(axis=0))

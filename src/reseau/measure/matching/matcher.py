@@ -386,6 +386,16 @@ class Matches:
         Whether the adjustment converged.
     residuals : ndarray (k, rows, columns)
         Adjusted minus observed, NaN where a pixel was not used.
+
+    Examples
+    --------
+    >>> one, none = np.ones(2), np.zeros((2, 0))
+    >>> xy, cov = np.array([[10.3, 9.6], [40.1, 9.8]]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
+    >>> seen = np.array([1.0, 0.4])
+    >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
+    ...                 one > 0, np.zeros((2, 17, 17)))
+    >>> len(marks.select(marks.seen > 0.5))
+    1
     """
 
     xy: Array

@@ -38,6 +38,15 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     -------
     (a, b) or None
         Coefficients of the variance a + b·grey; None if it does not increase with the grey values.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> light = np.tile(np.linspace(20.0, 200.0, 40), (40, 1))
+    >>> pixels = light + rng.normal(0.0, np.sqrt(4 + light / 10))
+    >>> a, b = grey_variance(pixels, np.array([[20.0, 20.0]]), (light - pixels)[None, 1:, 1:])
+    >>> bool(abs(b - 0.1) < 0.03)
+    True
     """
     column, row = (
         np.rint(start[:, axis]).astype(np.intp)[:, None] + np.arange(size) - size // 2

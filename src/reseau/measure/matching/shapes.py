@@ -27,6 +27,12 @@ class Window:
         Coordinates of the columns and rows, pixels.
     response : PixelResponse
         Response of a pixel.
+
+    Examples
+    --------
+    >>> columns, rows = np.arange(10.0)[None] + [[0], [30]], np.arange(8.0)[None] + [[0], [20]]
+    >>> Window(columns, rows, PixelResponse()).select(np.array([1])).columns[:, 0]
+    array([30.])
     """
 
     columns: Array
@@ -39,7 +45,18 @@ class Window:
 
 
 class Shape(Protocol):
-    """Images of marks as functions of position (px), width of the point-spread function (px) and form."""
+    """Images of marks as functions of position (px), width of the point-spread function (px) and form.
+
+    Examples
+    --------
+    >>> disk = Outline.circle(2.0, 0.5)
+    >>> shape: Shape = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
+    >>> window = Window(np.arange(9.0)[None], np.arange(9.0)[None], PixelResponse())
+    >>> one = np.array([0])
+    >>> image = shape.image(np.array([[4.0, 4.0]]), np.ones(1), np.zeros((1, 0)), one, window)
+    >>> image.shape, bool(image[0, 4, 4] > 0.8)
+    ((1, 9, 9), True)
+    """
 
     @property
     def parameters(self) -> int:
@@ -65,6 +82,17 @@ class GrownOutline:
         fewer nodes. Outlines in single precision are formed in single precision, about eight times faster.
     generators : ndarray (p, 2, 2)
         The generators F_i.
+
+    Examples
+    --------
+    A disk whose diameter is an unknown, at 10 % more than its nominal size:
+
+    >>> disk = Outline.circle(2.0, 0.5)
+    >>> shape = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.eye(2)[None])
+    >>> window = Window(np.arange(15.0)[None], np.arange(15.0)[None], PixelResponse())
+    >>> image = shape.image(np.array([[7.0, 7.0]]), np.ones(1), np.array([[0.1]]), np.array([0]), window)
+    >>> round(float(image.sum() / np.pi), 3)
+    4.84
     """
 
     nodes: Outline
@@ -130,6 +158,16 @@ class ShapeSubset:
         Shape of all marks.
     rows : ndarray of int (k,)
         Indices of the marks in the subset.
+
+    Examples
+    --------
+    >>> disk = Outline.circle(2.0, 0.5)
+    >>> nodes = Outline(np.stack([disk.xy, 1.5 * disk.xy]), np.stack([disk.dxy, 1.5 * disk.dxy]))
+    >>> large = ShapeSubset(GrownOutline(nodes, np.zeros((0, 2, 2))), np.array([1]))
+    >>> window = Window(np.arange(15.0)[None], np.arange(15.0)[None], PixelResponse())
+    >>> image = large.image(np.array([[7.0, 7.0]]), np.ones(1), np.zeros((1, 0)), np.array([0]), window)
+    >>> round(float(image.sum() / np.pi), 3)
+    9.0
     """
 
     whole: Shape
@@ -163,6 +201,16 @@ class FormedShape:
         Position and width at which the images were formed; the form was 0.
     share, slopes : ndarray (k, r, c), (k, 3 + p, r, c)
         Images and their derivatives.
+
+    Examples
+    --------
+    >>> disk = Outline.circle(2.0, 0.5)
+    >>> shape = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
+    >>> window = Window(np.arange(9.0)[None], np.arange(9.0)[None], PixelResponse())
+    >>> at = np.array([[4.0, 4.0]]), np.ones(1), np.zeros((1, 0)), np.array([0]), window
+    >>> formed = FormedShape(shape, *at[:2], *shape.derivatives(*at))
+    >>> np.array_equal(formed.derivatives(*at)[0], formed.share), formed.parameters
+    (True, 0)
     """
 
     shape: Shape

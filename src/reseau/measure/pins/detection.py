@@ -184,6 +184,16 @@ class PinDetections:
     centroid : ndarray (m, 2)
         Centroid of the region above one fifth of the height, for comparison with programs that measure it;
         the tail of a reverberation shifts it downwards.
+
+    Examples
+    --------
+    >>> none, one = np.full(2, np.nan), np.ones(2)
+    >>> xy, ok = np.array([[40.1, 40.2], [80.0, 12.0]]), np.array([True, False])
+    >>> why = ("", Reason("a character in a row of characters", Code.DRAWN))
+    >>> columns = [xy, np.tile(1e-4 * np.eye(2), (2, 1, 1)), ok, why, *[one] * 9, xy]
+    >>> spots = PinDetections("screen.png", "", *columns)
+    >>> len(spots), spots.points.names, spots.codes
+    (2, ('1',), (None, <Code.DRAWN: 'drawn'>))
     """
 
     image: str

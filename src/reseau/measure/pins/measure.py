@@ -53,6 +53,16 @@ class PinResult(Measured):
         All spots of the frame.
     notes : tuple of Remark
         Notes for the user.
+
+    Examples
+    --------
+    >>> xy, one = np.array([[40.1, 40.2], [np.nan, np.nan]]), np.array([1.0, np.nan])
+    >>> cov, why = 1e-4 * one[:, None, None] * np.eye(2), ("", Reason("no echo", Code.NOT_FOUND))
+    >>> spots = PinDetections("screen.png", "", xy, cov, one > 0, why, *[one] * 9, xy)
+    >>> measured = [xy, cov, one > 0, why, xy, 0.01 * xy, *[one] * 3]
+    >>> found = PinResult("screen.png", "", ("R1", "R2"), *measured, *[one] * 6, spots)
+    >>> found.found, found.points.names, found.codes[1]
+    (1, ('R1',), <Code.NOT_FOUND: 'not-found'>)
     """
 
     correlation: Array
@@ -98,6 +108,20 @@ def measure_pins(
         When the frame is all black, saturated, or of one grey.
     UsageError
         When the marks of the design are not rods, or fewer than four have coordinates.
+
+    Examples
+    --------
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.optics import Arcs
+    >>> rods = regular_reseau(4, 2, 10.0, Mark(shape="rod", size=1.0), polarity="bright")
+    >>> centres = rods.xy * [3.0, -3.0] + [55.0, 40.0]
+    >>> arcs = Arcs(*np.repeat([[6.0], [2.0], [0.01], [0.0]], 8, axis=1))
+    >>> light = arcs.image(centres, np.tile(np.arange(110.0), (8, 1)), np.tile(np.arange(80.0), (8, 1)))
+    >>> grey = 20 + 150 * light.sum(axis=0) + np.random.default_rng(0).normal(0, 1, (80, 110))
+    >>> found = measure_pins(Frame(grey, 255.0), rods)
+    >>> found.found, bool(abs(found.xy - centres).max() < 0.05), found.notes[0].code
+    (8, True, <Code.AMBIGUOUS: 'ambiguous'>)
     """
     o = options or PinOptions()
     if design.mark.shape != "rod":

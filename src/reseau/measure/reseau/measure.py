@@ -46,6 +46,18 @@ class ReseauResult(Measured):
         Smooth mapping from the design to the image: a polynomial with a local model on top.
     notes : tuple of Remark
         Notes for the user.
+
+    Examples
+    --------
+    >>> plane = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [5.0, 5.0]])
+    >>> ok, one = np.array([True, True, True, True, False]), np.ones(5)
+    >>> xy = np.where(ok[:, None], 4 * plane + 20, np.nan)
+    >>> why = (*[""] * 4, Reason("covered by a reflection", Code.HIDDEN))
+    >>> columns = [xy, np.tile(1e-4 * np.eye(2), (5, 1, 1)), ok, why]
+    >>> field = SmoothField.fit(plane, 4 * plane + 20, degree=1, local=False)
+    >>> found = ReseauResult("a.tif", "", tuple("OSTUV"), *columns, field(plane), 0 * xy, *[one] * 4, field)
+    >>> found.points.names, found.predicted[4].round(6), found.codes[4]
+    (('O', 'S', 'T', 'U'), array([40., 40.]), <Code.HIDDEN: 'hidden'>)
     """
 
     psf_px: Array

@@ -97,6 +97,21 @@ class TestfieldResult(Measured):
         Classification of the clusters.
     squares : int
         Number of clusters that were read and agree with each other.
+
+    Examples
+    --------
+    >>> from reseau.optics import Chain, Similarity
+    >>> lattice = LatticeFit(
+    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2), 0.02, 400
+    ... )
+    >>> none = np.zeros((0, 16))
+    >>> reading = Reading(np.zeros((0, 2), int), none, none, (), np.zeros((0, 16, 2)), none, none, 0.8)
+    >>> ok, one = np.array([True, False]), np.ones(2)
+    >>> xy = np.array([[40.1, 40.2], [np.nan, np.nan]])
+    >>> columns = [xy, np.tile(1e-4 * np.eye(2), (2, 1, 1)), ok, ("", "outside"), xy, 0 * xy, *[one] * 4]
+    >>> found = TestfieldResult("a.tif", "", ("1.01", "1.02"), *columns, lattice, reading, squares=0)
+    >>> found.found, found.points.names, found.lattice.rms_px
+    (1, ('1.01',), 0.02)
     """
 
     __test__ = False  # prevents collection by pytest
@@ -131,6 +146,27 @@ def measure_testfield(
         When the frame is all of one grey, or almost all saturated.
     UsageError
         When the squares of the design do not consist of sixteen targets in a grid.
+
+    Examples
+    --------
+    Form an image of a testfield of one square, one pixel per millimetre, and measure its targets:
+
+    >>> from reseau.designs import coded_testfield
+    >>> from reseau.optics.formation import draw, rectangles
+    >>> from reseau.optics.targets import target_outline
+    >>> design = coded_testfield(1, 1)
+    >>> flip, targets = np.diag([1.0, -1.0]), design.targets
+    >>> centres = design.xy @ flip + 74.5
+    >>> bars = [[11.0, 11.0, 13.0, 138.0], [136.0, 11.0, 138.0, 138.0]]
+    >>> bars += [[13.0, 11.0, 136.0, 13.0], [13.0, 136.0, 136.0, 138.0]]
+    >>> share = draw(rectangles(np.array(bars), 0.5), (150, 150), 0.8)
+    >>> for shape, size, centre in zip(targets.shape, targets.size, centres, strict=True):
+    ...     outline = target_outline(shape, size, 0.0, 0.5).affine(flip[None], centre[None]).oriented()
+    ...     share += draw(outline, (150, 150), 0.8)
+    >>> grey = 200 * (1 - 0.8 * share) + np.random.default_rng(0).normal(0, 1, share.shape)
+    >>> found = measure_testfield(Frame(grey, 255.0), design)
+    >>> found.found, found.squares, bool(abs(found.xy - centres).max() < 0.02)
+    (16, 1, True)
     """
     options = options or TestfieldOptions()
     screened = screen(frame, None)
