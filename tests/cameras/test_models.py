@@ -355,7 +355,7 @@ def test_an_unknown_model_or_option_is_named_in_one_line(reseau: Run, tmp_path: 
         assert err.count("\n") == 1
     entry = entry_of(camera_of(Case(camera_model("opencv"), {})))
     for change, words in (
-        ({"model": "pinhole"}, "'pinhole' is none of the models"),
+        ({"model": "pinhole"}, "'pinhole' is not one of the models"),
         ({"wide": 1}, "camera 'cam': unknown key `wide`"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -83,11 +83,11 @@ CASES = [
     ("a corner of the image", "bad.png", "was not found in the frame of 40×40"),
     ("nominal positions of a larger frame", "photo.png", "was not found in the frame of 360×300"),
     ("wrong key", "bad.json", "unknown key `colour`"),
-    ("duplicate ids", "bad.json", "the id 'A1' stands twice"),
-    ("no json", "bad.json", "is no JSON"),
+    ("duplicate ids", "bad.json", "duplicate id 'A1'"),
+    ("no json", "bad.json", "is not JSON"),
     ("another document", "bad.json", "'reseau-design/1' was expected"),
     ("no such design", "bad.json", "No such file"),
-    ("image for a design", "photo.png", "is no UTF-8 text"),
+    ("image for a design", "photo.png", "is not UTF-8 text"),
 ]
 
 

@@ -247,7 +247,7 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--pitch", 0.027, "--free", "c,fx"), "fx: is none of c, x0"),
+        (("--pitch", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
         (("--side", "inner", "--pitch", 0.027), "write `object` or `image`"),
         (("--size", "large"), "write 640x480"),
         (("--distance", -3), "-3 is not above zero"),

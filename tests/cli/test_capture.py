@@ -281,7 +281,7 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
             "park: roll = 400 deg is out of range; use -5 to",
         ),
         (["testfield", *TESTFIELD, "--heights", "0,50"], "z 0: the table has no axis z"),
-        (["testfield", *TESTFIELD[:-6], "--free", "c,q"], "q: is none of c, x0"),
+        (["testfield", *TESTFIELD[:-6], "--free", "c,q"], "q: is not one of c, x0"),
         (
             ["testfield", *TESTFIELD, "--until", "sigma_K2 < 1"],
             "sigma_K2: is not estimated; use c, x0",

@@ -81,14 +81,14 @@ def broken(change: str) -> str:
     [
         ("unknown", "unknown key `lines.colour`"),
         ("missing", "missing key `pitch`"),
-        ("twice", "'1.01' stands twice"),
+        ("twice", "duplicate id '1.01'"),
         ("short", "`size` has 31 entries for 32 ids"),
         ("shape", r"`targets.shape\[0\]`"),
         ("size", r"`targets.size\[0\]`.*greater than 0"),
         ("lines", "bound 1 × 1 squares, not 2 × 1"),
         ("order", "`vertical_x` must ascend"),
-        ("extent", "`extent` does not reach"),
-        ("square", "no square 3 among 2 × 1"),
+        ("extent", "`extent` must include"),
+        ("square", "square 3 does not exist in 2 × 1"),
     ],
 )
 def test_a_broken_testfield_is_refused_with_the_key(change: str, complaint: str) -> None:

@@ -227,13 +227,13 @@ REFUSED_ON_FILM: dict[str, tuple[dict[str, Any], FrameOrientation, str]] = {
     "no parameters": (
         {"id": "cam", "calibration": "frame.json"}, orientation(), "does not give the principal distance"
     ),
-    "a principal point": (FILM | {"parameters": {"c": 8.0, "x0": 0.1}}, orientation(), "'x0' is that of"),
-    "a pixel size": (FILM | {"pitch_mm": [0.01, 0.01]}, orientation(), "`pitch_mm` is that of"),
+    "a principal point": (FILM | {"parameters": {"c": 8.0, "x0": 0.1}}, orientation(), "'x0' follows from"),
+    "a pixel size": (FILM | {"pitch_mm": [0.01, 0.01]}, orientation(), "`pitch_mm` follows from"),
     "a model in pixels": (
         FILM | {"model": "opencv", "parameters": {"fx": 800.0, "fy": 800.0, "cx": 320.0, "cy": 240.0},
                 "free": [], "side": None},
         orientation(),
-        "no size of a pixel",
+        "no pixel size",
     ),
     "a declined frame": (
         FILM,

@@ -78,9 +78,9 @@ def broken(change: str) -> str:
         ("unknown", "unknown key `colour`"),
         ("unknown-in-point", r"unknown key `points\[1\]\.z`"),
         ("missing", "missing key `unit`"),
-        ("twice", "the id 'a' stands twice"),
+        ("twice", "duplicate id 'a'"),
         ("half", "point 'b' has only one of its two coordinates"),
-        ("origin", "`origin` names 'q'"),
+        ("origin", "`origin` is 'q'"),
         ("same", "must differ"),
         ("empty", "no points"),
         ("shape", "mark.shape"),
@@ -96,26 +96,26 @@ def test_a_design_that_breaks_a_rule_is_refused_in_one_line(change: str, complai
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", "3", "null", "[" * 100_000, '{"a": 1}'])
-def test_what_is_no_document_is_refused(text: str) -> None:
-    with pytest.raises(FormatError, match=r"x\.json: (is no JSON|has no key `schema`)"):
+def test_text_that_is_not_a_document_is_refused(text: str) -> None:
+    with pytest.raises(FormatError, match=r"x\.json: (is not JSON|has no key `schema`)"):
         ReseauDesign.parse(text, where="x.json")
 
 
-def test_not_a_number_is_no_coordinate() -> None:
+def test_nan_is_refused_as_a_coordinate() -> None:
     text = json.dumps(design()).replace("10.0", "NaN", 1)
     with pytest.raises(FormatError, match="finite"):
         ReseauDesign.parse(text, where="x.json")
 
 
-def test_files_that_are_not_there_or_no_text_are_named(tmp_path: Path) -> None:
+def test_missing_and_binary_files_are_named_in_the_message(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.json: cannot be read \(No such file"):
         read_text(tmp_path / "none.json")
     (tmp_path / "b.json").write_bytes(b"\xff\xfe\0")
-    with pytest.raises(InputError, match=r"b\.json: is no UTF-8"):
+    with pytest.raises(InputError, match=r"b\.json: is not UTF-8"):
         read_text(tmp_path / "b.json")
 
 
-def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
     write_whole(tmp_path / "a.txt", "ä")
     write_whole(tmp_path / "a.txt", b"new")
     assert (tmp_path / "a.txt").read_bytes() == b"new"
@@ -165,12 +165,12 @@ def test_coordinates_by_hand_come_as_csv(tmp_path: Path) -> None:
     [
         ("", "first line"),
         ("name,x,y\na,1,2\n", "first line"),
-        ("id,x,y\n", "holds no points"),
+        ("id,x,y\n", "contains no points"),
         ("id,x,y\na,1\n", "line 2"),
         ("id,x,y\na,1,2,3\n", "line 2"),
         ("id,x,y\na,1,2\nb,1,nan\n", "line 3"),
         ("id,x,y,sx,sy\na,1,2,0,1\n", "line 2"),
-        ("id,x,y\na,1,2\na,3,4\n", "line 3: the id 'a' stands twice"),
+        ("id,x,y\na,1,2\na,3,4\n", "line 3: duplicate id 'a'"),
     ],
 )
 def test_a_csv_that_breaks_a_rule_is_refused_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:

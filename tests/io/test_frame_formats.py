@@ -52,7 +52,7 @@ def test_corners_read_back_the_same_with_sigmas_or_without() -> None:
 
 def test_corners_with_y_down_are_refused() -> None:
     turned = {"ul": [-18, -12], "ur": [18, -12], "lr": [18, 12], "ll": [-18, 12]}
-    with pytest.raises(FormatError, match=r"c\.json: .*do not go around a frame with y up"):
+    with pytest.raises(FormatError, match=r"c\.json: .*must run clockwise with y up"):
         FrameCorners.parse(corners(corners=turned), where="c.json")
 
 
@@ -67,8 +67,8 @@ def test_an_orientation_reads_back_the_same() -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"corners": None}, "has four corners"),
-        ({"status": "declined"}, "says `why`"),
+        ({"corners": None}, "requires four corners"),
+        ({"status": "declined"}, "needs a reason in `why`"),
         ({"status": "good"}, "status"),
         ({"colour": 1}, "unknown key `colour`"),
         ({"edges": "left out"}, "missing key `edges`"),

@@ -91,7 +91,7 @@ def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the
     assert "rings" not in plain.to_dict()
     content = design.to_dict()
     content["rings"]["sectors"]["no such disk"] = [[0.0, 90.0]]
-    with pytest.raises(FormatError, match="none of the points"):
+    with pytest.raises(FormatError, match="not the id of a point"):
         ReseauDesign.parse(json.dumps(content), where="file")
 
 

@@ -108,7 +108,7 @@ def test_a_camera_without_equal_in_another_model_is_converted_with_its_residual(
 def test_a_conversion_that_cannot_be_made_is_refused() -> None:
     with pytest.raises(UsageError, match="use one of brown, opencv"):
         convert(Brown(BROWN, "object", 0.0, GRID), GRID, "pinhole")
-    with pytest.raises(UsageError, match="K1: is none of fx"):
+    with pytest.raises(UsageError, match="K1: is not one of fx"):
         convert(Brown(BROWN, "object", 0.0, GRID), GRID, "opencv", free=("K1",))
     folded = Brown([24.0, 0, 0, -1e-2, 0, 0, 0, 0, 0, 0], "object", 0.0, GRID)
     with pytest.raises(UsageError, match="no directions over most of the image"):

@@ -1,7 +1,7 @@
-"""The documents that others exchange with us, one module for each kind.
+"""Images and documents: designs, measurements, frame orientations, networks.
 
-A document is a strict pydantic model: an unknown key is an error that names it, a missing one likewise. A
-file appears whole or not at all.
+A document is a strict pydantic model: unknown and missing keys are errors that name the key. Files are
+written completely or not at all.
 """
 
 from .design import DesignPoint, Mark, ReseauDesign, Rings

@@ -1,4 +1,4 @@
-"""``reseau-design/1``: a reseau, or the rods of a test object."""
+"""``reseau-design/1``: a reseau, a sheet of targets, or the rods of a test object."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
 
 
 class Mark(Strict):
-    """What every mark of a design looks like, in the unit of the design.
+    """Shape and size of the marks of a design, in the unit of the design.
 
     Examples
     --------
@@ -28,7 +28,7 @@ class Mark(Strict):
 
 
 class DesignPoint(Strict):
-    """One mark of a design: coordinates in its plane, and where in the image it may be expected.
+    """One mark of a design: coordinates in its plane, and its approximate position in the image.
 
     Examples
     --------
@@ -44,15 +44,15 @@ class DesignPoint(Strict):
 
 
 class Rings(Strict):
-    """Coded rings around some of the disks of a sheet, which tell these from all others.
+    """Coded rings around some disks of a sheet, which identify these disks.
 
     Parameters
     ----------
     inner, outer : float
         Diameters of the rings in the unit of the design.
     sectors : dict of str to tuple of (float, float)
-        For each coded point the parts of its ring that are of the marks' polarity: from one angle to another,
-        degrees from x towards y.
+        For each coded point the sectors of its ring that have the marks' polarity: start and end angle in
+        degrees, from x towards y.
 
     Examples
     --------
@@ -67,10 +67,10 @@ class Rings(Strict):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if not self.inner < self.outer:
-            raise ValueError(f"rings reach from {self.inner} to {self.outer}")
+            raise ValueError(f"`inner` ({self.inner}) must be less than `outer` ({self.outer})")
         for name, sectors in self.sectors.items():
             if not all(start < end <= start + 360 for start, end in sectors):
-                raise ValueError(f"a sector of {name!r} does not go from an angle to a greater one")
+                raise ValueError(f"each sector of {name!r} must end at a larger angle than it starts")
         return self
 
 
@@ -105,14 +105,14 @@ class ReseauDesign(Document):
         names = set()
         for point in self.points:
             if point.id in names:
-                raise ValueError(f"the id {point.id!r} stands twice among the points")
+                raise ValueError(f"duplicate id {point.id!r} in `points`")
             names.add(point.id)
             if (point.x is None) != (point.y is None):
                 raise ValueError(f"point {point.id!r} has only one of its two coordinates")
         for role in ("origin", "axis"):
             named = getattr(self, role)
             if named is not None and named not in names:
-                raise ValueError(f"`{role}` names {named!r}, which is none of the points")
+                raise ValueError(f"`{role}` is {named!r}, which is not the id of a point")
         if self.origin is not None and self.origin == self.axis:
             raise ValueError(f"`origin` and `axis` both name {self.origin!r}; they must differ")
         if self.rings is not None:
@@ -122,12 +122,12 @@ class ReseauDesign(Document):
     def _check_rings(self, rings: Rings, names: set[str]) -> None:
         for name in rings.sectors:
             if name not in names:
-                raise ValueError(f"`rings` names {name!r}, which is none of the points")
+                raise ValueError(f"`rings` contains {name!r}, which is not the id of a point")
         if self.mark.shape != "disk" or self.mark.size is None or self.mark.size >= rings.inner:
-            raise ValueError("`rings` stand around disks of a size that is less than theirs")
+            raise ValueError("`rings` require marks of shape 'disk' and a size less than `inner`")
 
     def to_dict(self) -> dict[str, Any]:
-        """The content as it stands in the file; without coded rings there is no key for them."""
+        """Return the content of the file; without coded rings the key is left out."""
         content = super().to_dict()
         if self.rings is None:
             del content["rings"]
@@ -145,11 +145,11 @@ class ReseauDesign(Document):
 
     @property
     def nominal_px(self) -> Array:
-        """Prior positions in the image, (n, 2); NaN where there is none."""
+        """Approximate positions in the image, (n, 2); NaN where unknown."""
         return np.array([p.nominal_px or (np.nan, np.nan) for p in self.points], dtype=np.float64)
 
     def expected_at(self, nominal_px: Array) -> Self:
-        """The same design with prior positions in an image (n, 2); NaN where a mark has none."""
+        """Return the design with approximate positions in an image (n, 2); NaN where unknown."""
         places = [(float(x), float(y)) if np.isfinite([x, y]).all() else None for x, y in nominal_px]
         points = [
             point.model_copy(update={"nominal_px": place})

@@ -1,4 +1,4 @@
-"""The one way in which documents are read and written: strictly, and whole or not at all."""
+"""Reading and writing of documents: strict validation, and files written completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Document", "Strict", "read_text", "write_whole"]
 
 
 class Strict(BaseModel):
-    """A part of a document: no unknown key, no coercion of types, no NaN.
+    """Base class of the parts of a document: no unknown keys, no coercion of types, no NaN.
 
     Examples
     --------
@@ -35,12 +35,12 @@ class Strict(BaseModel):
 
 
 def read_text(path: Path) -> str:
-    """Text of a UTF-8 file of less than 1 GB.
+    """Read a UTF-8 text file of at most 1 GB.
 
     Raises
     ------
     InputError
-        When it cannot be read, is too large or is no UTF-8.
+        When it cannot be read, is larger than 1 GB or is not UTF-8.
 
     Examples
     --------
@@ -55,13 +55,13 @@ def read_text(path: Path) -> str:
             raise InputError("is larger than 1 GB", where=path)
         return path.read_text("utf-8")
     except UnicodeDecodeError:
-        raise InputError("is no UTF-8 text", where=path, do="is this the file you meant?") from None
+        raise InputError("is not UTF-8 text", where=path, do="check the file name") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file that appears whole or not at all.
+    """Write a file completely or not at all.
 
     Raises
     ------
@@ -91,10 +91,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def _one_line(error: ValidationError) -> str:
-    """Say the first complaint of pydantic in one line, and how many more there are."""
-    complaints = error.errors(include_url=False, include_context=False)
-    first = complaints[0]
-    # Tags of unions, in angle brackets, are no keys of the document.
+    """Return the first error of a validation in one line, with the number of further errors."""
+    errors = error.errors(include_url=False, include_context=False)
+    first = errors[0]
+    # Tags of unions, in angle brackets, are not keys of the document.
     parts = [part for part in first["loc"] if not str(part).startswith("<")]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts).lstrip(".")
     text = {
@@ -104,7 +104,7 @@ def _one_line(error: ValidationError) -> str:
     if text is None:
         message = first["msg"].removeprefix("Value error, ")
         text = f"`{key}`: {message}" if key else message
-    more = len(complaints) - 1
+    more = len(errors) - 1
     return text + (f" (and {more} more)" if more else "")
 
 
@@ -136,18 +136,18 @@ class Document(Strict):
         Raises
         ------
         FormatError
-            When it is no JSON, or not this document.
+            When it is not JSON, or not this document.
         """
         try:
             content = json.loads(text)
         except (json.JSONDecodeError, RecursionError) as error:
-            raise FormatError(f"is no JSON ({error})", where=where) from None
+            raise FormatError(f"is not JSON ({error})", where=where) from None
         found = content.pop("schema", None) if isinstance(content, dict) else None
         if found != cls.SCHEMA:
             kind = "has no key `schema`" if found is None else f"has the schema {found!r}"
             raise FormatError(f"{kind}; {cls.SCHEMA!r} was expected", where=where)
         try:
-            # As JSON again: pydantic's strict mode takes a JSON array for a tuple, but not a Python list.
+            # As JSON again: pydantic's strict mode accepts a JSON array as a tuple, but not a Python list.
             return cls.model_validate_json(json.dumps(content))
         except ValidationError as error:
             raise FormatError(_one_line(error), where=where) from None
@@ -166,19 +166,19 @@ class Document(Strict):
         return cls.parse(read_text(Path(path)), where=path)
 
     def to_dict(self) -> dict[str, Any]:
-        """The content as it stands in the file, ``schema`` first."""
+        """Return the content of the file, ``schema`` first."""
         return {"schema": self.SCHEMA} | self.model_dump(mode="json")
 
     def to_json(self) -> str:
-        """The file's text: same content, same bytes."""
+        """Return the text of the file: same content, same bytes."""
         return canonical_json(self.to_dict())
 
     def write(self, path: Path | str) -> None:
-        """Write the document, whole or not at all.
+        """Write the document completely or not at all.
 
         Raises
         ------
         InputError
-            When the place cannot be written to.
+            When the file cannot be written.
         """
         write_whole(Path(path), self.to_json())

@@ -1,4 +1,4 @@
-"""``frame-corners/1`` and ``reseau-orientation/1``: the frame of a camera, and a scan oriented by it."""
+"""``frame-corners/1`` and ``reseau-orientation/1``: the frame of a camera, and the orientation of a scan."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = [
 ]
 
 CORNERS = ("ul", "ur", "lr", "ll")
-"""Upper left, upper right, lower right, lower left: once around, as the frame is seen."""
+"""Upper left, upper right, lower right, lower left: clockwise, as the frame is seen."""
 EDGES = ("upper", "right", "lower", "left")
-"""In the same order: an edge begins at the corner that stands at its place in `CORNERS`."""
+"""In the same order: edge k begins at corner k of `CORNERS`."""
 
 Pair = tuple[float, float]
 
@@ -59,23 +59,23 @@ class FrameCorners(Document):
         side, following = np.roll(xy, -1, axis=0) - xy, np.roll(xy, -2, axis=0) - np.roll(xy, -1, axis=0)
         # With y up, upper left to upper right to lower right turns clockwise at each corner.
         if not (side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] < 0).all():
-            raise ValueError("`corners` do not go around a frame with y up: ul, ur, lr, ll")
+            raise ValueError("`corners` must run clockwise with y up: ul, ur, lr, ll")
         if self.sigma is not None and min(self.sigma) < 0:
-            raise ValueError("`sigma` is below zero")
+            raise ValueError("`sigma` must not be negative")
         return self
 
     def xy(self) -> Array:
-        """The corners in the order of `CORNERS`, (4, 2)."""
+        """Return the corners in the order of `CORNERS`, (4, 2)."""
         return np.array([getattr(self.corners, name) for name in CORNERS], dtype=np.float64)
 
     @classmethod
     def from_xy(cls, xy: Array, sigma: Pair | None = None) -> Self:
-        """From corners (4, 2) in the order of `CORNERS`."""
+        """Create the document from corners (4, 2) in the order of `CORNERS`."""
         named = {name: (float(x), float(y)) for name, (x, y) in zip(CORNERS, xy, strict=True)}
         return cls(corners=CornerPositions(**named), sigma=sigma)
 
     def to_dict(self) -> dict[str, Any]:
-        """The content as it stands in the file; without sigmas where none are known."""
+        """Return the content of the file; unknown sigmas are left out."""
         content = super().to_dict()
         return content if self.sigma is not None else {k: v for k, v in content.items() if k != "sigma"}
 
@@ -97,14 +97,14 @@ class MeasuredCorner(Strict):
 
     @classmethod
     def from_columns(cls, xy: Array, cov: Array) -> Self:
-        """From coordinates (2,) and covariance (2, 2)."""
+        """Create a corner from coordinates (2,) and covariance (2, 2)."""
         sx, sy = (float(s) for s in np.sqrt(np.maximum(np.diagonal(cov), 0.0)))
         rho = float(np.clip(cov[0, 1] / (sx * sy), -1, 1)) if sx * sy > 0 else 0.0
         return cls(x=float(xy[0]), y=float(xy[1]), sx=sx, sy=sy, rho=rho)
 
 
 class MeasuredEdge(Strict):
-    """How well an edge was found: profiles used and rejected, their scatter, how far it bows.
+    """Quality of an edge: profiles used and rejected, their scatter, and the bow of the edge.
 
     Examples
     --------
@@ -140,9 +140,9 @@ class FrameTransform(Strict):
 
 
 class FrameOrientation(Document):
-    """``reseau-orientation/1``: the inner orientation of one scanned frame, or why there is none.
+    """``reseau-orientation/1``: the inner orientation of a scanned frame, or why it was declined.
 
-    Of a frame that was declined the numbers are null. `angle_deg` is the direction of the photo x-axis, which
+    The numbers of a declined frame are null. `angle_deg` is the direction of the photo x-axis, which
     runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
 
     Examples
@@ -174,13 +174,13 @@ class FrameOrientation(Document):
         numbers = (self.corners, self.principal_point, self.angle_deg, self.angle_sigma_deg)
         if self.status == "declined":
             if not self.why:
-                raise ValueError("a frame that was declined says `why`")
+                raise ValueError("a declined frame needs a reason in `why`")
         elif any(n is None for n in numbers) or set(self.corners or ()) != set(CORNERS):
-            raise ValueError(f"a frame that is {self.status!r} has four corners, principal point and angle")
+            raise ValueError(f"status {self.status!r} requires four corners, principal point and angle")
         return self
 
     def image_points(self) -> ImagePoints:
-        """The corners in the scan with their covariances; none of a frame that was declined."""
+        """Return the corners in the scan with their covariances; empty for a declined frame."""
         corners = self.corners or {}
         found = [(name, corners[name]) for name in CORNERS if name in corners]
         xy = np.array([(c.x, c.y) for _, c in found], dtype=np.float64).reshape(-1, 2)
@@ -190,6 +190,6 @@ class FrameOrientation(Document):
         return ImagePoints(tuple(name for name, _ in found), xy, cov)
 
     def to_dict(self) -> dict[str, Any]:
-        """The content as it stands in the file; `transform` only where there is one."""
+        """Return the content of the file; a missing `transform` is left out."""
         content = super().to_dict()
         return content if self.transform else {k: v for k, v in content.items() if k != "transform"}

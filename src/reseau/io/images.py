@@ -48,8 +48,8 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     path : path
         PNG, JPEG, BMP or TIFF; see :mod:`reseau.io.images` for the kinds of TIFF.
     channel : {"luma", "red", "green", "blue"}
-        What is taken of a colour image. A lens images colours at slightly different scales; a single channel
-        avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
+        Channel of a colour image that is used. A lens images colours at slightly different scales; a single
+        channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
 
     Returns
     -------
@@ -387,7 +387,7 @@ def _tiff_dpi(page: Any) -> float | None:
 
 
 def write_image(path: Path | str, pixels: NDArray[Any]) -> None:
-    """Write an image, whole or not at all.
+    """Write an image completely or not at all.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ def write_image(path: Path | str, pixels: NDArray[Any]) -> None:
     Raises
     ------
     InputError
-        When the suffix is none of these, or the file cannot be written.
+        When the suffix is not one of these, or the file cannot be written.
 
     Examples
     --------

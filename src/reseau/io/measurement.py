@@ -1,4 +1,4 @@
-"""``reseau-measurement/1``: image coordinates of marks, measured by us or by others."""
+"""``reseau-measurement/1``: image coordinates of marks, measured by this or another program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["MeasuredPoint", "ReseauMeasurement"]
 
 
 class MeasuredPoint(Strict):
-    """One mark as it was, or was not, measured; sigmas in pixels.
+    """One mark, measured or not; sigmas in pixels.
 
     Examples
     --------
@@ -38,7 +38,7 @@ class MeasuredPoint(Strict):
 
 
 class ReseauMeasurement(Document):
-    """``reseau-measurement/1``: image coordinates of marks, and why some have none.
+    """``reseau-measurement/1``: image coordinates of marks, and why others were not measured.
 
     Examples
     --------
@@ -57,9 +57,9 @@ class ReseauMeasurement(Document):
     expected: int
 
     def image_points(self) -> ImagePoints:
-        """The marks that were measured.
+        """Return the marks that were measured.
 
-        A point without sigmas gets those of a coordinate known to one pixel.
+        A point without sigmas gets sigmas of one pixel.
         """
         ok = [p for p in self.points if p.ok and p.x is not None and p.y is not None]
         xy = np.array([(p.x, p.y) for p in ok], dtype=np.float64).reshape(-1, 2)
@@ -80,7 +80,7 @@ class ReseauMeasurement(Document):
         ok: Mask,
         why: Sequence[str],
     ) -> Self:
-        """Marks as columns: those that are not `ok` have the reason and no coordinates."""
+        """Create the document from columns; marks that are not `ok` have a reason and no coordinates."""
         points = []
         for i, name in enumerate(ids):
             if not ok[i]:
@@ -104,7 +104,7 @@ class ReseauMeasurement(Document):
 
     @classmethod
     def from_image_points(cls, points: ImagePoints, *, image: str, sha256: str) -> Self:
-        """Points that were all measured, by us or by another."""
+        """Create the document from measured points."""
         s = points.sigma
         rho = points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])
         measured = tuple(
@@ -146,11 +146,11 @@ class ReseauMeasurement(Document):
                 ) from None
             name = cells[0].strip()
             if any(p.id == name for p in points):
-                raise FormatError(f"line {number}: the id {name!r} stands twice", where=path)
+                raise FormatError(f"line {number}: duplicate id {name!r}", where=path)
             sx, sy = sigma or (None, None)
             points.append(MeasuredPoint(id=name, x=x, y=y, sx=sx, sy=sy, ok=True))
         if not points:
-            raise FormatError("holds no points", where=path)
+            raise FormatError("contains no points", where=path)
         return cls(
             image=Path(path).name,
             sha256=sha256,

@@ -28,7 +28,7 @@ Triple = tuple[float, float, float]
 
 
 class AdditionalParameters(Strict):
-    """Additional parameters of the image, in one set or in several."""
+    """Additional parameters of the images: one set per camera, group or image."""
 
     model: str
     base_mm: float = Field(gt=0)
@@ -42,7 +42,7 @@ class AdditionalParameters(Strict):
 
 
 class CameraEntry(Strict):
-    """One camera: its pixels, its model, and what is known of its interior orientation.
+    """One camera: its pixels, its model, and its interior orientation as far as it is known.
 
     The models are those of :func:`reseau.optics.camera_models`; the options of a model are keys of the entry.
     """
@@ -68,7 +68,7 @@ class CameraEntry(Strict):
 
     @property
     def on_film(self) -> bool:
-        """Whether size of the pixels and principal point are those of a film frame's orientation."""
+        """Whether pixel size and principal point follow from the orientation of a film frame."""
         return False
 
     @property
@@ -97,24 +97,24 @@ class CameraEntry(Strict):
             for name in names:
                 if name not in model.names:
                     raise ValueError(
-                        f"{who}: `{key}` names {name!r}, which is no parameter of {self.model!r}"
+                        f"{who}: `{key}` contains {name!r}, which is not a parameter of {self.model!r}"
                     )
         for name in model.required:
             if name not in self.parameters:
                 raise ValueError(f"{who}: parameter {name!r} is missing")
         for name in model.of_role("scale"):
             if name in self.parameters and self.parameters[name] <= 0:
-                raise ValueError(f"{who}: parameter {name!r} is not above zero")
+                raise ValueError(f"{who}: parameter {name!r} must be above zero")
         twice = _twice(self.free)
         if twice is not None:
-            raise ValueError(f"{who}: `free` names {twice!r} twice")
+            raise ValueError(f"{who}: `free` contains {twice!r} twice")
         for name, sigma in (self.sigma or {}).items():
             if sigma <= 0:
-                raise ValueError(f"{who}: the sigma of {name!r} is not above zero")
+                raise ValueError(f"{who}: the sigma of {name!r} must be above zero")
             if name not in self.free:
-                raise ValueError(f"{who}: {name!r} has a sigma and is not free")
+                raise ValueError(f"{who}: {name!r} has a sigma but is not free")
         if self.additional is not None and model.combine is None:
-            raise ValueError(f"{who}: the model {self.model!r} takes no `additional` parameters")
+            raise ValueError(f"{who}: the model {self.model!r} does not support `additional` parameters")
         return self
 
 
@@ -151,21 +151,19 @@ class FilmCameraEntry(CameraEntry):
 
     @property
     def on_film(self) -> bool:
-        """Whether size of the pixels and principal point are those of a film frame's orientation."""
+        """Whether pixel size and principal point follow from the orientation of a film frame."""
         return True
 
     @model_validator(mode="after")
     def _of_the_frame(self) -> Self:
         model, who = camera_model(self.model), f"camera {self.id!r}"
         if not model.needs_pitch:
-            raise ValueError(
-                f"{who}: the model {self.model!r} has no size of a pixel to take from a film frame"
-            )
+            raise ValueError(f"{who}: the model {self.model!r} has no pixel size and cannot use a film frame")
         if self.pitch_mm is not None:
-            raise ValueError(f"{who}: `pitch_mm` is that of the film frame: leave it out")
+            raise ValueError(f"{who}: `pitch_mm` follows from the film frame: leave it out")
         for name in model.of_role("centre"):
             if name in {*self.parameters, *self.free, *(self.sigma or {})}:
-                raise ValueError(f"{who}: {name!r} is that of the film frame: leave it out")
+                raise ValueError(f"{who}: {name!r} follows from the film frame: leave it out")
         return self
 
 
@@ -271,7 +269,7 @@ class Network1(Document):
         for what, ids in (("cameras", cameras), ("images", self.images.id), ("points", self.points.id)):
             twice = _twice(ids)
             if twice is not None:
-                raise ValueError(f"the id {twice!r} stands twice among the {what}")
+                raise ValueError(f"duplicate id {twice!r} in `{what}`")
             if not ids:
                 raise ValueError(f"the network has no {what}")
         images, points = set(self.images.id), set(self.points.id)
@@ -294,9 +292,9 @@ class Network1(Document):
             if sigma is not None and any(s is not None and s < 0 for s in sigma):
                 raise ValueError(f"point {name!r} has a negative sigma")
             if xyz is None and sigma is not None and any(s is not None for s in sigma):
-                raise ValueError(f"point {name!r} has sigmas and no coordinates")
+                raise ValueError(f"point {name!r} has sigmas but no coordinates")
             if role == "check" and xyz is None:
-                raise ValueError(f"check point {name!r} has no coordinates to check against")
+                raise ValueError(f"check point {name!r} has no coordinates")
 
     def _check_observations(self) -> None:
         table = self.observations
@@ -304,12 +302,12 @@ class Network1(Document):
             zip(table.image, table.point, table.sx, table.sy, strict=True)
         ):
             if sx <= 0 or sy <= 0:
-                raise ValueError(f"point {point!r} in image {image!r}: its sigmas are not above zero")
+                raise ValueError(f"point {point!r} in image {image!r}: its sigmas must be above zero")
             if table.rho is not None and not -1 < table.rho[k] < 1:
-                raise ValueError(f"point {point!r} in image {image!r}: rho is not between -1 and 1")
+                raise ValueError(f"point {point!r} in image {image!r}: rho must be between -1 and 1")
         twice = _twice(zip(table.image, table.point, strict=True))
         if twice is not None:
-            raise ValueError(f"point {twice[1]!r} stands twice in image {twice[0]!r}")
+            raise ValueError(f"point {twice[1]!r} is observed twice in image {twice[0]!r}")
         if self.distances is not None:
             columns = self.distances
             for a, b, length, sigma in zip(
@@ -336,7 +334,7 @@ class Network1(Document):
 
 def _known(name: str, names: Sequence[str]) -> str:
     if name not in names:
-        raise ValueError(f"{name!r} is none of the models {', '.join(names)}")
+        raise ValueError(f"{name!r} is not one of the models {', '.join(names)}")
     return name
 
 
@@ -353,4 +351,4 @@ def _twice(names: Iterable[T]) -> T | None:
 def _named(column: str, names: Sequence[str], known: set[str], what: str) -> None:
     for name in names:
         if name not in known:
-            raise ValueError(f"`{column}` names {name!r}, which is none of the {what}")
+            raise ValueError(f"`{column}` contains {name!r}, which is not in `{what}`")

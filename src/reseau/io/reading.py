@@ -1,4 +1,4 @@
-"""Files whose kind is recognised by their content or suffix: designs, and image coordinates."""
+"""Readers that recognise the kind of a file by its content or suffix: designs, image coordinates."""
 
 from __future__ import annotations
 

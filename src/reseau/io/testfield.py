@@ -16,12 +16,12 @@ __all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign", "parse_des
 
 TargetShape = Literal["square", "triangle", "cross", "circle"]
 SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
-"""Shapes of targets, in the order by which they are numbered."""
+"""Shapes of targets, in the order of their numbers."""
 Positive = Annotated[float, Field(gt=0)]
 
 
 class FieldLines(Strict):
-    """The straight lines: their width, where they stand, and the rectangle that they fill.
+    """The straight lines: their width, their positions, and the rectangle that they fill.
 
     Examples
     --------
@@ -45,9 +45,9 @@ class FieldLines(Strict):
                 raise ValueError(f"`{name}` must ascend by more than the width of the lines")
         x0, y0, x1, y1 = self.extent
         if not (x0 <= self.vertical_x[0] < self.vertical_x[-1] <= x1):
-            raise ValueError("`extent` does not reach from the first to the last of `vertical_x`")
+            raise ValueError("`extent` must include all of `vertical_x`")
         if not (y0 <= self.horizontal_y[0] < self.horizontal_y[-1] <= y1):
-            raise ValueError("`extent` does not reach from the first to the last of `horizontal_y`")
+            raise ValueError("`extent` must include all of `horizontal_y`")
         return self
 
 
@@ -79,7 +79,7 @@ class FieldTargets(Strict):
                 raise ValueError(f"`{name}` has {len(getattr(self, name))} entries for {len(self.id)} ids")
         if len(set(self.id)) != len(self.id):
             twice = next(name for i, name in enumerate(self.id) if name in self.id[:i])
-            raise ValueError(f"the id {twice!r} stands twice among the targets")
+            raise ValueError(f"duplicate id {twice!r} in `targets`")
         return self
 
 
@@ -100,7 +100,7 @@ class TestfieldDesign(Document):
     [0, 1, 2]
     """
 
-    __test__: ClassVar[bool] = False  # not one for pytest, which collects what is named so
+    __test__: ClassVar[bool] = False  # prevents collection by pytest
     SCHEMA: ClassVar[str] = "testfield-design/1"
     name: str
     unit: Literal["mm"]
@@ -119,7 +119,7 @@ class TestfieldDesign(Document):
         if not self.targets.id:
             raise ValueError("the design has no targets")
         if max(self.targets.square) > columns * rows:
-            raise ValueError(f"there is no square {max(self.targets.square)} among {columns} × {rows}")
+            raise ValueError(f"square {max(self.targets.square)} does not exist in {columns} × {rows}")
         return self
 
     @property
@@ -152,7 +152,7 @@ class TestfieldDesign(Document):
 
     @property
     def symbols(self) -> NDArray[np.intp]:
-        """What the targets (n,) are: twice the number of their shape, one more where they are large."""
+        """Symbols of the targets (n,): twice the number of the shape, plus one for large targets."""
         shape = np.array([SHAPES.index(name) for name in self.targets.shape], dtype=np.intp)
         return 2 * shape + self.large
 

@@ -21,7 +21,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
 
 _SIDE = 5.5
-"""End of the table of the normal distribution in standard deviations: 2e-8 of the light lie beyond."""
+"""End of the table of the normal distribution in standard deviations; 2e-8 of the light is outside."""
 _PER_SIGMA = 64
 """Entries per standard deviation; with two more terms of the series in between, accurate to 1e-7."""
 
@@ -37,7 +37,7 @@ f32 = np.float32
 
 _FREE = {"nnan", "ninf", "nsz"}
 """Assumptions allowed to the compiler. Sums must not be reordered, and products not be fused into sums: both
-would make the last bits differ from one compilation to the next.
+would make the last bits depend on the compilation.
 """
 
 
@@ -51,11 +51,11 @@ def _compiled(function: F) -> F:
 def _edges(
     first: np.float32, inverse: np.float32, n: int, count: int, jump: np.float32, step: Single, bell: Single
 ) -> None:
-    """Distribution and density at (first + k) · inverse, from k = n on a jump farther."""
+    """Distribution and density at (first + k) · inverse, shifted by `jump` from k = n."""
     for k in range(count):
         z = first + f32(k) + (jump if k >= n else f32(0))
         z = min(max(z * inverse, f32(-_SIDE)), f32(_SIDE))
-        # An index without a sign is looked up without a question, many at a time.
+        # An unsigned index needs no check for negative values, so that the loop is vectorised.
         i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
         middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
         d = z - middle
@@ -70,8 +70,8 @@ def _responses(
 ) -> tuple[int, int]:
     """Integral, value and derivative (3, last − first) of the response of pixels to light at a point.
 
-    Pixels are at 0, 1, … Returns the first one that has any response, and the first beyond. The integral is
-    0 before and 1 behind.
+    Pixels are at 0, 1, … Returns the first pixel with a response, and the first one after the last. The
+    integral is 0 before and 1 after them.
     """
     reach = f32(_SIDE) * sigma + half
     first = min(max(0, int(np.ceil(point - reach))), count)
@@ -165,7 +165,7 @@ def formed(
     fill : float
         Light-sensitive share of the pitch.
     parts : ndarray (n, 1, r, c) or (n, 4 + m, r, c)
-        The share and, if there is room, its derivatives by shifts along x and y, width, and forms.
+        The share and, if there is space for them, its derivatives by shifts along x and y, width, and forms.
     """
     half, (high, wide) = f32(max(fill, 1e-6) / 2), parts.shape[2:]
     down, across = np.empty((3, high), f32), np.empty((3, wide), f32)
@@ -194,7 +194,7 @@ def formed(
             _add_node((top, bottom, left, right), (dx, dy), normals, sigma[k], (down, across), parts[k])
             for r in range(top, bottom):
                 behind[r, right] -= down[1, r - top] * dy
-        # Beyond the reach of a node its integral stays 1: one sum for all.
+        # Outside the reach of a node its integral is 1: add all nodes at once.
         for r in range(high):
             total = f32(0)
             for c in range(wide):

@@ -1,4 +1,4 @@
-"""A grid of wires as disjoint outlines: their sum is the union, exact also at the crossings."""
+"""A grid of wires as disjoint outlines, whose sum is exact at the crossings too."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ def line_grid(
     if min(len(x), len(y)) < 1 or min(np.diff(x).min(initial=np.inf), np.diff(y).min(initial=np.inf)) <= (
         line_width
     ):
-        raise UsageError("are not ascending, or nearer than their width", where="wires of a line grid")
+        raise UsageError("must ascend, by more than their width", where="wires of a line grid")
     whole = np.ones((len(y), len(x)), dtype=bool) if broken is None else ~broken
     if whole.shape != (len(y), len(x)) or not whole.any():
-        raise UsageError(f"has no crossing among {whole.shape}", where="line grid")
+        raise UsageError(f"has no crossing; `broken` has the shape {whole.shape}", where="line grid")
     row, column = np.nonzero(whole)
     crossings = np.stack([x[column] - half, y[row] - half, x[column] + half, y[row] + half], axis=1)
     along, start, end = _between(y, whole, half, beyond)

@@ -107,7 +107,7 @@ class CameraOptions:
             raise UsageError("needs the size of a pixel", where=model.name)
         unknown = [name for name in self.free if name not in model.names]
         if unknown:
-            raise UsageError(f"is none of {', '.join(model.names)}", where=unknown[0])
+            raise UsageError(f"is not one of {', '.join(model.names)}", where=unknown[0])
         object.__setattr__(self, "options", model.checked_options(self.options))
 
     @property

@@ -1,4 +1,4 @@
-"""Image coordinates corrected for systematic errors: of the camera (group A) and the instrument (group B)."""
+"""Correction of image coordinates for errors of the camera (group A) and the instrument (group B)."""
 
 from .camera import CorrectionFit, FittedCamera, correct_camera
 from .causes import CAUSES, COEFFICIENTS, CONDITIONS, Causes, causes_of, physical_causes

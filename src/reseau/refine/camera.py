@@ -44,7 +44,7 @@ class CorrectionFit:
     check_target : ndarray (c, 2)
         Their coordinates in the design.
     local : SmoothField or None
-        What the model leaves, as a smooth field; `local.need` is the probability, per axis, of a field as
+        Remaining residuals as a smooth field; `local.need` is the probability, per axis, of a field as
         large from white noise alone. None with fewer than 20 marks.
 
     Examples
@@ -123,8 +123,8 @@ def correct_camera(
     points : ImagePoints
         Measured marks in pixels.
     design : ReseauDesign
-        The reseau; `origin` and `axis` name O and S. Without them the mark nearest to the middle is O and
-        that farthest to the right of it S.
+        The reseau; `origin` and `axis` name O and S. By default O is the mark nearest to the centre, S the
+        one farthest to its right.
     model : RationalPolynomial, optional
         Any model whose terms are data; by default equations (5a, b).
     alpha : float
@@ -172,7 +172,8 @@ def correct_camera(
     plane = np.array([coordinates[name][:2] for name in known], dtype=np.float64)
     if on_one_line(plane):
         return Failure(
-            f"the {len(known)} marks lie on one line and determine nothing across it", Code.COLLINEAR
+            f"the {len(known)} marks lie on one line; nothing is determined across it",
+            Code.COLLINEAR,
         )
     sigma = np.array([coordinates[name][2] for name in known])
     systems = _common_system(marks, plane, design)
@@ -249,13 +250,13 @@ def defining_marks(
     plane : ndarray (n, 2)
         Their designed coordinates.
     design : ReseauDesign
-        Names the two; without names the mark nearest to the middle and that farthest to its right.
+        Names the two marks; by default the one nearest to the centre and the one farthest to its right.
 
     Returns
     -------
     two pairs of ndarray (2,), or Failure
-        For each of the two its place among the marks and its designed coordinates. A mark that was not
-        measured lies where a projectivity through the others has it.
+        For each of the two its measured and its designed coordinates. The position of a mark that was not
+        measured is predicted by a projectivity through the others.
     """
     row_of = {name: i for i, name in enumerate(marks.names)}
     ends: list[tuple[Array, Array]] = []

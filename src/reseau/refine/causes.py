@@ -52,7 +52,7 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "A4 = B3 + A5": {"A4": 1, "B3": -1, "A5": -1},
     "B4 = A3 + B5": {"B4": 1, "A3": -1, "B5": -1},
 }
-"""What 13 causes impose on 16 coefficients, each as a sum that is nought."""
+"""Conditions that 13 causes impose on 16 coefficients; each sum is zero."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ConditionTest:
     misclosure, sigma : float
         Misclosure of the condition, and its standard deviation.
     statistic, critical, p : float
-        χ² of one degree of freedom, the value it exceeds with probability alpha, and its probability.
+        χ² with one degree of freedom, its critical value at level alpha, and its p-value.
     holds : bool
         Whether the condition is not contradicted.
     """
@@ -87,10 +87,10 @@ class Causes:
     Parameters
     ----------
     adjustment : Adjustment
-        Of the 13 causes, by name, to the 16 coefficients; redundancy 3. Its global test is that of the three
-        conditions together.
+        Adjustment of the 13 causes to the 16 coefficients; redundancy 3. Its global test is the joint test of
+        the three conditions.
     conditions : tuple of ConditionTest
-        Each condition on its own.
+        Test of each condition.
 
     Examples
     --------

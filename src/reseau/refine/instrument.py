@@ -44,7 +44,7 @@ class InstrumentFit:
     Parameters
     ----------
     elimination : Elimination
-        The record of the tests of all coefficients; what is left of them is the reduced model.
+        The record of the tests of all coefficients; the remaining ones form the reduced model.
     points : ImagePoints
         Photo-coordinates of the rods in the common system, corrected for group A; the covariances are those
         of the measurement alone.
@@ -55,13 +55,13 @@ class InstrumentFit:
     check_target : ndarray (c, 2)
         Their designed object coordinates.
     monomials : Elimination or None
-        The same with a coefficient for every monomial (``A6.x3``, ``A6.xy2``): what remains is the reduced
-        model of the paper's end. None where there are too few rods.
+        The same with one coefficient for every monomial (``A6.x3``, ``A6.xy2``): the reduced model at the end
+        of the paper. None with too few rods.
     local : SmoothField or None
-        What the model leaves; see :func:`reseau.measure.fitting.residual_field`.
+        Remaining residuals; see :func:`reseau.measure.fitting.residual_field`.
     displays : Rivalry or None
-        The polynomials (first) beside Wong's display model (second), both with all their coefficients; None
-        where there are too few rods for them.
+        Comparison of the polynomials (first) with Wong's display model (second), both with all coefficients;
+        None with too few rods.
 
     Examples
     --------

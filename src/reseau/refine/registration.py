@@ -146,7 +146,7 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
 def _of_the_camera(
     camera: CameraCorrection, marks: ImagePoints, expected: Array, length: float, cofactor: Array
 ) -> Array:
-    """What the errors of the camera's coefficients add to the similarity's covariance, (4, 4).
+    """Contribution of the errors of the camera's coefficients to the covariance of the similarity, (4, 4).
 
     They move the expected positions together, by −(∂X/∂x)⁻¹ ∂X/∂a.
     """
@@ -162,7 +162,7 @@ def _of_the_camera(
 
 
 def _about(values: Array, centre: Array, length: float) -> Similarity:
-    """A similarity of coordinates reduced to a centre and a length, as one of pixels."""
+    """Convert a similarity of coordinates reduced to a centre and a length to one of pixels."""
     x0, y0, a, b = values
     shift = centre + length * np.array([x0, y0]) - np.array([[a, -b], [b, a]]) @ centre
     return Similarity(np.array([*shift, a, b]))

@@ -1,4 +1,4 @@
-"""Remarks on photographs of the oscilloscope procedure, for those who took them."""
+"""Remarks on the photographs of the oscilloscope procedure, for the user."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["of_the_camera", "of_the_change", "of_the_object"]
 _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is accepted."""
 _ANOTHER_SHAPE_PX = 0.3
-"""Residuals (px) of the marks of a photograph referred to PHOTO I up to which it has the same shape."""
+"""Largest rms residual of the marks of a photograph that has the shape of PHOTO I."""
 
 
 def of_the_camera(camera: CameraCorrection, registration: Registration | None) -> tuple[Remark, ...]:
@@ -62,17 +62,17 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
         return ()
     notes, shift = [], float(np.hypot(*test.shift))
     if test.p_shift < test.alpha:
-        said = f"the display has shifted against the reseau by {shift:.3g} {unit}"
+        shifted = f"the display has shifted against the reseau by {shift:.3g} {unit}"
         if registration is not None and registration.moved:
             notes.append(
                 Remark(
-                    f"{said} while the camera moved: there is a gap between reseau and screen (parallax); "
+                    f"{shifted} while the camera moved: there is a gap between reseau and screen (parallax); "
                     "keep the camera where PHOTO I was taken",
                     Code.PARALLAX,
                 )
             )
         else:
-            notes.append(Remark(f"{said}: was it centred again?", Code.DISPLAY_SHIFTED))
+            notes.append(Remark(f"{shifted}: was it centred again?", Code.DISPLAY_SHIFTED))
     if test.p_rest < test.alpha:
         rod, length = test.largest
         notes.append(

@@ -1,6 +1,6 @@
-"""Which of two models explains the same points better, when neither contains the other.
+"""Test which of two models that are not nested explains the same points better.
 
-An F-test needs nested models. Here every point is predicted from all others by both models, and the weighted
+An F-test needs nested models. Here both models predict every point from all others, and the weighted
 squares of the errors of prediction are compared point by point (Wilcoxon's signed ranks). More parameters are
 no advantage: fitting the noise makes the prediction worse.
 """
@@ -29,7 +29,7 @@ class Rivalry:
     Parameters
     ----------
     first, second : Adjustment
-        The two.
+        Adjustments of the two models.
     rms : ndarray (2, 2)
         Root mean square of the prediction of a point from the others; a row for each model, x and y.
     p : float
@@ -98,7 +98,7 @@ def rivals(
         )
         if not np.isfinite(found[0]).all():
             return Failure(
-                f"{len(points)} points leave none to predict with {len(model.names)} parameters",
+                f"{len(points)} points are too few for predictions with {len(model.names)} parameters",
                 Code.TOO_FEW_POINTS,
             )
         fits.append(fit)

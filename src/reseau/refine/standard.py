@@ -1,13 +1,14 @@
 r"""Test whether stored coefficients still hold for a new photograph of the test object.
 
-Wishahy calls the coefficients of an instrument "theoretically standard": determined once, they serve for
-every later photograph. A new image of the test object tests that. With the same rods as before, their errors
+Wishahy calls the coefficients of an instrument "theoretically standard": determined once, they are valid for
+every later photograph. A new image of the test object tests this. With the same rods as before, their errors
 are the same, and every rod is compared with its earlier image:
 
 .. math:: d_i = f(x_i^{new}) - f(x_i^{old}), \qquad \chi^2 = \sum_i d_i^T \Sigma_i^{-1} d_i ,
 
 with f the stored correction and the covariances of both measurements alone. With other rods
-:math:`d_i = f(x_i) - X_i`; the rods' tolerance and the covariance of the coefficients take part.
+:math:`d_i = f(x_i) - X_i`; the covariance then includes the rods' tolerance and the covariance of the
+coefficients.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ class StandardTest:
     sigma : ndarray (n, 2)
         Standard deviations of the changes when nothing has changed.
     statistic, degrees, critical, p : float, int, float, float
-        χ² of all changes together, the value it exceeds with probability alpha, and its probability.
+        χ² of all changes, its degrees of freedom, its critical value at level alpha, and its p-value.
     shift, shift_sigma : ndarray (2,)
         Common part of the changes, and its standard deviations.
     p_shift, p_rest : float
         Probability of a common shift at least as large, and of other changes at least as large, when nothing
         has changed.
     same_object : bool
-        Whether the rods were taken to be those of the stored calibration.
+        Whether the rods are those of the stored calibration.
     alpha : float
         Level.
 

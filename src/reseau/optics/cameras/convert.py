@@ -1,4 +1,4 @@
-"""A camera in another model: the parameters that come nearest to it over the image, and how near that is."""
+"""Conversion of a camera to another model: best fitting parameters over the image, and the differences."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Converted(NamedTuple):
     mapping : PlaneMapping
         From ideal directions to pixels.
     rms_px, greatest_px : float
-        Differences from the original over the image, root mean square and greatest.
+        Differences from the original over the image: root mean square, and largest.
     share : float
-        Part of the image in which the original has directions; the rest was not compared.
+        Share of the image where the original has directions; the rest was not compared.
 
     Examples
     --------
@@ -69,12 +69,12 @@ def convert(
     options : mapping, optional
         Options of that model.
     free : tuple of str
-        Parameters to be used, others are zero; all by default.
+        Parameters to be estimated, the others are zero; all by default.
 
     Returns
     -------
     Converted
-        The camera, and how far it differs from the original.
+        The camera, and its differences from the original.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def convert(
     wanted = camera_model(model)
     unknown = [name for name in free if name not in wanted.names]
     if unknown:
-        raise UsageError(f"is none of {', '.join(wanted.names)}", where=unknown[0])
+        raise UsageError(f"is not one of {', '.join(wanted.names)}", where=unknown[0])
     step = max(grid.width, grid.height) / _POINTS
     columns = np.linspace(0, grid.width - 1, max(2, round(grid.width / step)))
     rows = np.linspace(0, grid.height - 1, max(2, round(grid.height / step)))
@@ -113,7 +113,7 @@ def convert(
 
 
 def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> PlaneMapping:
-    """Gauss–Newton with halved steps; undetermined corrections are as small as possible."""
+    """Gauss–Newton with halved steps; undetermined corrections have least norm."""
     cost = _cost(mapping, uv, target)
     for _ in range(_ITERATIONS):
         seen = mapping.derivatives(uv)

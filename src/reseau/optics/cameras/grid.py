@@ -1,4 +1,4 @@
-"""Pixels of an image, and the photo-coordinates they stand for."""
+"""Pixels of an image and their photo-coordinates."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["PixelGrid"]
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Pixels of an image and the photo-coordinates they stand for.
+    """Pixels of an image and their photo-coordinates.
 
-    Pixels have their origin at the centre of the top-left pixel, y down; photo-coordinates theirs at the
+    Pixels have their origin at the centre of the top-left pixel, y down; photo-coordinates at the
     centre of the image, y up.
 
     Parameters

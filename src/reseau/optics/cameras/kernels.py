@@ -95,7 +95,7 @@ def kernel(function: Callable[P, R]) -> Kernel[P, R]:
 def compiled(function: Kernel[P, R], **slots: Kernel[..., Any]) -> Callable[P, R]:
     """Compile a kernel, with other kernels in its slots.
 
-    The machine code is kept on disk under a digest of all source files that take part, so that a change in
+    The machine code is cached on disk under a digest of all its source files, so that a change in
     one of them is never answered with old code. It does not hold the interpreter's lock.
 
     Parameters
@@ -140,7 +140,7 @@ def _called(function: Kernel[..., Any]) -> list[str]:
 
 
 def _digest(function: Kernel[..., Any], slots: dict[str, Kernel[..., Any]]) -> str:
-    """Digest of the kernels that take part and of their files; empty where one is not in a file."""
+    """Digest of the kernels and of their source files; empty if one is not in a file."""
     digest, todo, done = hashlib.sha256(), [function], list[Kernel[..., Any]]()
     while todo:
         current = todo.pop()

@@ -53,7 +53,7 @@ class Parameter:
     role : {"scale", "centre", "distortion"}
         Principal distance or focal length, principal point, or distortion. A scale is above zero.
     usual : bool
-        Whether a calibration estimates it unless told otherwise.
+        Whether a calibration estimates it by default.
     required : bool
         Whether files must give it; otherwise it is zero where it is not given.
 
@@ -172,7 +172,7 @@ class CameraModel:
 
     @property
     def usual(self) -> tuple[str, ...]:
-        """Parameters that a calibration estimates unless told otherwise."""
+        """Parameters that a calibration estimates by default."""
         return tuple(p.name for p in self.parameters if p.usual)
 
     @property
