@@ -26,13 +26,13 @@ ValuesFunction = Callable[[Array, Rows], Array]
 Reweight = Callable[[Array], Array]
 
 _EPS = float(np.finfo(np.float64).eps)
-# The matrices of normal equations are scaled to a unit diagonal before this is asked of their eigenvalues.
+# Normal equations, scaled to a unit diagonal, are singular if their smallest eigenvalue is below this.
 _SINGULAR = 1e-12
 _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e12
 _MAD_TO_SIGMA = 1.4826
 _SERVES, _SHRINKS = 0.75, 0.1
-"""Part of the decrease predicted that must come true if a Jacobian is to be kept, and part of the one before
-that the next may promise."""
+"""A Jacobian is kept if the decrease is more than the first share of the predicted one, and the predicted
+decrease at most the second share of the previous prediction."""
 
 
 class BatchReason(IntEnum):
@@ -221,11 +221,11 @@ class _Marquardt:
         self._accept(rows[finite], self.x[finite], residuals[finite], jacobian[finite])
 
     def iterate(self) -> bool:
-        """One correction of every active problem; False when none is left."""
+        """Correct every active problem once; return False when no problem is active any more."""
         rows = np.flatnonzero(self.active)
         step, predicted = self._step(rows)
         done = self._arrived(rows, step, predicted)
-        # The last, negligible correction is applied to the estimates; evaluating it again would show nothing.
+        # The last, negligible correction is applied to the estimates; the function is not evaluated again.
         self.x[rows[done]] += step[done]
         self._leave(rows[done], BatchReason.CONVERGED)
         rows, step, predicted = rows[~done], step[~done], predicted[~done]
@@ -236,11 +236,11 @@ class _Marquardt:
         return bool(self.active.any())
 
     def _arrived(self, rows: Rows, step: Array, predicted: Array) -> Mask:
-        """Which problems need no more than this correction."""
+        """Mask of problems that have converged with this correction."""
         return self._small(rows, step, predicted)
 
     def _try(self, rows: Rows, trial: Array, predicted: Array) -> None:
-        """Evaluate the problems `rows` at `trial`, and move there those that gain by it."""
+        """Evaluate the problems `rows` at `trial`, accept it where the sum of squares decreases."""
         residuals, jacobian = self._evaluate(trial, rows)
         cost = self._cost(residuals, trial, rows)
         gain = (self.cost[rows] - cost) / np.maximum(predicted, np.finfo(float).tiny)
@@ -256,8 +256,8 @@ class _Marquardt:
         self._leave(refused[self.damping[refused] > _MOST_DAMPING], BatchReason.DIVERGED)
 
     def finish(self) -> BatchAdjustment:
-        """Cofactors and what else follows from the last normal equations."""
-        # Problems still active when the iterations end may have arrived with the last of them.
+        """Compute cofactors and results from the last normal equations."""
+        # Problems still active when the iterations end may have converged in the last one.
         rows = np.flatnonzero(self.active)
         self._leave(rows[self._small(rows, *self._step(rows))], BatchReason.CONVERGED)
         scaled, scale = self._scaled(np.arange(len(self.x)))
@@ -318,7 +318,7 @@ class _Marquardt:
             self.factors[rows] = self._robust_factors(rows, residuals)
         self.cost[rows] = self._cost(residuals, x, rows)
         w = self.weights[rows] * self.factors[rows]
-        # A Jacobian in single precision stays so: its products are what takes the time.
+        # A Jacobian in single precision is kept so: its products dominate the computing time.
         weighted = np.swapaxes(jacobian * w[:, :, None].astype(jacobian.dtype, copy=False), 1, 2)
         normal: Array = np.asarray(weighted @ jacobian, dtype=np.float64)
         diagonal = np.arange(x.shape[1])
@@ -331,13 +331,13 @@ class _Marquardt:
         self._formed(rows, weighted)
 
     def _formed(self, rows: Rows, weighted: Array) -> None:
-        """What else is to be done with Jacobians times weights (m, u, n) that were formed."""
+        """Hook for subclasses: called with new Jacobians times weights (m, u, n)."""
 
     def _robust_factors(self, rows: Rows, residuals: Array) -> Array:
         assert self.options.reweight is not None
         missing = self.missing[rows]
         size = np.abs(residuals) * np.sqrt(self.weights[rows])
-        # Missing ones sort to the end, so that the median of the others stands at half their number.
+        # Missing ones are sorted to the end, so that the median of the others is at half their number.
         ordered = np.sort(np.where(missing, np.inf, size), axis=1)
         count = np.maximum((~missing).sum(axis=1), 1)
         each = np.arange(len(rows))
@@ -347,7 +347,7 @@ class _Marquardt:
         return np.asarray(self.options.reweight(signed), dtype=np.float64)
 
     def _scaled(self, rows: Rows) -> tuple[Array, Array]:
-        """Normal equations of unit diagonal, and the scale of the parameters that makes them so."""
+        """Normal equations scaled to a unit diagonal, and the scale of the parameters."""
         normal = self.normal[rows]
         diagonal = np.diagonal(normal, axis1=1, axis2=2)
         scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
@@ -366,10 +366,10 @@ class _Marquardt:
         return step * scale, predicted
 
     def _small(self, rows: Rows, step: Array, predicted: Array) -> Mask:
-        """Which corrections are negligible, and not merely damped to look so."""
+        """Mask of corrections that are negligible, and not only small because of the damping."""
         small = self._negligible(rows, step, predicted)
-        # Near the minimum rounding may refuse one step after another until the damping holds all of them
-        # back: what the step would be without it decides.
+        # Near the minimum, rounding errors may reject several steps until the damping makes them small: the
+        # step without damping decides.
         held = np.flatnonzero(small & (self.damping[rows] > max(self.options.damping, 1e-2)))
         if len(held):
             free, gain = self._step(rows[held], np.full(len(held), _LEAST_DAMPING))
@@ -388,7 +388,7 @@ class _Marquardt:
 
 
 def _floating(values: ArrayLike) -> Array:
-    """An array of floats in the precision that it has."""
+    """Convert to an array of floats; single precision is kept."""
     array: NDArray[Any] = np.asarray(values)
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
@@ -396,20 +396,20 @@ def _floating(values: ArrayLike) -> Array:
 class _Chord(_Marquardt):
     """Chord method: reuse an earlier Jacobian while the corrections agree with the prediction.
 
-    Near the solution they shrink by a nearly constant rate (Kelley 1995, *Iterative Methods for Linear and
-    Nonlinear Equations*, 5.4.1), so that a correction times that rate is what is left after it: a problem has
-    arrived when this is negligible. Where less is gained than predicted, or corrections shrink slowly, the
-    Jacobian is formed anew.
+    Near the solution they decrease at a nearly constant rate (Kelley 1995, *Iterative Methods for Linear and
+    Nonlinear Equations*, 5.4.1), so that a correction times that rate is the remaining error: a problem has
+    converged when this is negligible. Where the decrease is less than predicted, or corrections decrease
+    slowly, the Jacobian is computed again.
 
-    With the Jacobian A kept, Aᵀ W v = 0 is solved. Where A is by a share e not that of the estimates, these
-    differ from those of least squares by e of their standard deviations, and their variance is larger by e²:
-    nothing, if the approximate values are good.
+    With a fixed Jacobian A, the solution of Aᵀ W v = 0 is found. If A differs from the Jacobian at the
+    estimates by a share e, these differ from the least-squares estimates by e times their standard
+    deviations, and their variance is larger by e²: negligible if the approximate values are good.
     """
 
     def __init__(self, values: ValuesFunction, *given: Any) -> None:
         super().__init__(*given)
         if self.options.reweight is not None:
-            raise UsageError("weights are not renewed where Jacobians are kept", where="adjust_batch")
+            raise UsageError("must not be given together", where="values and reweight of adjust_batch")
         self.values = values
         self.kept: Array | None = None
         self.last, (self.slow, self.stale) = np.zeros(len(self.x)), np.zeros((2, len(self.x)), dtype=bool)
@@ -442,7 +442,7 @@ class _Chord(_Marquardt):
             self.damping[some] = np.maximum(self.damping[some] / 3, _LEAST_DAMPING)
         if not serves.all():
             self.last[rows[~serves]] = 0.0
-            # One that is not of the present place is formed there first; else the step is to blame.
+            # An old Jacobian is computed again at the present place; with a new one the step is rejected.
             old, fresh = ~serves & self.stale[rows], ~serves & ~self.stale[rows]
             if old.any():
                 again = rows[old]
@@ -475,8 +475,8 @@ def adjust_batch(
     Parameters
     ----------
     function : callable
-        `function(x, rows)` with x (m, u), the parameters, and rows (m,), the indices of the problems they
-        belong to, gives the computed observations (m, n) and their Jacobian (m, n, u). Only active
+        `function(x, rows)` with x (m, u), the parameters, and rows (m,), the indices of their
+        problems, gives the computed observations (m, n) and their Jacobian (m, n, u). Only active
         problems are evaluated. A step to values that are not finite is rejected; at weight zero they have no
         effect.
     initial : array_like (k, u)

@@ -96,7 +96,7 @@ def compiled(function: Kernel[P, R], **slots: Kernel[..., Any]) -> Callable[P, R
     """Compile a kernel, with other kernels in its slots.
 
     The machine code is cached on disk under a digest of all its source files, so that a change in
-    one of them is never answered with old code. It does not hold the interpreter's lock.
+    one of them never runs old code. It releases the interpreter's lock.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The registry: what a camera model is to files, commands, adjustments and reports.
+"""The registry of camera models: their definition for files, commands, adjustments and reports.
 
 A new camera model is one module that defines its mapping and registers a :class:`CameraModel`; where the
 bundle adjustment needs speed, the module also has a kernel (see :mod:`reseau.optics.cameras.kernels`).
@@ -121,7 +121,7 @@ class Option:
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """A camera model: its parameters and options, its mapping, and what an adjustment needs of it.
+    """A camera model: its parameters and options, its mapping, and its compiled kernel.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ class CameraModel:
     needs_pitch : bool
         Whether the parameters are in millimetres, so that the size of a pixel must be known.
     combine : callable, optional
-        For a model that takes additional parameters, in its kernel too: ``combine(mapping, additional)`` is
-        the mapping with the parameters of both, or None where this has no closed form.
+        For a model that supports additional parameters, also in its kernel: ``combine(mapping, additional)``
+        is the mapping with the parameters of both, or None where this has no closed form.
     kernel : Kernel, optional
         For the compiled loops of the bundle adjustment.
     constants : callable
@@ -190,7 +190,7 @@ class CameraModel:
         return tuple(p.name for p in self.parameters if p.role in roles)
 
     def checked_options(self, given: Options | None = None) -> dict[str, str | float]:
-        """All options: those given, and the default of each other.
+        """All options: the given ones, and the defaults of the others.
 
         Raises
         ------
@@ -291,7 +291,7 @@ _ADDITIONAL: dict[str, AdditionalModel] = {}
 
 
 def register_camera(model: CameraModel) -> CameraModel:
-    """Make a camera model known by its name.
+    """Register a camera model under its name.
 
     Raises
     ------
@@ -315,7 +315,7 @@ def register_camera(model: CameraModel) -> CameraModel:
 
 
 def register_additional(model: AdditionalModel) -> AdditionalModel:
-    """Make additional parameters known by their name.
+    """Register additional parameters under their name.
 
     Raises
     ------
@@ -390,7 +390,7 @@ def additional_model(name: str) -> AdditionalModel:
 
 
 def default_camera_model(pitch_known: bool) -> CameraModel:
-    """The model of a calibration that names none: the first whose need of a pixel size is met.
+    """The default model of a calibration: the first one that does not need an unknown pixel size.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ def default_camera_model(pitch_known: bool) -> CameraModel:
 
 
 def distortion_names(names: Iterable[str], model: str = "mapping") -> tuple[str, ...]:
-    """Those of the names that are not of the interior orientation (scale and centre).
+    """Names of parameters that do not belong to the interior orientation (scale and centre).
 
     Parameters
     ----------
