@@ -216,9 +216,9 @@ def test_a_jacobian_that_does_not_serve_is_formed_anew():
     np.testing.assert_allclose(np.sqrt((t**2).mean(axis=0)), 1.0, atol=0.35)
 
 
-def test_weights_are_not_renewed_where_jacobians_are_kept():
+def test_values_and_reweight_must_not_be_given_together():
     _, y = simulated(k=2)
-    with pytest.raises(UsageError, match="not renewed"):
+    with pytest.raises(UsageError, match="values and reweight.*must not be given together"):
         adjust_batch(
             decay,
             np.ones((2, 3)),
