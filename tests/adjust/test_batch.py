@@ -218,7 +218,7 @@ def test_a_jacobian_that_does_not_serve_is_formed_anew():
 
 def test_values_and_reweight_must_not_be_given_together():
     _, y = simulated(k=2)
-    with pytest.raises(UsageError, match="values and reweight.*must not be given together"):
+    with pytest.raises(UsageError, match="must not be given together"):
         adjust_batch(
             decay,
             np.ones((2, 3)),
