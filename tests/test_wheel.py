@@ -37,15 +37,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         stored = set(archive.namelist())
-    wanted = {
+    expected = {
         path.relative_to(folder).as_posix()
         for package, folder in SOURCES.items()
         for path in (folder / package).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert any(name.endswith(".rules") for name in wanted)
-    assert any(name.endswith(".html.j2") for name in wanted)
-    assert wanted <= stored
+    assert any(name.endswith(".rules") for name in expected)
+    assert any(name.endswith(".html.j2") for name in expected)
+    assert expected <= stored
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def test_the_sigmas_cover_the_true_errors():
     assert np.sqrt((fit.sigma0**2).mean()) == pytest.approx(0.01, rel=0.012)
 
 
-def test_a_missing_observation_counts_for_nothing_even_when_it_is_not_a_number():
+def test_observations_of_weight_zero_have_no_effect_even_if_nan():
     true, y = simulated(k=3)
     keep = np.ones(len(T), bool)
     keep[[3, 17]] = False
@@ -58,7 +58,7 @@ def test_a_missing_observation_counts_for_nothing_even_when_it_is_not_a_number()
     assert (fit.redundancy == len(T) - 2 - 3).all()
 
 
-def test_a_hopeless_problem_is_marked_and_poisons_no_other():
+def test_a_singular_problem_is_flagged_and_does_not_affect_the_others():
     true, y = simulated(k=5)
 
     def with_troubles(x, rows):
@@ -115,7 +115,7 @@ def test_a_prior_counts_as_an_observation():
     np.testing.assert_allclose(np.sqrt(fit.cofactor[:, 2, 2]), 1e-9, rtol=1e-3)
 
 
-def test_badly_scaled_columns_are_no_rank_defect():
+def test_badly_scaled_columns_do_not_cause_a_rank_defect():
     true, y = simulated(k=3)
     unit = np.array([1e-9, 1.0, 1e9])
 
@@ -129,7 +129,7 @@ def test_badly_scaled_columns_are_no_rank_defect():
     np.testing.assert_allclose(fit.estimates * unit, plain.estimates, atol=1e-6)
 
 
-def test_reweighting_withstands_a_corner_of_wrong_pixels():
+def test_reweighting_is_robust_against_a_corner_of_wrong_pixels():
     true, y = simulated(k=20)
     bad = y.copy()
     bad[:, 30:36] += 0.5
@@ -147,7 +147,7 @@ def test_reweighting_withstands_a_corner_of_wrong_pixels():
     assert np.abs((plain.estimates - clean.estimates) / clean.sigma).max() > 10.0
 
 
-def test_a_problem_out_of_iterations_says_so():
+def test_a_problem_that_reaches_the_iteration_limit_is_reported():
     true, y = simulated(k=2)
     fit = adjust_batch(decay, true * 0.3, y, options=BatchOptions(max_iterations=1))
     assert fit.reasons.tolist() == [BatchReason.MAX_ITERATIONS] * 2
@@ -169,7 +169,7 @@ def test_misuse_is_an_error(start, observed, weights, prior):
         adjust_batch(decay, start, observed, weights=weights, prior=prior)
 
 
-def test_derivatives_of_the_wrong_sign_diverge_and_are_not_taken_for_convergence():
+def test_derivatives_of_the_wrong_sign_are_reported_as_not_converged():
     true, y = simulated(k=2)
 
     def wrong(x, rows):
@@ -180,7 +180,7 @@ def test_derivatives_of_the_wrong_sign_diverge_and_are_not_taken_for_convergence
     assert fit.reasons.tolist() == [BatchReason.DIVERGED, BatchReason.CONVERGED]
 
 
-def test_kept_jacobians_lead_to_nearly_the_same_estimates_with_fewer_of_them():
+def test_reused_jacobians_give_nearly_the_same_estimates_with_fewer_evaluations():
     true, y = simulated(k=200, seed=4)
     asked = 0
 
@@ -201,7 +201,7 @@ def test_kept_jacobians_lead_to_nearly_the_same_estimates_with_fewer_of_them():
     np.testing.assert_allclose(kept.sigma, renewed.sigma, rtol=0.1)
 
 
-def test_a_jacobian_that_does_not_serve_is_formed_anew():
+def test_a_jacobian_that_does_not_reduce_the_cost_is_recomputed():
     true, y = simulated(k=50)
     fit = adjust_batch(
         decay,

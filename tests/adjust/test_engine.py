@@ -77,7 +77,7 @@ def test_linear_theory_holds_at_the_minimum(method, jacobian):
     np.testing.assert_allclose(fit.adjusted, decay(fit.values), atol=1e-13)
 
 
-def test_sigmas_a_full_matrix_blocks_and_lists_of_them_mean_the_same():
+def test_sigmas_full_matrix_blocks_and_lists_of_blocks_are_equivalent():
     sigma = np.linspace(0.01, 0.03, len(T))
     given = [
         sigma,
@@ -93,7 +93,7 @@ def test_sigmas_a_full_matrix_blocks_and_lists_of_them_mean_the_same():
         np.testing.assert_allclose(fit.redundancy_numbers, fits[0].redundancy_numbers, atol=1e-9)
 
 
-def test_correlated_blocks_are_the_full_matrix_they_stand_for():
+def test_correlated_blocks_are_equivalent_to_the_full_matrix():
     rng = np.random.default_rng(5)
     blocks = np.stack([spd(rng, 3) for _ in range(10)])
     full = np.zeros((30, 30))
@@ -108,7 +108,7 @@ def test_correlated_blocks_are_the_full_matrix_they_stand_for():
 
 @given(st.sets(st.sampled_from("abc"), min_size=1))
 @settings(max_examples=8, deadline=None)
-def test_fixed_parameters_stay_and_the_free_ones_are_those_of_the_smaller_problem(free):
+def test_fixing_parameters_is_equivalent_to_the_smaller_problem(free):
     start = Parameters("abc", TRUE, free=free)
     fit = adjust(decay_problem(parameters=start)).required()
     fixed = [name for name in "abc" if name not in free]
@@ -183,7 +183,7 @@ def test_the_prior_of_a_fixed_parameter_does_not_count():
     assert a.cost == b.cost
 
 
-def test_an_observation_of_weight_zero_is_as_good_as_absent():
+def test_an_observation_of_weight_zero_is_equivalent_to_no_observation():
     keep = np.ones(len(T), dtype=bool)
     keep[[4, 5, 20]] = False
     covariance = spd(np.random.default_rng(8), len(T))
@@ -202,7 +202,7 @@ def test_an_observation_of_weight_zero_is_as_good_as_absent():
     np.testing.assert_array_equal(fit.rejected, ~keep)
 
 
-def test_badly_scaled_parameters_are_no_rank_defect():
+def test_badly_scaled_parameters_do_not_cause_a_rank_defect():
     unit = np.array([1e12, 1.0, 1e-12])
     scaled = GaussMarkov(
         lambda x: decay(x * unit), noisy(), 0.01, Parameters("abc", np.array([1.0, 1.0, 0.1]) / unit)
@@ -294,7 +294,7 @@ def net(datum=(), start=START):
     )
 
 
-def test_inner_constraints_give_the_corrections_and_the_covariance_of_least_norm():
+def test_inner_constraints_give_corrections_and_covariance_of_minimum_norm():
     fit = adjust(net(["H1", "H2", "H3", "H4"])).required()
     assert fit.datum_defect == 1
     assert fit.redundancy == len(PAIRS) - 3
@@ -321,7 +321,7 @@ def test_a_net_without_datum_names_all_heights():
     assert set(failed.null_space[0]) == {"H1", "H2", "H3", "H4"}
 
 
-def test_a_datum_that_cannot_help_is_a_failure():
+def test_a_datum_that_does_not_remove_the_rank_defect_is_a_failure():
     names = ["H1", "H2", "H3", "H4", "free"]
     problem = GaussMarkov(
         lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
@@ -388,7 +388,7 @@ def line_points(m=40, seed=0, sigma=(0.05, 0.02)):
 
 
 @pytest.mark.parametrize("jacobians", [line_jacobians, None])
-def test_a_line_through_points_of_two_errors_is_the_one_of_total_least_squares(jacobians):
+def test_a_line_with_errors_in_both_coordinates_is_that_of_total_least_squares(jacobians):
     points = line_points(sigma=(0.05, 0.05))
     problem = GaussHelmert(line_conditions, points, 0.05, Parameters("ab", [0.0, 0.0]), jacobians)
     fit = adjust(problem).required()
@@ -457,7 +457,7 @@ def test_gauss_helmert_redundancy_numbers_sum_to_the_redundancy():
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-7)
 
 
-def test_a_mark_of_weight_zero_is_left_out_whole():
+def test_a_mark_of_weight_zero_is_excluded_with_both_coordinates():
     points = line_points()
     spoilt = points.copy()
     spoilt[7] += 5.0
@@ -533,7 +533,7 @@ def test_gauss_newton_shortens_steps_that_overshoot():
 
 
 @pytest.mark.parametrize("number", [np.longdouble, "decimal"])
-def test_wider_observations_give_digits_that_double_precision_has_not(number):
+def test_extended_precision_observations_give_digits_beyond_double_precision(number):
     """Observations 1 + a t that differ from 1 by a few rounding units of double precision only."""
     decimals = [Decimal(1) + Decimal(i) * Decimal("1e-17") for i in range(10)]
     kind = object if number == "decimal" else np.longdouble
@@ -553,7 +553,7 @@ def test_wider_observations_give_digits_that_double_precision_has_not(number):
     assert fit.exact_values.dtype == kind
 
 
-def test_everything_public_is_exported_and_says_what_it_is():
+def test_everything_public_is_exported_and_has_a_docstring():
     import reseau.adjust as adjust_package
 
     assert sorted(adjust_package.__all__) == adjust_package.__all__
@@ -606,7 +606,7 @@ def test_misuse_is_an_error(misuse):
         misuse()
 
 
-def test_nothing_to_estimate_is_still_an_adjustment():
+def test_an_adjustment_without_free_parameters_works():
     fit = adjust(decay_problem(parameters=Parameters("abc", TRUE, free=[]))).required()
     assert fit.redundancy == len(T)
     np.testing.assert_allclose(fit.values, TRUE)

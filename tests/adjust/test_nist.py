@@ -35,13 +35,13 @@ def fits(problems):
     return {(name, start): adjust(problems[name].problem(start)) for name, start in STARTS}
 
 
-def test_all_problems_are_there_and_have_a_model():
+def test_all_problems_exist_and_have_a_model():
     assert set(NAMES) == set(nist.MODELS)
     assert len(NAMES) == 27
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_files_are_read_whole(problems, name):
+def test_the_files_are_read_completely(problems, name):
     assert len(problems[name].table) == problems[name].stated
 
 
@@ -63,7 +63,7 @@ def test_the_certified_parameters_give_the_certified_residual_sum(problems, name
     assert float(residuals @ residuals) == pytest.approx(problem.residual_sum, rel=tolerance)
 
 
-def test_a_value_taken_for_a_misprint_contradicts_the_residual_sum_of_its_own_file(problems):
+def test_a_value_treated_as_a_misprint_contradicts_the_residual_sum_of_its_file(problems):
     for problem in problems.values():
         for printed in problem.misprinted:
             y, *x = problem.columns()
@@ -99,7 +99,7 @@ def test_the_residual_sum_is_the_certified_one(fits, problems, name):
 
 @pytest.mark.parametrize("start", [0, 1])
 @pytest.mark.parametrize("name", sorted(BEYOND_DOUBLE & set(NAMES)))
-def test_decimal_arithmetic_has_the_digits_double_precision_lacks(problems, name, start):
+def test_decimal_arithmetic_gives_the_digits_that_double_precision_lacks(problems, name, start):
     fit = adjust(problems[name].problem(start, Decimal)).required()
     parameters, sigmas = nist.digits_of(fit, problems[name])
     assert parameters.min() >= MEAN_DIGITS
@@ -119,7 +119,7 @@ def test_rounding_to_double_alone_costs_the_sigmas_of_lanczos1_their_digits(prob
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_differences_serve_nearly_as_well_as_derivatives(problems, name):
+def test_numerical_derivatives_are_nearly_as_accurate_as_analytical_ones(problems, name):
     """From the nearer start, with the function alone."""
     fit = adjust(problems[name].problem(1, analytic=False), Options(rank_tolerance=1e-12)).required()
     parameters, sigmas = nist.digits_of(fit, problems[name])

@@ -80,7 +80,7 @@ def test_no_iterations_give_no_result(run, problem):
 
 @path
 @kind
-def test_the_scale_decides_on_the_covariance(run, problem):
+def test_the_scale_option_determines_the_covariance(run, problem):
     prior, posterior = (run(problem(), Options(scale=s)) for s in ("a-priori", "a-posteriori"))
     assert (prior.scale, posterior.scale) == ("a-priori", "a-posteriori")
     np.testing.assert_array_equal(prior.values, posterior.values)
@@ -99,7 +99,7 @@ def test_wrong_derivatives_are_refused_where_they_are_checked(run, problem):
 
 @path
 @kind
-def test_the_rank_tolerance_decides_on_a_rank_defect(run, problem):
+def test_the_rank_tolerance_determines_a_rank_defect(run, problem):
     found = run(problem(), Options(rank_tolerance=0.5))
     assert isinstance(found, Failure)
     assert found.code is Code.RANK_DEFECT

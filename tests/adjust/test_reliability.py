@@ -49,7 +49,7 @@ def parabola(y, given):
 
 
 @pytest.mark.parametrize("kind", ["sigmas", "blocks", "full"])
-def test_reliability_is_that_of_the_definitions(kind):
+def test_reliability_agrees_with_the_definitions(kind):
     given = covariance(kind)
     q = full(given)
     y = np.random.default_rng(1).multivariate_normal(np.zeros(len(T)), q)
@@ -71,7 +71,7 @@ def test_reliability_is_that_of_the_definitions(kind):
 
 
 @pytest.mark.parametrize("kind", ["sigmas", "blocks", "full"])
-def test_external_reliability_is_what_such_an_error_does(kind):
+def test_external_reliability_equals_the_effect_of_the_error(kind):
     given = covariance(kind)
     y = np.zeros(len(T))
     error = adjust(parabola(y, given)).required().minimal_detectable_errors()
@@ -82,7 +82,7 @@ def test_external_reliability_is_what_such_an_error_does(kind):
         np.testing.assert_allclose(adjust(parabola(spoilt, given)).required().values, effects[i], atol=1e-8)
 
 
-def test_an_observation_nothing_controls_has_no_test():
+def test_an_uncontrolled_observation_has_no_test():
     function = lambda x: np.array([x[0], x[0], x[0] + x[1]])  # noqa: E731
     fit = adjust(GaussMarkov(function, [1.0, 1.2, 5.0], 0.1, Parameters("ab", [0.0, 0.0]))).required()
     assert np.isnan(fit.w[2])

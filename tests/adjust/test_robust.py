@@ -85,7 +85,7 @@ def test_snooping_leaves_good_observations_alone_at_its_level():
     assert abs(some - expected) < 4 * np.sqrt(expected)
 
 
-def test_snooping_takes_back_what_worse_blunders_had_made_look_bad():
+def test_snooping_restores_good_observations_rejected_because_of_larger_blunders():
     """Two blunders on the same lever hide each other, and good observations look worst at first."""
     x = np.append(np.arange(0.0, 5.5, 0.5), [12.0, 12.5])
     design = np.stack([np.ones_like(x), x], axis=1)
@@ -103,7 +103,7 @@ def test_snooping_takes_back_what_worse_blunders_had_made_look_bad():
     assert restored > 2
 
 
-def test_too_many_blunders_are_a_failure_that_suspects_the_model():
+def test_too_many_blunders_are_a_failure_that_names_the_model_as_possible_cause():
     y = 2.0 + 0.3 * T + np.sin(T) * 3
     found = data_snooping(line(y))
     assert not found
@@ -111,7 +111,7 @@ def test_too_many_blunders_are_a_failure_that_suspects_the_model():
     assert "model" in found.reason
 
 
-def test_what_is_left_out_from_the_start_stays_out_and_is_not_counted_as_rejected():
+def test_initially_excluded_observations_stay_excluded_and_are_not_counted_as_rejected():
     weights = np.ones(50)
     weights[7] = 0.0
     y = spoilt()
@@ -121,7 +121,7 @@ def test_what_is_left_out_from_the_start_stays_out_and_is_not_counted_as_rejecte
     assert found.adjustment.rejected[7]
 
 
-def test_of_marks_the_whole_mark_goes():
+def test_a_mark_is_rejected_with_both_coordinates():
     rejected = data_snooping(marks(rows=[5, 30]), 0.0001).required().rejected
     assert np.flatnonzero(rejected[:, 0]).tolist() == [5, 30]
     np.testing.assert_array_equal(rejected[:, 0], rejected[:, 1])
@@ -129,7 +129,7 @@ def test_of_marks_the_whole_mark_goes():
 
 @pytest.mark.parametrize("name", ["huber", "tukey", "danish"])
 @pytest.mark.parametrize("scale", ["mad", "a-priori"])
-def test_robust_weights_withstand_blunders(name, scale):
+def test_robust_weights_limit_the_effect_of_blunders(name, scale):
     found = robust(line(spoilt(size=20.0)), name, scale=scale).required()
     good = adjust(line(clean())).required()
     plain = adjust(line(spoilt(size=20.0))).required()
@@ -169,7 +169,7 @@ def test_weight_functions_are_one_at_zero_even_and_falling(name):
     np.testing.assert_array_equal(function(-t), w)
 
 
-def test_weight_functions_serve_the_batch():
+def test_weight_functions_work_in_a_batch():
     y = spoilt(size=20.0)[None]
 
     def function(x, rows):

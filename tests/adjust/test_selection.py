@@ -34,7 +34,7 @@ def cubic(seed=0, sigma=0.05):
 
 
 @pytest.mark.parametrize("criterion", ["t", "chi2", "F"])
-def test_elimination_leaves_the_terms_the_data_were_made_with(criterion):
+def test_elimination_keeps_the_terms_of_the_simulated_model(criterion):
     found = eliminate(polynomial(cubic()), alpha=0.001, criterion=criterion).required()
     assert set(found.adjustment.free) == {"a0", "a1", "a3"}
     assert set(found.dropped) == {"a2", "a4", "a5"}
@@ -47,7 +47,7 @@ def test_elimination_leaves_the_terms_the_data_were_made_with(criterion):
         assert found.adjustment[name] == 0.0
 
 
-def test_the_weakest_parameter_goes_first_and_the_record_is_its_test():
+def test_the_weakest_parameter_is_dropped_first_and_its_test_is_recorded():
     fit = adjust(polynomial(cubic())).required()
     weakest = min(NAMES, key=lambda name: fit.test_of(name).statistic)
     first = eliminate(polynomial(cubic())).required().steps[0]
@@ -72,7 +72,7 @@ def test_parameters_to_be_kept_are_kept():
         eliminate(polynomial(cubic()), keep=["a9"])
 
 
-def test_elimination_of_what_cannot_be_adjusted_is_the_failure():
+def test_elimination_returns_the_failure_of_the_adjustment():
     twice = GaussMarkov(lambda x: T * (x[0] + x[1]), cubic(), 0.1, Parameters("ab", [0.0, 0.0]))
     found = eliminate(twice)
     assert not found
@@ -169,7 +169,7 @@ def test_one_group_of_all_is_the_variance_factor():
         ({"a": np.ones(39, bool)}, "mask"),
     ],
 )
-def test_groups_that_make_no_sense_are_errors(groups, words):
+def test_invalid_groups_are_errors(groups, words):
     with pytest.raises(UsageError, match=words):
         variance_components(polynomial(cubic()), groups)
 

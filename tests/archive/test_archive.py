@@ -64,7 +64,7 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[
         server.dispose()
 
 
-def test_what_was_stored_is_there_when_opened_again(opened: Callable[[], Archive]) -> None:
+def test_stored_content_is_present_after_reopening(opened: Callable[[], Archive]) -> None:
     with opened() as archive:
         session = archive.begin("first", "frames", {"count": 2}, "schema = 'reseau-bench/1'")
         kept = session.store("0", frame(1), facts={"gain": 2.5}, clock={"taken": "2026-01-01T00:00:00Z"})
@@ -132,7 +132,7 @@ def test_a_name_is_unique_and_an_unknown_one_is_refused(opened: Callable[[], Arc
             archive.begin("../s", "frames", {})
 
 
-def test_a_session_has_what_it_was_given_from_the_beginning(opened: Callable[[], Archive]) -> None:
+def test_a_session_contains_its_inputs_from_the_beginning(opened: Callable[[], Archive]) -> None:
     with opened() as archive:
         session = archive.begin("s", "testfield", {}, inputs={"design.json": "{}", "field.csv": "ä"})
         session.store("0", frame())
@@ -150,7 +150,7 @@ def test_a_session_has_what_it_was_given_from_the_beginning(opened: Callable[[],
         assert verify(archive).files == 3
 
 
-def test_verifying_finds_what_was_changed_lost_or_left_over(tmp_path: Path) -> None:
+def test_verification_finds_changed_missing_and_unindexed_files(tmp_path: Path) -> None:
     with Archive.open(tmp_path, create=True) as archive:
         session = archive.begin("s", "frames", {})
         kept = [session.store(str(k), frame(k)) for k in range(3)]
@@ -219,9 +219,7 @@ def test_a_session_is_exported_to_the_same_bytes_each_time(tmp_path: Path) -> No
     facts=st.dictionaries(st.text(max_size=9), st.floats(allow_nan=False, allow_infinity=False) | st.text()),
 )
 @settings(deadline=None, max_examples=40)
-def test_pixels_and_facts_come_back_from_a_tiff_as_they_were(
-    pixels: np.ndarray, facts: dict[str, object]
-) -> None:
+def test_pixels_and_metadata_survive_storage_as_tiff(pixels: np.ndarray, facts: dict[str, object]) -> None:
     data = tiff_of(Frame(pixels, 4095.0, "näme"), facts)
     assert data == tiff_of(Frame(pixels, 4095.0, "näme"), facts)
     found, about = frame_of(data, "here")
@@ -259,20 +257,20 @@ def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> 
             session.store("1", Frame(np.zeros((800, 800), np.uint8), 255.0))
             print([f.step for f in session.frames()])
         """
-    said = subprocess.run(
+    message = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script), str(tmp_path)],
         capture_output=True,
         text=True,
         check=True,
     ).stdout.splitlines()
-    assert said == [
+    assert message == [
         f"{tmp_path / 'objects'}: cannot be stored (File too large); free disk space or name another archive",
         "['0', '1']",
     ]
     assert len([p for p in (tmp_path / "objects").rglob("*") if p.is_file()]) == 2
 
 
-def test_places_that_cannot_be_used_are_refused_in_one_line(tmp_path: Path) -> None:
+def test_unusable_locations_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ArchiveError, match="is not an archive; create one with `reseau capture`"):
         Archive.open(tmp_path / "none")
     (tmp_path / "file").write_text("x")
@@ -310,7 +308,7 @@ def test_an_archive_on_a_read_only_disk_can_be_read(tmp_path: Path, monkeypatch:
             session.end("done")
 
 
-def test_what_a_killed_process_left_in_the_log_is_read_on_a_read_only_disk_too(
+def test_entries_in_the_log_of_a_killed_process_are_read_on_a_read_only_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script = """
@@ -360,7 +358,7 @@ def test_a_damaged_index_is_reported(tmp_path: Path) -> None:
         assert all(line.startswith("index: ") for line in found.damaged)
 
 
-def test_two_processes_write_into_one_archive(tmp_path: Path) -> None:
+def test_two_processes_can_write_to_one_archive(tmp_path: Path) -> None:
     script = """
         import sys
         import numpy as np

@@ -34,7 +34,7 @@ def calibration(**changes: object) -> Calibration:
     return Calibration(**(content | changes))  # type: ignore[arg-type]
 
 
-def test_a_calibration_survives_the_way_to_the_file_and_back() -> None:
+def test_a_calibration_is_read_back_unchanged() -> None:
     first = calibration(times={"computed": "2024-01-01T00:00:00+00:00"})
     again = Calibration.parse(first.to_json(), where="c.json")
     assert again == first
@@ -47,7 +47,7 @@ def test_the_matrix_is_in_the_order_of_the_parameters_with_zeros_for_held_ones()
     )
 
 
-def test_clock_times_stand_apart() -> None:
+def test_clock_times_are_separate_from_other_content() -> None:
     one = json.loads(calibration(times={"computed": "then"}).to_json())
     other = json.loads(calibration(times={"computed": "now"}).to_json())
     assert one.pop("times") != other.pop("times")
@@ -61,7 +61,7 @@ def test_clock_times_stand_apart() -> None:
         ({"names": ["a", "q"], "matrix": [[1.0, 0.0], [0.0, 1.0]]}, "names 'q'"),
     ],
 )
-def test_a_covariance_that_does_not_fit_is_refused(covariance: dict[str, object], complaint: str) -> None:
+def test_a_covariance_of_the_wrong_size_is_refused(covariance: dict[str, object], complaint: str) -> None:
     content = json.loads(calibration().to_json()) | {"covariance": covariance}
     with pytest.raises(FormatError, match=complaint):
         Calibration.parse(json.dumps(content), where="c.json")

@@ -133,7 +133,7 @@ def test_photo_coordinates_have_the_covariance_of_points_and_corners(
     compare(found, np.array(drawn))
 
 
-def test_the_way_back_to_pixels_has_both_covariances() -> None:
+def test_the_inverse_mapping_to_pixels_includes_both_covariances() -> None:
     mapping = camera().mapping()
     points = ImagePoints.with_sigma(["a"], [[150.0, 120.0]], 0.2)
     back = mapping.inverse(mapping.apply(points))
@@ -152,7 +152,7 @@ def test_points_outside_the_validity_get_a_reason() -> None:
     assert outside == "lies outside the image"
 
 
-def test_every_kind_says_what_it_applies_to() -> None:
+def test_every_kind_states_what_it_applies_to() -> None:
     flat = np.ones((4, 5), dtype=np.float32)
     sensor = SensorCorrection(Fields(flat, 0 * flat, flat, flat == 0), 0.0, 0.0, 255.0, 1e3)
     plane = CameraCorrection(
@@ -191,7 +191,7 @@ def test_a_kind_with_the_model_of_another_and_a_declined_frame_are_refused() -> 
         parse_calibration(json.dumps(declined), where="scan.json")
 
 
-def test_fields_of_view_keep_show_all_or_have_the_angle() -> None:
+def test_the_field_of_view_is_kept_complete_or_has_the_given_angle() -> None:
     mapping = camera().mapping()
     assert isinstance(mapping, CameraMapping)
     keep = CorrectedImage.undistorted(mapping, "keep")

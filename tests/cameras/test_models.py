@@ -91,7 +91,7 @@ def differences(function: Callable[[Array], Array], at: Array, h: Array) -> Arra
 
 
 @EVERY
-def test_derivatives_are_those_of_differences(case: Case) -> None:
+def test_derivatives_agree_with_finite_differences(case: Case) -> None:
     mapping, uv = case.mapping(), directions()
     seen = mapping.derivatives(uv)
     np.testing.assert_allclose(mapping(uv), seen.value, rtol=1e-13)
@@ -103,7 +103,7 @@ def test_derivatives_are_those_of_differences(case: Case) -> None:
 
 
 @EVERY
-def test_the_inverse_goes_back(case: Case) -> None:
+def test_the_inverse_returns_to_the_point(case: Case) -> None:
     mapping, uv = case.mapping(), directions()
     np.testing.assert_allclose(mapping.inverse(mapping(uv)), uv, rtol=0, atol=1e-12)
 
@@ -131,7 +131,7 @@ WITH_KERNEL = pytest.mark.parametrize("case", [c for c in cases() if c.values[0]
 
 
 @WITH_KERNEL
-def test_the_kernel_is_the_mapping(case: Case) -> None:
+def test_the_kernel_agrees_with_the_mapping(case: Case) -> None:
     """To 1e-12 of the size; where the misfit is that of a corrected image point, with the slope of this."""
     mapping, uv, values = case.mapping(), directions(), case.values()
     seen = mapping.derivatives(uv)
@@ -153,7 +153,7 @@ def test_the_kernel_is_the_mapping(case: Case) -> None:
 
 
 @WITH_KERNEL
-def test_the_compiled_kernel_computes_as_its_source_does(case: Case) -> None:
+def test_the_compiled_kernel_agrees_with_its_source(case: Case) -> None:
     uv, values = directions(5), case.values()
     xy = np.zeros_like(uv)
     for ours, source in zip(
@@ -163,7 +163,7 @@ def test_the_compiled_kernel_computes_as_its_source_does(case: Case) -> None:
 
 
 @EVERY
-def test_a_model_says_what_it_is(case: Case) -> None:
+def test_a_model_describes_its_parameters(case: Case) -> None:
     model = case.model
     assert camera_model(model.name) is model
     assert set(model.usual) <= set(model.names)
@@ -183,7 +183,7 @@ def test_a_model_says_what_it_is(case: Case) -> None:
 
 
 @EVERY
-def test_it_is_converted_to_itself_and_to_every_other_model(case: Case) -> None:
+def test_the_model_is_converted_to_itself_and_to_every_other_model(case: Case) -> None:
     camera = case.mapping()
     same = convert(camera, GRID, case.model.name, case.options)
     assert same.greatest_px < 1e-6
@@ -276,7 +276,9 @@ def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
 
 
 @EVERY
-def test_commands_take_it_and_write_report_and_calibration(case: Case, reseau: Run, tmp_path: Path) -> None:
+def test_commands_accept_the_model_and_write_report_and_calibration(
+    case: Case, reseau: Run, tmp_path: Path
+) -> None:
     """`reseau bundle`, and `reseau calibrate` of a testfield, with report, calibration and its use."""
     _, path = network_file(case, tmp_path / "network.json")
     status, out, err = reseau("bundle", path, "--json", "--report", tmp_path / "B.html")

@@ -176,12 +176,12 @@ class FieldRig:
         return TestfieldProcedure(design, measure, model, name="field", sigmas=sigmas)
 
     def acquisition(
-        self, kept: Session, procedure: TestfieldProcedure | None = None, **more: Any
+        self, session: Session, procedure: TestfieldProcedure | None = None, **more: Any
     ) -> Acquisition:
         """An acquisition on this bench."""
         return Acquisition(
             self.bench,
-            kept,
+            session,
             procedure,
             watch=lambda kind, facts: self.events.append((kind, facts)),
             **more,

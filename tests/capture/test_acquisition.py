@@ -28,11 +28,11 @@ def rig() -> FieldRig:
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Session:
+def session(tmp_path: Path) -> Session:
     return Archive.open(tmp_path / "archive", create=True).begin("monday", "testfield", {"design": "field"})
 
 
-def test_the_papers_recordings_are_36_and_each_has_a_name() -> None:
+def test_the_plan_of_the_paper_has_36_named_recordings() -> None:
     assert len(EVERY) == len({step.name for step in EVERY}) == 36
     lifted = at_heights(EVERY, (0.0, 100.0))
     assert len({step.name for step in lifted}) == 72
@@ -41,15 +41,15 @@ def test_the_papers_recordings_are_36_and_each_has_a_name() -> None:
     assert [step.position for step in paper_steps(axes=("tilt",))] == [{"tilt": t} for t in (0.0, 30.0, 45.0)]
 
 
-def test_a_plan_leaves_frames_verdicts_documents_and_results(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept, rig.procedure())
+def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW, checks=2))
-    frames = kept.frames(kind="frame")
+    frames = session.frames(kind="frame")
     assert [f.step for f in frames] == [step.name for step in FEW]
     assert all(f.verdict is not None and f.verdict.ok and f.verdict.facts["points"] > 200 for f in frames)
     assert [f.facts["position"] for f in frames] == [step.position for step in FEW]
-    assert len(kept.frames(kind="check")) == 2
-    kinds = [kind for kind, _ in kept.notes()]
+    assert len(session.frames(kind="check")) == 2
+    kinds = [kind for kind, _ in session.notes()]
     assert [kinds.count(kind) for kind in ("start", "descriptor", "event", "stop", "check")] == [
         1,
         1,
@@ -57,31 +57,31 @@ def test_a_plan_leaves_frames_verdicts_documents_and_results(rig: FieldRig, kept
         1,
         1,
     ]
-    events = [note["data"] for kind, note in kept.notes("event")]
+    events = [note["data"] for kind, note in session.notes("event")]
     assert [event["frame"] for event in events] == [f.sha256 for f in frames]
-    (result,) = kept.results()
-    calibration = json.loads(kept.content(result))
+    (result,) = session.results()
+    calibration = json.loads(session.content(result))
     c = calibration["parameters"]["c"]
     assert abs(c["value"] - 57.5) < 4 * c["sigma"] < 1.0
     assert calibration["times"] == {}
     assert result.inputs == {f.name: f.sha256 for f in frames}
     assert calibration["provenance"]["inputs"] == {f.step: f.sha256 for f in frames}
-    assert kept.status == "done"
+    assert session.status == "done"
     assert rig.table.stops > 0
 
 
-def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept, rig.procedure())
+def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
     (predicted,) = [facts for kind, facts in rig.events if kind == "outlook"]
     (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == predicted["step"]]
     assert abs(predicted["sigma_c"] / came["sigma_c"] - 1) < 0.1
 
 
-def test_a_disk_that_is_full_ends_the_session_and_with_room_it_goes_on(
-    rig: FieldRig, kept: Session, monkeypatch: pytest.MonkeyPatch
+def test_a_full_disk_stops_the_session_which_can_be_resumed(
+    rig: FieldRig, session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put, count = kept.objects.put, []
+    put, count = session.objects.put, []
 
     def full(data: bytes, suffix: str) -> str:
         count.append(suffix)
@@ -89,19 +89,19 @@ def test_a_disk_that_is_full_ends_the_session_and_with_room_it_goes_on(
             raise ArchiveError("cannot be kept (No space left on device)", where="archive", do="make room")
         return put(data, suffix)
 
-    monkeypatch.setattr(kept.objects, "put", full)
-    run = rig.acquisition(kept)
+    monkeypatch.setattr(session.objects, "put", full)
+    run = rig.acquisition(session)
     with pytest.raises(ArchiveError, match="No space left on device"):
         carry_out(run, plans.poses(run, FEW))
-    assert kept.status == "failed"
+    assert session.status == "failed"
     assert rig.table.stops > 0
-    again = rig.acquisition(kept)
+    again = rig.acquisition(session)
     carry_out(again, plans.poses(again, FEW))
-    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
+    assert [f.step for f in session.frames()] == [step.name for step in FEW]
 
 
 def test_a_clock_that_jumps_changes_neither_order_nor_result(
-    rig: FieldRig, kept: Session, monkeypatch: pytest.MonkeyPatch
+    rig: FieldRig, session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Jumping(datetime):
         """An hour back with every question."""
@@ -114,59 +114,62 @@ def test_a_clock_that_jumps_changes_neither_order_nor_result(
             return datetime(2026, 3, 29, 12, tzinfo=UTC) - timedelta(hours=cls.asked)
 
     monkeypatch.setattr("reseau.archive.session.datetime", Jumping)
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    assert [f.step for f in kept.frames(kind="frame")] == [step.name for step in FEW]
-    assert kept.status == "done"
-    assert rerun(kept, rig.procedure())[0].same
+    assert [f.step for f in session.frames(kind="frame")] == [step.name for step in FEW]
+    assert session.status == "done"
+    assert rerun(session, rig.procedure())[0].same
 
 
-def test_offline_equals_live_to_the_byte(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept, rig.procedure())
+def test_offline_equals_live_to_the_byte(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    (again,) = rerun(kept, rig.procedure())
+    (again,) = rerun(session, rig.procedure())
     assert again.same
     other = rig.procedure()
     other.name = "another"
-    assert not rerun(kept, other)[0].same
+    assert not rerun(session, other)[0].same
 
 
-def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, kept: Session) -> None:
+def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, session: Session) -> None:
     rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 255) if number == 2 else pixels
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    takes = kept.frames(FEW[1].name)
+    takes = session.frames(FEW[1].name)
     assert [(f.take, f.verdict.ok) for f in takes if f.verdict] == [(0, False), (1, True)]
     assert takes[0].verdict is not None
     assert "saturated: reduce the exposure" in takes[0].verdict.why
     assert rig.camera.exposures == 6
 
 
-def test_retakes_end_and_the_session_goes_on(rig: FieldRig, kept: Session) -> None:
+def test_retakes_are_limited_and_the_session_continues(rig: FieldRig, session: Session) -> None:
     grey = np.full((240, 240), 120, np.uint8)
     rig.camera.spoil = lambda number, pixels: grey if rig.table.stands["roll"] == 90 else pixels
-    run = rig.acquisition(kept, rig.procedure(), retakes=1)
+    run = rig.acquisition(session, rig.procedure(), retakes=1)
     carry_out(run, plans.poses(run, FEW))
-    assert [len(kept.frames(step.name)) for step in FEW] == [1, 1, 2, 1, 1]
-    assert kept.status == "done"
-    declined = [f.verdict.why for f in kept.frames() if f.verdict and not f.verdict.ok]
+    assert [len(session.frames(step.name)) for step in FEW] == [1, 1, 2, 1, 1]
+    assert session.status == "done"
+    declined = [f.verdict.why for f in session.frames() if f.verdict and not f.verdict.ok]
     assert len(declined) == 2
     assert declined[0]
 
 
-def test_a_frame_exposed_while_the_table_moves_is_rejected(rig: FieldRig, kept: Session) -> None:
+def test_a_frame_exposed_while_the_table_moves_is_rejected(rig: FieldRig, session: Session) -> None:
     def push(number: int) -> None:
         if number == 1:
             rig.table.stands["tilt"] += 0.5
 
     rig.camera.during = push
-    run = rig.acquisition(kept)
+    run = rig.acquisition(session)
     carry_out(run, plans.poses(run, FEW[:1]))
-    assert [f.verdict.why for f in kept.frames() if f.verdict] == ["the table moved during the exposure", ""]
+    assert [f.verdict.why for f in session.frames() if f.verdict] == [
+        "the table moved during the exposure",
+        "",
+    ]
 
 
 @pytest.mark.parametrize("when", ["moving", "exposing"])
-def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, kept: Session, when: str) -> None:
+def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, session: Session, when: str) -> None:
     """The engine replays all messages since the checkpoint, the exposure among them."""
     pid, asked = os.getpid(), []
 
@@ -182,7 +185,7 @@ def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, kept: S
         rig.camera.during = lambda number: interrupt() if number == 3 else None
     else:
         rig.table.before = lambda axis, position: interrupt() if position == 180 else None
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     stops: list[int] = []
 
     def paused() -> Any:
@@ -193,27 +196,27 @@ def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, kept: S
     assert len(stops) == 1
     assert stops[0] > 0  # the table stood before anyone was asked
     assert rig.camera.exposures == len(FEW)
-    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
-    assert [kind for kind, _ in kept.notes()].count("event") == len(FEW)
-    assert kept.status == "done"
+    assert [f.step for f in session.frames()] == [step.name for step in FEW]
+    assert [kind for kind, _ in session.notes()].count("event") == len(FEW)
+    assert session.status == "done"
 
 
-def test_a_session_that_was_stopped_goes_on_where_it_stood_and_ends_the_same(
-    rig: FieldRig, kept: Session, tmp_path: Path
+def test_a_stopped_session_is_resumed_with_the_same_result(
+    rig: FieldRig, session: Session, tmp_path: Path
 ) -> None:
     pid = os.getpid()
     rig.camera.during = lambda number: os.kill(pid, signal.SIGTERM) if number == 3 else None
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    assert kept.status == "stopped"
-    assert len(kept.frames()) < len(FEW)
-    assert not kept.results()
+    assert session.status == "stopped"
+    assert len(session.frames()) < len(FEW)
+    assert not session.results()
     rig.camera.during = lambda number: None
     moves = len(rig.table.moves)
-    again = rig.acquisition(kept, rig.procedure())
+    again = rig.acquisition(session, rig.procedure())
     carry_out(again, plans.poses(again, FEW))
-    assert kept.status == "done"
-    assert [f.step for f in kept.frames()] == [step.name for step in FEW]
+    assert session.status == "done"
+    assert [f.step for f in session.frames()] == [step.name for step in FEW]
     assert rig.camera.exposures == len(FEW)
     assert len(rig.table.moves) - moves <= 3 * 3  # poses that were done are not gone to again
     other = FieldRig()
@@ -222,10 +225,10 @@ def test_a_session_that_was_stopped_goes_on_where_it_stood_and_ends_the_same(
     )
     straight = other.acquisition(undisturbed, other.procedure())
     carry_out(straight, plans.poses(straight, FEW))
-    assert kept.content(kept.results()[-1]) == undisturbed.content(undisturbed.results()[-1])
+    assert session.content(session.results()[-1]) == undisturbed.content(undisturbed.results()[-1])
 
 
-def test_ctrl_c_where_it_is_asked_what_to_do_stops_it(rig: FieldRig, kept: Session) -> None:
+def test_ctrl_c_at_the_prompt_stops_the_session(rig: FieldRig, session: Session) -> None:
     def interrupt(count: int) -> None:
         if count == 2:
             os.kill(os.getpid(), signal.SIGINT)
@@ -236,58 +239,62 @@ def test_ctrl_c_where_it_is_asked_what_to_do_stops_it(rig: FieldRig, kept: Sessi
         raise KeyboardInterrupt
 
     rig.camera.during = interrupt
-    run = rig.acquisition(kept)
+    run = rig.acquisition(session)
     carry_out(run, plans.poses(run, FEW), paused=paused)
-    assert kept.status == "stopped"
-    assert [document["exit_status"] for _, document in kept.notes("stop")] == ["success"]
+    assert session.status == "stopped"
+    assert [document["exit_status"] for _, document in session.notes("stop")] == ["success"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_terminal_that_is_closed_stops_it_at_rest(rig: FieldRig, kept: Session, number: int) -> None:
+def test_closing_the_terminal_stops_the_session_and_the_instruments(
+    rig: FieldRig, session: Session, number: int
+) -> None:
     pid = os.getpid()
     rig.camera.during = lambda count: os.kill(pid, number) if count == 2 else None
-    run = rig.acquisition(kept)
+    run = rig.acquisition(session)
     carry_out(run, plans.poses(run, FEW))
-    assert kept.status == "stopped"
+    assert session.status == "stopped"
     assert rig.table.stops > 0
-    assert len(kept.frames()) < len(FEW)
+    assert len(session.frames()) < len(FEW)
     assert rig.events[-1] == ("end", {"status": "stopped", "why": ""})
 
 
-def test_an_instrument_that_fails_ends_the_session_at_rest_and_nothing_is_lost(
-    rig: FieldRig, kept: Session
+def test_a_failing_instrument_ends_the_session_without_losses_and_stops_the_others(
+    rig: FieldRig, session: Session
 ) -> None:
     def stall(axis: str, position: float) -> None:
         if position == 180:
             raise StateError("stalled", where="table", command="move", do="free the axis")
 
     rig.table.before = stall
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     with pytest.raises(StateError, match="stalled; free the axis"):
         carry_out(run, plans.poses(run, FEW))
-    assert kept.status == "failed"
-    assert len(kept.frames()) == 3
+    assert session.status == "failed"
+    assert len(session.frames()) == 3
     assert rig.table.stops > 0
     assert rig.table.stands["tilt"] != 0  # it stays where it stopped
 
 
-def test_it_parks_only_if_asked_and_only_when_done(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept)
+def test_the_table_parks_only_if_requested_and_only_after_completion(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session)
     carry_out(run, plans.poses(run, FEW[:2]))
     assert rig.table.stands["tilt"] == 30
-    again = rig.acquisition(kept)
+    again = rig.acquisition(session)
     carry_out(again, plans.poses(again, FEW[:2]), park={"tilt": 5.0})
     assert rig.table.stands["tilt"] == 5
     assert rig.camera.exposures == 2
 
 
-def test_it_retreats_only_if_asked_and_only_when_ended_early(rig: FieldRig, kept: Session) -> None:
+def test_the_table_retreats_only_if_requested_and_only_after_an_early_end(
+    rig: FieldRig, session: Session
+) -> None:
     def stall(axis: str, position: float) -> None:
         if position == 90:
             raise StateError("stalled", where="table", command="move")
 
     rig.table.before = stall
-    run = rig.acquisition(kept)
+    run = rig.acquisition(session)
     with pytest.raises(StateError, match="stalled"):
         carry_out(run, plans.poses(run, FEW[:3]), retreat={"tilt": 7.0})
     assert rig.table.stands["tilt"] == 7
@@ -303,8 +310,8 @@ def test_it_retreats_only_if_asked_and_only_when_ended_early(rig: FieldRig, kept
     assert rig.table.stands["tilt"] == 30
 
 
-def test_an_own_plan_is_a_generator(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept)
+def test_a_user_plan_is_a_generator(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session)
 
     def twice_from_both_sides() -> Plan:
         for tilt in (10.0, 350.0):
@@ -313,36 +320,36 @@ def test_an_own_plan_is_a_generator(rig: FieldRig, kept: Session) -> None:
         return "seen"
 
     assert carry_out(run, twice_from_both_sides()) == "seen"
-    picture = kept.picture(kept.frames()[0])
+    picture = session.picture(session.frames()[0])
     assert picture.pixels.dtype == np.float32
     assert rig.camera.exposures == 4
 
 
-def test_wrong_use_is_refused_before_anything_moves(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept)
+def test_wrong_use_is_refused_before_anything_moves(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session)
     with pytest.raises(UsageError, match=r"has no axis height; use tilt, roll, camera_roll"):
         carry_out(run, plans.poses(run, [Step("a", {"height": 1.0})]))
     with pytest.raises(UsageError, match="has no UltrasonicScanner"):
         carry_out(run, plans.scan(run))
     with pytest.raises(UsageError, match="needs an operator"):
         carry_out(run, plans.oscilloscope(run))
-    wrong = rig.acquisition(kept, camera="table")
+    wrong = rig.acquisition(session, camera="table")
     with pytest.raises(UsageError, match="is not a Camera"):
         carry_out(wrong, plans.frames(wrong, 1))
 
 
-def test_failed_checks_stop_the_acquisition(rig: FieldRig, kept: Session) -> None:
+def test_failed_checks_stop_the_acquisition(rig: FieldRig, session: Session) -> None:
     rig.camera.spoil = lambda number, pixels: pixels // 20
-    run = rig.acquisition(kept)
+    run = rig.acquisition(session)
     with pytest.raises(StateError, match=r"of full scale: expose more.*--checks 0"):
         carry_out(run, plans.poses(run, FEW, checks=3))
-    assert len(kept.frames(kind="check")) == 3
-    assert not kept.frames(kind="frame")
+    assert len(session.frames(kind="check")) == 3
+    assert not session.frames(kind="frame")
 
 
-def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, kept: Session) -> None:
+def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, session: Session) -> None:
     """What was predicted of a pose from the design matrix comes about."""
-    run = rig.acquisition(kept, rig.procedure())
+    run = rig.acquisition(session, rig.procedure())
     goal = Goal("c", 0.007, "mm")
     first = (EVERY[0], EVERY[4], EVERY[9])
     candidates = [step for step in EVERY if step.position["camera_roll"] == 0]
@@ -356,13 +363,13 @@ def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, kept
     for name, sigma in predicted:
         assert sigma is None or 0.9 < came[name] / sigma < 1.1
     # It begins anew: every choice is remembered.
-    again = rig.acquisition(kept, rig.procedure())
+    again = rig.acquisition(session, rig.procedure())
     exposures = rig.camera.exposures
     assert carry_out(again, plans.until(again, goal, first, candidates)) == ""
     assert rig.camera.exposures == exposures
 
 
-def test_looking_for_the_next_pose_ends_when_it_is_stopped(rig: FieldRig, kept: Session) -> None:
+def test_the_search_for_the_next_pose_can_be_stopped(rig: FieldRig, session: Session) -> None:
     looked: list[str] = []
 
     class Slow:
@@ -385,19 +392,19 @@ def test_looking_for_the_next_pose_ends_when_it_is_stopped(rig: FieldRig, kept: 
         def finish(self) -> dict[str, str]:
             return {}
 
-    run = rig.acquisition(kept, Slow())  # type: ignore[arg-type]
+    run = rig.acquisition(session, Slow())  # type: ignore[arg-type]
     carry_out(run, plans.until(run, Goal("c", 0.1, "mm"), FEW[:1], EVERY))
-    assert kept.status == "stopped"
+    assert session.status == "stopped"
     assert len(looked) < 6
 
 
-def test_the_closed_loop_reports_when_no_pose_is_left(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept, rig.procedure())
+def test_the_closed_loop_reports_when_no_pose_is_left(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
     why = carry_out(run, plans.until(run, Goal("c", 1e-9, "mm"), FEW[:3], FEW[3:]))
     assert "no pose is left" in why
 
 
-def test_a_goal_for_what_is_not_estimated_is_refused(rig: FieldRig, kept: Session) -> None:
-    run = rig.acquisition(kept, rig.procedure())
+def test_a_goal_for_a_parameter_that_is_not_estimated_is_refused(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
     with pytest.raises(EstimationError, match="is not estimated; use c, x0, y0, K1"):
         carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))

@@ -23,7 +23,7 @@ AXES = "[instruments.table.options.axes.tilt]\nper_unit = 1000.0\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "schema"),
         ("x = ", "no TOML"),
@@ -32,12 +32,12 @@ AXES = "[instruments.table.options.axes.tilt]\nper_unit = 1000.0\n"
         (HEAD + "[instruments.table]\ndriver = 'zaber'\n", "address"),
     ],
 )
-def test_a_file_that_is_no_bench_is_refused_by_key(text: str, said: str) -> None:
-    with pytest.raises(FormatError, match=said):
+def test_an_invalid_bench_file_is_refused_with_its_key(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
         BenchFile.parse_toml(text, where="bench.toml")
 
 
-def test_what_cannot_be_built_is_named_all_at_once() -> None:
+def test_all_instruments_that_cannot_be_created_are_named_together() -> None:
     text = (
         HEAD
         + TABLE
@@ -49,11 +49,11 @@ def test_what_cannot_be_built_is_named_all_at_once() -> None:
     with pytest.raises(BenchError) as caught:
         Bench(BenchFile.parse_toml(text, where="bench.toml"))
     assert len(caught.value.failures) == 5
-    for said in ("nothing", "gain", "colour", "tcp://x", "table"):
-        assert said in str(caught.value)
+    for message in ("nothing", "gain", "colour", "tcp://x", "table"):
+        assert message in str(caught.value)
 
 
-def test_a_bench_that_does_not_answer_fails_as_one_in_time() -> None:
+def test_all_silent_instruments_are_reported_together_in_time() -> None:
     text = HEAD + TABLE + AXES + '[instruments.sonar]\ndriver = "ping360"\naddress = "tcp://127.0.0.1:1"\n'
     bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
     began = time.monotonic()
@@ -65,7 +65,7 @@ def test_a_bench_that_does_not_answer_fails_as_one_in_time() -> None:
         bench["camera"]
 
 
-def test_limits_of_the_bench_are_kept() -> None:
+def test_limits_of_the_bench_are_respected() -> None:
     text = HEAD + TABLE + "limits = {speed = [1.0, 20.0]}\n" + AXES
     bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
     with pytest.raises(UsageError, match="1…20"):
@@ -119,13 +119,13 @@ def test_every_scanner_of_the_simulated_bench_sees_the_same_rods_in_millimetres(
         assert not any(simulated.violations.values())
 
 
-def test_a_table_or_a_family_that_nobody_simulates_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_simulated_table_or_family_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     for wrong in (["--table", "acme"], ["--family", "acme"]):
         assert run(["bench", "sim", "--seconds", "0.01", *wrong]) == 2
         assert "acme" in capsys.readouterr().err
 
 
-def test_check_tells_every_failure_and_its_exit_status(
+def test_check_reports_every_failure_and_sets_the_exit_status(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "bench.toml"
@@ -145,25 +145,27 @@ def test_check_tells_every_failure_and_its_exit_status(
             for number in range(40):
                 script.fault_at(script.count + number, Fault("dropped"))
         assert run(["bench", "check", "--bench", str(path), "--seconds", "0.5"]) == 1
-        said = capsys.readouterr().out
-    assert said.count("failed") == len(simulated.machines)
-    assert "did not answer" in said
-    assert "└── oscilloscope" in said
+        message = capsys.readouterr().out
+    assert message.count("failed") == len(simulated.machines)
+    assert "did not answer" in message
+    assert "└── oscilloscope" in message
     assert run(["bench", "check", "--bench", str(tmp_path / "none.toml")]) == 2
     with pytest.raises(InputError):
         Bench.read(tmp_path / "none.toml")
 
 
-def test_sim_writes_a_bench_that_check_accepts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_writes_a_bench_file_that_check_accepts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "bench.toml"
     assert run(["bench", "sim", "--out", str(path), "--seconds", "0.01"]) == 0
-    wanted = {"table", "scanner", "bmode", "pulser", "oscilloscope"}
-    assert set(BenchFile.read(path).instruments) >= wanted
+    expected = {"table", "scanner", "bmode", "pulser", "oscilloscope"}
+    assert set(BenchFile.read(path).instruments) >= expected
     assert run(["bench", "sim", "--seconds", "0.01"]) == 0
     assert "reseau-bench/1" in capsys.readouterr().out
 
 
-def test_sim_has_the_testfield_flat_where_it_is_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sim_simulates_a_plane_testfield_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[SimulatedBench] = []
 
     def bench(seed: int, **options: Any) -> SimulatedBench:
@@ -176,7 +178,7 @@ def test_sim_has_the_testfield_flat_where_it_is_asked_to(monkeypatch: pytest.Mon
     assert [each.laboratory.field.bend_mm > 0 for each in made] == [True, False]
 
 
-def test_list_tells_what_was_found_and_why_a_search_failed(
+def test_list_shows_found_instruments_and_why_a_search_failed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # No real search: it would broadcast.
@@ -197,6 +199,6 @@ def test_list_tells_what_was_found_and_why_a_search_failed(
     assert "zaber" in document["drivers"]
 
 
-def test_plugins_that_are_not_there_are_said() -> None:
+def test_missing_plugins_are_reported() -> None:
     with pytest.raises(UsageError, match="there are"):
         plugin("reseau.instruments", "none")

@@ -21,49 +21,49 @@ TILT, SIGMAS = (4e-3, -3e-3), (0.05, 5e-3, 1e-3)
 FRONTAL = at_heights((Step("frontal", dict.fromkeys(AXES, 0.0)),), HEIGHTS)
 
 
-def made() -> FieldRig:
+def make_rig() -> FieldRig:
     field = FieldBench(seed=3, bend_mm=0.0, stage_tilt=TILT, stage_sigma_mm=SIGMAS[0])
     return FieldRig(field, (*AXES, "z"))
 
 
-def begun(folder: Path) -> Session:
+def new_session(folder: Path) -> Session:
     return Archive.open(folder, create=True).begin("monday", "testfield", {"design": "field"})
 
 
 def test_frontal_frames_at_several_heights_give_the_principal_distance(tmp_path: Path) -> None:
-    rig, kept, live = made(), begun(tmp_path / "archive"), made().procedure(sigmas=SIGMAS)
-    run = rig.acquisition(kept, live)
+    rig, session, live = make_rig(), new_session(tmp_path / "archive"), make_rig().procedure(sigmas=SIGMAS)
+    run = rig.acquisition(session, live)
     carry_out(run, plans.poses(run, FRONTAL))
     found = live.calibrated()
     assert isinstance(found, Calibrated)
     result = found.result
     assert len(np.unique(result.fit.values.rotation, axis=0)) == 1  # one orientation
     assert 0.9 < result.sigma0 < 1.1
-    c = json.loads(kept.content(kept.results()[-1]))["parameters"]["c"]
+    c = json.loads(session.content(session.results()[-1]))["parameters"]["c"]
     assert abs(c["value"] - 57.5) < 3 * c["sigma"] < 0.15
-    assert all(again.same for again in rerun(kept, rig.procedure(sigmas=SIGMAS)))
+    assert all(again.same for again in rerun(session, rig.procedure(sigmas=SIGMAS)))
 
     with pytest.raises(EstimationError):  # each height an image of its own: a plane leaves c and the distance
-        rerun(kept, rig.procedure())
+        rerun(session, rig.procedure())
 
 
-def test_a_session_stopped_between_heights_goes_on_and_ends_the_same(tmp_path: Path) -> None:
-    rig, kept, straight = made(), begun(tmp_path / "archive"), begun(tmp_path / "straight")
+def test_a_session_stopped_between_heights_is_resumed_with_the_same_result(tmp_path: Path) -> None:
+    rig, session, straight = make_rig(), new_session(tmp_path / "archive"), new_session(tmp_path / "straight")
     rig.camera.during = lambda number: os.kill(os.getpid(), signal.SIGTERM) if number == 3 else None
-    run = rig.acquisition(kept, rig.procedure(sigmas=SIGMAS))
+    run = rig.acquisition(session, rig.procedure(sigmas=SIGMAS))
     carry_out(run, plans.poses(run, FRONTAL))
-    assert kept.status == "stopped"
+    assert session.status == "stopped"
     rig.camera.during = lambda number: None
-    again = rig.acquisition(kept, rig.procedure(sigmas=SIGMAS))
+    again = rig.acquisition(session, rig.procedure(sigmas=SIGMAS))
     carry_out(again, plans.poses(again, FRONTAL))
-    other = made()
+    other = make_rig()
     run = other.acquisition(straight, other.procedure(sigmas=SIGMAS))
     carry_out(run, plans.poses(run, FRONTAL))
-    assert kept.content(kept.results()[-1]) == straight.content(straight.results()[-1])
+    assert session.content(session.results()[-1]) == straight.content(straight.results()[-1])
 
 
-def test_what_another_height_would_bring_is_what_it_brings() -> None:
-    rig = made()
+def test_the_predicted_gain_of_another_height_is_reached() -> None:
+    rig = make_rig()
     live = rig.procedure(sigmas=SIGMAS)
     for step in FRONTAL[:3]:
         rig.table.stands.update(step.position)

@@ -82,7 +82,7 @@ def faulty(seed: int) -> Iterator[Bench]:
             yield bench
 
 
-def ended(place: Path, kind: str, after_s: float | None, seed: int = 0) -> bool:
+def finished(place: Path, kind: str, after_s: float | None, seed: int = 0) -> bool:
     """Whether a process came to its end before it was killed, or an instrument ended it."""
     code = exit_code(work, (place, kind, seed), after_s, HEAVY)
     assert code in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
@@ -110,10 +110,10 @@ def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["testfield", "frames", "faults"])
 @pytest.mark.timeout(7200)
-def test_killed_at_any_moment_a_session_ends_as_if_undisturbed(kind: str, tmp_path: Path) -> None:
+def test_a_killed_and_resumed_session_gives_the_same_result(kind: str, tmp_path: Path) -> None:
     rng = random.Random(kind)
     began = time.monotonic()
-    while not ended(tmp_path / "undisturbed", kind, None):
+    while not finished(tmp_path / "undisturbed", kind, None):
         assert kind == "faults"  # those of the instruments end a session; it is resumed
     seconds = time.monotonic() - began
     undisturbed = held(tmp_path / "undisturbed", kind)
@@ -122,7 +122,7 @@ def test_killed_at_any_moment_a_session_ends_as_if_undisturbed(kind: str, tmp_pa
     while kills < KILLS // 3:
         place = tmp_path / f"killed {sessions}"
         # Half of an undisturbed run on average: each session is killed a few times.
-        while not ended(place, kind, rng.uniform(0, seconds), seed=kills + 7):
+        while not finished(place, kind, rng.uniform(0, seconds), seed=kills + 7):
             kills += 1
         assert held(place, kind) == undisturbed
         sessions += 1

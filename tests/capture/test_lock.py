@@ -71,9 +71,9 @@ def test_a_lock_of_another_user_is_reported_and_taken_when_it_is_free() -> None:
             pass
         with BenchLock(["a"], "mine", folder):
             command = [sys.executable, "-c", textwrap.dedent(AS_ANOTHER), str(folder)]
-            said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert said[0].startswith("a: is in use by mine (process")
-    assert said[1:] == ["free"]
+            message = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert message[0].startswith("a: is in use by mine (process")
+    assert message[1:] == ["free"]
 
 
 def test_two_names_of_one_device_are_one_instrument(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def test_the_width_of_edges_is_measured(sigma: float) -> None:
     assert edge_sigma(scene(sigma=sigma)) == pytest.approx(sigma, abs=0.12 * sigma)
 
 
-def test_a_frame_without_edges_has_no_focus() -> None:
+def test_a_frame_without_edges_has_no_focus_value() -> None:
     flat = np.random.default_rng(0).normal(100, 3, (60, 60)).round().astype(np.uint8)
     assert edge_sigma(Frame(flat, 255.0)) == float("inf")
 
@@ -48,7 +48,7 @@ def test_a_shift_is_found_within_its_sigma(dx: float, dy: float, seed: int) -> N
     assert np.all(sigma < 0.01)
 
 
-def test_a_scene_without_edges_gives_a_fault_that_any_index_can_store() -> None:
+def test_a_scene_without_edges_gives_a_fault_without_nan() -> None:
     """JSON knows no infinity; PostgreSQL refuses it."""
     flat = [Frame(np.full((60, 60), 90, np.uint8), 255.0)] * 2
     found = readiness(flat)
@@ -56,7 +56,7 @@ def test_a_scene_without_edges_gives_a_fault_that_any_index_can_store() -> None:
     assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["edge_px"] is None
 
 
-def test_a_quiet_bench_is_ready() -> None:
+def test_a_bench_without_faults_is_ready() -> None:
     found = readiness([scene(seed=k) for k in range(4)])
     assert found
     assert found.vibration_px < 3 * found.vibration_sigma_px

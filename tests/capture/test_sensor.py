@@ -62,7 +62,7 @@ def kept(tmp_path: Path) -> Iterator[Session]:
         yield archive.begin("s", "sensor", {})
 
 
-def test_a_series_is_streamed_and_the_camera_set_back(kept: Session) -> None:
+def test_a_series_is_streamed_and_the_camera_settings_are_restored(kept: Session) -> None:
     rig = Rig()
     with rig.bench:
         rig.carry_out(kept)
@@ -83,9 +83,7 @@ def test_a_series_is_streamed_and_the_camera_set_back(kept: Session) -> None:
     assert (gaps == 1).mean() > 0.9
 
 
-def test_a_frame_that_does_not_come_is_asked_for_again(
-    kept: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_frame_is_requested_again(kept: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     rig, fails = Rig(), [3, 17, 30]
     taken, frames = [0], type(rig.camera).frames
 
@@ -105,7 +103,7 @@ def test_a_frame_that_does_not_come_is_asked_for_again(
 
 
 @pytest.mark.parametrize("decision", ["resume", "stop"])
-def test_interrupted_in_the_middle_of_a_series_it_goes_on_there(
+def test_a_series_is_resumed_where_it_was_interrupted(
     kept: Session, monkeypatch: pytest.MonkeyPatch, decision: Decision
 ) -> None:
     rig = Rig()
@@ -136,18 +134,21 @@ def test_interrupted_in_the_middle_of_a_series_it_goes_on_there(
     assert again.same
 
 
-def test_no_light_and_too_much_of_it_are_said(tmp_path: Path) -> None:
-    for light, said in ((0.0, "gives almost no signal at 8 ms"), (1e4, "saturated at its shortest exposure")):
+def test_missing_and_excessive_light_are_reported(tmp_path: Path) -> None:
+    for light, message in (
+        (0.0, "gives almost no signal at 8 ms"),
+        (1e4, "saturated at its shortest exposure"),
+    ):
         with Archive.open(tmp_path / f"{light:g}", create=True) as archive, (rig := Rig(light)).bench:
             kept = archive.begin("s", "sensor", {})
-            with pytest.raises(StateError, match=said):
+            with pytest.raises(StateError, match=message):
                 rig.carry_out(kept, SensorSeriesPlan(5, 2, 8000.0))
             assert rig.camera.settings.to_dict()["exposure_us"] == 1000.0
             assert not kept.frames(kind="frame")
 
 
 @pytest.mark.parametrize("light", [0.1, 3.0])
-def test_exposures_reach_from_little_light_to_saturation(kept: Session, light: float) -> None:
+def test_exposures_range_from_little_light_to_saturation(kept: Session, light: float) -> None:
     rig = Rig(light)
     with rig.bench:
         rig.carry_out(kept, SensorSeriesPlan(10, 2, 60_000.0))
@@ -155,7 +156,7 @@ def test_exposures_reach_from_little_light_to_saturation(kept: Session, light: f
     assert validity["saturated"]
 
 
-def test_the_procedure_holds_no_frames() -> None:
+def test_the_procedure_keeps_no_frames_in_memory() -> None:
     rng, peaks = np.random.default_rng(0), []
     for count in (10, 200):
         live = SensorProcedure(name="eye")
@@ -170,7 +171,7 @@ def test_the_procedure_holds_no_frames() -> None:
     assert peaks[1] < 9 * 8 * 200 * 300
 
 
-def test_what_is_no_frame_of_the_series_is_no_good() -> None:
+def test_frames_that_are_not_part_of_the_series_are_rejected() -> None:
     live = SensorProcedure(name="eye")
     frame = Frame(np.full((8, 8), 100, dtype=np.uint8), 255.0)
     assert not live.on_frame(frame, Step("00000")).ok
@@ -192,7 +193,7 @@ def work(place: Path) -> None:
         rig.carry_out(kept)
 
 
-def ended(place: Path, after_s: float | None) -> bool:
+def finished(place: Path, after_s: float | None) -> bool:
     """Whether a process came to its end before it was killed."""
     code = exit_code(work, (place,), after_s, ["reseau.procedures.sensor"])
     assert code in (0, -signal.SIGKILL)
@@ -209,13 +210,13 @@ def stored(place: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_killed_at_any_moment_no_frame_is_lost_or_doubled(tmp_path: Path) -> None:
+def test_no_frame_is_lost_or_duplicated_when_the_process_is_killed(tmp_path: Path) -> None:
     rng, began = random.Random(1), time.monotonic()
-    assert ended(tmp_path / "undisturbed", None)
+    assert finished(tmp_path / "undisturbed", None)
     seconds, kills = time.monotonic() - began, 0
     for number in range(12):
         place, held = tmp_path / f"killed {number}", dict[str, str]()
-        while not ended(place, rng.uniform(0, 0.7) * seconds):
+        while not finished(place, rng.uniform(0, 0.7) * seconds):
             kills, before, held = kills + 1, held, stored(place)
             assert before.items() <= held.items()
         assert held.items() <= stored(place).items()

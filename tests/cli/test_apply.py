@@ -85,7 +85,7 @@ def test_straight_lines_are_straight_in_an_undistorted_image(
         assert np.abs(centroid - place).max() < 0.02
 
 
-def test_points_of_a_camera_agree_with_its_undistorted_image_and_carry_both_covariances(
+def test_points_of_a_camera_agree_with_its_undistorted_image_and_include_both_covariances(
     camera: Path, tmp_path: Path, reseau: Run
 ) -> None:
     lens = OpenCV.from_parameters(LENS)
@@ -269,15 +269,15 @@ def test_a_frame_is_corrected_for_its_sensor(sensor: Path, tmp_path: Path, resea
 def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, reseau: Run) -> None:
     (tmp_path / "p.csv").write_text("id,x,y\na,1,1\n")
     write_image(tmp_path / "large.png", np.zeros((50, 50), np.uint8))
-    for source, said in (("p.csv", "corrects images, not points"), ("large.png", "has 50×50 pixels")):
+    for source, message in (("p.csv", "corrects images, not points"), ("large.png", "has 50×50 pixels")):
         status, _, err = reseau("apply", sensor, tmp_path / source)
         assert status == 2
-        assert said in err
+        assert message in err
         assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--object",), "--object: needs a calibration of an oscilloscope, not of a camera"),
         (("--exposure-ms", 5), "--exposure-ms: needs a calibration of a sensor, not of a camera"),
@@ -287,8 +287,8 @@ def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, r
     ],
 )
 def test_options_of_another_kind_are_refused(
-    camera: Path, tmp_path: Path, reseau: Run, options: tuple[object, ...], said: str
+    camera: Path, tmp_path: Path, reseau: Run, options: tuple[object, ...], message: str
 ) -> None:
     write_image(tmp_path / "photo.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     status, _, err = reseau("apply", camera, tmp_path / "photo.png", *options)
-    assert (status, err) == (2, f"reseau: {said}\n")
+    assert (status, err) == (2, f"reseau: {message}\n")

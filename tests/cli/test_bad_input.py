@@ -93,7 +93,7 @@ CASES = [
 
 @pytest.mark.parametrize(("case", "named", "reason"), CASES, ids=[case for case, *_ in CASES])
 @pytest.mark.parametrize("command", ["measure", "refine"])
-def test_bad_input_is_one_line_and_leaves_nothing(
+def test_bad_input_is_reported_in_one_line_and_writes_nothing(
     reseau: Run, photo: Any, tmp_path: Path, command: str, case: str, named: str, reason: str
 ) -> None:
     image, design = make(case, photo, tmp_path)
@@ -147,7 +147,7 @@ def test_fewer_marks_than_parameters_is_a_failure(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_wrong_use_is_one_line_with_status_two(
+def test_wrong_use_is_reported_in_one_line_with_status_two(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], reason: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -93,7 +93,7 @@ def plan(run, tilts, average=1):
 """
 
 
-def test_a_plan_of_ones_own_is_carried_out_and_resumed_as_it_was_begun(
+def test_a_user_plan_is_carried_out_and_resumed_with_its_original_code(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("own.py").write_text(OWN)
@@ -143,7 +143,7 @@ def test_an_invalid_own_plan_is_reported_in_one_line(
     assert not Path("archive").exists()
 
 
-def test_what_an_archive_cannot_do_is_reported_in_one_line(
+def test_impossible_requests_to_an_archive_are_reported_in_one_line(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert capture("frames", "--name", "a") == 0
@@ -165,7 +165,7 @@ def test_what_an_archive_cannot_do_is_reported_in_one_line(
         assert says in err
 
 
-def test_options_come_from_a_toml_file_and_the_command_line_wins(
+def test_options_come_from_a_toml_file_and_the_command_line_takes_precedence(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("plan.toml").write_text('count = 3\nname = "toml"\n')
@@ -182,7 +182,7 @@ def test_options_come_from_a_toml_file_and_the_command_line_wins(
     assert "plan.toml: unknown key `cuont`; use " in capsys.readouterr().err
 
 
-def test_toml_names_options_as_the_command_line_does_and_may_hold_lists_and_tables(
+def test_toml_keys_are_option_names_and_values_may_be_lists_and_tables(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("monday.toml").write_text(
@@ -229,7 +229,7 @@ def test_events_for_programs_are_json_lines(rig: FieldRig, capsys: pytest.Captur
     assert failed == f"reseau: {events[-1]['why']}\n"
 
 
-def test_a_session_that_failed_is_resumed_where_it_stood(
+def test_a_failed_session_is_resumed_where_it_stopped(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stall(axis: str, position: float) -> None:
@@ -293,7 +293,7 @@ def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.Ca
         (["frames", "--archive", "poses.csv"], "cannot be created"),
     ],
 )
-def test_what_cannot_be_done_is_reported_in_one_line(
+def test_impossible_requests_are_reported_in_one_line(
     rig: FieldRig, capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
 ) -> None:
     assert capture(*arguments) in (1, 2)
@@ -335,7 +335,7 @@ def test_a_session_that_another_process_carries_out_is_not_resumed(
         assert not archive.session("a").frames()
 
 
-def test_sections_are_those_of_the_scanner_that_is_named_and_the_session_keeps_to_it(
+def test_sections_come_from_the_named_scanner_also_after_resume(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = ("near", "far")
@@ -366,7 +366,7 @@ def test_bad_frames_are_reported_and_stored(rig: FieldRig, capsys: pytest.Captur
     assert [(f["take"], f["ok"]) for f in document["frames"]] == [(0, False), (1, True), (0, True)]
 
 
-def test_the_operator_is_asked_and_a_photograph_that_shows_no_reseau_ends_it(
+def test_the_operator_is_asked_and_a_photograph_without_a_reseau_ends_the_session(
     rig: FieldRig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     designs.standard_reseau().write("reseau.json")

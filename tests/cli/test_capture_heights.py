@@ -29,7 +29,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
     return rig
 
 
-def test_one_frontal_pose_at_three_heights_calibrates_and_is_the_same_again(
+def test_one_frontal_pose_at_three_heights_gives_a_reproducible_calibration(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0")
@@ -44,7 +44,7 @@ def test_one_frontal_pose_at_three_heights_calibrates_and_is_the_same_again(
     assert json.loads(capsys.readouterr().out)["same"]
 
 
-def test_a_sigma_of_nothing_is_refused(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sigma_of_zero_is_refused(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["capture", "testfield", "--design", "field.json", "--height-sigma", "0"]) == 2
     assert "--height-sigma" in capsys.readouterr().err
     assert rig.camera.exposures == 0

@@ -54,7 +54,7 @@ def asked(lamp: LampScene, camera: VideoCamera, tmp_path: Path, monkeypatch: pyt
     """A folder with a bench; and what the operator was asked to do, who does it at once."""
     asked: list[str] = []
 
-    def said(text: str = "", err: bool = False, **_: Any) -> None:
+    def message(text: str = "", err: bool = False, **_: Any) -> None:
         asked.append(text)
         if "cover" in text:
             lamp.light = 0.0
@@ -66,7 +66,7 @@ def asked(lamp: LampScene, camera: VideoCamera, tmp_path: Path, monkeypatch: pyt
             lamp.light = step * float(os.environ.get("LIGHT_OF_THE_EDGE", "2"))
 
     monkeypatch.setattr("reseau_drivers.camera.KernelNode", lambda address: camera.open())
-    monkeypatch.setattr(typer, "echo", said)
+    monkeypatch.setattr(typer, "echo", message)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 99))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # locks of parallel tests are apart
     monkeypatch.chdir(tmp_path)
@@ -87,8 +87,8 @@ def test_a_sensor_is_calibrated_on_the_bench(
     asked: list[str], sensor: PixelSensor, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert capture("--edge", "--out", "sensor.json", "--json") == 0
-    said = capsys.readouterr().out
-    events = [json.loads(line) for line in said.splitlines()]
+    message = capsys.readouterr().out
+    events = [json.loads(line) for line in message.splitlines()]
     assert [event["event"] for event in events].count("frame") == 4 * (14 + 12 + 1)
     assert [event["event"] for event in events[-4:]] == ["result", "result", "end", "calibration"]
     found = events[-1]["parameters"]
@@ -112,14 +112,14 @@ def test_a_sensor_is_calibrated_on_the_bench(
     assert len(curve["sigma"]) == len(curve["gaussian"]) == len(curve["mtf"])
 
 
-def test_every_raw_frame_is_kept_and_the_calibration_computed_again_from_them(
+def test_every_raw_frame_is_archived_and_the_calibration_can_be_recomputed(
     asked: list[str], camera: VideoCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert capture("--edge") == 0
-    said = capsys.readouterr().out
-    assert "108/108 edge 00 003: good" in said
-    assert "monday: done, 108 frames in archive\n  calibration.json\n  report.html\n" in said
-    assert "mtf50_free" in said
+    message = capsys.readouterr().out
+    assert "108/108 edge 00 003: good" in message
+    assert "monday: done, 108 frames in archive\n  calibration.json\n  report.html\n" in message
+    assert "mtf50_free" in message
     kept = frames_of()
     assert len(kept) == len({step for step, _ in kept}) == 108
     assert run(["archive", "show", "monday", "--out", "results"]) == 0
@@ -134,7 +134,7 @@ def test_every_raw_frame_is_kept_and_the_calibration_computed_again_from_them(
     assert run(["archive", "verify"]) == 0
 
 
-def test_a_session_that_was_interrupted_goes_on_where_it_stood(
+def test_an_interrupted_session_is_resumed_where_it_stopped(
     asked: list[str], lamp: LampScene, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, left = Session.store, [20]

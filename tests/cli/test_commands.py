@@ -29,7 +29,7 @@ def test_help_names_every_command(reseau: Run) -> None:
         assert command in out
 
 
-def test_help_is_not_kept_waiting_by_heavy_imports() -> None:
+def test_help_does_not_import_heavy_packages() -> None:
     heavy = ("numpy", "scipy", "cv2", "matplotlib", "pydantic")
     code = f"import reseau.cli, sys; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
@@ -47,7 +47,7 @@ def _processor_seconds(code: str) -> float:
     return min(times)
 
 
-def test_help_answers_at_once() -> None:
+def test_help_is_fast() -> None:
     seconds = _processor_seconds("from reseau.cli import main; main(['--help'])")
     # Shared caches and cores make a busy machine slower also in processor time: by as much as Typer itself.
     typer = _processor_seconds("import typer, typer.rich_utils, rich.table, rich.markdown")
@@ -60,7 +60,7 @@ def test_the_version_is_that_of_the_package(reseau: Run) -> None:
     assert reseau("--version")[:2] == (0, f"reseau {__version__}\n")
 
 
-def test_measuring_finds_the_marks_where_they_are(reseau: Run, photo: Any, tmp_path: Path) -> None:
+def test_marks_are_measured_at_their_true_positions(reseau: Run, photo: Any, tmp_path: Path) -> None:
     status, out, _ = reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
     assert status == 0
     assert "63 of 63 marks measured" in out
@@ -81,7 +81,7 @@ def test_json_on_standard_output_is_the_document(reseau: Run, photo: Any, tmp_pa
     np.testing.assert_allclose(again.xy, document.image_points().xy, rtol=0, atol=1e-6)
 
 
-def test_coordinates_are_taken_where_an_image_is(
+def test_coordinates_are_accepted_instead_of_an_image(
     reseau: Run, photo: Any, calibration: Path, tmp_path: Path
 ) -> None:
     reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
@@ -119,7 +119,7 @@ def test_a_calibration_corrects_its_own_marks(
 @pytest.mark.parametrize(
     ("name", "dtype"), [("a.png", np.uint8), ("a.tif", np.uint8), ("b.tif", np.uint16), ("b.png", np.uint16)]
 )
-def test_a_corrected_image_has_its_marks_in_place(
+def test_a_corrected_image_has_its_marks_at_the_design_positions(
     reseau: Run, photo: Any, calibration: Path, tmp_path: Path, name: str, dtype: type
 ) -> None:
     factor = 1 if dtype is np.uint8 else 200
@@ -142,7 +142,7 @@ def test_a_corrected_image_has_its_marks_in_place(
         np.testing.assert_allclose(centroid + np.array([column, row]), [x, y], rtol=0, atol=0.06)
 
 
-def test_a_corrected_tiff_says_its_true_size(
+def test_a_corrected_tiff_contains_its_true_resolution(
     reseau: Run, photo: Any, calibration: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "c.tif"
@@ -179,7 +179,7 @@ def test_a_design_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> N
     assert (design.name, len(design.points), design.mark.size) == ("five", 20, 2.0)
 
 
-def test_a_report_can_be_asked_for(reseau: Run, photo: Any, tmp_path: Path) -> None:
+def test_a_report_is_written_on_request(reseau: Run, photo: Any, tmp_path: Path) -> None:
     page = tmp_path / "r.html"
     arguments = ("refine", "--photo-i", photo.image, "--reseau", photo.design, "--report", page)
     status, out, _ = reseau(*arguments, "--check", "B2,E7")

@@ -44,10 +44,10 @@ Run = Callable[..., tuple[int, str, str]]
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Its folder, and what it said."""
-    folder, said = tmp_path_factory.mktemp("demo") / "out", StringIO()
-    with redirect_stdout(said):
+    folder, message = tmp_path_factory.mktemp("demo") / "out", StringIO()
+    with redirect_stdout(message):
         assert run(["demo", "--out", str(folder), "--seed", "2"]) == 0
-    return folder, said.getvalue()
+    return folder, message.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def true_coordinates(path: Path) -> dict[str, tuple[float, ...]]:
     return {row[0]: tuple(map(float, row[1:])) for row in rows}
 
 
-def test_all_files_are_there_and_fit_together(out: Path) -> None:
+def test_all_files_exist_and_are_consistent(out: Path) -> None:
     assert {path.name for path in out.iterdir()} == FILES
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     instrument, reseau, rods = InstrumentCorrection.from_calibration(
@@ -81,7 +81,7 @@ def test_all_files_are_there_and_fit_together(out: Path) -> None:
     assert np.abs(again.xy - np.array(list(written.values()))[:, :2]).max() < 0.01  # millimetres
 
 
-def test_every_frame_is_in_the_archive_and_can_be_computed_with_again(out: Path) -> None:
+def test_every_frame_is_archived_and_can_be_used_again(out: Path) -> None:
     with Archive.open(out / "archive") as archive:
         assert [(s.name, s.status) for s in archive.sessions()] == [
             ("oscilloscope", "done"),
@@ -110,15 +110,15 @@ def test_every_frame_is_in_the_archive_and_can_be_computed_with_again(out: Path)
 
 
 @pytest.mark.parametrize("name", ["oscilloscope", "testfield"])
-def test_results_come_out_of_the_archive_again_to_the_byte(out: Path, reseau: Run, name: str) -> None:
+def test_results_are_recomputed_from_the_archive_to_the_byte(out: Path, reseau: Run, name: str) -> None:
     with threadpool_limits(2, user_api="blas"):  # whatever the machine has
-        status, said, err = reseau("archive", "rerun", name, "--archive", out / "archive")
+        status, message, err = reseau("archive", "rerun", name, "--archive", out / "archive")
     second = {"oscilloscope": "true.csv", "testfield": "report.html"}[name]
-    assert said == f"calibration.json: identical\n{second}: identical\n"
+    assert message == f"calibration.json: identical\n{second}: identical\n"
     assert (status, err) == (0, "")
 
 
-def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> None:
+def test_each_group_removes_its_part_of_the_error_and_the_sigmas_are_correct(out: Path) -> None:
     truth = json.loads((out / "comparison.json").read_text())
     check = {stage["name"]: max(stage["check"]) for stage in truth["camera"]["stages"]}
     assert check["best similarity"] > 0.05
@@ -134,14 +134,14 @@ def test_each_group_takes_its_part_off_and_the_sigmas_are_right(out: Path) -> No
     assert max(body["error_normalised"]) < 2.0
 
 
-def test_it_says_by_which_way_frames_came(made: tuple[Path, str]) -> None:
+def test_the_source_of_the_frames_is_reported(made: tuple[Path, str]) -> None:
     gige = aravis_is_installed()
     ways = ("Video4Linux, simulated in process (Aravis or PyGObject is not installed)", "GigE Vision")
     assert f"\n{ways[gige]}; all frames are in" in made[1]
     assert ways[not gige] not in made[1]
 
 
-def test_same_seed_same_bytes_but_for_the_clock_whichever_way_frames_come(
+def test_the_same_seed_gives_the_same_bytes_except_clock_times(
     out: Path, reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("reseau.sessions.demo._gige_available", lambda: False)
@@ -157,7 +157,7 @@ def test_same_seed_same_bytes_but_for_the_clock_whichever_way_frames_come(
     assert one == other
 
 
-def test_an_error_leaves_what_was_there_before(
+def test_an_error_leaves_existing_files_unchanged(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "out"
@@ -178,7 +178,7 @@ def test_an_error_leaves_what_was_there_before(
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "mine.txt"]
 
 
-def test_a_folder_that_cannot_be_is_refused_at_once(reseau: Run, tmp_path: Path) -> None:
+def test_an_invalid_output_folder_is_refused_at_once(reseau: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for place in (tmp_path / "file", tmp_path / "none" / "out"):
         status, _, err = reseau("demo", "--out", place)

@@ -34,7 +34,7 @@ def frame(step: str, **more: object) -> dict[str, object]:
     return {"step": step, "take": 0, "ok": True, "why": "", "there": False} | more
 
 
-def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bar_shows_pose_frames_precision_and_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = at_terminal(monkeypatch)
     with Display(False, 3, units={"c": "mm"}) as display:
         for k in range(2):
@@ -49,14 +49,14 @@ def test_the_bar_tells_pose_frames_precision_and_time_left(monkeypatch: pytest.M
     ]
 
 
-def test_a_bad_frame_is_told_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_frame_is_reported_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = at_terminal(monkeypatch)
     with Display(False, 3) as display:
         display.watch("frame", frame("tilt 0", ok=False, why="the table moved during the exposure"))
     assert "0/3 tilt 0: the table moved during the exposure" in [line.rstrip() for line in shown(terminal)]
 
 
-def test_nothing_is_drawn_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_drawn_during_a_question(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = at_terminal(monkeypatch)
     with Display(False, 3) as display:
 
@@ -72,7 +72,7 @@ def test_nothing_is_drawn_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatc
     assert "2/3 tilt 1: good, 0 s left" in [line.rstrip() for line in shown(terminal)]
 
 
-def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
+def test_remaining_time_depends_only_on_frames_taken_now(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, *[1.0] * 8, 11.0])
@@ -84,23 +84,23 @@ def test_time_left_counts_what_is_taken_now_and_not_what_was_there(
     assert capsys.readouterr().out.splitlines()[-2:] == ["8/12 7: good", "9/12 8: good, 30 s left"]
 
 
-def test_an_outlook_is_a_line_also_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_prediction_is_also_reported(capsys: pytest.CaptureFixture[str]) -> None:
     display = Display(False, 3, units={"c": "mm"})
     display.watch("outlook", {"step": "tilt 2", "sigma_c": 0.01})
     display.watch("outlook", {"step": "tilt 2", "why": "poses are 9° off"})
     display.watch("next", {"step": "tilt 2", "sigma_c": None})
-    said = capsys.readouterr().out.splitlines()
-    assert said[:2] == [
+    message = capsys.readouterr().out.splitlines()
+    assert message[:2] == [
         "    next tilt 2: sigma_c 0.01 mm predicted",
         "    next tilt 2: no prediction (poses are 9° off)",
     ]
-    assert said[2] == "next pose tilt 2"
+    assert message[2] == "next pose tilt 2"
 
 
-def test_sections_are_counted_where_they_are_what_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sections_are_counted_in_a_session_of_sections(capsys: pytest.CaptureFixture[str]) -> None:
     for sections in (True, False):
         display = Display(False, 2, sections)
         for kind in ("scan", "screen"):
             display.watch("picture", {"step": "PHOTO II", "kind": kind, "there": False})
-    said = capsys.readouterr().out.splitlines()
-    assert said == ["1/2 PHOTO II: scan", "PHOTO II: screen", "PHOTO II: scan", "PHOTO II: screen"]
+    message = capsys.readouterr().out.splitlines()
+    assert message == ["1/2 PHOTO II: scan", "PHOTO II: screen", "PHOTO II: scan", "PHOTO II: screen"]

@@ -58,7 +58,7 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     assert helped.corners["ul"].sx < 0.5 * alone["corners"]["ul"]["sx"]
 
 
-def test_a_second_run_goes_on_where_the_first_ended(roll: Path, tmp_path: Path, reseau: Run) -> None:
+def test_a_second_run_continues_where_the_first_ended(roll: Path, tmp_path: Path, reseau: Run) -> None:
     images = [roll / "0.tif", roll / "1.tif"]
     arguments = ("--frame", "36x24", "--out", tmp_path, "--jobs", 1, "--no-marked")
     reseau("orient", images[0], *arguments)
@@ -71,7 +71,7 @@ def test_a_second_run_goes_on_where_the_first_ended(roll: Path, tmp_path: Path, 
     assert (tmp_path / "0.json").stat().st_mtime_ns > written
 
 
-def test_calibrated_corners_give_a_transformation_with_residuals_or_honestly_none(
+def test_calibrated_corners_give_a_transformation_and_its_residuals_if_there_are_any(
     roll: Path, tmp_path: Path, reseau: Run
 ) -> None:
     frame = FilmFrame(0, dpi=300)
@@ -132,17 +132,17 @@ def one_bad(name: str, path: Path) -> None:
         ("32 bit floating point", 2, "32 bit floating point", "convert it to grey or RGB of 8 or 16 bit"),
     ],
 )
-def test_bad_input_says_what_is_wrong_and_what_would_help(
+def test_bad_input_is_reported_with_a_remedy(
     name: str, status: int, wrong: str, helps: str, tmp_path: Path, reseau: Run
 ) -> None:
     one_bad(name, tmp_path / "bad.tif")
     out_folder = tmp_path / "out"
     got, out, err = reseau("orient", tmp_path / "bad.tif", "--frame", "36x24", "--out", out_folder)
-    told = out + err
+    reported = out + err
     assert got == status
-    assert wrong in told
-    assert helps in told
-    assert told.count("\n") == 1
+    assert wrong in reported
+    assert helps in reported
+    assert reported.count("\n") == 1
     assert not list(out_folder.glob("*-marked.tif"))
 
 
@@ -168,7 +168,9 @@ def test_every_frame_of_a_strip_is_oriented(tmp_path: Path, reseau: Run) -> None
         np.testing.assert_allclose(xy - [start, 0], frame.truth.corners, rtol=0, atol=0.3)
 
 
-def test_what_cannot_be_oriented_is_told_in_one_line(tmp_path: Path, reseau: Run, roll: Path) -> None:
+def test_frames_that_cannot_be_oriented_are_reported_in_one_line(
+    tmp_path: Path, reseau: Run, roll: Path
+) -> None:
     tifffile.imwrite(tmp_path / "blank.tif", np.full((300, 400), 9, np.uint8))
     status, out, err = reseau("orient", tmp_path / "blank.tif")
     assert (status, err) == (1, "")

@@ -48,17 +48,19 @@ def test_rods_are_measured_and_the_missing_one_is_named(
     assert np.abs(points.xy - TRUTH[:6]).max() < 0.2
 
 
-def test_json_and_csv_hold_the_same(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
+def test_json_and_csv_contain_the_same_values(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
     image, design = bench
     status, out, _ = reseau("measure", "pins", image, "-d", design, "-o", tmp_path / "m.csv", "--json")
     assert status == 0
-    told = ReseauMeasurement.parse(out, where="output").image_points()
+    reported = ReseauMeasurement.parse(out, where="output").image_points()
     read = ReseauMeasurement.read_csv(tmp_path / "m.csv").image_points()
-    assert told.names == read.names
-    assert np.abs(told.xy - read.xy).max() < 1e-5
+    assert reported.names == read.names
+    assert np.abs(reported.xy - read.xy).max() < 1e-5
 
 
-def test_what_cannot_be_measured_is_one_line(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
+def test_unmeasurable_images_are_reported_in_one_line(
+    reseau: Run, bench: tuple[Path, Path], tmp_path: Path
+) -> None:
     image, design = bench
     crossed = ReseauDesign.read(design).to_json().replace('"rod"', '"disk"')
     (tmp_path / "disks.json").write_text(crossed, "utf-8")

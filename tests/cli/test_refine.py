@@ -84,9 +84,9 @@ def test_three_photographs_give_true_coordinates_and_a_calibration(bench, tmp_pa
         assert abs(true[name][0] - x) < 0.03
         assert abs(true[name][1] - y) < 0.03
         assert 0.001 < true[name][2] < 0.03
-    said = capsys.readouterr().out
-    assert "A6 = B6 is satisfied" in said
-    assert "note" not in said
+    message = capsys.readouterr().out
+    assert "A6 = B6 is satisfied" in message
+    assert "note" not in message
 
 
 def test_a_stored_calibration_gives_the_same_true_coordinates(bench, tmp_path, capsys):
@@ -102,7 +102,7 @@ def test_a_stored_calibration_gives_the_same_true_coordinates(bench, tmp_path, c
     assert document["notes"] == []
 
 
-def test_stored_coefficients_are_held_against_a_new_photo_ii(bench, tmp_path, capsys):
+def test_stored_coefficients_are_tested_with_a_new_photo_ii(bench, tmp_path, capsys):
     assert _run(bench, "--out", tmp_path / "k.json") == 0
     reseau, rods, aside = standard_reseau(), np.array(list(_RODS.values())), np.array([0.05, 0.0])
     anew = _csv(tmp_path / "the same.csv", (reseau.ids, _pixels(reseau.xy)), (list(_RODS), _shown(rods)))
@@ -136,7 +136,7 @@ def test_a_camera_that_moved_before_photo_iii_is_noticed_and_corrected(bench, tm
         assert abs(_read_true(tmp_path / "true.csv")[name][0] - x) < 0.03
 
 
-def test_a_missing_row_of_pins_a_turned_object_and_swapped_marks_are_named(bench, tmp_path, capsys):
+def test_a_missing_row_of_pins_a_rotated_object_and_swapped_marks_are_reported(bench, tmp_path, capsys):
     rods = ReseauDesign.read(bench["--object"])
     reseau = ReseauDesign.read(bench["--reseau"])
     turn = np.deg2rad(5)
@@ -150,25 +150,25 @@ def test_a_missing_row_of_pins_a_turned_object_and_swapped_marks_are_named(bench
     assert rods.axis == "r50"
     files = {key: value for key, value in bench.items() if key != "--photo-iii"}
     assert _run(files | {"--photo-ii": photo}) == 0
-    said = capsys.readouterr().out
-    assert "the whole row of rods at y = 40 mm is missing" in said
-    assert "the test object is turned by 5.6° against the reseau" in said  # 5° and the display's own 0.6°
+    message = capsys.readouterr().out
+    assert "the whole row of rods at y = 40 mm is missing" in message
+    assert "the test object is turned by 5.6° against the reseau" in message  # 5° and the display's own 0.6°
     assert _run(files | {"--reseau": tmp_path / "swapped.json"}) == 0
     assert "are O and S swapped?" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("left_out", "said"),
+    ("left_out", "message"),
     [
         (("--object",), "--photo-ii and --object must be given together"),
         (("--photo-ii", "--object"), "needs PHOTO II"),
         (("--reseau",), "needs --photo-i and --reseau, or --calibration"),
     ],
 )
-def test_what_does_not_go_together_is_refused_in_one_line(bench, capsys, left_out, said):
+def test_contradictory_options_are_refused_in_one_line(bench, capsys, left_out, message):
     assert _run({key: value for key, value in bench.items() if key not in left_out}) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
 
 
@@ -188,7 +188,7 @@ def test_a_stored_calibration_writes_its_result_and_a_report(bench, tmp_path, ca
     assert page.count("SHA-256") == 3
 
 
-def test_a_calibration_of_the_camera_alone_says_what_to_do(bench, tmp_path, capsys):
+def test_a_calibration_without_group_b_is_refused_with_a_remedy(bench, tmp_path, capsys):
     first = {key: bench[key] for key in ("--photo-i", "--reseau")}
     assert _run(first, "--out", tmp_path / "camera.json") == 0
     assert _run({"--calibration": tmp_path / "camera.json", "--photo-iii": bench["--photo-iii"]}) == 2

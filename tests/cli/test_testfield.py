@@ -26,13 +26,13 @@ def test_a_testfield_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -
     assert pdf.read_bytes().startswith(b"%PDF")
 
 
-def test_the_design_goes_to_standard_output_where_it_is_asked_for(reseau: Run) -> None:
+def test_the_design_is_printed_on_request(reseau: Run) -> None:
     status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--json", "-")
     assert status == 0
     assert TestfieldDesign.parse(out, where="stdout") == coded_testfield(2, 1)
 
 
-def test_what_does_not_fit_is_said_in_one_line(reseau: Run, tmp_path: Path) -> None:
+def test_impossible_testfields_are_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
     status, out, err = reseau("design", "testfield", "--pitch", 90, "--json", tmp_path / "f.json")
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
@@ -42,7 +42,7 @@ def test_what_does_not_fit_is_said_in_one_line(reseau: Run, tmp_path: Path) -> N
     assert (status, "use .json" in err) == (2, True)
 
 
-def test_a_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
+def test_a_simulated_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
     bench = FieldBench()
     write_image(tmp_path / "frame.png", bench.record(Station(30)).pixels)
     bench.design.write(tmp_path / "field.json")
@@ -59,7 +59,7 @@ def test_a_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
     assert np.abs(error).max() < 0.05  # px
 
 
-def test_a_frame_without_the_testfield_is_said_to_be_so(reseau: Run, tmp_path: Path) -> None:
+def test_a_frame_without_the_testfield_is_reported(reseau: Run, tmp_path: Path) -> None:
     write_image(tmp_path / "ramp.png", np.tile(np.arange(200, dtype=np.uint8), (200, 1)))
     coded_testfield().write(tmp_path / "field.json")
     status, out, err = reseau("measure", "testfield", tmp_path / "ramp.png", "-d", tmp_path / "field.json")

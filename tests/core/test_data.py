@@ -15,7 +15,7 @@ def test_a_frame_knows_its_size() -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 4, 3), (1, 5), (5, 1), (0, 0)])
-def test_what_is_no_grey_image_is_refused_by_name(shape: tuple[int, ...]) -> None:
+def test_arrays_that_are_not_grey_images_are_refused_by_name(shape: tuple[int, ...]) -> None:
     with pytest.raises(ImageError, match=r"photo\.png: has the shape"):
         Frame(np.zeros(shape), 1.0, "photo.png")
 

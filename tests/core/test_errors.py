@@ -8,7 +8,7 @@ from reseau.core import errors
 from reseau.core.errors import EstimationError, FormatError, ImageError, InputError, ReseauError, UsageError
 
 
-def test_all_errors_grow_on_one_tree_and_are_exported() -> None:
+def test_all_errors_have_one_base_class_and_are_exported() -> None:
     for name in errors.__all__:
         assert issubclass(getattr(errors, name), ReseauError)
     assert issubclass(ImageError, InputError)
@@ -26,11 +26,13 @@ def test_all_errors_grow_on_one_tree_and_are_exported() -> None:
         (ReseauError, 1),
     ],
 )
-def test_wrong_use_and_input_exit_with_two_failures_with_one(kind: type[ReseauError], status: int) -> None:
+def test_wrong_use_and_input_exit_with_status_two_and_failures_with_one(
+    kind: type[ReseauError], status: int
+) -> None:
     assert kind("is wrong").exit_status == status
 
 
-def test_an_error_says_where_what_and_what_to_do_in_one_line() -> None:
+def test_an_error_names_place_problem_and_remedy_in_one_line() -> None:
     error = InputError("cannot be\n  read", where="a.png", do="look\tthere")
     assert str(error) == "a.png: cannot be read; look there"
     assert (error.what, error.where, error.do) == ("cannot be\n  read", "a.png", "look\tthere")

@@ -26,7 +26,7 @@ def test_json_has_no_nan_and_ends_in_a_newline() -> None:
         canonical_json(float("nan"))
 
 
-def test_the_order_of_inputs_and_options_says_nothing() -> None:
+def test_the_order_of_inputs_and_options_does_not_matter() -> None:
     one = Provenance({"b": "2", "a": "1"}, {"z": 1, "y": 2}).to_dict()
     other = Provenance({"a": "1", "b": "2"}, {"y": 2, "z": 1}).to_dict()
     assert canonical_json(one) == canonical_json(other)

@@ -16,7 +16,7 @@ from reseau.io import Mark
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def test_the_paper_and_its_units_are_millimetres() -> None:
+def test_drawings_are_in_millimetres() -> None:
     root = ET.fromstring(design_svg(standard_reseau()))
     width, height = (float(root.get(side, "").removesuffix("mm")) for side in ("width", "height"))
     assert root.get("viewBox") == f"0 0 {width:g} {height:g}"
@@ -56,18 +56,18 @@ def test_crosses_have_their_arms() -> None:
     assert 'fill="#000000"/>' in svg  # the ground of bright marks
 
 
-def test_same_design_same_bytes() -> None:
+def test_the_same_design_gives_the_same_bytes() -> None:
     assert design_pdf(standard_reseau()) == design_pdf(standard_reseau())
     assert design_svg(standard_reseau()) == design_svg(standard_reseau())
 
 
-def test_a_design_without_millimetres_cannot_be_drawn() -> None:
+def test_a_design_in_other_units_cannot_be_drawn() -> None:
     inches = standard_reseau().model_copy(update={"unit": "inch"})
     with pytest.raises(UsageError, match="no millimetre coordinates"):
         design_svg(inches)
 
 
-def test_every_target_and_line_of_a_testfield_is_drawn_in_its_place() -> None:
+def test_every_target_and_line_of_a_testfield_is_drawn_at_its_position() -> None:
     field = coded_testfield(2, 1)
     root = ET.fromstring(design_svg(field))
     circles = np.array([(float(c.get("cx", "")), float(c.get("cy", ""))) for c in root.iter(f"{SVG}circle")])

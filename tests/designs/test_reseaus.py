@@ -19,7 +19,7 @@ def test_rows_are_lettered_beyond_z() -> None:
     assert grid.xy[0, 1] == 70.0
 
 
-def test_the_standard_reseau_covers_its_screen_and_is_a_document() -> None:
+def test_the_standard_reseau_covers_its_screen_and_can_be_written() -> None:
     grid = standard_reseau()
     assert len(grid.points) == 165
     np.testing.assert_array_equal(np.abs(grid.xy).max(axis=0), [70.0, 50.0])
@@ -47,7 +47,7 @@ def test_impossible_reseaus_are_refused(
         regular_reseau(columns, rows, pitch, mark, **options)  # type: ignore[arg-type]
 
 
-def test_the_rings_of_a_sheet_differ_however_it_is_turned_or_reflected() -> None:
+def test_the_rings_of_a_sheet_differ_under_rotation_and_reflection() -> None:
     rings = coded_sheet(10, 10, 25.0).rings
     assert rings is not None
     degrees = np.arange(720) / 2 + 0.25
@@ -64,7 +64,7 @@ def test_the_rings_of_a_sheet_differ_however_it_is_turned_or_reflected() -> None
             assert min((way != other).mean() for way in seen) >= 4 / 12 - 1e-9
 
 
-def test_a_sheet_that_cannot_be_is_refused() -> None:
+def test_an_impossible_sheet_is_refused() -> None:
     with pytest.raises(UsageError, match="no room for four rings"):
         coded_sheet(3, 9, 25.0)
     with pytest.raises(UsageError, match="do not fit rings"):

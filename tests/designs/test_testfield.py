@@ -39,7 +39,7 @@ def test_squares_are_numbered_in_rows_from_the_upper_left_and_so_are_their_targe
     np.testing.assert_allclose(field.centres[[0, 5]], [[-100, 50], [100, -50]], rtol=0, atol=0)
 
 
-def test_a_testfield_survives_the_way_to_the_file_and_back(tmp_path: Path) -> None:
+def test_a_testfield_is_read_back_unchanged(tmp_path: Path) -> None:
     field = coded_testfield(2, 3, turn_seed=4)
     field.write(tmp_path / "field.json")
     assert TestfieldDesign.read(tmp_path / "field.json") == field
@@ -91,7 +91,7 @@ def broken(change: str) -> str:
         ("square", "square 3 does not exist in 2 × 1"),
     ],
 )
-def test_a_broken_testfield_is_refused_with_the_key(change: str, complaint: str) -> None:
+def test_an_invalid_testfield_is_refused_with_the_key(change: str, complaint: str) -> None:
     with pytest.raises(FormatError, match=complaint):
         TestfieldDesign.parse(broken(change), where="field.json")
 

@@ -43,12 +43,12 @@ def test_among_the_64_squares_shapes_alone_differ_in_eight_targets() -> None:
     assert differ[square[:, None] != square].min() == 8
 
 
-def test_every_cluster_holds_two_targets_of_each_kind() -> None:
+def test_every_cluster_contains_two_targets_of_each_kind() -> None:
     for word in words(168):
         np.testing.assert_array_equal(np.bincount(word, minlength=8), 2)
 
 
-def test_every_cluster_is_read_from_every_side_and_in_a_mirror() -> None:
+def test_every_cluster_is_decoded_at_any_rotation_and_mirrored() -> None:
     for seen, (square, quarters, mirrored) in zip(*every_appearance(64), strict=True):
         found = CODE.decode(seen)
         assert (found.square, found.quarter_turns, found.mirrored, found.corrections) == (
@@ -59,7 +59,7 @@ def test_every_cluster_is_read_from_every_side_and_in_a_mirror() -> None:
         )
 
 
-def test_any_single_misclassified_target_is_put_right() -> None:
+def test_any_single_misclassified_target_is_corrected() -> None:
     # All 64 clusters × 4 rotations × 16 targets × 7 wrong kinds; at once, as decode() would be slow here.
     every, what = every_appearance(64)
     for seen, (square, quarters, mirrored) in zip(every, what, strict=True):
@@ -82,7 +82,7 @@ def test_any_single_misclassified_target_is_put_right() -> None:
     wrong=st.integers(0, 8),
     shift=st.lists(st.integers(1, 7), min_size=8, max_size=8),
 )
-def test_reading_is_right_or_refused(
+def test_decoding_is_correct_or_refused(
     square: int, quarters: int, order: list[int], hidden: int, wrong: int, shift: list[int]
 ) -> None:
     seen = np.rot90(CODE.clusters[square - 1].reshape(4, 4), quarters).ravel().copy()
@@ -110,7 +110,7 @@ def test_a_cluster_that_matches_no_square_is_declined_with_the_reason() -> None:
     assert other.code is Code.INCONSISTENT
 
 
-def test_a_design_is_read_in_whatever_order_its_targets_stand() -> None:
+def test_a_design_is_decoded_independently_of_the_order_of_its_targets() -> None:
     field = coded_testfield(3, 2)
     order = np.random.default_rng(0).permutation(len(field.ids))
     columns = {
@@ -122,7 +122,7 @@ def test_a_design_is_read_in_whatever_order_its_targets_stand() -> None:
     assert shuffled.ids[places(shuffled)[4, 6]] == "5.07"
 
 
-def test_squares_that_hold_no_four_by_four_have_no_code() -> None:
+def test_squares_without_four_by_four_targets_have_no_code() -> None:
     field = coded_testfield(2, 1)
     fewer = {name: getattr(field.targets, name)[:-1] for name in type(field.targets).model_fields}
     with pytest.raises(UsageError, match="sixteen targets"):

@@ -57,15 +57,15 @@ def test_a_fault_gives_the_right_result_or_an_error_in_time(
         found.work(0)
         script.fault_at(script.count + at, Fault(kind, 0.2))
         began = time.monotonic()
-        said = None
+        message = None
         try:
             found.work(1)
         except InstrumentError as error:
-            said = error
+            message = error
         took = time.monotonic() - began
-        record_property("outcome", "right" if said is None else type(said).__name__)
+        record_property("outcome", "right" if message is None else type(message).__name__)
         record_property("seconds", took)
-        assert said is None or (said.instrument, bool(said.command)) == (found.device.name, True)
+        assert message is None or (message.instrument, bool(message.command)) == (found.device.name, True)
         assert took < 10.0
         assert [fault.kind for fault in script.happened] == [kind]
         _recovered(found)

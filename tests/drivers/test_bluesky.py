@@ -30,7 +30,7 @@ def linked(machine: Machine) -> InProcess:
     return InProcess(lambda: FaultyConnection(machine))
 
 
-def a_zaber() -> Pair:
+def zaber_table() -> Pair:
     chain = ZaberChain([2], low=-100_000.0)
     axes = {
         "tilt": {"per_unit": 1000.0, "high": 90.0, "backlash": 0.5},
@@ -39,7 +39,7 @@ def a_zaber() -> Pair:
     return zaber("table", linked(chain), axes=axes, settings={"speed": 900.0}), chain
 
 
-def an_smc100() -> Pair:
+def smc100_table() -> Pair:
     line = Smc100Line(2, low=-10.0, high=100.0)
     axes = {
         "tilt": {"device": 1, "high": 90.0, "backlash": 0.5},
@@ -48,22 +48,22 @@ def an_smc100() -> Pair:
     return smc100("table", linked(line), axes=axes, settings={"speed": 900.0}), line
 
 
-def a_sonar(tmp_path: Path) -> Pair:
+def ping360_scanner(tmp_path: Path) -> Pair:
     head = serving.Ping360()
     return ping360("sonar", linked(head), settings={"half_sector": 3}), head
 
 
-def an_oscilloscope(tmp_path: Path) -> Pair:
+def keysight_oscilloscope(tmp_path: Path) -> Pair:
     machine = serving.Oscilloscope("keysight")
     return oscilloscope("scope", linked(machine)), machine
 
 
-def a_bk(tmp_path: Path) -> Pair:
+def bk_scanner(tmp_path: Path) -> Pair:
     machine = serving.BkScanner()
     return bk_oem("bk", linked(machine)), machine
 
 
-def a_pulser(tmp_path: Path) -> Pair:
+def pulser_scanner(tmp_path: Path) -> Pair:
     machine = serving.CompactPulser()
     scope = oscilloscope("scope", linked(serving.Oscilloscope("rigol-1000z")))
     return compact_pulser(
@@ -71,7 +71,7 @@ def a_pulser(tmp_path: Path) -> Pair:
     ), machine
 
 
-def some_files(tmp_path: Path) -> Pair:
+def dicom_folder(tmp_path: Path) -> Pair:
     pytest.importorskip("pydicom", reason="pydicom is not installed")
     from .test_dicom import PICTURE, file, region
 
@@ -79,8 +79,14 @@ def some_files(tmp_path: Path) -> Pair:
     return dicom_files("files", str(tmp_path)), None
 
 
-DETECTORS: list[Callable[[Path], Pair]] = [a_sonar, an_oscilloscope, a_bk, a_pulser, some_files]
-TABLES: list[Callable[[], Pair]] = [a_zaber, an_smc100]
+DETECTORS: list[Callable[[Path], Pair]] = [
+    ping360_scanner,
+    keysight_oscilloscope,
+    bk_scanner,
+    pulser_scanner,
+    dicom_folder,
+]
+TABLES: list[Callable[[], Pair]] = [zaber_table, smc100_table]
 
 
 @pytest.fixture
@@ -94,8 +100,8 @@ def test_count_and_scan_with_every_detector_on_every_table(
     make: Callable[[Path], Pair], make_table: Callable[[], Pair], tmp_path: Path, engine: Any
 ) -> None:
     (detector, machine), (table, controller) = make(tmp_path), make_table()
-    for wanted in EVERY:
-        assert isinstance(detector, getattr(protocols, wanted)), wanted
+    for expected in EVERY:
+        assert isinstance(detector, getattr(protocols, expected)), expected
     documents: list[tuple[str, dict[str, Any]]] = []
     with table, detector:
         table.home("tilt")
@@ -120,13 +126,13 @@ def test_count_and_scan_with_every_detector_on_every_table(
 def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], engine: Any) -> None:
     table, controller = make_table()
     tilt, roll = table.axes["tilt"], table.axes["roll"]
-    for wanted in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable", "NamedMovable"):
-        assert isinstance(tilt, getattr(protocols, wanted)), wanted
-    for wanted in EVERY:
-        assert isinstance(table, getattr(protocols, wanted)), wanted
+    for expected in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable", "NamedMovable"):
+        assert isinstance(tilt, getattr(protocols, expected)), expected
+    for expected in EVERY:
+        assert isinstance(table, getattr(protocols, expected)), expected
     events: list[dict[str, Any]] = []
 
-    def kept(kind: str, document: dict[str, Any]) -> None:
+    def store(kind: str, document: dict[str, Any]) -> None:
         if kind == "event":
             events.append(document["data"])
 
@@ -136,9 +142,9 @@ def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], eng
         engine(bps.mv(tilt, 12.0, roll, -5.0))
         assert (tilt.position, roll.position) == pytest.approx((12.0, -5.0), abs=2e-3)
         table.configure(speed=500.0)
-        engine(bp.grid_scan([], tilt, 5.0, 15.0, 2, roll, 0.0, 10.0, 2), kept)
+        engine(bp.grid_scan([], tilt, 5.0, 15.0, 2, roll, 0.0, 10.0, 2), store)
         engine(bps.mv(tilt, 20.0))
-        engine(bp.rel_scan([], tilt, -5.0, 5.0, 3), kept)
+        engine(bp.rel_scan([], tilt, -5.0, 5.0, 3), store)
         assert tilt.position == pytest.approx(20.0, abs=2e-3)
         assert [event["table_tilt"] for event in events[4:]] == pytest.approx([15, 20, 25], abs=2e-3)
         with pytest.raises(SettingError, match=r"axis tilt of table.*outside"):
@@ -153,7 +159,7 @@ def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], eng
 
 
 @pytest.mark.parametrize("make_table", TABLES)
-def test_an_aborted_plan_leaves_the_table_standing(make_table: Callable[[], Pair], engine: Any) -> None:
+def test_an_aborted_plan_stops_the_table(make_table: Callable[[], Pair], engine: Any) -> None:
     table, controller = make_table()
     with table:
         table.home("tilt")
@@ -177,7 +183,7 @@ def test_an_aborted_plan_leaves_the_table_standing(make_table: Callable[[], Pair
 
 
 def test_a_failure_of_an_instrument_ends_the_plan_with_its_name(engine: Any) -> None:
-    table, chain = a_zaber()
+    table, chain = zaber_table()
     with table:
         table.home("tilt")
         assert isinstance(chain, ZaberChain)

@@ -122,8 +122,8 @@ def test_a_compressed_frame_keeps_its_file(device: VideoCamera) -> None:
         shot = camera.expose()
         assert shot.pattern == "MJPEG"
         assert shot.raw.startswith(b"\xff\xd8")
-        wanted = StripeScene()(device.view).astype(float)
-        assert np.sqrt(((shot.pixels - wanted) ** 2).mean()) < 8
+        expected = StripeScene()(device.view).astype(float)
+        assert np.sqrt(((shot.pixels - expected) ** 2).mean()) < 8
 
 
 def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCamera, camera: Cam) -> None:
@@ -139,7 +139,7 @@ def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCam
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"gain": 99.0}, "gain 99 is outside 0…24"),
         ({"exposure_us": 2e6}, "is outside 1…10000"),
@@ -152,11 +152,11 @@ def test_exposure_gain_brightness_and_region_act_on_the_picture(device: VideoCam
     ],
 )
 def test_unsupported_settings_raise_and_change_nothing(
-    device: VideoCamera, camera: Cam, changes: dict[str, Any], said: str
+    device: VideoCamera, camera: Cam, changes: dict[str, Any], message: str
 ) -> None:
     camera.expose()
     before, view = camera.settings, device.view
-    with pytest.raises(RefusedError, match=said):
+    with pytest.raises(RefusedError, match=message):
         camera.configure(**changes)
     assert (camera.settings, device.view) == (before, view)
     assert camera.expose().fresh
@@ -228,8 +228,8 @@ def test_lost_and_damaged_frames_are_counted_and_not_returned(
     script.fault_at(script.count + 2, Fault(kind, 0.02))
     shots = list(camera.frames(6))
     assert [fault.kind for fault in script.happened] == [kind]
-    wanted = StripeScene()(device.view)
-    assert all((shot.pixels == wanted).all() for shot in shots)
+    expected = StripeScene()(device.view)
+    assert all((shot.pixels == expected).all() for shot in shots)
     steps = shots[-1].sequence - before.sequence
     assert steps == 6 + shots[-1].dropped - before.dropped
     if lost is not None:
@@ -337,10 +337,10 @@ def test_missing_aravis_raises_with_instructions(monkeypatch: pytest.MonkeyPatch
     library = importlib.import_module("reseau_drivers.camera.aravis")._library
     library.cache_clear()
     monkeypatch.setitem(sys.modules, "gi", None)
-    said = r"Aravis is not installed .*; install gir1.2-aravis-0.8, and pip install reseau\[aravis\]"
-    with pytest.raises(UsageError, match=said):
+    message = r"Aravis is not installed .*; install gir1.2-aravis-0.8, and pip install reseau\[aravis\]"
+    with pytest.raises(UsageError, match=message):
         cameras.aravis_cameras()
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         cameras.aravis("camera", "127.0.0.1").connect()
     library.cache_clear()
 

@@ -36,7 +36,7 @@ PICTURE = np.random.default_rng(3).integers(0, 256, SIZE, dtype=np.uint8)
 def region(**changes: Any) -> Any:
     """A section of 0.2 × 0.25 mm a pixel, in the words of PS3.3 C.8.5.5."""
     item = Dataset()
-    told = {
+    reported = {
         "RegionSpatialFormat": 1,
         "RegionDataType": 1,
         "RegionFlags": 0,
@@ -50,7 +50,7 @@ def region(**changes: Any) -> Any:
         "PhysicalDeltaY": 0.025,
         "TransducerFrequency": 7500,
     }
-    for key, value in (told | changes).items():
+    for key, value in (reported | changes).items():
         if value is not None:
             setattr(item, key, value)
     return item
@@ -98,13 +98,13 @@ def test_a_frame_has_the_pixel_size_of_its_region(tmp_path: Path) -> None:
 
 
 def test_the_physical_origin_is_converted_to_pixels(tmp_path: Path) -> None:
-    told = {
+    reported = {
         "ReferencePixelX0": 28,
         "ReferencePixelY0": 5,
         "ReferencePixelPhysicalValueX": 0.1,
         "ReferencePixelPhysicalValueY": 0.05,
     }
-    with DicomFiles("files", file(tmp_path / "a.dcm", region(**told))) as scanner:
+    with DicomFiles("files", file(tmp_path / "a.dcm", region(**reported))) as scanner:
         # Pixel 4 + 28 is at 0.1 cm, five pixels of 0.02 cm to the right of the origin.
         assert scanner.scan().origin_px == pytest.approx((27.0, 5.0))
 
@@ -243,9 +243,9 @@ def test_real_files_give_pixels_and_no_wrong_pixel_size(name: str, maker: str, f
     if not path.exists():
         pytest.skip(f"pydicom came without {name}")
     with DicomFiles("files", path) as scanner:
-        told = scanner.check()
-        assert maker in told["identity"]
-        assert (told["frames"], told["pixels"]) == (str(frames), f"unknown: {why}")
+        reported = scanner.check()
+        assert maker in reported["identity"]
+        assert (reported["frames"], reported["pixels"]) == (str(frames), f"unknown: {why}")
         scan = scanner.scan()
         assert (scan.mm_per_px, scan.region_px) == (None, None)
         header = pydicom.dcmread(path, stop_before_pixels=True)
@@ -267,7 +267,7 @@ def test_invalid_files_raise_one_line(tmp_path: Path) -> None:
     )
     (tmp_path / "huge").write_bytes(huge)
     file(tmp_path / "many", region(), NumberOfFrames=2_000_000_000)
-    for name, said in {
+    for name, message in {
         "cut": "cannot be decoded",
         "head": "is not a DICOM image",
         "text": "is not a DICOM image",
@@ -276,7 +276,7 @@ def test_invalid_files_raise_one_line(tmp_path: Path) -> None:
         "many": "states 2000000000 frames",
         "empty": "contains no DICOM image",
     }.items():
-        with pytest.raises(ProtocolError, match=said) as caught:
+        with pytest.raises(ProtocolError, match=message) as caught:
             DicomFiles("files", tmp_path / name).scan()
         assert caught.value.instrument == "files"
     with pytest.raises(ConnectionLost, match="give a DICOM file"):

@@ -51,7 +51,7 @@ def pattern(shift: int = 0) -> StripeScene:
     return StripeScene(640, 480, shift)
 
 
-def seen(shift: int, exposure_us: float = 2000.0, full_scale: float = 255.0) -> Any:
+def expected_image(shift: int, exposure_us: float = 2000.0, full_scale: float = 255.0) -> Any:
     return pattern(shift)(View(exposure_us, 0.0, 0.0, 0, 0, 640, 480, full_scale))
 
 
@@ -97,7 +97,7 @@ def test_colour_stays_raw_with_its_pattern(simulated: GigeCamera, camera: Cam, n
     camera.configure(format=name)
     shot = camera.expose()
     assert shot.pattern == {"BayerRG8": "RGGB", "BayerGR8": "GRBG"}[name]
-    assert (shot.pixels == seen(0)).all()
+    assert (shot.pixels == expected_image(0)).all()
 
 
 @pytest.mark.parametrize("trigger", ["off", "software"])
@@ -107,7 +107,7 @@ def test_exposures_start_after_the_request(simulated: GigeCamera, camera: Cam, t
         simulated.body.point_at(pattern(shift))
         shot = camera.expose()
         assert shot.fresh
-        assert (shot.pixels == seen(shift)).all()
+        assert (shot.pixels == expected_image(shift)).all()
     assert camera.skipped > 0 or trigger != "off"
 
 
@@ -117,14 +117,14 @@ def test_a_delayed_frame_is_not_fresh(simulated: GigeCamera, camera: Cam) -> Non
     simulated.body.point_at(pattern(5))
     shots = list(camera.frames(4))
     assert not shots[0].fresh
-    assert (shots[0].pixels == seen(0)).all()
-    assert (camera.expose().pixels == seen(5)).all()
+    assert (shots[0].pixels == expected_image(0)).all()
+    assert (camera.expose().pixels == expected_image(5)).all()
 
 
 def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, camera: Cam) -> None:
     before = camera.expose().pixels.astype(float)
     camera.configure(exposure_us=4000.0)
-    assert (camera.expose().pixels == seen(0, 4000.0)).all()
+    assert (camera.expose().pixels == expected_image(0, 4000.0)).all()
     camera.configure(exposure_us=2000.0, gain=6)
     assert camera.expose().pixels.mean() == pytest.approx(10**0.3 * before.mean(), rel=0.03)
     camera.configure(gain=0, left=8, top=16, width=128, height=64)
@@ -132,7 +132,7 @@ def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, came
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"gain": 99.0}, "gain 99 is outside 0…10"),
         ({"exposure_us": 1.0}, "exposure_us 1 is outside 10…"),
@@ -143,13 +143,13 @@ def test_exposure_gain_and_region_act_on_the_picture(simulated: GigeCamera, came
     ],
 )
 def test_unsupported_settings_raise_and_change_nothing(
-    camera: Cam, changes: dict[str, Any], said: str
+    camera: Cam, changes: dict[str, Any], message: str
 ) -> None:
     before = camera.settings
-    with pytest.raises(RefusedError, match=said):
+    with pytest.raises(RefusedError, match=message):
         camera.configure(**changes)
     assert camera.settings == before
-    assert (camera.expose().pixels == seen(0)).all()
+    assert (camera.expose().pixels == expected_image(0)).all()
     assert camera.reconnections == 1
 
 
@@ -194,7 +194,7 @@ def test_features_are_set_by_name_also_after_unplugging(simulated: GigeCamera, c
 
 
 @pytest.mark.parametrize(
-    ("features", "error", "said"),
+    ("features", "error", "message"),
     [
         ("Nope=1", RefusedError, "has no feature Nope"),
         ("GainAuto=Sometimes", RefusedError, "'Sometimes' not an entry"),
@@ -204,9 +204,9 @@ def test_features_are_set_by_name_also_after_unplugging(simulated: GigeCamera, c
     ],
 )
 def test_unknown_features_and_invalid_values_raise(
-    camera: Cam, features: str, error: type[Exception], said: str
+    camera: Cam, features: str, error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         camera.configure(features=features)
     assert (camera.settings.features, camera.reconnections) == ("", 1)
     assert camera.expose().fresh
@@ -233,7 +233,7 @@ def test_lost_and_damaged_frames_are_counted_and_not_returned(
     script.fault_at(script.count + 2, Fault(kind))
     shots = list(camera.frames(8))
     assert [fault.kind for fault in script.happened] == [kind]
-    assert all((shot.pixels == seen(0)).all() for shot in shots)
+    assert all((shot.pixels == expected_image(0)).all() for shot in shots)
     lost = shots[-1].dropped - before.dropped
     assert lost >= 1
     assert shots[-1].sequence - before.sequence == 8 + lost
@@ -254,7 +254,7 @@ def test_lost_control_raises_and_is_regained_with_the_settings(simulated: GigeCa
     simulated.power_cycle()
     with pytest.raises(ConnectionLost, match="control of the camera was lost"):
         camera.expose()
-    assert (camera.expose().pixels == seen(0, 4000.0)).all()
+    assert (camera.expose().pixels == expected_image(0, 4000.0)).all()
     assert camera.reconnections == 2
 
 
@@ -269,7 +269,7 @@ def test_unplugging_and_plugging_in(simulated: GigeCamera, camera: Cam) -> None:
     # The library alone would try for a quarter of a minute.
     assert time.monotonic() - began < 8.0
     simulated.plug_in()
-    assert (camera.expose(5.0).pixels == seen(0)).all()
+    assert (camera.expose(5.0).pixels == expected_image(0)).all()
 
 
 def test_a_camera_controlled_by_another_program_is_refused(simulated: GigeCamera, camera: Cam) -> None:
@@ -417,12 +417,12 @@ def _program(name: str) -> str:
 def test_aravis_s_own_tool_reads_and_sets_its_features(simulated: GigeCamera) -> None:
     tool = [_program("arv-tool-0.8"), "-a", simulated.address]
     names = ["DeviceID", "DeviceModelName", "Width", "PixelFormat", "ExposureTimeAbs"]
-    said = subprocess.run([*tool, "control", *names], capture_output=True, text=True, timeout=30).stdout
-    assert "DeviceID = SIM1" in said
-    assert "Fake" in said
+    message = subprocess.run([*tool, "control", *names], capture_output=True, text=True, timeout=30).stdout
+    assert "DeviceID = SIM1" in message
+    assert "Fake" in message
     subprocess.run([*tool, "control", "Width=320"], capture_output=True, text=True, timeout=30, check=True)
-    said = subprocess.run([*tool, "control", "Width"], capture_output=True, text=True, timeout=30).stdout
-    assert "Width = 320" in said
+    message = subprocess.run([*tool, "control", "Width"], capture_output=True, text=True, timeout=30).stdout
+    assert "Width = 320" in message
 
 
 def test_aravis_s_own_client_receives_whole_frames(simulated: GigeCamera) -> None:
@@ -433,8 +433,8 @@ def test_aravis_s_own_client_receives_whole_frames(simulated: GigeCamera) -> Non
     )
     time.sleep(4.0)
     running.send_signal(2)
-    said = running.communicate(timeout=30)[0]
-    whole = int(said.split("n_completed_buffers")[1].split()[1])
-    failed = int(said.split("n_failures")[1].split()[1])
+    message = running.communicate(timeout=30)[0]
+    whole = int(message.split("n_completed_buffers")[1].split()[1])
+    failed = int(message.split("n_failures")[1].split()[1])
     assert whole >= 20
     assert failed <= whole // 20  # what a busy machine loses of packets is its own

@@ -91,11 +91,11 @@ def test_bluesky_scans_over_the_turntable_with_the_sonar() -> None:
         settings={"speed": 900.0},
     )
     sonar = ping360("sonar", InProcess(lambda: FaultyConnection(head)), settings={"half_sector": 3})
-    for wanted in ("Readable", "Triggerable", "Stageable", "Stoppable", "Configurable"):
-        assert isinstance(sonar, getattr(protocols, wanted)), wanted
-        assert isinstance(table, getattr(protocols, wanted)), wanted
-    for wanted in ("Readable", "Movable", "Stoppable", "Configurable"):
-        assert isinstance(table.axes["tilt"], getattr(protocols, wanted)), wanted
+    for expected in ("Readable", "Triggerable", "Stageable", "Stoppable", "Configurable"):
+        assert isinstance(sonar, getattr(protocols, expected)), expected
+        assert isinstance(table, getattr(protocols, expected)), expected
+    for expected in ("Readable", "Movable", "Stoppable", "Configurable"):
+        assert isinstance(table.axes["tilt"], getattr(protocols, expected)), expected
     documents: list[tuple[str, dict[str, Any]]] = []
     with table, sonar:
         table.home("tilt")

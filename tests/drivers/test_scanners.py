@@ -166,8 +166,8 @@ def test_a_moved_transducer_makes_sections() -> None:
     scope = oscilloscope("scope", linked(shown))
     axes = {"z": {"per_unit": 1000.0, "unit": "mm", "high": 300.0}}
     table = zaber("table", linked(chain), axes=axes, settings={"speed": 1000.0})
-    wanted = {"repetition_hz": 100.0, "speed_m_s": speed, "lines": 25, "full_scale_v": 5.0, "gain_db": 20.0}
-    device, machine = pulser(digitiser=scope, carrier=table, settings=wanted)
+    expected = {"repetition_hz": 100.0, "speed_m_s": speed, "lines": 25, "full_scale_v": 5.0, "gain_db": 20.0}
+    device, machine = pulser(digitiser=scope, carrier=table, settings=expected)
     with scope, table, device:
         assert isinstance(device, UltrasonicScanner)
         with pytest.raises(StateError, match="home z first"):
@@ -193,8 +193,8 @@ def test_stop_ends_a_section_and_stops_the_carrier() -> None:
     axes = {"z": {"per_unit": 1000.0, "unit": "mm", "high": 300.0}}
     table = zaber("table", linked(chain), axes=axes, settings={"speed": 20.0})
     scope = oscilloscope("scope", linked(shown))
-    wanted = {"repetition_hz": 100.0, "step_mm": 100.0, "lines": 3}
-    device, machine = pulser(digitiser=scope, carrier=table, settings=wanted)
+    expected = {"repetition_hz": 100.0, "step_mm": 100.0, "lines": 3}
+    device, machine = pulser(digitiser=scope, carrier=table, settings=expected)
     with scope, table, device:
         table.home("z")
         caught: list[Exception] = []
@@ -236,12 +236,12 @@ def test_combined_instruments_are_named_on_the_bench() -> None:
     bench = Bench(BenchFile.parse_toml(text, where="bench.toml"))
     assert bench["pulser"]._digitiser is bench["scope"]  # type: ignore[attr-defined]
     assert bench["pulser"]._carrier is bench["table"]  # type: ignore[attr-defined]
-    for wrong, said in (
+    for wrong, message in (
         (text.replace('"scope", carrier', '"table", carrier'), "digitiser 'table' is not an oscilloscope"),
         (text.replace("axes = {z", "axes = {tilt"), "is not a table with an axis 'z'"),
         (text.replace('carrier = "table"', 'carrier = "none"'), "carrier 'none'"),
     ):
-        with pytest.raises(BenchError, match=said):
+        with pytest.raises(BenchError, match=message):
             Bench(BenchFile.parse_toml(wrong, where="bench.toml"))
 
 

@@ -109,16 +109,16 @@ def test_a_move_that_takes_too_long_is_stopped(which: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
+    ("kind", "message"),
     [("stuck", "stalled"), ("out of range", "limit switch"), ("wrong state", "driver is off")],
 )
-def test_flags_of_a_movement_raise(kind: str, said: str) -> None:
+def test_flags_of_a_movement_raise(kind: str, message: str) -> None:
     chain, script = ZaberChain([1]), FaultScript()
     link = InProcess(lambda: FaultyConnection(chain, script))
     with Table("table", Zaber(link), {"tilt": AxisPlan(per_unit=1000.0)}) as table:
         table.home("tilt")
         script.fault_at(script.count + 6, Fault(kind))  # type: ignore[arg-type]
-        with pytest.raises(StateError, match=said):
+        with pytest.raises(StateError, match=message):
             table.move("tilt", 200.0)
 
 

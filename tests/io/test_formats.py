@@ -31,7 +31,7 @@ def design() -> dict[str, Any]:
     }
 
 
-def test_a_design_survives_the_way_to_the_file_and_back(tmp_path: Path) -> None:
+def test_a_design_is_read_back_unchanged(tmp_path: Path) -> None:
     first = ReseauDesign.parse(json.dumps(design()), where="d.json")
     path = tmp_path / "d.json"
     write_whole(path, first.to_json())
@@ -88,7 +88,7 @@ def broken(change: str) -> str:
         ("schema", "'reseau-design/1' was expected"),
     ],
 )
-def test_a_design_that_breaks_a_rule_is_refused_in_one_line(change: str, complaint: str) -> None:
+def test_an_invalid_design_is_refused_in_one_line(change: str, complaint: str) -> None:
     with pytest.raises(FormatError, match=complaint) as caught:
         ReseauDesign.parse(broken(change), where="bad.json")
     assert str(caught.value).startswith("bad.json: ")
@@ -136,7 +136,7 @@ def test_measured_points_keep_their_covariance() -> None:
     np.testing.assert_array_equal(again.xy, points.xy)
 
 
-def test_marks_that_were_not_measured_are_no_points() -> None:
+def test_marks_that_were_not_measured_are_not_returned_as_points() -> None:
     document = {
         "schema": "reseau-measurement/1",
         "image": "p.png",
@@ -151,7 +151,7 @@ def test_marks_that_were_not_measured_are_no_points() -> None:
     np.testing.assert_array_equal(points.sigma, [[1.0, 1.0]])
 
 
-def test_coordinates_by_hand_come_as_csv(tmp_path: Path) -> None:
+def test_coordinates_are_read_from_csv(tmp_path: Path) -> None:
     path = tmp_path / "p.csv"
     path.write_text("id,x,y,sx,sy\n a ,1,2,0.1,0.2\n\nb,3.5,-4e1,1,1\n")
     points = ReseauMeasurement.read_csv(path).image_points()
@@ -173,7 +173,7 @@ def test_coordinates_by_hand_come_as_csv(tmp_path: Path) -> None:
         ("id,x,y\na,1,2\na,3,4\n", "line 3: duplicate id 'a'"),
     ],
 )
-def test_a_csv_that_breaks_a_rule_is_refused_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
+def test_an_invalid_csv_is_refused_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / "p.csv"
     path.write_text(text)
     with pytest.raises(FormatError, match=rf"p\.csv: .*{complaint}"):

@@ -74,6 +74,6 @@ def test_an_orientation_reads_back_the_same() -> None:
         ({"edges": "left out"}, "missing key `edges`"),
     ],
 )
-def test_an_orientation_that_breaks_a_rule_is_refused(changes: dict[str, Any], complaint: str) -> None:
+def test_an_invalid_orientation_is_refused(changes: dict[str, Any], complaint: str) -> None:
     with pytest.raises(FormatError, match=complaint):
         FrameOrientation.parse(orientation(**changes), where="o.json")

@@ -32,7 +32,7 @@ def everywhere() -> np.ndarray:
 
 
 @pytest.mark.parametrize("polarity", [-1, 1])
-def test_every_mark_is_among_the_strongest_and_lies_where_it_is(polarity):
+def test_every_mark_is_among_the_strongest_candidates_at_its_position(polarity):
     found = find_candidates(frame(40.0 * polarity), everywhere(), template(polarity))
     distance = np.hypot(*(found.xy[:30, None] - PLACES[None]).transpose(2, 0, 1))
     assert set(distance.argmin(axis=1)) == set(range(30))
@@ -40,13 +40,13 @@ def test_every_mark_is_among_the_strongest_and_lies_where_it_is(polarity):
     assert np.all(np.diff(found.t) <= 0)
 
 
-def test_a_mark_of_the_other_polarity_is_none():
+def test_a_mark_of_the_other_polarity_is_not_a_candidate():
     found = find_candidates(frame(40.0), everywhere(), template(-1))
     near = np.hypot(*(found.xy[:, None] - PLACES[None]).transpose(2, 0, 1)).min(axis=1) < 2
     assert not near.any()
 
 
-def test_noise_alone_is_seldom_as_significant_as_a_weak_mark():
+def test_noise_is_rarely_as_significant_as_a_weak_mark():
     counts = [len(find_candidates(frame(0.0, seed), everywhere(), template(), 5.5)) for seed in range(5)]
     # 286 000 pixels with neighbours of like content: about one in 50 000 000 beyond 5.5.
     assert sum(counts) <= 1
@@ -64,7 +64,7 @@ def test_the_significance_is_the_amplitude_over_its_standard_deviation():
     assert np.mean(t) == pytest.approx(expected, rel=0.1)
 
 
-def test_what_lies_on_pixels_without_an_image_is_no_candidate_and_lost_lines_do_no_harm():
+def test_pixels_without_an_image_give_no_candidates_and_lost_lines_no_errors():
     pixels, valid = frame(-40.0), everywhere()
     pixels[:, :60] = 0
     valid[:, :60] = False
@@ -77,7 +77,7 @@ def test_what_lies_on_pixels_without_an_image_is_no_candidate_and_lost_lines_do_
     assert distance.max() < 0.5
 
 
-def test_no_more_candidates_than_asked_for_and_the_strongest_of_them():
+def test_at_most_the_requested_number_of_strongest_candidates_is_returned():
     pixels = frame(-40.0)
     every, few = (find_candidates(pixels, everywhere(), template(), 3.0, most) for most in (4000, 12))
     assert len(few) == 12

@@ -47,7 +47,7 @@ def families() -> dict[str, PlaneMapping]:
     }
 
 
-def begun(model: PlaneMapping) -> PlaneMapping:
+def approximate(model: PlaneMapping) -> PlaneMapping:
     """The same family at the approximate values a user begins from."""
     if isinstance(model, RationalPolynomial):
         if set(model.names) >= {"X_00", "Y_00"}:
@@ -71,7 +71,7 @@ def noisy(seed, sigma, target_sigma=0.0, model=None):
 @pytest.mark.parametrize("name", families())
 def test_every_family_is_recovered_from_points_without_noise(name):
     model = families()[name]
-    fit = fit_mapping(begun(model), points(XY), model(XY)).required()
+    fit = fit_mapping(approximate(model), points(XY), model(XY)).required()
     # What a coefficient does to the outermost mark must be right to a nanometre.
     effect = np.abs(model.derivatives(XY).d_parameters).max(axis=(0, 1))
     assert np.abs((fit.values - model.values) * effect).max() < 1e-6
@@ -80,13 +80,13 @@ def test_every_family_is_recovered_from_points_without_noise(name):
 
 
 @pytest.mark.parametrize("name", families())
-def test_the_conditions_have_the_jacobians_they_state(name):
+def test_the_jacobians_of_the_conditions_are_correct(name):
     model = families()[name]
-    check = check_jacobian(mapping_problem(begun(model), points(XY), model(XY)), at=model.values)
+    check = check_jacobian(mapping_problem(approximate(model), points(XY), model(XY)), at=model.values)
     assert check.agrees(1e-7), str(check)
 
 
-def test_the_residuals_take_the_points_onto_the_model():
+def test_adding_the_residuals_moves_the_points_onto_the_model():
     seen, target = noisy(1, 0.05)
     fit = fit_mapping(RationalPolynomial.camera(), seen, target).required()
     adjusted = RationalPolynomial.camera().with_values(fit.values)(seen.xy + fit.residuals)
@@ -94,7 +94,7 @@ def test_the_residuals_take_the_points_onto_the_model():
     assert np.abs(fit.residuals).max() > 0.05
 
 
-def test_points_with_larger_sigmas_weigh_less():
+def test_points_with_larger_sigmas_have_less_weight():
     seen, target = noisy(2, 0.01)
     wrong = seen.xy.copy()
     wrong[7] += (3.0, -2.0)
@@ -108,7 +108,7 @@ def test_points_with_larger_sigmas_weigh_less():
     assert np.abs((affected.values - truth.values) / truth.sigma).max() > 10
 
 
-def test_the_sigma_of_the_target_enters():
+def test_the_sigma_of_the_target_is_used():
     """Points and target of a thousandth and a hundredth: as if the points had the root of both squared."""
     model = RationalPolynomial.affine().with_values({"a1": 2.0, "b2": 2.0})
     seen, target = noisy(3, 0.003, 0.008, model)
@@ -151,7 +151,7 @@ def test_the_covariance_is_that_of_repeated_fits():
     assert np.mean([fit.global_test(0.05).passed for fit in runs]) == pytest.approx(0.95, abs=0.06)
 
 
-def test_fewer_coordinates_than_parameters_are_a_failure_that_counts_them():
+def test_too_few_coordinates_are_a_failure_that_counts_them():
     six = points(XY[:6])
     for found in (
         fit_mapping(RationalPolynomial.camera(), six, XY[:6]),
@@ -172,12 +172,12 @@ def test_marks_on_one_line_are_a_failure_that_names_what_they_do_not_determine()
     assert "b2" in found.reason
 
 
-def test_targets_of_another_number_are_misuse():
+def test_a_wrong_number_of_targets_is_an_error():
     with pytest.raises(UsageError, match="72 points"):
         mapping_problem(RationalPolynomial.affine(), points(XY), XY[:-1])
 
 
-def test_reduction_drops_the_terms_the_world_lacks_and_keeps_the_others():
+def test_reduction_drops_absent_terms_and_keeps_the_others():
     model = families()["camera"].with_values({"d2": 0.0, "h1": 0.0, "a0": 0.0})
     seen, target = noisy(6, 0.01, model=model)
     found = reduce_mapping(RationalPolynomial.camera(), seen, target, alpha=0.001).required()
@@ -191,7 +191,7 @@ def test_reduction_drops_the_terms_the_world_lacks_and_keeps_the_others():
         assert found.adjustment[name] == pytest.approx(again[name], abs=1e-6 * again.sigma_of(name))
 
 
-def test_reduction_keeps_what_it_is_told_to_and_hands_its_options_on():
+def test_reduction_keeps_the_requested_terms_and_passes_options_on():
     model = families()["camera"].with_values({"d2": 0.0, "h1": 0.0})
     seen, target = noisy(7, 0.01, model=model)
     found = reduce_mapping(
@@ -210,7 +210,7 @@ def test_reduction_keeps_what_it_is_told_to_and_hands_its_options_on():
     np.testing.assert_array_equal(found.adjustment.covariance, found.adjustment.cofactor)
 
 
-def test_a_fit_is_an_adjustment_with_all_that_belongs_to_it():
+def test_a_fit_contains_a_complete_adjustment():
     seen, target = noisy(8, 0.01)
     fit = fit_mapping(RationalPolynomial.camera(), seen, target)
     assert isinstance(fit, Adjustment)

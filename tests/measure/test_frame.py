@@ -45,13 +45,13 @@ def errors(result: FrameResult, frame: FilmFrame) -> Array:
     ],
     ids=lambda frame: f"seed {frame.seed}",
 )
-def test_corners_are_found_whatever_disturbs(frame: FilmFrame) -> None:
+def test_corners_are_found_despite_disturbances(frame: FilmFrame) -> None:
     result = oriented(frame)
     assert result.status == "oriented", result.why
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
-def test_a_frame_that_stands_upright_is_named_as_seen() -> None:
+def test_corners_of_an_upright_frame_are_named_as_seen() -> None:
     frame = FilmFrame(12, tilt_deg=90.0)
     result = oriented(frame)
     assert result.format_mm == (24.0, 36.0)
@@ -80,7 +80,7 @@ def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
     assert any(bow for bow in reported)
 
 
-def test_a_line_that_nothing_parts_from_an_edge_is_not_taken_for_it() -> None:
+def test_a_line_that_touches_an_edge_is_not_measured_as_the_edge() -> None:
     # A bright line within half a pixel of the upper edge at one end: told by the width of its steps alone.
     result = oriented(FilmFrame(320035, beside=Beside(lines=1)))
     assert result.status == "declined"
@@ -95,7 +95,7 @@ def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
-def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None:
+def test_certain_frames_of_a_roll_locate_an_edge_hidden_by_a_line() -> None:
     """The line is at one distance from the edge all along: alone, nothing tells them apart."""
     frame = FilmFrame(320035, beside=Beside(lines=1))
     alone = oriented(frame)
@@ -117,13 +117,13 @@ def test_sure_frames_of_a_roll_tell_where_an_edge_is_that_a_line_hides() -> None
     ],
     ids=["hardly noise", "fine", "grain"],
 )
-def test_edges_are_found_as_soft_and_as_grainy_as_they_are(frame: FilmFrame) -> None:
+def test_edges_of_any_softness_and_grain_are_found(frame: FilmFrame) -> None:
     result = oriented(frame)
     assert result.status == "oriented", result.why
     assert np.abs(errors(result, frame)).max() < 0.4
 
 
-def test_a_thing_that_bends_away_from_a_dark_edge_is_no_bow_of_it() -> None:
+def test_a_curve_that_leaves_a_dark_edge_is_not_measured_as_its_bow() -> None:
     frame = FilmFrame(
         6010, dpi=1200, blur_px=2.5, beside=Beside(rods=1)
     )  # it was 1.2 px off with sigmas of 0.2
@@ -131,7 +131,7 @@ def test_a_thing_that_bends_away_from_a_dark_edge_is_no_bow_of_it() -> None:
     assert not result or np.abs(errors(result, frame)).max() < 0.5
 
 
-def test_places_do_not_lie_inwards_in_noise() -> None:
+def test_edge_positions_are_unbiased_in_noise() -> None:
     """With a noise of a tenth of the contrast the mean of eight frames was 0.04 px, five standard errors."""
     inwards = []
     for seed in range(8):
@@ -142,14 +142,14 @@ def test_places_do_not_lie_inwards_in_noise() -> None:
     assert abs(np.mean(inwards)) < 0.025
 
 
-def test_a_scratch_along_the_film_beside_an_edge_is_passed_over() -> None:
+def test_a_scratch_parallel_to_an_edge_is_ignored() -> None:
     frame = FilmFrame(300017, beside=Beside(scratches=8))
     result = oriented(frame)
     assert result.status == "oriented", result.why
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
-def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_fourth_is() -> None:
+def test_a_frame_cropped_on_one_side_has_three_edges_and_a_sigma_for_the_fourth() -> None:
     frame = FilmFrame(31, crop="right")
     result = oriented(frame)
     assert result.status == "three-edges"
@@ -162,14 +162,14 @@ def test_a_frame_cropped_on_one_side_has_three_edges_and_says_how_uncertain_the_
     assert not result.edges["right"].found
 
 
-def test_of_the_channels_that_of_most_contrast_is_kept() -> None:
+def test_the_channel_with_the_highest_contrast_is_used() -> None:
     frame = FilmFrame(42, colour=True, dpi=400)
     result = oriented(frame)
     assert result.channel == "red"
     assert np.abs(errors(result, frame)).max() < 0.3
 
 
-def test_another_channel_is_kept_where_that_of_most_contrast_hides_an_edge() -> None:
+def test_another_channel_is_used_if_that_with_the_highest_contrast_hides_an_edge() -> None:
     frame = FilmFrame(320035, colour=True)
     pixels = frame.scan()
     pixels[..., 0] = FilmFrame(320035, colour=True, beside=Beside(lines=1)).scan()[..., 0]
@@ -202,7 +202,7 @@ def test_a_frame_seen_at_an_angle_is_oriented_with_a_remark() -> None:
     np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=0.3)
 
 
-def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
+def test_four_edges_without_a_perspective_frame_are_declined() -> None:
     # One corner moved alone: its edges are turned by a degree and more.
     by = np.array([[24.0, 16.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     result, _ = moved_at_its_corners(FilmFrame(52), by)
@@ -211,7 +211,7 @@ def test_four_edges_that_no_perspective_makes_a_frame_are_declined() -> None:
     assert "do not form a frame" in result.why
 
 
-def test_what_is_no_frame_is_declined_with_what_would_help() -> None:
+def test_images_without_a_frame_are_declined_with_a_remedy() -> None:
     rng = np.random.default_rng(0)
     blank = np.full((500, 700), 12, dtype=np.uint8)
     noise = rng.integers(0, 255, (500, 700)).astype(np.uint8)
@@ -231,7 +231,7 @@ def test_a_wrong_format_is_declined() -> None:
     assert not result
 
 
-def test_the_document_says_pp_axes_and_scale() -> None:
+def test_the_document_contains_principal_point_axes_and_scale() -> None:
     frame = FilmFrame(51, tilt_deg=3.0)
     document = oriented(frame).document()
     ul, ur, lr, ll = frame.truth.corners

@@ -50,7 +50,7 @@ def share_right(found, image) -> float:
 
 @pytest.mark.parametrize("shift", [(0, 0), (38, -27), (-30, 34)])
 @pytest.mark.parametrize("bend", [-30.0, 25.0])
-def test_prior_positions_may_be_tens_of_pixels_off(shift, bend):
+def test_prior_positions_may_be_wrong_by_tens_of_pixels(shift, bend):
     rng, xy = np.random.default_rng(1), design()
     image = seen(xy, bend=bend)
     start = seen(xy) + shift
@@ -102,7 +102,7 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
     assert (found.candidate[~there] >= 0).mean() < 0.2
 
 
-def test_a_handedness_that_is_known_is_kept():
+def test_a_known_handedness_is_kept():
     rng, xy = np.random.default_rng(7), design()
     image = seen(xy)
     found = place_grid(xy, candidates(image, rng), VALID, GridOptions(mirrored=True))
@@ -110,7 +110,7 @@ def test_a_handedness_that_is_known_is_kept():
     assert np.linalg.det(found.field.jacobian(xy[:1])[0]) < 0
 
 
-def test_marks_beyond_the_frame_or_on_lost_pixels_are_not_held_against_it():
+def test_marks_outside_the_frame_or_on_lost_pixels_do_not_count_as_missing():
     rng, xy = np.random.default_rng(8), design()
     image = seen(xy, shift=(250, 120))
     valid = VALID.copy()
@@ -122,7 +122,7 @@ def test_marks_beyond_the_frame_or_on_lost_pixels_are_not_held_against_it():
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_hardly_any_candidates_are_no_grid(count):
+def test_too_few_candidates_give_no_grid(count):
     few = Candidates(np.full((count, 2), 50.0) + np.arange(count)[:, None], np.full(count, 9.0))
     assert assign(design(), seen(design()), few, VALID) is None
     assert place_grid(design(), few, VALID, GridOptions()) is None

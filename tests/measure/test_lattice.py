@@ -56,7 +56,7 @@ def test_lines_are_adjusted_to_a_hundredth_of_a_pixel(station: Station) -> None:
     assert min(len(fit.across), len(fit.along)) >= 5
 
 
-def test_the_lattice_runs_up_when_it_runs_right() -> None:
+def test_the_lattice_is_right_handed() -> None:
     bench = FieldBench()
     for station in (Station(0), Station(30, 90, 180)):
         fit = fitted(bench, station)
@@ -75,7 +75,7 @@ def test_second_order_is_the_derivative_of_the_mapping() -> None:
     np.testing.assert_allclose(slope, analytic, rtol=0, atol=2e-3)
 
 
-def test_a_mapping_goes_through_the_points_it_is_given() -> None:
+def test_a_mapping_passes_through_its_points() -> None:
     bench, station = FieldBench(), Station(45)
     fit = fitted(bench, station)
     at = np.random.default_rng(0).uniform([0, 0], [4, 4], (60, 2))
@@ -84,7 +84,7 @@ def test_a_mapping_goes_through_the_points_it_is_given() -> None:
     np.testing.assert_allclose(again(at), moved, rtol=0, atol=0.003)
 
 
-def test_where_there_are_no_lines_there_is_no_lattice() -> None:
+def test_an_image_without_lines_gives_no_lattice() -> None:
     grey = np.random.default_rng(1).normal(100, 3, (200, 200)).astype(np.float32)
     found = find_lattice(ridge_points(grey, 3.0))
     assert isinstance(found, Failure)

@@ -92,7 +92,7 @@ def test_without_noise_positions_are_exact_to_a_thousandth_of_a_pixel(shape, pol
     assert np.abs(found.form).max() < 0.01
 
 
-def test_a_shift_of_a_thousandth_of_a_pixel_is_seen_as_one():
+def test_a_shift_of_a_thousandth_of_a_pixel_is_measured():
     xy = places()
     first, second = (matched(formed("square", xy + d), xy, "square", sigma=0.05).xy for d in (0.0, 0.001))
     assert second - first == pytest.approx(0.001, abs=1e-4)
@@ -110,7 +110,7 @@ def test_covariances_are_those_of_the_errors(polarity):
     assert np.mean(errors) == pytest.approx(0.0, abs=0.13)
 
 
-def test_row_jitter_that_is_known_is_in_the_weights_and_in_the_covariances():
+def test_known_row_jitter_enters_weights_and_covariances():
     jitter, xy, errors, plain = 0.15, places(), [], []
     for seed in range(20):
         shifts = np.random.default_rng(seed).normal(0, jitter, SHAPE[0])
@@ -126,7 +126,7 @@ def test_row_jitter_that_is_known_is_in_the_weights_and_in_the_covariances():
     assert np.sqrt(np.mean(error[..., 1] ** 2)) < np.sqrt(np.mean(blind[..., 1] ** 2))
 
 
-def test_the_course_of_the_noise_makes_weights_and_covariances_true():
+def test_the_noise_model_gives_correct_weights_and_covariances():
     a, b, xy, runs = 0.5, 0.2, places(), {}
     clean = formed("disk", xy, contrast=0.9)
     for variance in (None, (a, b)):
@@ -162,7 +162,7 @@ def test_bit_errors_in_a_mark_do_not_move_it():
     assert found.psf_px == pytest.approx(undisturbed.psf_px, abs=0.05)
 
 
-def test_something_beside_a_mark_is_left_out_with_a_larger_sigma_at_most():
+def test_a_disturbance_beside_a_mark_at_most_increases_its_sigma():
     xy = places()
     pixels = formed("disk", xy) + noise(4)
     column, row = np.rint(xy).astype(int).T
@@ -174,7 +174,7 @@ def test_something_beside_a_mark_is_left_out_with_a_larger_sigma_at_most():
     assert np.abs(found.xy - xy).max() < 0.15
 
 
-def test_a_mark_partly_on_lost_pixels_is_measured_by_what_is_left_of_it():
+def test_a_mark_partly_on_lost_pixels_is_measured_from_the_rest():
     xy = places()
     pixels, valid = formed("disk", xy) + noise(5), np.ones(SHAPE, dtype=bool)
     for row in range(25, 140, 33):
@@ -187,7 +187,7 @@ def test_a_mark_partly_on_lost_pixels_is_measured_by_what_is_left_of_it():
     assert np.sqrt(((found.xy - xy) ** 2).mean()) < 0.1
 
 
-def test_a_mark_beyond_the_edge_of_the_frame_is_seen_in_part_and_less_sure():
+def test_a_mark_cut_by_the_edge_of_the_frame_has_a_larger_sigma():
     xy = np.array([[0.5, 60.2], [94.3, 147.8], [94.4, 75.1]])
     found = matched(formed("disk", xy) + noise(6), xy)
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
@@ -197,7 +197,7 @@ def test_a_mark_beyond_the_edge_of_the_frame_is_seen_in_part_and_less_sure():
     assert sigma[:2].max() > 1.5 * sigma[2].max()
 
 
-def test_the_result_of_each_mark_is_its_own():
+def test_the_result_of_a_mark_does_not_depend_on_the_others():
     xy = places()
     pixels = formed("disk", xy) + noise(7)
     together = matched(pixels, xy)

@@ -23,7 +23,7 @@ def windows(a: float, b: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return pixels, light[index] - pixels[index]
 
 
-def test_read_noise_and_the_light_s_share_are_told_apart():
+def test_read_noise_and_photon_noise_are_separated():
     pixels, residuals = windows(A, B)
     a, b = grey_variance(pixels, STARTS, residuals)
     # 18 000 residuals, a fifth of them dark: the variances at both levels to two or three per cent.
@@ -32,7 +32,7 @@ def test_read_noise_and_the_light_s_share_are_told_apart():
 
 
 @pytest.mark.parametrize("b", [0.0, -0.02])
-def test_noise_that_does_not_grow_with_the_light_is_taken_as_even(b):
+def test_noise_that_does_not_grow_with_light_is_modelled_as_constant(b):
     assert grey_variance(*_with_starts(4.0, b)) is None
 
 
@@ -41,7 +41,7 @@ def _with_starts(a, b):
     return pixels, STARTS, residuals
 
 
-def test_pixels_left_out_take_no_part():
+def test_excluded_pixels_are_not_used():
     pixels, residuals = windows(A, B)
     residuals[:, 0] = np.nan
     residuals[3] = np.nan
@@ -54,12 +54,12 @@ def test_pixels_left_out_take_no_part():
     )
 
 
-def test_too_few_residuals_tell_nothing():
+def test_too_few_residuals_give_no_noise_model():
     pixels, residuals = windows(A, B)
     assert grey_variance(pixels, STARTS[:2], residuals[:2]) is None
 
 
-def test_weights_are_inverse_to_the_variances_of_a_patch_and_never_wild():
+def test_weights_are_inverse_to_the_variances_of_a_patch_and_bounded():
     grey = np.array([[50.0, 100.0, 150.0], [0.0, 0.0, 1e6]])
     weights = relative_weights(grey, (A, B))
     assert weights[0] * (A + B * grey[0]) == pytest.approx(np.full(3, A + B * 100))
@@ -67,7 +67,7 @@ def test_weights_are_inverse_to_the_variances_of_a_patch_and_never_wild():
     assert weights.min() > 0
 
 
-def test_medians_are_of_the_values_in_use_alone():
+def test_medians_use_only_the_used_values():
     values = np.array(
         [[3.0, 1.0, 2.0, 9.0], [4.0, np.nan, 1.0, 7.0], [1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]]
     )

@@ -78,7 +78,7 @@ def bound(xy: Array, shown: Arcs, light: float) -> Array:
     start=st.tuples(st.floats(3.0, 20.0), st.floats(0.8, 5.0), st.floats(-0.03, 0.03), st.floats(-1.5, 1.5)),
     at=st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)),
 )
-def test_images_change_as_their_derivatives_say(start: tuple[float, ...], at: tuple[float, float]):
+def test_the_derivatives_of_images_are_correct(start: tuple[float, ...], at: tuple[float, float]):
     pixels = np.arange(-20, 21.0)[None]
     values = np.array([*at, start[1], np.log(start[0]), *start[2:]])
 
@@ -101,7 +101,7 @@ def test_images_change_as_their_derivatives_say(start: tuple[float, ...], at: tu
     ("along", "across", "curvature", "tilt"),
     [(7.0, 1.7, 0.015, 0.0), (10.0, 1.4, 0.02, 0.5), (5.0, 2.2, -0.01, -0.7)],
 )
-def test_positions_reach_the_bound(along: float, across: float, curvature: float, tilt: float):
+def test_positions_reach_the_cramer_rao_bound(along: float, across: float, curvature: float, tilt: float):
     rng = np.random.default_rng(5)
     grid = np.stack(np.meshgrid(60 + 75 * np.arange(8), 55 + 60 * np.arange(7)), axis=-1).reshape(-1, 2)
     deviation, limits, own = [], [], []
@@ -123,7 +123,7 @@ def test_positions_reach_the_bound(along: float, across: float, curvature: float
     assert (np.abs(normalised - 1) < 0.15).all()
 
 
-def test_positions_are_free_of_bias_and_form_is_told():
+def test_positions_are_unbiased_and_the_form_is_estimated():
     grid = np.stack(np.meshgrid(60 + 75 * np.arange(6), 55 + 60 * np.arange(5)), axis=-1).reshape(-1, 2)
     truth = grid + np.random.default_rng(1).uniform(-0.5, 0.5, grid.shape)
     found = find_pins(frame(picture(truth, arcs(len(truth), 8.0, 1.7, 0.015, 0.2), (360, 500), noise=0.02)))
@@ -135,7 +135,7 @@ def test_positions_are_free_of_bias_and_form_is_told():
 
 
 @pytest.mark.parametrize("apart", [22.0, 26.0, 30.0, 40.0])
-def test_neighbours_that_touch_are_measured_as_well_as_they_say_or_declined(apart: float):
+def test_touching_neighbours_are_measured_within_their_sigmas_or_declined(apart: float):
     truth = np.array([[150.3, 120.2], [150.3 + apart, 121.1]])
     found = find_pins(frame(picture(truth, arcs(2), (240, 400))))
     rows = nearest(found.xy, truth)
@@ -149,7 +149,7 @@ def test_neighbours_that_touch_are_measured_as_well_as_they_say_or_declined(apar
         assert sigma.max() < 0.5
 
 
-def test_what_is_too_faint_is_declined_and_the_rest_measured_where_it_is():
+def test_faint_echoes_are_declined_and_the_others_measured_correctly():
     truth = np.stack([60.0 + 70 * np.arange(8), np.full(8, 80.25)], axis=1)
     light = 150 * np.array([1.0, 0.8, 0.6, 0.45, 0.35, 0.28, 0.17, 0.06])
     found = find_pins(frame(picture(truth, arcs(8), (160, 620), light)))
@@ -162,7 +162,7 @@ def test_what_is_too_faint_is_declined_and_the_rest_measured_where_it_is():
 
 @pytest.mark.parametrize("wire", [148, 151, 154])
 @pytest.mark.parametrize("width", [1, 2, 3])
-def test_a_wire_across_the_echo_is_seen_and_left_out(wire: int, width: int):
+def test_a_wire_across_an_echo_is_detected_and_excluded(wire: int, width: int):
     truth = np.array([[150.3, 100.2]])
     pixels = picture(truth, arcs(1, 9.0), (200, 300), noise=0.0)
     pixels[:, wire : wire + width] *= 0.1
@@ -174,19 +174,19 @@ def test_a_wire_across_the_echo_is_seen_and_left_out(wire: int, width: int):
     assert (np.abs(found.xy[k] - truth[0]) < 4.5 * found.points.sigma[0]).all()
 
 
-def test_a_wire_whose_place_is_known_does_not_bias_even_where_it_cuts_the_fading_end():
+def test_a_wire_at_a_known_position_causes_no_bias_even_at_the_end_of_an_echo():
     truth = np.array([[150.3, 100.2]])
     hidden = np.zeros((200, 300), dtype=bool)
     hidden[:, 159:163] = True
     pixels = picture(truth, arcs(1, 9.0), (200, 300))
     pixels[hidden] = 0.0
-    told, untold = find_pins(frame(pixels), hidden=hidden), find_pins(frame(pixels))
-    assert np.abs(told.xy[0] - truth[0]).max() < 0.3
-    assert np.abs(told.xy[0] - truth[0]).max() < np.abs(untold.xy[0] - truth[0]).max()
+    reported, untold = find_pins(frame(pixels), hidden=hidden), find_pins(frame(pixels))
+    assert np.abs(reported.xy[0] - truth[0]).max() < 0.3
+    assert np.abs(reported.xy[0] - truth[0]).max() < np.abs(untold.xy[0] - truth[0]).max()
 
 
 @pytest.mark.parametrize("x", [-8.0, -2.0, 3.0, 8.0, 20.0])
-def test_at_the_edge_of_the_screen_measured_rightly_or_declined(x: float):
+def test_echoes_at_the_edge_of_the_screen_are_measured_correctly_or_declined(x: float):
     truth = np.array([[x + 0.3, 100.2], [150.0, 60.0]])
     found = find_pins(frame(picture(truth, arcs(2), (200, 300))))
     k = nearest(found.xy, truth[:1])[0]
@@ -212,7 +212,7 @@ def test_frames_without_an_image_are_refused():
 
 @pytest.mark.parametrize("quality", [None, 60])
 @pytest.mark.parametrize("scale", [0.4, 0.6, 1.0])
-def test_what_the_instrument_draws_is_no_pin(scale: float, quality: int | None):
+def test_graphics_of_the_instrument_are_not_measured_as_pins(scale: float, quality: int | None):
     truth = np.array([[100.3, 160.2], [300.0, 160.0]])
     pixels = picture(truth, arcs(2, 9.0), (250, 480), noise=0.0).astype(np.uint8)
     cv2.putText(pixels, "GAIN: 20 dB  DEPTH-7 cm il1|/", (10, 40), cv2.FONT_HERSHEY_SIMPLEX, scale, 180, 1)
@@ -233,7 +233,7 @@ def test_what_the_instrument_draws_is_no_pin(scale: float, quality: int | None):
     assert np.abs(found.xy[nearest(found.xy, truth)] - truth).max() < 0.3
 
 
-def test_what_stands_still_in_a_sequence_is_no_echo():
+def test_static_spots_of_a_sequence_are_not_echoes():
     still, moving = np.array([[90.0, 60.0]]), np.array([[100.0, 140.0], [200.0, 140.0]])
     frames = [
         frame(
@@ -291,7 +291,7 @@ def on_screen(matrix: Array) -> Array:
 @pytest.mark.parametrize(
     "matrix", [[[5, 0], [0, -5]], [[-5, 0], [0, -5.2]], [[-5, 0], [0, 5]], [[4.95, -0.5], [-0.5, -4.95]]]
 )
-def test_rods_are_told_apart_mirrored_turned_or_not(matrix: list[list[float]]):
+def test_rods_are_identified_also_if_mirrored_or_rotated(matrix: list[list[float]]):
     truth = on_screen(np.array(matrix))
     inside = ((truth > 12) & (truth < [788, 588])).all(axis=1)
     result = measure_pins(frame(picture(truth, arcs(len(truth), 6.0), (600, 800))), rods())
@@ -301,7 +301,7 @@ def test_rods_are_told_apart_mirrored_turned_or_not(matrix: list[list[float]]):
     assert len(result.points) == result.found == result.measurement().found
 
 
-def test_a_symmetric_pattern_is_taken_upright_and_said_to_be_ambiguous():
+def test_a_symmetric_pattern_is_assumed_upright_and_reported_as_ambiguous():
     truth = (SYMMETRIC - 50) @ np.diag([5.0, -5.0]) + [400.2, 300.3]
     result = measure_pins(frame(picture(truth, arcs(len(truth), 6.0), (600, 800))), rods(SYMMETRIC))
     assert result
@@ -327,7 +327,7 @@ def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():
     assert result.notes == ()
 
 
-def test_a_pattern_that_is_not_there_is_a_failure_with_the_reason():
+def test_a_missing_pattern_is_a_failure_with_the_reason():
     truth = np.random.default_rng(4).uniform([40, 40], [600, 440], (5, 2))
     result = measure_pins(frame(picture(truth, arcs(5), (480, 640))), rods())
     assert not result
@@ -337,7 +337,7 @@ def test_a_pattern_that_is_not_there_is_a_failure_with_the_reason():
     assert "0 echoes" in blank.reason
 
 
-def test_misuse_is_said():
+def test_misuse_is_reported():
     shown = frame(picture(np.array([[100.0, 100.0]]), arcs(1), (200, 200)))
     with pytest.raises(UsageError, match="cross"):
         measure_pins(shown, ReseauDesign.parse(rods().to_json().replace('"rod"', '"cross"'), where="test"))
@@ -345,7 +345,7 @@ def test_misuse_is_said():
         measure_pins(shown, rods(OBJECT[:3]))
 
 
-def test_slanted_wires_are_read_off_their_segments():
+def test_slanted_wires_are_derived_from_their_segments():
     start = np.array(
         [[30, 20], [55, 20], [60, 20], [30, 10], [35, 10], [60, 10], [35, 0], [55, 0], [60, 0.0]]
     )
@@ -365,7 +365,7 @@ def test_slanted_wires_are_read_off_their_segments():
 @pytest.mark.parametrize(
     ("sequence", "every"), [("VLCUS_6pt", 5), ("fCal20_3NWires_cal", 6)], ids=["characters", "plain"]
 )
-def test_real_frames_have_every_wire_that_plus_found(
+def test_in_real_frames_every_wire_found_by_plus_is_measured(
     sequence: str, every: int, reference_data: Callable[[str], Path]
 ):
     folder = reference_data("ultrasound_nwire")

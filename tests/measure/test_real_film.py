@@ -35,7 +35,7 @@ def options(size, **known):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STILLS)
-def test_a_still_frame_is_oriented_at_its_edges(name, reference_data):
+def test_a_still_frame_is_oriented_by_its_edges(name, reference_data):
     size, corners = STILLS[name]
     (result,) = orient_frames(open_scan(reference_data("film_frames") / name), options(size))
     assert result.status == "oriented", result.why
@@ -43,7 +43,7 @@ def test_a_still_frame_is_oriented_at_its_edges(name, reference_data):
 
 
 @pytest.mark.slow
-def test_a_frame_that_a_tilted_camera_copied_is_oriented_and_said_to_be_so(reference_data):
+def test_a_frame_copied_by_a_tilted_camera_is_oriented_with_a_remark(reference_data):
     size, corners = STILLS["strw_in3.jpg"]
     scan = open_scan(reference_data("film_frames") / "strw_in3.jpg")
     (result,) = orient_frames(scan, FrameOptions((size,)))
@@ -54,7 +54,7 @@ def test_a_frame_that_a_tilted_camera_copied_is_oriented_and_said_to_be_so(refer
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CINE)
-def test_a_cine_frame_whose_film_is_a_few_pixels_wide_is_not_wrong_silently(name, reference_data):
+def test_a_cine_frame_with_a_border_of_a_few_pixels_gives_no_unflagged_error(name, reference_data):
     near = np.array(CINE[name], dtype=float)
     scan = open_scan(reference_data("film_frames") / name)
     (result,) = orient_frames(scan, options((22.0, 16.0), near=near))

@@ -31,17 +31,17 @@ def rms(deviation):
 
 
 @pytest.mark.parametrize("name", [*VOYAGER, JRINGS])
-def test_at_least_as_many_marks_as_nasa_s_program(measured, name):
+def test_at_least_as_many_marks_are_measured_as_by_nasa_s_program(measured, name):
     case, result = measured(name)
     assert result.found >= np.isfinite(case.others["vicar"][:, 0]).sum()
 
 
-def test_at_least_eighty_of_the_marks_of_viking(measured):
+def test_at_least_eighty_marks_of_viking_are_measured(measured):
     assert measured(VIKING)[1].found >= 80
 
 
 @pytest.mark.parametrize("name", [*VOYAGER, JRINGS, VIKING])
-def test_marks_lie_where_their_neighbours_have_them(measured, name):
+def test_marks_agree_with_their_neighbours(measured, name):
     _, result = measured(name)
     off = np.abs(result.deviation[result.ok]).max(axis=1)
     # Beside Io's bright limb the image is bent by as much: one mark there, plainly seen, lies 1.2 px off.
@@ -60,7 +60,7 @@ def test_common_marks_agree_better_with_their_neighbours_than_those_of_nasa_s_pr
         assert (ours < rms(frames.leave_one_out(source[both], theirs[both], degree))).all()
 
 
-def test_the_flat_frame_beats_the_published_figures(measured):
+def test_the_flat_frame_is_more_accurate_than_published(measured):
     case, result = measured(VOYAGER[0])
     theirs, source = case.others["vicar"], case.design.xy
     inner = result.ok & np.isfinite(theirs[:, 0]) & frames.inner_marks(case.design)
@@ -83,7 +83,7 @@ def test_the_frame_resampled_by_our_marks_agrees_with_nasa_s_corrected_frame(mea
     assert found.mad.max() <= mad
 
 
-def test_without_nominal_positions_the_same_marks_come_out(measured):
+def test_without_nominal_positions_the_same_marks_are_measured(measured):
     case, result = measured(JRINGS)
     points = tuple(p.model_copy(update={"nominal_px": None}) for p in case.design.points)
     blind = measure_reseau(case.frame, case.design.model_copy(update={"points": points}))

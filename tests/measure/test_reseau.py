@@ -44,7 +44,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", sorted(CASES))
 @pytest.mark.parametrize("shape", sorted(MARKS))
-def test_errors_are_at_the_cramer_rao_bound_unbiased_and_as_large_as_said(shape, case):
+def test_errors_reach_the_cramer_rao_bound_and_agree_with_their_sigmas(shape, case):
     s = measure_many(small(mark=MARKS[shape], **CASES[case]), 1 if shape == "line-grid" else 2, seed=2)
     count = s.error.size
     assert len(s.error) == s.expected
@@ -57,7 +57,7 @@ def test_errors_are_at_the_cramer_rao_bound_unbiased_and_as_large_as_said(shape,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", sorted(MARKS))
-def test_the_bias_is_below_two_thousandths_of_a_pixel_everywhere_under_a_pixel(shape):
+def test_the_bias_is_below_two_thousandths_of_a_pixel_at_every_subpixel_position(shape):
     s = measure_many(small(mark=MARKS[shape], sigma=sigma_of_snr(46)), 40, seed=3)
     assert np.abs(s.bias).max() < 0.002 - 2 * s.bias_sigma.max()
     assert s.ratio.max() < 1.15
@@ -65,14 +65,14 @@ def test_the_bias_is_below_two_thousandths_of_a_pixel_everywhere_under_a_pixel(s
     assert worst < 0.002 + 3.5 * sigma
 
 
-def test_row_jitter_that_is_known_does_not_make_sigmas_too_small():
+def test_with_known_row_jitter_sigmas_are_not_too_small():
     s = measure_many(small(mark=MARKS["square"], jitter_px=0.1), 10, seed=4)
     # Eight marks of a row share its jitter: 60 groups.
     assert s.normalised == pytest.approx([1.0, 1.0], abs=0.25)
     assert s.ratio.max() < 1.15 + 0.25
 
 
-def test_the_bound_itself_is_reached_by_what_knows_as_little_and_no_more():
+def test_the_bound_agrees_with_an_independent_estimator():
     """The bound of a disk from its edges, against the sum of squared slopes of a finely sampled image."""
     scene = small(sigma=2.0)
     formed = form(scene, rng())
@@ -88,7 +88,7 @@ def test_the_bound_itself_is_reached_by_what_knows_as_little_and_no_more():
 
 
 @pytest.mark.parametrize("shape", ["disk", "cross", "line-grid"])
-def test_a_mark_that_is_not_there_is_never_measured_and_the_reason_is_said(shape):
+def test_an_absent_mark_is_never_measured_and_the_reason_is_given(shape):
     for seed, sigma in ((0, 2.5), (2, 8.0)):
         gone = frozenset(rng(seed).choice(48, 14, replace=False).tolist())
         scene = small(mark=MARKS[shape], sigma=sigma, missing=gone)
@@ -113,7 +113,7 @@ def test_of_thousands_of_absent_marks_none_is_measured():
     assert false == 0
 
 
-def test_without_nominal_positions_the_same_marks_come_out_at_the_same_positions():
+def test_without_nominal_positions_the_same_marks_have_the_same_positions():
     gone = frozenset({9})  # no symmetry is left
     scene = small(missing=gone)
     formed = form(scene, rng(5))
@@ -127,7 +127,7 @@ def test_without_nominal_positions_the_same_marks_come_out_at_the_same_positions
 
 
 @pytest.mark.parametrize("shift", [(30.0, -22.0), (-25.0, 35.0)])
-def test_nominal_positions_may_be_off_by_tens_of_pixels(shift):
+def test_nominal_positions_may_be_wrong_by_tens_of_pixels(shift):
     formed = form(SMALL, rng(6))
     points = tuple(
         p.model_copy(update={"nominal_px": (float(x), float(y))})
@@ -163,7 +163,7 @@ def test_a_design_of_unknown_size_and_unknown_coordinates_of_some_marks():
     assert np.abs(error).max() < 0.08
 
 
-def test_a_design_without_coordinates_goes_by_its_nominal_positions():
+def test_a_design_without_coordinates_uses_its_nominal_positions():
     formed = form(SMALL, rng(8))
     points = tuple(p.model_copy(update={"x": None, "y": None}) for p in formed.design.points)
     mark = formed.design.mark.model_copy(update={"size": 8.0})
@@ -172,7 +172,7 @@ def test_a_design_without_coordinates_goes_by_its_nominal_positions():
     assert np.abs(result.xy - formed.xy).max() < 0.08
 
 
-def test_a_scene_behind_the_marks_costs_few_of_them_and_makes_none_false():
+def test_a_scene_behind_the_marks_hides_few_of_them_and_adds_no_false_ones():
     y, x = np.mgrid[:350, :460]
     light = 1 - 0.55 / (1 + np.exp(-(np.hypot(x - 250, y - 160) - 90) / 2.0))
     light *= 1 + 0.15 * np.sin(x / 17.0) * np.cos(y / 23.0)
@@ -185,7 +185,7 @@ def test_a_scene_behind_the_marks_costs_few_of_them_and_makes_none_false():
     assert error.max() < 0.35
 
 
-def test_lost_lines_and_bit_errors_cost_the_marks_they_cover_and_no_others():
+def test_lost_lines_and_bit_errors_affect_only_the_marks_they_cover():
     formed = form(SMALL, rng(10))
     pixels = formed.frame.pixels.copy()
     y = formed.xy[:, 1]
@@ -204,7 +204,7 @@ def test_lost_lines_and_bit_errors_cost_the_marks_they_cover_and_no_others():
     assert np.abs(result.xy - formed.xy)[result.ok & clear].max() < 0.1
 
 
-def test_marks_beyond_the_frame_are_said_to_be_there():
+def test_marks_outside_the_frame_are_reported_as_such():
     formed = form(SMALL, rng(11))
     result = measured(SMALL, other(formed, formed.frame.pixels[:, :250]))
     beyond = formed.xy[:, 0] > 256
@@ -213,14 +213,14 @@ def test_marks_beyond_the_frame_are_said_to_be_there():
 
 
 @pytest.mark.parametrize(
-    ("pixels", "said"),
+    ("pixels", "message"),
     [
         (np.zeros((350, 460), np.uint8), "is all black"),
         (np.full((350, 460), 255, np.uint8), "is all saturated"),
     ],
 )
-def test_a_frame_without_an_image_is_an_error_of_one_line(pixels, said):
-    with pytest.raises(ImageError, match=said) as raised:
+def test_a_frame_without_an_image_is_an_error_in_one_line(pixels, message):
+    with pytest.raises(ImageError, match=message) as raised:
         measure_reseau(Frame(pixels, 255.0, "dark.png"), SMALL.design())
     assert "\n" not in str(raised.value)
 
@@ -257,14 +257,14 @@ def test_the_wrong_design_is_a_failure():
     assert "'wrong'" in result.reason
 
 
-def test_a_design_with_hardly_any_coordinates_is_refused():
+def test_a_design_with_too_few_coordinates_is_refused():
     design = SMALL.design()
     points = tuple(p if i < 3 else DesignPoint(id=p.id, x=None, y=None) for i, p in enumerate(design.points))
     with pytest.raises(UsageError, match="fewer than four points with coordinates"):
         measure_reseau(form(SMALL, rng()).frame, design.model_copy(update={"points": points}))
 
 
-def test_the_document_holds_what_was_measured_and_reads_back():
+def test_the_document_contains_the_measurement_and_is_read_back_unchanged():
     scene = small(missing=frozenset({5}))
     result = measured(scene, form(scene, rng(13)))
     document = ReseauMeasurement.parse(result.measurement().to_json(), where="test")

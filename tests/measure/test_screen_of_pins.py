@@ -36,7 +36,7 @@ def _glowing(lines: float = 0.0, fall: float = 0.0, seed: int = 0) -> tuple[Arra
     return truth, light + NOISE * rng.standard_normal(_SIZE)
 
 
-def test_where_one_flank_is_hidden_the_sigma_knows_of_the_lines_of_a_raster():
+def test_with_one_flank_hidden_the_sigma_includes_the_raster_lines():
     normalised, unveiled = [], []
     for seed in range(3):
         truth, pixels = _glowing(lines=0.015, seed=seed)
@@ -56,7 +56,7 @@ def test_where_one_flank_is_hidden_the_sigma_knows_of_the_lines_of_a_raster():
     assert np.median(np.concatenate(unveiled)) < 0.05
 
 
-def test_light_that_falls_off_moves_no_echo_where_the_raster_tells_how():
+def test_light_falloff_known_from_the_raster_does_not_shift_echoes():
     truth, pixels = _glowing(fall=0.3)
     hidden = _reseau(np.array([5.0, 595.0]))
     sides = np.sign(truth[:, 0] - 400)
@@ -70,7 +70,7 @@ def test_light_that_falls_off_moves_no_echo_where_the_raster_tells_how():
 
 
 @pytest.mark.parametrize("glow", [0.0, 45.0])
-def test_without_a_raster_that_is_lit_nothing_is_said_of_its_light(glow: float):
+def test_without_a_lit_raster_no_light_falloff_is_estimated(glow: float):
     ground = np.full(_SIZE, glow, dtype=np.float32)
     ground += np.linspace(0, 0.2 * glow, _SIZE[1], dtype=np.float32)
     found = falloff(ground, _reseau(np.array([5.0, 595.0])), NOISE)

@@ -16,7 +16,7 @@ def noise(level: float = 120.0, sigma: float = 2.0, shape: tuple[int, int] = (16
 
 
 @pytest.mark.parametrize(
-    ("pixels", "said"),
+    ("pixels", "message"),
     [
         (np.zeros((40, 50), np.uint8), "is all black"),
         (np.full((40, 50), 255, np.uint8), "is all saturated"),
@@ -25,8 +25,8 @@ def noise(level: float = 120.0, sigma: float = 2.0, shape: tuple[int, int] = (16
         (np.where(np.arange(2000).reshape(40, 50) < 1990, 0, 90).astype(np.uint8), "is black over 100%"),
     ],
 )
-def test_a_frame_without_an_image_is_refused_in_one_line_that_names_it(pixels, said):
-    with pytest.raises(ImageError, match=said) as raised:
+def test_a_frame_without_an_image_is_refused_by_name_in_one_line(pixels, message):
+    with pytest.raises(ImageError, match=message) as raised:
         screen(Frame(pixels, 255.0, "lost.png"), run=15)
     assert str(raised.value).startswith("lost.png: ")
     assert "\n" not in str(raised.value)
@@ -46,7 +46,7 @@ def test_shading_and_a_scene_do_not_count_as_noise():
     assert screen(Frame(pixels, 255.0), run=15).noise == pytest.approx(2.0, rel=0.1)
 
 
-def test_lost_lines_and_borders_carry_no_image():
+def test_lost_lines_and_borders_are_excluded():
     pixels = noise()
     pixels[:, :9] = 0
     pixels[40:43, 50:170] = 0
@@ -56,14 +56,14 @@ def test_lost_lines_and_borders_carry_no_image():
     assert valid.sum() > 0.999 * (valid.size - 9 * 160 - 3 * 120)
 
 
-def test_a_black_mark_is_no_lost_line():
+def test_a_black_mark_is_not_a_lost_line():
     pixels = noise()
     pixels[50:56, 70:76] = 0
     pixels[10, 10:199] = 0  # nought is the least grey value elsewhere, too
     assert screen(Frame(pixels, 255.0), run=24).valid[50:56, 70:76].all()
 
 
-def test_bit_errors_are_left_out_and_marks_are_not():
+def test_bit_errors_are_excluded_and_marks_are_not():
     pixels = noise()
     pixels[80:84, 90:94] = 30
     pixels[5:155:15, 5:60:9] ^= 64
@@ -73,7 +73,7 @@ def test_bit_errors_are_left_out_and_marks_are_not():
     assert valid[:, 100:].mean() > 0.999
 
 
-def test_uneven_border_lines_are_levelled_and_a_mark_in_them_stays():
+def test_uneven_border_lines_are_levelled_and_marks_in_them_preserved():
     pixels = noise().astype(float)
     pixels[0] *= 1.6
     pixels[-1] *= 0.5

@@ -40,7 +40,7 @@ def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll:
     assert 0.8 < np.sqrt((error**2).sum() / np.trace(result.cov, axis1=1, axis2=2).sum()) < 1.25
 
 
-def test_disks_beyond_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
+def test_disks_outside_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
     formed = sheets.form(sheets.Camera(20.0, 30.0, (330.0, 0.0)))
     result = measured(formed)
     inside = ((formed.truth > 12) & (formed.truth < np.array([787, 587]))).all(axis=1)
@@ -61,14 +61,14 @@ def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
     assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
 
 
-def test_a_sheet_whose_rings_are_hidden_has_no_numbers() -> None:
+def test_a_sheet_with_hidden_rings_cannot_be_numbered() -> None:
     result = measure_reseau(sheets.form(sheets.Camera(10.0, 20.0), rings=False).frame, sheets.DESIGN)
     assert not result
     assert result.code is Code.AMBIGUOUS
     assert "no coded ring identifies them" in result.reason
 
 
-def test_a_mirrored_sheet_is_said_to_be_mirrored() -> None:
+def test_a_mirrored_sheet_is_reported_as_mirrored() -> None:
     formed = sheets.form(sheets.Camera(10.0, 20.0))
     turned = Frame(np.ascontiguousarray(formed.frame.pixels[:, ::-1]), 255.0)
     result = measure_reseau(turned, sheets.DESIGN)
@@ -84,7 +84,7 @@ def test_a_frame_without_a_sheet_is_a_failure_with_a_reason() -> None:
     assert result.reason
 
 
-def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the_design() -> None:
+def test_the_file_contains_rings_only_if_present_and_they_name_points_of_the_design() -> None:
     design = sheets.DESIGN
     assert ReseauDesign.parse(design.to_json(), where="file") == design
     plain = design.model_copy(update={"rings": None})
@@ -95,7 +95,7 @@ def test_rings_stand_in_the_file_only_where_there_are_any_and_name_points_of_the
         ReseauDesign.parse(json.dumps(content), where="file")
 
 
-def test_the_command_measures_one_colour_of_a_photograph(tmp_path: Path) -> None:
+def test_the_command_measures_one_colour_channel(tmp_path: Path) -> None:
     formed = sheets.form(sheets.Camera(30.0, 20.0))
     green = formed.frame.pixels
     # The red image lies two pixels beside the green one.
@@ -113,7 +113,7 @@ def test_the_command_measures_one_colour_of_a_photograph(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 7, 10, 18])
-def test_in_photographs_every_disk_that_another_program_found_is_measured_and_numbered_alike(
+def test_every_disk_found_by_another_program_is_measured_with_the_same_number(
     reference_data: Callable[[str], Path], number: int
 ) -> None:
     folder = reference_data("testfield_camcal")
@@ -127,7 +127,7 @@ def test_in_photographs_every_disk_that_another_program_found_is_measured_and_nu
     assert np.abs(difference).max() < 0.6
 
 
-def test_a_sheet_that_is_designed_is_numbered_from_every_side() -> None:
+def test_a_designed_sheet_is_numbered_at_any_rotation() -> None:
     design = coded_sheet(8, 7, 10.0)
     for roll in (15.0, 105.0, 195.0, 285.0):
         formed = sheets.form(sheets.Camera(roll, 35.0), design)
@@ -136,7 +136,7 @@ def test_a_sheet_that_is_designed_is_numbered_from_every_side() -> None:
         assert np.abs(result.xy - formed.truth).max() < 0.1
 
 
-def test_light_reflected_in_disks_does_not_move_them() -> None:
+def test_reflections_in_disks_do_not_shift_them() -> None:
     camera = sheets.Camera(20.0, 30.0)
     x, y = np.meshgrid(np.arange(800.0), np.arange(600.0))
     # Its contrast changes by a fifth from the middle of a disk to its edge, where it changes most.
@@ -150,7 +150,7 @@ def test_light_reflected_in_disks_does_not_move_them() -> None:
 
 
 @pytest.mark.parametrize("kept", [(0,), (1,), (2,), (3,)])
-def test_one_ring_in_sight_numbers_a_sheet(kept: tuple[int]) -> None:
+def test_one_visible_ring_suffices_to_number_a_sheet(kept: tuple[int]) -> None:
     design = coded_sheet(8, 7, 10.0)
     assert design.rings is not None
     names = list(design.rings.sectors)

@@ -31,7 +31,7 @@ def measured(bench: FieldBench, station: Station) -> tuple[TestfieldResult, Arra
     return result, result.xy - bench.truth(station).xy
 
 
-def test_jitter_makes_the_bound_of_x_a_third_larger_than_that_of_y() -> None:
+def test_row_jitter_increases_the_bound_of_x_by_a_third() -> None:
     bench, station = FieldBench(), Station(0)
     inside = bench.inside(bench.truth(station), 8.0)
     variance = np.diagonal(bounds(bench, station, inside)[inside], axis1=1, axis2=2).mean(axis=0)
@@ -39,7 +39,7 @@ def test_jitter_makes_the_bound_of_x_a_third_larger_than_that_of_y() -> None:
 
 
 @pytest.mark.parametrize("station", [Station(0), Station(45, 90, 180), Station(60, 180, 90)])
-def test_targets_are_found_numbered_and_measured_to_their_bound(station: Station) -> None:
+def test_targets_are_numbered_and_measured_at_the_cramer_rao_bound(station: Station) -> None:
     bench = FieldBench(seed=11)
     result, error = measured(bench, station)
     expected = bench.inside(bench.truth(station), 9.0)
@@ -72,7 +72,7 @@ CASES: dict[str, tuple[FieldBench, Station, int]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_nothing_is_wrong_silently(case: str) -> None:
+def test_there_are_no_unflagged_errors(case: str) -> None:
     bench, station, least = CASES[case]
     result, error = measured(bench, station)
     assert result.found >= least
@@ -80,7 +80,7 @@ def test_nothing_is_wrong_silently(case: str) -> None:
     assert np.nanmax(np.abs(error) / np.hypot(sigma, 0.01)) < 5.0
 
 
-def test_hidden_and_saturated_targets_are_declared_or_right() -> None:
+def test_hidden_and_saturated_targets_are_flagged_or_correct() -> None:
     stains = (Stain(80, 80, 30, 200.0), Stain(180, 170, 20, 90.0), Stain(100, 170, 20, 300.0, opaque=False))
     bench, station = FieldBench(stains=stains), Station(30)
     result, error = measured(bench, station)
@@ -91,7 +91,7 @@ def test_hidden_and_saturated_targets_are_declared_or_right() -> None:
     assert all(why for why, ok in zip(result.why, result.ok, strict=True) if not ok)
 
 
-def test_a_bend_fixed_to_the_board_does_no_harm() -> None:
+def test_a_board_bend_does_not_affect_the_measurement() -> None:
     _, error = measured(FieldBench(bend_with="board", bend_mm=1.6), Station(45, 90))
     assert np.nanmax(np.abs(error)) < 0.05
 
@@ -147,7 +147,9 @@ FRAME = PLAIN.record(STATION).pixels
         "a larger one",
     ],
 )
-def test_what_is_not_the_testfield_gets_a_clear_answer(pixels: Array, design: Any, codes: str) -> None:
+def test_images_without_the_testfield_are_failures_with_a_reason(
+    pixels: Array, design: Any, codes: str
+) -> None:
     found = answer(np.ascontiguousarray(pixels).astype(np.uint8), design)
     assert isinstance(found, Failure)
     assert found.where == "frame"
@@ -161,7 +163,7 @@ def test_a_frame_without_an_image_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(("corners", "squares"), [([[-250, 250], [125, 125]], 3), ([[-125, 125], [0, 0]], 1)])
-def test_a_part_of_the_testfield_is_enough(corners: Any, squares: int) -> None:
+def test_a_part_of_the_testfield_suffices(corners: Any, squares: int) -> None:
     truth = PLAIN.truth(STATION)
     ends = truth.view(np.array(corners, dtype=float))[0]
     (x0, y0), (x1, y1) = np.floor(ends.min(axis=0) - 4), np.ceil(ends.max(axis=0) + 4)
@@ -173,7 +175,7 @@ def test_a_part_of_the_testfield_is_enough(corners: Any, squares: int) -> None:
     assert np.nanmax(np.abs(error)) < 0.05
 
 
-def test_a_quarter_turn_of_the_frame_turns_the_numbers_with_it() -> None:
+def test_numbers_follow_a_quarter_turn_of_the_frame() -> None:
     first = answer(FRAME)
     turned = answer(np.ascontiguousarray(np.rot90(FRAME)))
     both = first.ok & turned.ok

@@ -215,30 +215,30 @@ def test_forward_of_inverse_returns_to_the_image(case: Case) -> None:
 
 
 @EVERY
-def test_is_finite_at_the_origin_and_at_its_centre(case: Case) -> None:
+def test_mapping_is_finite_at_the_origin_and_at_its_centre(case: Case) -> None:
     for part in case.mapping.derivatives([[0.0, 0.0], case.centre]):
         assert np.isfinite(part).all()
 
 
 @EVERY
-def test_takes_no_points_at_all(case: Case) -> None:
+def test_mapping_accepts_zero_points(case: Case) -> None:
     none = np.zeros((0, 2))
     assert case.mapping(none).shape == case.mapping.inverse(none).shape == (0, 2)
     assert case.mapping.derivatives(none).d_parameters.shape == (0, 2, len(case.mapping.names))
 
 
 @EVERY
-def test_is_one_to_one_where_it_is_used(case: Case) -> None:
+def test_mapping_is_one_to_one_in_the_image(case: Case) -> None:
     assert case.mapping.one_to_one(case.points(500)).all()
 
 
 @EVERY
-def test_answers_nan_for_what_is_not_finite(case: Case) -> None:
+def test_mapping_returns_nan_for_non_finite_points(case: Case) -> None:
     assert np.isnan(case.mapping.inverse([[np.nan, 0.0], [np.inf, 1.0]])).any(axis=1).all()
 
 
 @EVERY
-def test_with_values_changes_values_and_nothing_else(case: Case) -> None:
+def test_with_values_changes_only_values(case: Case) -> None:
     mapping = case.mapping
     zero = mapping.with_values(np.zeros(len(mapping.names)))
     assert type(zero) is type(mapping)
@@ -248,7 +248,7 @@ def test_with_values_changes_values_and_nothing_else(case: Case) -> None:
 
 
 @EVERY
-def test_values_cannot_be_changed_behind_its_back(case: Case) -> None:
+def test_values_are_read_only(case: Case) -> None:
     before = case.mapping.values.copy()
     given = before.copy()
     mapping = case.mapping.with_values(given)
@@ -257,7 +257,7 @@ def test_values_cannot_be_changed_behind_its_back(case: Case) -> None:
 
 
 @EVERY
-def test_refuses_unknown_names_wrong_numbers_and_other_shapes(case: Case) -> None:
+def test_mapping_refuses_unknown_names_wrong_numbers_and_shapes(case: Case) -> None:
     with pytest.raises(UsageError, match="nonsense"):
         case.mapping.with_values({"nonsense": 1.0})
     with pytest.raises(UsageError):
@@ -280,7 +280,7 @@ POLYNOMIALS = [name for name, make in CASES.items() if isinstance(make().mapping
 
 
 @pytest.mark.parametrize("name", POLYNOMIALS)
-def test_polynomial_comes_back_from_its_dictionary(name: str) -> None:
+def test_polynomial_is_restored_from_its_dictionary(name: str) -> None:
     case = CASES[name]()
     mapping = case.mapping
     assert isinstance(mapping, RationalPolynomial)
@@ -296,7 +296,7 @@ def test_polynomial_comes_back_from_its_dictionary(name: str) -> None:
 @EVERY
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_derivatives_and_inverse_hold_for_other_values_too(case: Case, seed: int) -> None:
+def test_derivatives_and_inverse_are_correct_for_other_values(case: Case, seed: int) -> None:
     """Parameters changed so that each moves the image by up to 2 % of its size."""
     rng, points = np.random.default_rng(seed), case.points(25)
     u = len(case.mapping.names)

@@ -95,7 +95,7 @@ def test_brown_on_the_object_side_equals_its_conversion_to_opencv_and_back() -> 
         Brown(BROWN, "object", 0.0, GRID).with_values({"B1": 1e-4, "B2": 2e-4}),
     ],
 )
-def test_a_camera_without_equal_in_another_model_is_converted_with_its_residual(camera: Brown) -> None:
+def test_a_camera_without_exact_equivalent_is_converted_with_its_residual(camera: Brown) -> None:
     opencv = convert(camera, GRID, "opencv", free=PLAIN_TERMS)
     assert 1e-3 < opencv.rms_px < opencv.greatest_px < 30
     rational = OpenCV([2400.0, 2400.0, 2807.5, 1871.5, *RATIONAL[4:]])
@@ -105,7 +105,7 @@ def test_a_camera_without_equal_in_another_model_is_converted_with_its_residual(
     assert np.hypot(*off.T).max() <= 1.5 * brown.greatest_px
 
 
-def test_a_conversion_that_cannot_be_made_is_refused() -> None:
+def test_an_impossible_conversion_is_refused() -> None:
     with pytest.raises(UsageError, match="use one of brown, opencv"):
         convert(Brown(BROWN, "object", 0.0, GRID), GRID, "pinhole")
     with pytest.raises(UsageError, match="K1: is not one of fx"):
@@ -175,7 +175,7 @@ def test_inverse_of_a_folding_distortion_is_on_the_inner_branch_or_nan(
     assert not distortion.one_to_one([[1.01 * fold, 0.0]]).any()
 
 
-def test_a_camera_with_distortion_on_the_image_side_has_no_image_beyond_the_fold() -> None:
+def test_image_side_distortion_has_no_image_beyond_the_fold() -> None:
     camera = Brown([20.0, 0, 0, -1e-3, 0, 0, 0, 0, 0, 0], "image")
     largest = camera.inverse([[(1 / 3e-3) ** 0.5 - 1e-6, 0.0]])[0, 0]
     assert np.isfinite(camera([[largest * 0.999, 0.0]])).all()
@@ -190,7 +190,7 @@ def test_a_camera_with_distortion_on_the_image_side_has_no_image_beyond_the_fold
     st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=10),
 )
 @example([1.0, 0, 0, 0, 0.25, -0.75, 0.25, 0.25], [(0.75, 0.75)])  # a full Newton step leaves the branch
-def test_inverse_of_any_opencv_camera_is_found_within_the_fold(
+def test_inverse_of_any_opencv_camera_is_found_inside_the_fold(
     turns: list[float], directions: list[tuple[float, float]]
 ) -> None:
     k1, k2, p1, p2, k3, k4, k5, k6 = np.array(turns) * [0.5, 0.3, 2e-3, 2e-3, 0.1, 0.5, 0.2, 0.1]
@@ -256,7 +256,7 @@ def test_angles_are_given_at_the_gimbal_lock() -> None:
     np.testing.assert_allclose(angles_to_matrix(omega, phi, kappa), matrix, atol=1e-12)
 
 
-def test_what_is_no_rotation_is_refused() -> None:
+def test_invalid_rotations_are_refused() -> None:
     for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(UsageError, match="orthogonal"):
             matrix_to_vector(matrix)

@@ -33,7 +33,7 @@ def test_images_and_derivatives_are_those_in_double_precision(shape, fill):
     np.testing.assert_allclose(parts[:, 1:], slopes, rtol=0, atol=3e-5)
 
 
-def test_nodes_of_no_weight_and_light_that_falls_elsewhere_count_for_nothing():
+def test_nodes_of_zero_weight_and_outside_light_have_no_effect():
     circle = Outline.circle(2.0, 0.5)
     xy, dxy = np.zeros((2, 1, len(circle.xy) + 7, 2), np.float32)
     xy[:, : len(circle.xy)], dxy[:, : len(circle.xy)] = circle.xy, circle.dxy

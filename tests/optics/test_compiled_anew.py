@@ -20,8 +20,8 @@ MEASURED = """
 
 
 @pytest.mark.slow
-def test_compiled_or_from_the_cache_a_measurement_is_the_same_to_the_byte(tmp_path: Path) -> None:
-    said = [
+def test_compiled_code_and_cached_code_give_the_same_bytes(tmp_path: Path) -> None:
+    message = [
         subprocess.run(
             [sys.executable, "-c", textwrap.dedent(MEASURED)],
             env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
@@ -31,5 +31,5 @@ def test_compiled_or_from_the_cache_a_measurement_is_the_same_to_the_byte(tmp_pa
         ).stdout.strip()
         for _ in range(2)
     ]
-    assert len(said[0]) == len(hashlib.sha256().hexdigest())
-    assert said[0] == said[1]
+    assert len(message[0]) == len(hashlib.sha256().hexdigest())
+    assert message[0] == message[1]

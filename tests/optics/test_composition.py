@@ -19,12 +19,12 @@ def test_common_system_has_its_origin_and_axis_in_the_two_marks() -> None:
         Similarity.common_system(o, o)
 
 
-def test_chain_tells_of_a_name_that_stands_twice() -> None:
+def test_chain_reports_a_duplicate_name() -> None:
     with pytest.raises(UsageError, match="a1"):
         Chain(RationalPolynomial.camera(), RationalPolynomial.camera())
 
 
-def test_chain_of_a_mapping_and_its_start_is_the_mapping() -> None:
+def test_chain_of_a_mapping_and_the_identity_is_the_mapping() -> None:
     points = np.array([[1.0, 2.0], [-3.0, 4.0]])
     turn = Similarity([1.0, 2.0, 0.6, 0.8])
     for chain in (Chain(Identity(), turn), Chain(turn, Identity())):

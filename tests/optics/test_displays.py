@@ -56,7 +56,7 @@ def test_display_expands_to_the_ultrasonic_polynomials_as_wishahy_lists_them() -
     np.testing.assert_allclose(display(POINTS), ultrasonic(POINTS), rtol=0, atol=1e-12)
 
 
-def test_display_leaves_three_conditions_among_the_ultrasonic_coefficients() -> None:
+def test_display_implies_three_conditions_among_the_ultrasonic_coefficients() -> None:
     """Of the 16 directions of (7) 13 can be reached: A4 − A5 = B3, B4 − B5 = A3 and A6 = B6 always hold."""
     display = wong_display().without("k2", "k3")
     ultrasonic = RationalPolynomial.ultrasonic()
@@ -74,7 +74,7 @@ def test_display_leaves_three_conditions_among_the_ultrasonic_coefficients() -> 
         np.testing.assert_allclose(broken, 0, atol=1e-12)
 
 
-def test_reduced_ultrasonic_model_is_the_one_the_paper_ends_in() -> None:
+def test_reduced_ultrasonic_model_is_the_final_model_of_the_paper() -> None:
     reduced = RationalPolynomial.ultrasonic(reduced=True)
     a0, a1, a6, a7, b0, b1, b2, b6, b7 = values = np.arange(1.0, 10.0)
     x, y = 0.7, -0.4

@@ -65,7 +65,7 @@ def test_leave_one_out_of_collocation_equals_kriging_without_each_point():
             assert sigma[i, axis] == pytest.approx(field.noise[axis] * np.sqrt(variance), rel=1e-6)
 
 
-def test_leave_one_out_deviations_have_the_sigmas_that_are_given_with_them():
+def test_leave_one_out_deviations_agree_with_their_sigmas():
     normalised = []
     for seed in range(8):
         source = np.random.default_rng(seed).uniform(0, 8, (120, 2))
@@ -75,7 +75,7 @@ def test_leave_one_out_deviations_have_the_sigmas_that_are_given_with_them():
     assert np.std(normalised) == pytest.approx(1.0, abs=0.12)
 
 
-def test_white_noise_seldom_asks_for_a_local_model():
+def test_white_noise_rarely_requires_a_local_model():
     source = grid(7)
     need = np.concatenate(
         [
@@ -88,7 +88,7 @@ def test_white_noise_seldom_asks_for_a_local_model():
     assert (need <= 0.5).mean() == pytest.approx(0.5, abs=0.2)
 
 
-def test_a_bent_field_asks_for_a_local_model_and_is_predicted_better_by_it():
+def test_a_bent_field_requires_a_local_model_which_predicts_it_better():
     source = grid(10)
     target = noisy(source, 0.02)
     field = SmoothField.fit(source, target, trials=99)
@@ -109,12 +109,12 @@ def test_a_field_without_signal_is_its_polynomial():
     )
 
 
-def test_a_length_that_is_given_is_kept():
+def test_a_given_correlation_length_is_kept():
     source = grid(8)
     assert SmoothField.fit(source, noisy(source, 0.02), length=2.5).length == pytest.approx(2.5)
 
 
-def test_the_derivatives_follow_the_signal_too():
+def test_the_derivatives_include_the_signal():
     source = grid(10)
     field = SmoothField.fit(source, noisy(source, 0.01))
     at, step = np.array([[4.1, 5.2], [3.0, 6.6]]), 1e-3
@@ -122,7 +122,7 @@ def test_the_derivatives_follow_the_signal_too():
     assert field.jacobian(at) == pytest.approx(numeric, abs=1e-3)
 
 
-def test_points_of_little_weight_pull_little():
+def test_points_of_low_weight_have_little_effect():
     source, sigma = grid(6), np.ones(36)
     target = 50 * source
     target[14] += 3.0

@@ -94,7 +94,7 @@ def test_every_shape_agrees_with_supersampling(shape: str, sigma: float, fill: f
 
 
 @pytest.mark.parametrize("shape", ["disk", "square", "cross"])
-def test_all_light_of_a_shape_arrives(shape: str) -> None:
+def test_the_total_light_of_a_shape_is_preserved(shape: str) -> None:
     size, width = SHAPES[shape]
     area = {
         "disk": np.pi * size**2 / 4,
@@ -109,7 +109,7 @@ def test_all_light_of_a_shape_arrives(shape: str) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("shift", [(0.001, 0.0), (0.25, -0.4), (0.499, 0.777)])
-def test_the_image_is_where_the_shape_is_to_a_thousandth_of_a_pixel(
+def test_the_image_position_is_correct_to_a_thousandth_of_a_pixel(
     shape: str, shift: tuple[float, float]
 ) -> None:
     known = np.array(shift)
@@ -147,7 +147,7 @@ def test_derivatives_agree_with_central_differences(shape: str, fill: float) -> 
     np.testing.assert_allclose(derivatives, np.array(expected), rtol=0, atol=2e-5)
 
 
-def test_batches_are_the_single_patches() -> None:
+def test_a_batch_equals_its_single_patches() -> None:
     outline = outline_of("cross")
     shifts = np.array([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]])
     turns = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.9, 0.1], [-0.1, 1.1]], [[1.2, 0.0], [0.2, 0.8]]])
@@ -165,7 +165,7 @@ def scattered_disks() -> Outline:
     return outline_of("disk").affine(np.tile(np.eye(2), (5, 1, 1)), centres)
 
 
-def test_a_drawing_is_the_sum_of_its_patches_also_at_the_border_and_beyond() -> None:
+def test_a_drawing_is_the_sum_of_its_patches_also_across_the_border() -> None:
     disks, shape = scattered_disks(), (48, 64)
     expected = sum(
         coverage(Outline(xy, dxy), np.arange(64.0), np.arange(48.0), SIGMA)
@@ -205,7 +205,7 @@ def test_a_disk_in_perspective_agrees_with_supersampling() -> None:
     assert np.hypot(*(centroid - PERSPECTIVE([[0.0, 0.0]])[0])) > 0.2
 
 
-def test_rectangles_are_what_their_edges_say() -> None:
+def test_rectangles_agree_with_the_product_of_their_edges() -> None:
     edges = np.array([[1.0, 2.0, 4.5, 3.0], [6.0, 1.0, 6.5, 9.0]])
     batch = rectangles(edges, SPACING)
     for k, (x0, y0, x1, y1) in enumerate(edges):
@@ -230,7 +230,7 @@ def test_a_line_grid_is_the_union_of_its_wires() -> None:
     np.testing.assert_allclose(drawn_grid(), 1 - np.outer(between_y, between_x), rtol=0, atol=EXACT)
 
 
-def test_a_broken_crossing_leaves_a_gap_half_way_to_its_neighbours() -> None:
+def test_a_broken_crossing_leaves_a_gap_halfway_to_its_neighbours() -> None:
     broken = np.zeros((2, 3), dtype=bool)
     broken[1, 1] = True
     whole, gap = drawn_grid(), drawn_grid(broken)

@@ -25,7 +25,7 @@ POINTS = np.random.default_rng(7).uniform(-50, 50, (40, 2))
     st.lists(st.floats(-1, 1), min_size=13, max_size=13),
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=20),
 )
-def test_inverse_of_any_plausible_camera_is_right_or_nan(
+def test_inverse_of_any_plausible_camera_is_correct_or_nan(
     turns: list[float], points: list[tuple[float, float]]
 ) -> None:
     size = [0.2, 0.2, 5, 0.2, 0.2, 5, 2e-3, 2e-3, 1e-3, 1e-3, 1e-4, 1e-6, 1e-6]
@@ -69,7 +69,7 @@ def test_ultrasonic_is_wishahy_equation_7() -> None:
     np.testing.assert_allclose(ULTRASONIC([[x, y]]), [expected], rtol=1e-14)
 
 
-def test_reduced_model_lacks_the_named_parameters_and_keeps_the_rest() -> None:
+def test_a_reduced_model_lacks_only_the_named_parameters() -> None:
     reduced = CAMERA.without("h1", "h2", "k")
     assert reduced.names == CAMERA.names[:10]
     full = CAMERA.with_values({"h1": 0.0, "h2": 0.0, "k": 0.0})
@@ -106,7 +106,7 @@ def test_unreadable_terms_are_refused(text: str) -> None:
         RationalPolynomial({"k": {"X": text}})
 
 
-def test_models_of_a_file_that_are_none_are_refused() -> None:
+def test_invalid_models_in_a_file_are_refused() -> None:
     for content in ({}, {"terms": {"k": "x"}}, {"terms": {"k": {"Q": "x"}}}, {"terms": {}, "more": 1}):
         with pytest.raises(FormatError):
             RationalPolynomial.from_dict(content)

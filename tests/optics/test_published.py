@@ -39,7 +39,7 @@ def poses_of(report: str) -> dict[str, Pose]:
 
 
 @pytest.mark.skipif(not NETWORKS.is_dir(), reason="needs the reference data in $RESEAU_DATA")
-def test_control_points_of_a_published_adjustment_are_where_they_were_measured() -> None:
+def test_control_points_of_a_published_adjustment_are_projected_to_their_measured_positions() -> None:
     network = json.loads((NETWORKS / "camcal.network.json").read_text())
     report = (NETWORKS / "camcal-dbatreport-model1.txt").read_text()
     camera, poses = camera_of(report, network["cameras"][0]), poses_of(report)

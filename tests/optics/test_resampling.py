@@ -26,14 +26,14 @@ def barrel(xy: Array) -> Array:
     return BARREL(xy) * 300.0 + [300.0, 200.0]
 
 
-def test_a_mapping_between_lattice_points_is_good_to_a_millionth_of_a_pixel() -> None:
+def test_interpolation_between_lattice_points_is_accurate_to_a_millionth_of_a_pixel() -> None:
     columns, rows = np.arange(20.0, 600.0), np.arange(0.0, 400.0)
     x, y = on_lattice(barrel, columns, rows)
     exact = barrel(np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)).reshape(400, 580, 2)
     np.testing.assert_allclose(np.stack([x, y], -1), exact, rtol=0, atol=1e-6)
 
 
-def test_where_a_mapping_has_no_value_every_pixel_is_asked() -> None:
+def test_near_undefined_values_every_pixel_is_evaluated() -> None:
     def half(xy: Array) -> Array:
         return np.where(xy[:, :1] < 30.4, xy, np.nan)
 
@@ -42,7 +42,7 @@ def test_where_a_mapping_has_no_value_every_pixel_is_asked() -> None:
     assert np.isnan(x[:, 31:]).all()
 
 
-def test_a_disk_is_carried_to_where_the_mapping_has_it() -> None:
+def test_a_disk_is_resampled_to_its_mapped_position() -> None:
     disk = mark_outline("disk", 12.0, None, 0.5)
     at = np.array([[420.3, 300.6]])
     source = 1000 + 50000 * draw(disk.affine(np.eye(2)[None], at), (400, 600), 1.2)
@@ -56,7 +56,7 @@ def test_a_disk_is_carried_to_where_the_mapping_has_it() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32])
-def test_types_are_kept_and_nothing_changes_under_the_identity(dtype: type) -> None:
+def test_types_are_kept_and_the_identity_changes_nothing(dtype: type) -> None:
     pixels = (np.random.default_rng(1).random((70, 1100)) * 127).astype(dtype)
     bands = list(resample(pixels, lambda xy: xy, pixels.shape, band=32))
     assert [len(b) for b in bands] == [32, 32, 6]
@@ -65,7 +65,7 @@ def test_types_are_kept_and_nothing_changes_under_the_identity(dtype: type) -> N
     np.testing.assert_allclose(result, pixels, rtol=0, atol=0 if np.dtype(dtype).kind in "ui" else 1e-4)
 
 
-def test_values_beyond_the_type_are_clipped_and_beyond_the_image_zero() -> None:
+def test_values_are_clipped_to_the_type_and_zero_outside_the_image() -> None:
     edge = np.zeros((40, 40), dtype=np.uint8)
     edge[:, 20:] = 255
     shifted = np.concatenate(list(resample(edge, lambda xy: xy + np.array([0.5, 0.0]), (40, 60))))
@@ -74,7 +74,7 @@ def test_values_beyond_the_type_are_clipped_and_beyond_the_image_zero() -> None:
     assert not shifted[:, 40:].any()
 
 
-def test_memory_stays_that_of_a_band() -> None:
+def test_memory_is_limited_to_one_band() -> None:
     pixels = np.zeros((3000, 3000), dtype=np.uint16)
     tracemalloc.start()
     for _ in resample(pixels, lambda xy: xy + 0.25, pixels.shape):

@@ -65,14 +65,14 @@ def test_dark_noise_is_clipped_at_black_unless_there_is_an_offset() -> None:
     assert raised.std() == pytest.approx((2.0**2 + 1 / 12) ** 0.5, rel=0.01)
 
 
-def test_same_state_of_the_generator_same_image() -> None:
+def test_the_same_generator_state_gives_the_same_image() -> None:
     sensor = Sensor(40, 30, read_noise=1.0)
     flat = np.full((30, 40), 100.0)
     first, second = (sensor.expose(flat, np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
-def test_exposing_leaves_the_light_as_it_was() -> None:
+def test_exposing_does_not_change_the_light() -> None:
     flat = np.full((30, 40), 100.0)
     Sensor(40, 30, shot_noise=False, read_noise=1.0, offset=3.0).expose(flat, np.random.default_rng(5))
     np.testing.assert_array_equal(flat, 100.0)

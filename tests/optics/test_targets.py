@@ -31,13 +31,13 @@ def test_the_triangle_has_its_apex_up_and_is_turned_from_x_into_y() -> None:
     np.testing.assert_allclose(np.hypot(*(upright[0] - upright[1])), 9.0, rtol=0, atol=1e-12)
 
 
-def test_the_arms_of_a_cross_are_a_third_of_its_length_unless_told() -> None:
+def test_the_arms_of_a_cross_are_a_third_of_its_length_by_default() -> None:
     for arm, width in ((None, 4.0), (1.5, 1.5)):
         corners = target_corners("cross", 12.0, arm=arm)
         assert corners is not None
         np.testing.assert_allclose(np.unique(corners[:, 0]), [-6, -width / 2, width / 2, 6], atol=1e-12)
 
 
-def test_a_star_is_no_target() -> None:
+def test_a_star_is_not_a_target() -> None:
     with pytest.raises(UsageError, match="no target of shape 'star'"):
         target_corners("star", 3.0)

@@ -36,7 +36,7 @@ def measure(frame: Frame) -> Measured | Failure:
     )  # fmt: skip
 
 
-def test_any_function_that_measures_a_frame_will_do() -> None:
+def test_any_function_that_measures_a_frame_is_accepted() -> None:
     frames = [blank(name) for name in (*STATIONS, "empty")]
     model = CameraOptions("brown", ("c",), (0.027, 0.027))
     found = calibrate_camera(frames, BENCH.design, measure, model=model)

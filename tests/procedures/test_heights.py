@@ -73,7 +73,7 @@ def test_errors_of_the_interior_orientation_are_as_large_as_their_sigmas() -> No
     assert abs(np.mean(sigma0) - 1) < 0.01
 
 
-def test_without_heights_the_same_images_do_not_give_it() -> None:
+def test_without_heights_the_same_images_do_not_determine_the_principal_distance() -> None:
     seen, heights = recorded(1)
     _, sigma, _ = camera_of(calibrated(seen, heights))
     plane = calibrated(seen, None)
@@ -82,7 +82,7 @@ def test_without_heights_the_same_images_do_not_give_it() -> None:
 
 
 @pytest.mark.parametrize("away", [1.0, -1.0])
-def test_whether_the_stage_lifts_or_lowers_is_found(away: float) -> None:
+def test_the_direction_of_the_stage_is_determined(away: float) -> None:
     values, sigma, result = camera_of(calibrated(*recorded(5, away=away)))
     stage = result.fit.values.stage
     assert stage is not None
@@ -90,7 +90,7 @@ def test_whether_the_stage_lifts_or_lowers_is_found(away: float) -> None:
     assert (np.abs(values - list(TRUE.values())) < 4 * sigma).all()
 
 
-def test_images_of_a_pose_differ_by_the_stage_alone() -> None:
+def test_images_of_a_pose_differ_only_by_the_stage() -> None:
     _, _, result = camera_of(calibrated(*recorded(2)))
     values, stage = result.fit.values, result.fit.values.stage
     assert stage is not None
@@ -103,7 +103,7 @@ def test_images_of_a_pose_differ_by_the_stage_alone() -> None:
     assert result.fit.counts[1] == 3 + own + 3 * len(result.network.points)
 
 
-def test_sigmas_of_nothing_are_refused() -> None:
+def test_sigmas_of_zero_are_refused() -> None:
     with pytest.raises(UsageError, match="standard deviation of a height"):
         Heights({}, {}, 0.0, 1e-3, 0.05)
 

@@ -35,9 +35,9 @@ def test_poses_of_any_mount_are_predicted(
     assert not isinstance(found, Failure)
     assert found.off_deg < 0.3
     for position in POSITIONS:
-        pose, wanted = found.pose(position), true.pose(position)
-        assert np.degrees(np.arccos((np.trace(pose.matrix @ wanted.matrix.T) - 1) / 2)) < 0.3
-        assert np.abs(pose.x0 - wanted.x0).max() < 1e-6
+        pose, expected = found.pose(position), true.pose(position)
+        assert np.degrees(np.arccos((np.trace(pose.matrix @ expected.matrix.T) - 1) / 2)) < 0.3
+        assert np.abs(pose.x0 - expected.x0).max() < 1e-6
 
 
 def test_axes_that_do_not_match_the_mount_are_refused() -> None:

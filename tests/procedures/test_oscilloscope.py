@@ -43,7 +43,7 @@ def test_a_frame_is_refined_to_a_hundredth_of_a_millimetre(world, refined):
     assert np.abs(refined.camera.fit.check.xy - refined.camera.fit.check_target).max() < 0.01
 
 
-def test_the_marks_of_a_frame_measured_elsewhere_give_the_same(world, refined):
+def test_marks_measured_elsewhere_give_the_same_result(world, refined):
     again = photo_i(refined.points, world.design, check=HELD)
     assert isinstance(again, PhotoI)
     assert again.measured is None
@@ -55,7 +55,7 @@ def test_the_marks_of_a_frame_measured_elsewhere_give_the_same(world, refined):
     assert ours == theirs
 
 
-def test_the_steps_are_those_of_refine(world, refined):
+def test_the_steps_agree_with_reseau_refine(world, refined):
     camera = correct_camera(refined.points, world.design, check=HELD).required()
     np.testing.assert_array_equal(camera.model.values, refined.camera.model.values)
     assert refined.camera.fit.elimination.criterion == "chi2"

@@ -19,7 +19,7 @@ def world() -> World:
     return World.standard(1)
 
 
-def test_the_shadow_of_a_reseau_lies_on_its_wires_and_nowhere_else(world):
+def test_the_shadow_of_a_reseau_covers_only_its_wires(world):
     frame = world.photo_i()
     found = measure_reseau(frame, world.design)
     hidden = found.shadow(world.design, frame.pixels.shape, margin_px=1.0)
@@ -55,7 +55,7 @@ def errors(found: ImagePoints, world: World) -> np.ndarray:
     return found.xy - truth.object_xy[row]
 
 
-def test_nothing_is_said_of_a_bench_that_is_in_order(bench):
+def test_a_bench_without_faults_gives_no_remarks(bench):
     _, second = bench
     assert second.notes == ()
     assert len(second.pins) >= 30
@@ -70,12 +70,12 @@ def test_true_coordinates_of_a_body_lie_within_their_sigmas(world, bench):
     assert (np.abs(off) < 4 * third.true.sigma).all()
 
 
-def test_a_missing_row_of_rods_is_named(bench):
+def test_a_missing_row_of_rods_is_reported(bench):
     found = photo_of(at_fault(missing_row="C"), bench)
     assert [str(note) for note in found.notes] == ["the whole row of rods at y = -60 mm is missing"]
 
 
-def test_a_test_object_that_stands_turned_is_named(bench):
+def test_a_rotated_test_object_is_reported(bench):
     found = photo_of(at_fault(object_turned_deg=3.0), bench)
     assert len(found.notes) == 1
     assert "turned by" in found.notes[0].text
@@ -90,7 +90,7 @@ def photo_of(world: World, bench: tuple[PhotoI, PhotoII]) -> PhotoII:
 
 
 @pytest.mark.parametrize("pushed", [0.4, 20.0])
-def test_a_camera_that_was_pushed_is_noticed_and_followed(pushed: float, bench):
+def test_a_displaced_camera_is_detected_and_corrected(pushed: float, bench):
     _, before = bench
     found = photo_of(at_fault(camera_moved_mm=pushed), bench)
     assert any("the camera has moved since PHOTO I" in note.text for note in found.notes)
@@ -100,14 +100,14 @@ def test_a_camera_that_was_pushed_is_noticed_and_followed(pushed: float, bench):
     assert np.abs(off).max() < 0.6
 
 
-def test_confused_marks_of_the_common_system_are_named(world, bench):
+def test_swapped_marks_of_the_common_system_are_reported(world, bench):
     confused = swapped(world.design)
     first = photo_i(world.photo_i(), confused).required()
     found = photo_ii(world.photo_ii(), confused, world.test_object, first.camera).required()
     assert any("are O and S swapped?" in note.text for note in found.notes)
 
 
-def test_a_gap_between_reseau_and_screen_does_no_harm_from_one_place():
+def test_a_gap_between_reseau_and_screen_has_no_effect_from_one_position():
     world = at_fault(parallax_mm=2.0)
     first = photo_i(world.photo_i(), world.design).required()
     second = photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
@@ -116,7 +116,7 @@ def test_a_gap_between_reseau_and_screen_does_no_harm_from_one_place():
     assert (np.abs(errors(third.true, world)) < 4 * third.true.sigma).all()
 
 
-def test_a_gap_between_reseau_and_screen_is_named_once_it_is_seen_from_two_places():
+def test_a_gap_between_reseau_and_screen_is_reported_from_two_positions():
     still = at_fault(parallax_mm=2.0)
     first = photo_i(still.photo_i(), still.design).required()
     second = photo_ii(still.photo_ii(), still.design, still.test_object, first.camera).required()
@@ -130,7 +130,7 @@ def test_a_gap_between_reseau_and_screen_is_named_once_it_is_seen_from_two_place
     assert any("a gap between reseau and screen (parallax)" in note.text for note in found.notes)
 
 
-def test_stored_coefficients_still_hold_in_a_new_photograph_of_the_same_bench(world, bench):
+def test_stored_coefficients_are_valid_in_a_new_photograph_of_the_same_bench(world, bench):
     _, second = bench
     again = world.photograph("PHOTO II anew", world.show(world.rods, "PHOTO II anew"))
     found = still_standard_in(again, second.instrument, world.design, world.test_object).required()

@@ -44,7 +44,7 @@ def recordings(seed: int) -> list[tuple[str, ImagePoints]]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_without_depth_do_not_keep_it_from_its_end(seed: int) -> None:
+def test_points_without_depth_do_not_prevent_convergence(seed: int) -> None:
     model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
     found = calibrate_camera(
         recordings(seed), board(), lambda frame: Failure("", Code.NOT_FOUND), (240, 240), model

@@ -34,7 +34,7 @@ def _covariance(seed: int) -> np.ndarray:
     return (spread @ spread.T + np.eye(16)) * 1e-8
 
 
-def test_causes_are_recovered_from_the_coefficients_they_make():
+def test_causes_are_recovered_from_their_coefficients():
     found = physical_causes(COEFFICIENTS, _coefficients(_TRUE), _covariance(0))
     assert found.adjustment.redundancy == 3
     np.testing.assert_allclose(found.adjustment.values, list(_TRUE.values()), atol=1e-12)
@@ -42,7 +42,7 @@ def test_causes_are_recovered_from_the_coefficients_they_make():
     assert all(test.holds and abs(test.misclosure) < 1e-14 for test in found.conditions)
 
 
-def test_coefficients_made_of_the_causes_map_points_as_wongs_display_does():
+def test_coefficients_of_the_causes_map_points_as_wongs_display_does():
     from reseau.optics import RationalPolynomial
 
     values = dict(zip(COEFFICIENTS, _coefficients(_TRUE), strict=True))
@@ -62,7 +62,7 @@ def test_the_order_of_the_coefficients_does_not_matter():
     np.testing.assert_allclose(other.adjustment.values, one.adjustment.values, atol=1e-12)
 
 
-def test_predicted_sigmas_of_causes_cover_and_the_conditions_keep_their_level():
+def test_predicted_sigmas_of_causes_cover_and_condition_tests_keep_their_level():
     values, covariance = _coefficients(_TRUE), _covariance(5)
     root, rng, trials = np.linalg.cholesky(covariance), np.random.default_rng(6), 400
     normalised, kept = [], []
@@ -76,7 +76,7 @@ def test_predicted_sigmas_of_causes_cover_and_the_conditions_keep_their_level():
     assert np.abs(np.mean(kept, axis=0) - 0.95).max() < 4 * np.sqrt(0.05 * 0.95 / trials)
 
 
-def test_a_contradicted_condition_is_the_one_that_is_named():
+def test_the_contradicted_condition_is_the_one_reported():
     values = _coefficients(_TRUE)
     values[COEFFICIENTS.index("A6")] += 0.01
     found = physical_causes(COEFFICIENTS, values, np.eye(16) * 1e-8)

@@ -74,7 +74,7 @@ def corrected(points=None, design=GRID, **options) -> CameraCorrection:
 
 @pytest.mark.parametrize("down", [False, True], ids=["design y up", "design y down"])
 @pytest.mark.parametrize("flip", [(1, -1), (1, 1), (-1, -1), (-1, 1)], ids=str)
-def test_o_is_the_origin_and_s_lies_on_the_axis_whatever_the_handedness(down, flip):
+def test_o_is_the_origin_and_s_lies_on_the_axis_for_either_handedness(down, flip):
     """(1, -1): as photographed; (1, 1): of a design that has its y the other way; (-1, …): from the back."""
     design = redesigned(down=down)
     points = measured(design, flip=flip, angle=0.4)
@@ -87,7 +87,7 @@ def test_o_is_the_origin_and_s_lies_on_the_axis_whatever_the_handedness(down, fl
     assert camera.photo_system.scale * 8.0 == pytest.approx(1.0, abs=0.03)
 
 
-def test_the_axis_is_the_line_of_two_marks_not_that_of_the_wires():
+def test_the_axis_joins_two_marks_and_is_not_parallel_to_the_wires():
     design = redesigned(origin="A1", axis="I11")
     camera = corrected(measured(world=PROJECTIVE), design)
     plane = dict(zip(design.ids, camera.object_system(design.xy), strict=True))
@@ -98,7 +98,7 @@ def test_the_axis_is_the_line_of_two_marks_not_that_of_the_wires():
     np.testing.assert_allclose(camera.apply(measured(world=PROJECTIVE)).xy, list(plane.values()), atol=1e-8)
 
 
-def test_the_system_is_frozen_at_the_measured_images():
+def test_the_system_is_fixed_at_the_measured_images():
     points = measured(seed=1)
     camera = corrected(points)
     np.testing.assert_allclose(camera.photo_system(points.select([GRID.origin]).xy), [[0, 0]], atol=1e-10)
@@ -106,7 +106,7 @@ def test_the_system_is_frozen_at_the_measured_images():
 
 
 @pytest.mark.parametrize("missing", [("E6",), ("E11",), ("E6", "E11")], ids=str)
-def test_an_unmeasured_o_or_s_is_where_a_projectivity_has_it(missing):
+def test_an_unmeasured_o_or_s_is_predicted_by_a_projectivity(missing):
     assert (GRID.origin, GRID.axis) == ("E6", "E11")
     points = measured(world=PROJECTIVE, missing=missing)
     camera = corrected(points)
@@ -116,7 +116,7 @@ def test_an_unmeasured_o_or_s_is_where_a_projectivity_has_it(missing):
     np.testing.assert_allclose(camera.apply(everything).xy, GRID.xy, atol=1e-7)
 
 
-def test_a_design_that_names_neither_gets_the_mark_in_the_middle_and_one_to_its_right():
+def test_by_default_o_is_the_middle_mark_and_s_is_to_its_right():
     design = redesigned(origin=None, axis=None)
     camera = corrected(measured(design), design)
     reference = corrected()
@@ -136,7 +136,7 @@ def test_a_named_mark_without_coordinates_is_a_failure():
 # The model
 
 
-def test_a_world_of_the_model_is_recovered():
+def test_a_simulated_model_is_recovered():
     camera = corrected()
     # The scale of the photograph is that of O and S, not one: powers of it go into the coefficients.
     scale = 50 / WORLD.inverse(np.array([[50.0, 0.0]]))[0, 0]
@@ -166,7 +166,7 @@ def test_to_pixels_is_the_inverse_of_apply():
     assert np.abs(points.xy - camera.photo_system.inverse(camera.apply(points).xy)).max() > 1.0
 
 
-def test_coefficients_the_world_lacks_are_dropped_and_the_scales_never_are():
+def test_absent_coefficients_are_dropped_but_never_the_scales():
     world = WORLD.with_values({"h1": 0.0, "d2": 0.0})
     camera = corrected(measured(world=world, seed=4), alpha=1e-3)
     dropped = camera.fit.elimination.dropped
@@ -180,7 +180,7 @@ def test_coefficients_the_world_lacks_are_dropped_and_the_scales_never_are():
     assert set(nothing.model.names) == {"a1", "b2"}
 
 
-def test_terms_are_data_another_model_is_a_table():
+def test_another_model_is_given_by_a_table_of_terms():
     terms = RationalPolynomial.camera().terms | {"g": {"X": "x2y", "Y": "x2y"}}
     model = RationalPolynomial(terms).with_values({"a1": 1.0, "b2": 1.0})
     world = RationalPolynomial(terms).with_values(VALUES | {"g": 2e-6})
@@ -223,7 +223,7 @@ def test_the_covariance_of_model_and_corrected_marks_is_that_of_repeated_measure
     assert np.mean(passed) == pytest.approx(0.95, abs=0.07)
 
 
-def test_corrected_covariance_is_the_points_own_carried_over_and_the_models():
+def test_corrected_covariances_are_those_of_points_and_model():
     camera = corrected(measured(seed=3))
     place = np.array([[400.0, 300.0]])
     exact = camera.apply(ImagePoints.with_sigma(["p"], place, 0.0))
@@ -245,7 +245,7 @@ def corrected_xy(camera, xy):
     return camera.apply(ImagePoints.with_sigma(["p"], xy, 0.0)).xy
 
 
-def test_chi2_takes_sigmas_at_their_word_and_t_does_not():
+def test_chi2_uses_input_sigmas_and_t_estimates_them():
     """Points half as good as they say."""
     points = measured(seed=5, sigma=2 * SIGMA)
     points = ImagePoints(points.names, points.xy, points.cov / 4)
@@ -259,7 +259,7 @@ def test_chi2_takes_sigmas_at_their_word_and_t_does_not():
     assert not word.fit.adjustment.global_test(1e-3).passed
 
 
-def test_the_designs_own_sigmas_enter():
+def test_the_sigmas_of_the_design_are_used():
     rng = np.random.default_rng(6)
     points = tuple(
         DesignPoint(id=p.id, x=p.x + rng.normal(0, 0.01), y=p.y + rng.normal(0, 0.01), sigma=0.01)
@@ -274,7 +274,7 @@ def test_the_designs_own_sigmas_enter():
 # Check marks, and the need of a local model
 
 
-def test_check_marks_take_no_part():
+def test_check_marks_are_not_used_in_the_adjustment():
     held = ("B3", "F7", "H2")
     points = measured(seed=8)
     camera = corrected(points, check=held)
@@ -289,14 +289,14 @@ def test_check_marks_take_no_part():
     assert np.abs(camera.fit.check.xy - camera.fit.check_target).max() < 5 * SIGMA / 8
 
 
-def test_a_local_bend_asks_for_a_local_model():
+def test_a_local_bend_requires_a_local_model():
     fit = corrected(measured(seed=9, bend=0.08), trials=199).fit
     assert fit.local is not None
     assert fit.local.need.max() <= 0.01
     assert fit.local.ratio.min() > 0
 
 
-def test_without_a_bend_the_need_of_a_local_model_keeps_its_level():
+def test_without_a_bend_the_test_for_a_local_model_keeps_its_level():
     """Half of white fields and more are likeliest without any signal: those have the probability 1."""
     need = np.array([corrected(measured(seed=seed), trials=59).fit.local.need for seed in range(100)]).ravel()
     # 99.9 % bands of the binomial distribution of 200 tests; the two axes share k and so very little.
@@ -305,7 +305,7 @@ def test_without_a_bend_the_need_of_a_local_model_keeps_its_level():
     assert 0.4 < (need == 1).mean() < 0.9
 
 
-def test_few_marks_bear_no_test_of_a_local_model():
+def test_too_few_marks_give_no_test_for_a_local_model():
     small = regular_reseau(4, 4, 20.0, Mark(shape="disk", size=1.0))
     assert corrected(measured(small), small).fit.local is None
 
@@ -313,7 +313,7 @@ def test_few_marks_bear_no_test_of_a_local_model():
 # Calibration file
 
 
-def test_a_calibration_reads_back_as_the_same_correction_and_the_same_bytes(tmp_path):
+def test_a_calibration_is_read_back_to_the_same_correction_and_bytes(tmp_path):
     points = measured(seed=10, world=WORLD.with_values({"h1": 0.0}))
     camera = corrected(points)
     provenance = {"inputs": [], "software": "reseau"}
@@ -331,7 +331,7 @@ def test_a_calibration_reads_back_as_the_same_correction_and_the_same_bytes(tmp_
     assert same.to_json() == made.to_json()
 
 
-def test_the_calibration_says_what_it_is_worth():
+def test_the_calibration_contains_accuracy_and_validity():
     camera = corrected(measured(seed=11), check=("B3",))
     made = camera.calibration(name="bench")
     assert made.kind == "oscilloscope"
@@ -370,7 +370,7 @@ def test_the_unit_of_a_shift_is_that_of_the_design():
     ],
     ids=["no dictionary", "another model", "no system", "no value of a coefficient", "no such part"],
 )
-def test_a_calibration_of_something_else_is_refused(spoil):
+def test_a_calibration_of_another_kind_is_refused(spoil):
     calibration = corrected(measured(seed=13)).calibration(name="bench")
     with pytest.raises(FormatError):
         CameraCorrection.from_calibration(spoil(calibration))
@@ -389,7 +389,7 @@ def test_a_calibration_of_something_else_is_refused(spoil):
     ],
     ids=["none", "three", "six", "one row"],
 )
-def test_too_little_is_a_failure_that_says_what_is_lacking(keep, words):
+def test_too_few_marks_are_a_failure_that_names_what_is_missing(keep, words):
     found = correct_camera(measured().select(keep), GRID)
     assert not found
     assert isinstance(found, Failure)
@@ -397,7 +397,7 @@ def test_too_little_is_a_failure_that_says_what_is_lacking(keep, words):
         assert word in found.reason
 
 
-def test_points_the_design_does_not_know_are_left_aside():
+def test_points_that_are_not_in_the_design_are_ignored():
     points = measured(seed=14)
     more = ImagePoints.with_sigma(
         (*points.names, "dirt"), np.vstack([points.xy, [[10.0, 10.0]]]), [[SIGMA, SIGMA]]
@@ -409,7 +409,7 @@ def test_points_the_design_does_not_know_are_left_aside():
     assert "0 of 99 points" in found.reason
 
 
-def test_a_system_by_hand_is_the_one_the_correction_has():
+def test_the_system_agrees_with_a_manual_computation():
     """Step (ii) written out: shift to O, turn to S, one scale."""
     points = measured(seed=15)
     camera = corrected(points)

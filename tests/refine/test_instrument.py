@@ -28,7 +28,7 @@ def _noise_free():
     return camera, rods
 
 
-def test_without_noise_object_coordinates_come_out_as_they_are():
+def test_without_noise_object_coordinates_are_exact():
     camera, rods = _noise_free()
     found = correct_instrument(rods, RODS, camera, alpha=_ALL).required()
     body = ImagePoints.with_sigma("abcd", displayed(_BODY), 0.01)
@@ -71,7 +71,7 @@ def test_predicted_covariances_of_true_coordinates_cover(trials):
     assert abs(rms - 1) < 4 / np.sqrt(4 * trials)
 
 
-def test_coefficients_that_are_not_there_are_dropped_from_the_reduced_model_and_the_datum_is_kept():
+def test_absent_coefficients_are_dropped_and_the_datum_is_kept():
     rng = np.random.default_rng(2)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
     found = correct_instrument(measured(RODS.ids, displayed(RODS.xy), rng), RODS, camera).required()
@@ -86,7 +86,7 @@ def test_coefficients_that_are_not_there_are_dropped_from_the_reduced_model_and_
     assert found.covariance.shape == (len(camera.model.names) + len(INSTRUMENT.names),) * 2
 
 
-def test_a_local_model_is_taken_off_where_the_rods_need_it_and_kept_with_the_calibration():
+def test_a_required_local_model_is_applied_and_stored_in_the_calibration():
     rng = np.random.default_rng(8)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
     side = np.linspace(0, 100, 9)
@@ -124,7 +124,7 @@ def bent_points(found, design, shape, names):
     return ImagePoints.with_sigma(names, displayed(shape(xy)), 0.01)
 
 
-def test_rods_held_out_are_predicted():
+def test_check_rods_are_predicted():
     rng = np.random.default_rng(3)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
     held = ("r7", "r12", "r17")
@@ -136,12 +136,12 @@ def test_rods_held_out_are_predicted():
     assert np.abs(normalised).max() < 4
 
 
-@pytest.mark.parametrize(("count", "said"), [(3, "four are needed"), (6, "fewer than the 16 parameters")])
-def test_too_few_rods_are_said(count, said):
+@pytest.mark.parametrize(("count", "message"), [(3, "four are needed"), (6, "fewer than the 16 parameters")])
+def test_too_few_rods_are_reported(count, message):
     camera, rods = _noise_free()
     found = correct_instrument(rods.select(rods.names[:count]), RODS, camera)
     assert isinstance(found, Failure)
-    assert said in found.reason
+    assert message in found.reason
 
 
 def test_rods_on_one_line_leave_the_second_scale_undetermined():
@@ -151,7 +151,7 @@ def test_rods_on_one_line_leave_the_second_scale_undetermined():
     assert "λ2" in found.reason or "fewer" in found.reason
 
 
-def test_a_calibration_of_both_groups_is_read_back_as_it_was_written():
+def test_a_calibration_of_both_groups_is_read_back_unchanged():
     rng = np.random.default_rng(4)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()
     found = correct_instrument(measured(RODS.ids, displayed(RODS.xy), rng), RODS, camera).required()
@@ -165,7 +165,7 @@ def test_a_calibration_of_both_groups_is_read_back_as_it_was_written():
     np.testing.assert_allclose(back.apply(body).cov, found.apply(body).cov, rtol=1e-12)
 
 
-def test_a_calibration_of_the_camera_alone_is_refused_with_what_to_do():
+def test_a_calibration_without_group_b_is_refused_with_instructions():
     camera = correct_camera(reseau_marks(np.random.default_rng(5)), RESEAU, trials=0).required()
     with pytest.raises(FormatError, match="camera alone; make it with a PHOTO II"):
         InstrumentCorrection.from_calibration(camera.calibration(name="bench"))

@@ -15,7 +15,7 @@ def _camera(seed: int = 0):
     return correct_camera(reseau_marks(np.random.default_rng(seed)), RESEAU, trials=0).required()
 
 
-def test_a_camera_that_stood_still_is_not_said_to_have_moved():
+def test_a_stationary_camera_is_not_reported_as_moved():
     # PHOTO I anew for each: its own errors are part of the test's level.
     found = [register(reseau_marks(np.random.default_rng(100 + s)), RESEAU, _camera(s)) for s in range(40)]
     assert not any(r.moved for r in found)
@@ -24,7 +24,7 @@ def test_a_camera_that_stood_still_is_not_said_to_have_moved():
     assert sum(r.p < 0.05 for r in found) <= 8
 
 
-def test_a_moved_camera_is_noticed_and_its_photograph_carried_back():
+def test_a_moved_camera_is_detected_and_its_photograph_registered():
     moved = Similarity(np.array([0.5, -0.3, 1.0002, 0.0003]))
     marks = measured(RESEAU.ids, moved(pixels(RESEAU.xy)), np.random.default_rng(1))
     found = register(marks, RESEAU, _camera())
@@ -35,7 +35,7 @@ def test_a_moved_camera_is_noticed_and_its_photograph_carried_back():
     assert np.abs(back).max() < 5 * SIGMA_PX
 
 
-def test_a_tilted_photograph_is_carried_back_as_well():
+def test_a_tilted_photograph_is_registered():
     xy = pixels(RESEAU.xy)
     tilted = measured(RESEAU.ids, xy * (1 + 2e-5 * (xy[:, :1] - 800)), np.random.default_rng(2))
     found = register(tilted, RESEAU, _camera())
@@ -45,13 +45,13 @@ def test_a_tilted_photograph_is_carried_back_as_well():
     assert np.abs(found.apply(tilted).xy - xy).max() < 5 * SIGMA_PX
 
 
-def test_marks_that_do_not_go_together_show_in_what_is_left():
+def test_inconsistent_marks_increase_the_residuals():
     rng = np.random.default_rng(2)
     apart = measured(RESEAU.ids, pixels(RESEAU.xy) + rng.normal(0, 0.5, RESEAU.xy.shape), rng)
     assert 0.3 < register(apart, RESEAU, _camera()).left_px < 0.8
 
 
-def test_three_marks_do_not_refer_a_photograph():
+def test_three_marks_are_too_few_to_register_a_photograph():
     marks = reseau_marks(np.random.default_rng(3))
     found = register(marks.select(marks.names[:3]), RESEAU, _camera())
     assert isinstance(found, Failure)

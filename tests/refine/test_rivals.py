@@ -20,7 +20,7 @@ def _points(model, seed: int, n: int = 60) -> tuple[ImagePoints, np.ndarray]:
     return ImagePoints.with_sigma([f"p{i}" for i in range(n)], noisy, _SIGMA), model(xy)
 
 
-def test_leave_one_out_is_what_a_fit_without_the_point_predicts():
+def test_leave_one_out_equals_the_prediction_of_a_fit_without_the_point():
     points, target = _points(RationalPolynomial.ultrasonic(), 0, n=20)
     fit = fit_mapping(RationalPolynomial.ultrasonic(), points, target).required()
     model = RationalPolynomial.ultrasonic().with_values(fit.values)
@@ -35,7 +35,7 @@ def test_leave_one_out_is_what_a_fit_without_the_point_predicts():
         np.testing.assert_allclose(error[i], predicted - target[i], atol=2e-3)
 
 
-def test_wongs_display_wins_where_it_is_true():
+def test_wongs_display_is_preferred_if_it_is_the_true_model():
     true = wong_display().with_values({"k1": 2e-6, "k2": 8e-10, "k3": -2e-13, "m1": 0.01})
     points, target = _points(true, 1)
     found = rivals(RationalPolynomial.ultrasonic(), wong_display(), points, target)
@@ -43,13 +43,13 @@ def test_wongs_display_wins_where_it_is_true():
     assert (found.rms[1] < found.rms[0]).all()
 
 
-def test_the_polynomials_win_where_they_are_true():
+def test_the_polynomials_are_preferred_if_they_are_the_true_model():
     true = RationalPolynomial.ultrasonic().with_values({"A4": 3e-4, "A5": -2e-4, "B6": 3e-6, "A6": -1e-6})
     points, target = _points(true, 2)
     assert rivals(RationalPolynomial.ultrasonic(), wong_display(), points, target).verdict == "first"
 
 
-def test_where_both_are_true_neither_is_preferred_more_often_than_the_level_says():
+def test_if_both_are_true_neither_is_preferred_more_often_than_the_level():
     true = wong_display().with_values({"k1": 1e-6, "P2": 1e-5, "P3": 0.005})
     verdicts = [
         rivals(RationalPolynomial.ultrasonic(), wong_display(), *_points(true, 10 + s)).verdict

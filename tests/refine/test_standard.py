@@ -25,7 +25,7 @@ def stored() -> tuple[InstrumentCorrection, np.ndarray]:
     return correct_instrument(measured(RODS.ids, displayed(real), rng), RODS, camera).required(), real
 
 
-def test_what_has_not_changed_is_contradicted_at_the_level_of_the_test(stored):
+def test_an_unchanged_instrument_is_rejected_at_the_level_of_the_test(stored):
     correction, real = stored
     rng, trials = np.random.default_rng(2), 300
     tests = []
@@ -47,7 +47,7 @@ def test_what_has_not_changed_is_contradicted_at_the_level_of_the_test(stored):
     assert all(test.degrees == 2 * len(RODS.ids) for test in tests)
 
 
-def test_other_rods_bring_their_tolerance_and_the_stored_covariance(stored):
+def test_other_rods_add_their_tolerance_and_the_stored_covariance(stored):
     correction, _ = stored
     rng = np.random.default_rng(3)
     other = RODS.xy + rng.normal(0, TOLERANCE, RODS.xy.shape)
@@ -56,7 +56,7 @@ def test_other_rods_bring_their_tolerance_and_the_stored_covariance(stored):
     assert not still_standard(correction, pins, RODS, same_object=True).holds
 
 
-def test_a_display_that_shifted_and_one_that_draws_otherwise_are_told_apart(stored):
+def test_a_shifted_and_a_deformed_display_are_distinguished(stored):
     correction, real = stored
     rng = np.random.default_rng(4)
     aside = np.array([0.03, -0.02])
@@ -72,7 +72,7 @@ def test_a_display_that_shifted_and_one_that_draws_otherwise_are_told_apart(stor
     assert drawn.largest[1] > 0.02
 
 
-def test_the_images_it_was_made_from_are_kept_with_a_calibration(stored):
+def test_a_calibration_contains_the_image_coordinates_it_was_computed_from(stored):
     correction, _ = stored
     text = correction.calibration(RESEAU, RODS, name="bench").to_json()
     back, _, rods = InstrumentCorrection.from_calibration(Calibration.parse(text, where="test"))

@@ -23,7 +23,7 @@ class Points:
     xy: Array
 
 
-def test_truth_and_group_a_agree_to_the_noise(bench: Bench) -> None:
+def test_truth_and_group_a_agree_within_the_noise(bench: Bench) -> None:
     camera = bench.truth.camera
     assert camera.position_px == pytest.approx((NOISE_PX, NOISE_PX), rel=0.2)
     assert camera.position_normalised == pytest.approx((1.0, 1.0), rel=0.2)
@@ -33,7 +33,7 @@ def test_truth_and_group_a_agree_to_the_noise(bench: Bench) -> None:
     assert max(camera.approximation) < 0.002
 
 
-def test_rods_and_points_are_compared_with_where_they_truly_are(bench: Bench) -> None:
+def test_rods_and_points_are_compared_with_their_true_positions(bench: Bench) -> None:
     rods, (body,) = bench.truth.rods, bench.truth.bodies
     assert rods is not None
     assert (rods.rods, rods.known) == (38, 38)
@@ -44,7 +44,7 @@ def test_rods_and_points_are_compared_with_where_they_truly_are(bench: Bench) ->
     assert all(name == known for name, known in body.identity.items())
 
 
-def test_each_group_takes_its_part_off_when_the_rods_are_free_of_error(bench: Bench) -> None:
+def test_each_group_removes_its_part_if_the_rods_have_no_errors(bench: Bench) -> None:
     left = {factor.name: np.hypot(*factor.ideal) for factor in bench.truth.factors if factor.ideal}
     raw, a, b, both, alone = (left[name] for name in FACTORS)
     assert both < 0.25 * min(raw, a, b)
@@ -52,7 +52,7 @@ def test_each_group_takes_its_part_off_when_the_rods_are_free_of_error(bench: Be
     assert both < 1.2 * alone
 
 
-def test_without_the_truth_rods_are_held_against_their_design(bench: Bench) -> None:
+def test_without_the_truth_rods_are_compared_with_their_design(bench: Bench) -> None:
     factors = factor_by_factor(bench.second, bench.world.test_object)
     assert [factor.name for factor in factors] == list(FACTORS)
     assert all(factor.body is None and factor.ideal is None and factor.check is None for factor in factors)
@@ -60,14 +60,14 @@ def test_without_the_truth_rods_are_held_against_their_design(bench: Bench) -> N
     assert rods == [factor.rods for factor in bench.truth.factors]
 
 
-def test_a_stray_is_no_point_and_of_two_the_nearer_is_the_point() -> None:
+def test_stray_points_are_ignored_and_the_nearest_point_is_matched() -> None:
     known = Points(("P", "Q"), np.array([[0.0, 0.0], [10.0, 0.0]]), np.zeros((2, 2)))
     found = np.array([[0.3, 0.0], [0.1, 0.0], [5.0, 40.0], [10.0, 0.5]])
     true = ImagePoints.with_sigma(("1", "2", "3", "4"), found, 0.1)
     assert identified(true, known).tolist() == [-1, 0, -1, 1]
 
 
-def test_the_table_of_text_is_narrow_and_has_the_numbers(bench: Bench) -> None:
+def test_the_text_table_is_narrow_and_contains_the_numbers(bench: Bench) -> None:
     lines = comparison_table(bench.truth).splitlines()
     assert max(map(len, lines)) <= 84
     assert not any(line.endswith(" ") for line in lines)

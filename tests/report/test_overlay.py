@@ -12,7 +12,7 @@ from reseau.report.overlay import Arcs, Marks, frame_overlay, preview
 FRAME = Frame(np.random.default_rng(2).integers(0, 4000, (60, 80)).astype(np.uint16), 65535.0)
 
 
-def test_marks_not_found_are_crossed_out_and_those_nobody_expects_are_left_out() -> None:
+def test_missing_marks_are_crossed_out_and_unexpected_ones_omitted() -> None:
     xy = np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 10.0], [np.nan, np.nan]])
     ok = np.array([True, False, True, False])
     drawn = frame_overlay(FRAME, Marks(("a", "b", "c", "d"), xy, ok, ("c",)))
@@ -22,7 +22,7 @@ def test_marks_not_found_are_crossed_out_and_those_nobody_expects_are_left_out()
     assert len(set(re.findall(r'stroke="(#\w+)"', drawn))) == 3  # fitted, not found, held out
 
 
-def test_the_frame_is_stretched_and_made_smaller() -> None:
+def test_the_frame_is_stretched_in_contrast_and_reduced() -> None:
     grey = preview(FRAME, 40)
     assert grey.shape == (30, 40)
     assert np.ptp(grey) > 100
@@ -38,7 +38,7 @@ def test_an_arc_is_drawn_through_its_middle_and_ends() -> None:
     assert ((x0 + 2 * x1 + x2) / 4, (y0 + 2 * y1 + y2) / 4) == (40.0, 30.0)
 
 
-def test_labels_of_close_marks_do_not_cover_one_another() -> None:
+def test_labels_of_close_marks_do_not_overlap() -> None:
     frame = Frame(np.zeros((750, 1000), dtype=np.uint8) + np.arange(1000, dtype=np.uint8), 255.0)
     xy = np.array([[500.0, 300.0], [510.0, 305.0], [520.0, 310.0]])
     names = ("X1", "X2", "<3")

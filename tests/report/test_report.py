@@ -40,7 +40,7 @@ def first_page(bench: Bench, frame: Frame | None = None) -> str:
     )
 
 
-def whole_page(bench: Bench, *frames: Frame, told: bool = True) -> str:
+def whole_page(bench: Bench, *frames: Frame, with_truth: bool = True) -> str:
     """The page of all three photographs, with the truth or without."""
     return oscilloscope_report(
         bench.first,
@@ -50,7 +50,7 @@ def whole_page(bench: Bench, *frames: Frame, told: bool = True) -> str:
         (bench.third,),
         frames=frames,
         title="A <title> & more",
-        truth=bench.truth if told else None,
+        truth=bench.truth if with_truth else None,
     )
 
 
@@ -110,7 +110,7 @@ def numbers(cells: list[str]) -> list[float]:
 
 
 @pytest.mark.parametrize("whole", [False, True])
-def test_the_page_stands_alone_and_is_well_formed(bench: Bench, whole: bool) -> None:
+def test_the_page_needs_no_other_files_and_is_well_formed(bench: Bench, whole: bool) -> None:
     page = whole_page(bench, FRAME, FRAME, FRAME) if whole else first_page(bench, FRAME)
     reader = Reader(page)
     assert reader.open == []
@@ -122,14 +122,14 @@ def test_the_page_stands_alone_and_is_well_formed(bench: Bench, whole: bool) -> 
     assert "A &lt;title&gt; &amp; more" in page
 
 
-def test_same_input_same_bytes_and_no_clock(bench: Bench) -> None:
+def test_the_same_input_gives_the_same_bytes_without_clock_times(bench: Bench) -> None:
     assert first_page(bench) == first_page(bench)
     page = whole_page(bench)
     assert page == whole_page(bench)
     assert not re.search(r"20\d\d-\d\d-\d\d", page)
 
 
-def test_figures_and_tables_are_numbered_without_a_gap(bench: Bench) -> None:
+def test_figures_and_tables_are_numbered_consecutively(bench: Bench) -> None:
     page = whole_page(bench, FRAME, FRAME, FRAME)
     for kind in ("Figure", "Table"):
         found = [int(n) for n in re.findall(rf"<b>{kind} (\d+)\.", page)]
@@ -137,7 +137,7 @@ def test_figures_and_tables_are_numbered_without_a_gap(bench: Bench) -> None:
         assert len(found) > 7
 
 
-def test_the_page_of_photo_i_alone_has_its_sections_and_none_of_the_others(bench: Bench) -> None:
+def test_the_page_of_photo_i_has_only_its_sections(bench: Bench) -> None:
     page = first_page(bench)
     for there in ("camera and film, group A", "Check marks", "against the simulated truth", "Provenance"):
         assert there in page
@@ -145,7 +145,7 @@ def test_the_page_of_photo_i_alone_has_its_sections_and_none_of_the_others(bench
         assert absent not in page
 
 
-def test_the_page_tells_what_was_computed_of_the_camera(bench: Bench) -> None:
+def test_the_page_contains_the_results_of_the_camera(bench: Bench) -> None:
     reader, fit = Reader(first_page(bench)), bench.first.camera.fit
     assert fit is not None
     assert reader.row("a posteriori σ0") == [f"{fit.adjustment.sigma0:.3f}"]
@@ -158,7 +158,7 @@ def test_the_page_tells_what_was_computed_of_the_camera(bench: Bench) -> None:
         )
 
 
-def test_the_page_tells_what_was_computed_of_the_instrument(bench: Bench) -> None:
+def test_the_page_contains_the_results_of_the_instrument(bench: Bench) -> None:
     reader, second = Reader(whole_page(bench)), bench.second
     fit, causes = second.instrument.fit, second.causes
     assert fit is not None
@@ -183,7 +183,7 @@ def test_the_page_tells_what_was_computed_of_the_instrument(bench: Bench) -> Non
     assert numbers(reader.row("Wong’s display model"))[-2:] == pytest.approx(fit.displays.rms[1], abs=6e-4)
 
 
-def test_true_coordinates_stand_in_the_page_with_their_sigmas_and_errors(bench: Bench) -> None:
+def test_the_page_contains_true_coordinates_with_sigmas_and_errors(bench: Bench) -> None:
     reader, true = Reader(whole_page(bench)), bench.third.true
     expected = dict(zip(bench.known.bodies[0].names, bench.known.bodies[0].object_xy, strict=True))
     for name, xy, sigma in zip(true.names, true.xy, true.sigma, strict=True):
@@ -193,7 +193,7 @@ def test_true_coordinates_stand_in_the_page_with_their_sigmas_and_errors(bench: 
         assert numbers(row[5:]) == pytest.approx(xy - expected[name], abs=6e-4)
 
 
-def test_factor_by_factor_the_page_has_the_numbers_of_the_comparison(bench: Bench) -> None:
+def test_the_page_contains_the_numbers_of_the_comparison_for_each_factor(bench: Bench) -> None:
     reader = Reader(whole_page(bench))
     assert len(bench.truth.factors) == 5
     for factor in bench.truth.factors:
@@ -207,12 +207,12 @@ def test_factor_by_factor_the_page_has_the_numbers_of_the_comparison(bench: Benc
     assert f"leave {np.hypot(*both.body):.3f}\u00a0mm" in whole_page(bench).replace("&nbsp;", "\u00a0")
 
 
-def test_without_the_truth_there_are_the_rods_alone(bench: Bench) -> None:
-    page = whole_page(bench, told=False)
+def test_without_the_truth_only_rods_are_listed(bench: Bench) -> None:
+    page = whole_page(bench, with_truth=False)
     assert "simulated" not in page
     assert "truth" not in page
-    told = {factor.name: factor.rods for factor in bench.truth.factors}
-    assert numbers(Reader(page).row("groups A and B")) == pytest.approx(told["groups A and B"], abs=6e-4)
+    reported = {factor.name: factor.rods for factor in bench.truth.factors}
+    assert numbers(Reader(page).row("groups A and B")) == pytest.approx(reported["groups A and B"], abs=6e-4)
 
 
 def test_dropped_terms_are_absent_from_the_reduced_equations(bench: Bench) -> None:
@@ -227,7 +227,7 @@ def test_dropped_terms_are_absent_from_the_reduced_equations(bench: Bench) -> No
     assert constant == pytest.approx(fit.monomials.adjustment["A0"], abs=6e-3)
 
 
-def test_the_papers_last_equations_are_written_as_it_prints_them() -> None:
+def test_the_final_equations_are_written_as_in_the_paper() -> None:
     model = RationalPolynomial.ultrasonic(reduced=True)
     value = dict.fromkeys(model.names, -2.5) | {"A0": 0.5}
     x, y = equations(model, value, dict.fromkeys(model.names, 0.1))
@@ -241,7 +241,7 @@ def test_the_papers_last_equations_are_written_as_it_prints_them() -> None:
     )
 
 
-def test_a_correction_from_a_file_has_nothing_to_show(bench: Bench) -> None:
+def test_a_correction_from_a_file_gives_no_report(bench: Bench) -> None:
     camera = CameraCorrection.from_calibration(bench.first.camera.calibration(name="c"))
     with pytest.raises(UsageError, match="was read from a file"):
         oscilloscope_report(PhotoI(bench.first.points, camera, None), bench.world.design)
@@ -253,14 +253,14 @@ def test_a_correction_from_a_file_has_nothing_to_show(bench: Bench) -> None:
         oscilloscope_report(bench.first, design, second, rods)
 
 
-def test_a_photograph_without_those_before_it_is_refused(bench: Bench) -> None:
+def test_a_photograph_without_its_predecessors_is_refused(bench: Bench) -> None:
     with pytest.raises(UsageError, match="needs PHOTO II"):
         oscilloscope_report(bench.first, bench.world.design, third=(bench.third,))
     with pytest.raises(UsageError, match="go together"):
         oscilloscope_report(bench.first, bench.world.design, bench.second)
 
 
-def test_the_overview_is_a_small_picture_and_the_same_to_the_byte(bench: Bench) -> None:
+def test_the_overview_is_small_and_reproducible_to_the_byte(bench: Bench) -> None:
     pixels = np.random.default_rng(2).integers(0, 255, (1200, 1600)).astype(np.uint8)
     frames = 3 * (Frame(pixels, 255.0),)
     one, other = (

@@ -31,7 +31,7 @@ def result() -> SensorResult:
     return with_edge(calibrate_sensor(SensorSeries(dark, light, sensor.full_scale)), frames)
 
 
-def test_the_report_tells_all_that_was_found_and_is_the_same_to_the_byte() -> None:
+def test_the_report_contains_all_results_and_is_reproducible_to_the_byte() -> None:
     provenance = Provenance({"edge 00 000": "ab" * 32}, {})
     page = sensor_report(result(), title="Sensor", provenance=provenance)
     assert page == sensor_report(result(), title="Sensor", provenance=provenance)
@@ -45,7 +45,7 @@ def test_the_report_tells_all_that_was_found_and_is_the_same_to_the_byte() -> No
     assert not re.search(r"(href|src)=\"[^#]", page)
 
 
-def test_the_curves_of_the_figure_are_those_that_were_found() -> None:
+def test_the_curves_of_the_figure_are_the_estimated_ones() -> None:
     edge = result().edge
     assert isinstance(edge, EdgeSpread)
     figure = mtf_figure(edge)
@@ -56,7 +56,7 @@ def test_the_curves_of_the_figure_are_those_that_were_found() -> None:
 
 
 @pytest.mark.parametrize("edge", [None, Failure("the edge is slanted by 0.1°", Code.SLANT)])
-def test_what_was_not_measured_is_told(edge: Failure | None) -> None:
+def test_quantities_that_were_not_measured_are_reported(edge: Failure | None) -> None:
     page = sensor_report(replace(result(), edge=edge), title="Sensor")
     assert page.count("<svg") == 1
     assert ("slanted by 0.1°" in page) is (edge is not None)

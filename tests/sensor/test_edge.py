@@ -41,12 +41,12 @@ def errors(kind: str, count: int) -> tuple[Array, Array, Array, Array]:
         assert free.mtf50 is not None
         half, half_sigma = free.mtf50
         nyquist, nyquist_sigma = free.nyquist
-        told = (
+        reported = (
             (half - edge.half()) / half_sigma,
             (nyquist - edge.truth(np.array([0.5]))[0]) / nyquist_sigma,
         )
         truth = edge.truth(SHOWN)
-        rows.append((value - truth, sigma, plain_iso(edge.frame, SHOWN) - truth, told))
+        rows.append((value - truth, sigma, plain_iso(edge.frame, SHOWN) - truth, reported))
     first, second, third, fourth = (np.array(column) for column in zip(*rows, strict=True))
     return first, second, third, fourth
 
@@ -56,7 +56,7 @@ def rms(values: Array) -> float:
 
 
 def check(kind: str, count: int, within: tuple[float, float], bias: float) -> None:
-    error, sigma, plain, told = errors(kind, count)
+    error, sigma, plain, reported = errors(kind, count)
     over = error / sigma
     assert within[0] < rms(over) < within[1], kind
     # Next to a zero of the curve, which every pixel has at one cycle, a modulus cannot be free of bias: 0.8.
@@ -64,7 +64,7 @@ def check(kind: str, count: int, within: tuple[float, float], bias: float) -> No
     assert np.abs(over[:, :20].mean()) < bias / 3, kind
     assert rms(error) < 0.8 * rms(plain), kind
     # rms of as many normalised errors: 1 ± 1/√(2·count), here by four of these.
-    assert np.abs(np.sqrt(np.mean(told**2, axis=0)) - 1).max() < 4 / np.sqrt(2 * count), kind
+    assert np.abs(np.sqrt(np.mean(reported**2, axis=0)) - 1).max() < 4 / np.sqrt(2 * count), kind
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -81,7 +81,7 @@ def test_the_free_curve_is_true_within_its_sigmas_over_many_edges(kind: str) -> 
     assert 0.7 < np.sqrt((over**2).mean(axis=0)).min() < np.sqrt((over**2).mean(axis=0)).max() < 1.33
 
 
-def test_nearly_without_noise_no_bias_is_left() -> None:
+def test_with_little_noise_there_is_no_bias() -> None:
     for kind in KINDS:
         edge = edge_of(kind, np.random.default_rng(7), decibels=100.0)
         _, free = measured(edge)
@@ -116,7 +116,7 @@ def test_the_tests_keep_their_levels_over_many_edges() -> None:
 
 
 @pytest.mark.parametrize("kind", ["defocus", "flare", "coma"])
-def test_what_is_no_gaussian_is_told(kind: str) -> None:
+def test_a_non_gaussian_edge_is_reported(kind: str) -> None:
     for seed in range(3):
         found, _ = measured(edge_of(kind, np.random.default_rng([seed, 5]), decibels=46.0))
         assert found.gaussian is not None
@@ -124,7 +124,7 @@ def test_what_is_no_gaussian_is_told(kind: str) -> None:
         assert {test["name"]: test["passed"] for test in found.tests()}["Gaussian edge"] is False
 
 
-def test_a_bent_edge_is_found_and_modelled() -> None:
+def test_a_bent_edge_is_detected_and_modelled() -> None:
     bow, over, curves = 4e-4, [], []
     sag = bow * 24**2
     for seed in range(8):
@@ -142,7 +142,7 @@ def test_a_bent_edge_is_found_and_modelled() -> None:
     assert 0.75 < rms(np.array(curves)) < 1.3
 
 
-def test_an_edge_with_no_blur_but_the_pixels_is_measured() -> None:
+def test_an_edge_blurred_only_by_the_pixels_is_measured() -> None:
     over = []
     for seed in range(8):
         edge = edge_of("none", np.random.default_rng([seed, 9]))
@@ -156,7 +156,7 @@ def test_an_edge_with_no_blur_but_the_pixels_is_measured() -> None:
     assert 0.7 < rms(np.array(over)) < 1.3
 
 
-def test_where_the_noise_is_known_it_is_taken_at_its_ratios() -> None:
+def test_known_noise_determines_the_weights() -> None:
     over = []
     for seed in range(8):
         edge = edge_of("gaussian", np.random.default_rng([seed, 4]), shot=True)
@@ -168,7 +168,7 @@ def test_where_the_noise_is_known_it_is_taken_at_its_ratios() -> None:
     assert 0.75 < rms(np.array(over)) < 1.3
 
 
-def test_blur_beyond_the_region_is_told() -> None:
+def test_blur_beyond_the_region_is_reported() -> None:
     edge = edge_of("gaussian", np.random.default_rng(0), decibels=46.0)
     y, x = np.mgrid[:48, :48]
     uneven = Frame(edge.frame.pixels * (1 + 1e-3 * x + 1e-3 * y), 1e4)
@@ -178,7 +178,7 @@ def test_blur_beyond_the_region_is_told() -> None:
         assert {test["name"]: test["passed"] for test in found.tests()}["flat beside the edge"] is flat
 
 
-def test_frequencies_that_the_distances_do_not_resolve_are_not_told() -> None:
+def test_frequencies_that_are_not_resolved_are_not_reported() -> None:
     y, x = np.mgrid[:40, :40] - 19.5
     noise = np.random.default_rng(1).normal(0, 1.0, (40, 40))
     for slope, limit in ((0.25, 1.0), (0.5, 0.56)):
@@ -199,7 +199,7 @@ def test_frequencies_that_the_distances_do_not_resolve_are_not_told() -> None:
     assert set(found.quantities()) == {"psf", "mtf50"}
 
 
-def test_noise_is_no_edge() -> None:
+def test_noise_is_not_an_edge() -> None:
     for seed in range(20):
         found = measure_edge(Frame(np.random.default_rng(seed).normal(100, 3, (40, 20)), 255.0))
         assert isinstance(found, Failure)
@@ -248,7 +248,7 @@ def test_the_sharpness_of_an_edge_is_recovered_within_its_sigmas() -> None:
         ),
     ],
 )
-def test_what_is_no_slanted_edge_is_declined(pixels: Array, code: Code) -> None:
+def test_regions_without_a_slanted_edge_are_declined(pixels: Array, code: Code) -> None:
     found = measure_edge(Frame(pixels, 255.0))
     assert isinstance(found, Failure)
     assert found.code is code

@@ -47,7 +47,7 @@ def test_the_truth_is_recovered_within_its_sigmas() -> None:
         assert abs(np.mean(normalised)) < 0.52, name
 
 
-def test_defective_pixels_are_found_and_hardly_any_good_one() -> None:
+def test_defective_pixels_are_found_with_few_false_alarms() -> None:
     found, wrong = 0, 0
     for seed in range(40):
         sensor, result = calibrated(seed)
@@ -74,7 +74,7 @@ def test_a_corrected_frame_is_flat_dark_and_straight() -> None:
     assert np.ptp(means) / np.mean(means) < 1.5e-3
 
 
-def test_uneven_light_is_no_defect_and_goes_into_the_response() -> None:
+def test_uneven_light_is_not_a_defect_and_enters_the_response() -> None:
     rng = np.random.default_rng(5)
     sensor = PixelSensor.drawn(rng)
     y, x = np.mgrid[-1:1:64j, -1:1:96j]
@@ -85,7 +85,7 @@ def test_uneven_light_is_no_defect_and_goes_into_the_response() -> None:
     assert abs(result.transfer.fit["gain"] - sensor.gain) < 4 * result.transfer.fit.sigma_of("gain")
 
 
-def test_a_file_gives_the_same_correction_back() -> None:
+def test_a_correction_is_read_back_unchanged() -> None:
     sensor, result = calibrated(0)
     calibration = Calibration.parse(result.calibration("sensor", {}, {}).to_json(), where="file")
     assert calibration.kind == "sensor"
@@ -111,7 +111,7 @@ def test_frames_of_another_sensor_and_files_of_another_kind_are_refused() -> Non
             SensorCorrection.from_calibration(broken)
 
 
-def test_what_cannot_be_calibrated_is_said() -> None:
+def test_series_that_cannot_be_calibrated_are_reported() -> None:
     rng = np.random.default_rng(0)
     sensor = PixelSensor.drawn(rng)
     dark = Level.of(100.0, [sensor.expose(0.0, 100.0, rng) for _ in range(2)])

@@ -44,7 +44,7 @@ def test_derivatives_and_inverse(mapping: PlaneMapping) -> None:
     np.testing.assert_allclose(mapping.inverse(mapping(POINTS)), POINTS, rtol=0, atol=1e-9)
 
 
-def test_a_drawn_tube_has_the_thirteen_parameters_and_bends_by_millimetres() -> None:
+def test_a_random_tube_has_thirteen_parameters_and_distorts_by_millimetres() -> None:
     world = World.standard(0)
     instrument = Instrument(world.display.correction, world.scanner.m1, world.scanner.m2)
     assert len(instrument.names) == 13
@@ -74,7 +74,7 @@ def plain(**settings: float) -> Display:
     return Display(identity, grain=0.0, gradient=(0.0, 0.0), falloff=0.0, **settings)  # type: ignore[arg-type]
 
 
-def test_black_glows_and_white_is_brighter_by_the_contrast() -> None:
+def test_black_has_a_glow_and_white_is_brighter_by_the_contrast() -> None:
     screen, display = Screen(), plain(glow=40.0, contrast=150.0)
     for signal, grey in ((0.0, 40.0), (0.5, 115.0), (1.0, 190.0)):
         display.show(video_of(display, screen, np.array(signal)), screen, np.random.default_rng(0))
@@ -83,7 +83,7 @@ def test_black_glows_and_white_is_brighter_by_the_contrast() -> None:
         assert middle.mean() == pytest.approx(grey, rel=1e-3)
 
 
-def test_lines_of_the_raster_show_as_far_as_the_spot_lets_them() -> None:
+def test_raster_lines_are_visible_depending_on_the_spot_size() -> None:
     screen = Screen()
     for spot in (0.12, 0.18, 0.22):
         display = plain(spot_mm=spot)
@@ -97,7 +97,7 @@ def test_lines_of_the_raster_show_as_far_as_the_spot_lets_them() -> None:
         assert spectrum[100] == pytest.approx(expected, rel=0.02)
 
 
-def test_a_point_is_drawn_where_the_correction_has_its_source() -> None:
+def test_a_point_is_drawn_at_the_inverse_of_the_correction() -> None:
     """What is displayed at p belongs at C(p): a point that belongs at q is drawn at the inverse of C."""
     display = replace(plain(), correction=RationalPolynomial.affine().with_values({"a1": 1.02, "c2": -1.5}))
     screen = Screen()
@@ -110,7 +110,7 @@ def test_a_point_is_drawn_where_the_correction_has_its_source() -> None:
     np.testing.assert_allclose(centre, [(20.4 - 0.02 * 11.0) / 1.02, 11.0], rtol=0, atol=2e-3)
 
 
-def test_photo_i_knows_nothing_of_scanner_and_display() -> None:
+def test_photo_i_does_not_depend_on_scanner_and_display() -> None:
     one = World.standard(3)
     other = World.standard(3, display="polynomial", scanner=Scanner(), rods=one.test_object)
     other.photo_ii()

@@ -33,7 +33,7 @@ def test_the_upper_edge_lies_on_the_chord_between_its_true_corners(tilt: float) 
     assert abs(np.median(off)) < 0.05
 
 
-def test_a_bowed_edge_leaves_its_chord_by_its_sagitta_in_the_middle_alone() -> None:
+def test_a_bowed_edge_deviates_by_its_sagitta_in_the_middle() -> None:
     frame = replace(QUIET, bow_mm=0.12, seed=3)
     straight, bowed = replace(frame, bow_mm=0.0).light(), frame.light()
     ul, ur = frame.truth.corners[:2]
@@ -46,7 +46,7 @@ def test_a_bowed_edge_leaves_its_chord_by_its_sagitta_in_the_middle_alone() -> N
     assert moved == pytest.approx(frame.bows_px[0], abs=0.1)
 
 
-def test_corners_are_named_as_seen_also_from_the_wrong_side() -> None:
+def test_corners_are_named_as_seen_also_in_mirrored_scans() -> None:
     for mirrored in (False, True):
         ul, ur, lr, ll = replace(QUIET, mirrored=mirrored, tilt_deg=5.0).truth.corners
         assert ul[0] < ur[0]
@@ -55,7 +55,7 @@ def test_corners_are_named_as_seen_also_from_the_wrong_side() -> None:
         assert ur[1] < lr[1]
 
 
-def test_a_cropped_scan_lacks_one_edge_and_no_other() -> None:
+def test_a_cropped_scan_lacks_exactly_one_edge() -> None:
     for tilt in (0.5, 8.0):
         frame = replace(QUIET, crop="right", tilt_deg=tilt)
         corners, (h, w) = frame.truth.corners, frame.shape
@@ -64,7 +64,7 @@ def test_a_cropped_scan_lacks_one_edge_and_no_other() -> None:
         assert (corners[:, 1] < h - 1).all()
 
 
-def test_the_same_seed_gives_the_same_scan_and_another_seed_another() -> None:
+def test_scans_depend_only_on_the_seed() -> None:
     busy = Beside(True, True, True, lines=1, rods=1, blown=True, dust=5, scratches=3)
     frame = FilmFrame(1, format=RICOH, dpi=200, beside=busy)
     np.testing.assert_array_equal(frame.scan(), replace(frame).scan())

@@ -124,7 +124,7 @@ def test_our_driver_moves_it_over_a_serial_line_and_a_frame_is_what_was_predicte
         assert chain.violations == []
 
 
-def test_a_table_on_its_way_is_seen_on_its_way() -> None:
+def test_a_moving_table_is_imaged_at_its_current_position() -> None:
     time = [0.0]
     chain = ZaberChain([1], clock=lambda: time[0])
     laboratory = Laboratory(World.standard(seed=5), room=Room(), clock=lambda: time[0])
@@ -140,7 +140,7 @@ def test_a_table_on_its_way_is_seen_on_its_way() -> None:
     assert laboratory.field_truth().pose.x0[0] != 0.0
 
 
-def test_light_exposure_and_gain_are_what_they_say_and_saturate() -> None:
+def test_light_exposure_and_gain_act_as_specified_and_saturate() -> None:
     time = [0.0]
     laboratory = Laboratory(World.standard(seed=1), room=Room(light_per_hour=-0.1), clock=lambda: time[0])
     bright = float(np.median(laboratory.expose("testfield").pixels))
@@ -153,7 +153,7 @@ def test_light_exposure_and_gain_are_what_they_say_and_saturate() -> None:
     assert laboratory.expose("testfield").pixels.max() < 20
 
 
-def test_the_camera_creeps_with_the_clock() -> None:
+def test_the_camera_drifts_with_time() -> None:
     time = [0.0]
     laboratory = Laboratory(
         World.standard(seed=1), room=Room(drift_mm_per_hour=(1.0, 0.0, 0.0)), clock=lambda: time[0]
@@ -165,7 +165,7 @@ def test_the_camera_creeps_with_the_clock() -> None:
     assert np.median(moved, axis=0) == pytest.approx([-2 * PX / 5000, 0.0], abs=0.02)
 
 
-def test_the_same_seed_gives_the_same_room_and_frames() -> None:
+def test_the_same_seed_gives_the_same_laboratory_and_frames() -> None:
     one, two = (Laboratory(World.standard(seed=8), clock=lambda: 0.0) for _ in range(2))
     assert one.room == two.room != Laboratory(World.standard(seed=9)).room
     assert one.expose("testfield").sha256 == two.expose("testfield").sha256
@@ -173,12 +173,12 @@ def test_the_same_seed_gives_the_same_room_and_frames() -> None:
 
 
 @pytest.mark.parametrize("tilt", [75.0, 89.0, 90.0, 180.0, 400.0])
-def test_any_position_that_a_client_can_drive_to_gives_a_frame(tilt: float) -> None:
+def test_every_reachable_position_gives_a_frame(tilt: float) -> None:
     laboratory = Laboratory(World.standard(seed=1))
     laboratory.attach("tilt", lambda: tilt)
     assert laboratory.expose("testfield").pixels.shape == (240, 240)
 
 
-def test_an_axis_that_no_table_has_is_refused() -> None:
+def test_an_unknown_axis_is_refused() -> None:
     with pytest.raises(UsageError, match="tilt, roll"):
         Laboratory(World.standard(seed=1)).attach("yaw", lambda: 0.0)

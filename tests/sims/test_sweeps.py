@@ -41,14 +41,14 @@ def alone(world: World) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("display", ["wong", "polynomial"])
-def test_middles_of_arcs_lie_where_the_truth_has_them(seed: int, display: str) -> None:
+def test_middles_of_arcs_are_at_their_true_positions(seed: int, display: str) -> None:
     world = quiet(World.standard(seed, display=display))  # type: ignore[arg-type]
     found = errors(echoes(world, world.rods), world.truth_ii(), alone(world))
     assert np.abs(found[:, 0]).max() < 0.02
     assert np.abs(found[:, 1]).max() < 0.006
 
 
-def test_a_body_lies_where_its_truth_has_it_and_inside_the_rods() -> None:
+def test_a_body_is_at_its_true_position_inside_the_rods() -> None:
     world = quiet(World.standard(4))
     body, truth = world.body(20), world.truth_iii(world.body(20))
     assert truth.names == body.names
@@ -61,7 +61,7 @@ def test_a_body_lies_where_its_truth_has_it_and_inside_the_rods() -> None:
     np.testing.assert_array_equal(world.body(20).xy, body.xy)
 
 
-def test_truth_goes_there_and_back(world: World) -> None:
+def test_the_true_mapping_and_its_inverse_agree(world: World) -> None:
     truth = world.truth_ii()
     np.testing.assert_allclose(truth.view.inverse(truth.xy), truth.object_xy, rtol=0, atol=1e-8)
     names = world.truth_iii().names
@@ -89,7 +89,7 @@ def test_the_test_object_determines_the_sixteen_coefficients() -> None:
     np.testing.assert_allclose(design.xy[n] - design.xy[m], [100.0, 0.0])
 
 
-def test_same_seed_same_photographs_in_any_order(world: World, photo_ii: Frame) -> None:
+def test_the_same_seed_gives_the_same_photographs_in_any_order(world: World, photo_ii: Frame) -> None:
     again = World.standard(3)
     iii = again.photo_iii()
     assert again.photo_ii().sha256 == photo_ii.sha256
@@ -124,7 +124,7 @@ def test_some_arcs_cross_wires_and_some_touch(world: World) -> None:
     assert 2 <= touching.any(axis=1).sum() <= 12
 
 
-def test_an_echo_is_as_long_as_the_beam_is_wide_and_bends_as_the_range_does() -> None:
+def test_an_echo_has_the_length_of_the_beam_width_and_the_curvature_of_the_range() -> None:
     scanner = Scanner(noise=0.0, face=0.0)
     x, y = np.arange(-60.0, 60.05, 0.1), np.arange(58.0, -55.0, -0.05)
     rod = Reflectors(("only",), np.array([[3.0, -40.0]]), np.ones(1))
@@ -140,7 +140,7 @@ def test_an_echo_is_as_long_as_the_beam_is_wide_and_bends_as_the_range_does() ->
     assert scanner.beam_mm(np.array([100.0]))[0] > 1.2 * width
 
 
-def test_the_parameters_of_the_beam_move_what_is_drawn() -> None:
+def test_the_parameters_of_the_beam_change_the_image() -> None:
     display = Display(RationalPolynomial.affine())
     x = np.array([[40.0, -30.0], [0.0, 20.0]])
     video = Scanner().sweep(World.standard(0).rods, *display.raster(World.standard(0).screen), rng())
@@ -154,7 +154,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
-def test_a_parallax_moves_the_echoes_and_not_the_reseau() -> None:
+def test_a_parallax_shifts_the_echoes_but_not_the_reseau() -> None:
     near, far = (quiet(World.standard(2, faults=Faults(parallax_mm=gap))) for gap in (0.0, 2.0))
     np.testing.assert_array_equal(near.truth("PHOTO II").xy, far.truth("PHOTO II").xy)
     moved = far.truth_ii().xy - near.truth_ii().xy
@@ -166,7 +166,7 @@ def test_a_parallax_moves_the_echoes_and_not_the_reseau() -> None:
     assert np.abs(errors(echoes(far, far.rods), far.truth_ii(), alone(far))).max() < 0.02
 
 
-def test_a_pushed_camera_moves_everything_after_photo_i() -> None:
+def test_a_displaced_camera_shifts_everything_after_photo_i() -> None:
     still, pushed = (World.standard(2, faults=Faults(camera_moved_mm=d)) for d in (0.0, 1.0))
     assert still.photo_i().sha256 == pushed.photo_i().sha256
     for photo in ("PHOTO II", "PHOTO III"):
@@ -178,7 +178,7 @@ def test_a_pushed_camera_moves_everything_after_photo_i() -> None:
     assert np.abs(errors(echoes(pushed, pushed.rods), pushed.truth_ii(), alone(pushed))).max() < 0.02
 
 
-def test_a_turned_test_object_is_seen_turned_and_the_body_is_not() -> None:
+def test_a_rotated_test_object_is_imaged_rotated_but_the_body_is_not() -> None:
     straight, turned = (quiet(World.standard(2, faults=Faults(object_turned_deg=d))) for d in (0.0, 3.0))
 
     def direction(world: World) -> float:
@@ -211,7 +211,7 @@ def test_swapped_marks_are_the_same_marks() -> None:
     assert other.points == design.points
 
 
-def test_bright_areas_push_the_beam_away_and_the_truth_knows() -> None:
+def test_bright_areas_deflect_the_beam_and_the_truth_includes_it() -> None:
     straight = quiet(World.standard(6))
     disk = (-30.0, 0.0, 12.0)
     display = replace(straight.display, bright=(disk,))
@@ -257,12 +257,12 @@ class Inverse:
         (lambda: Reflectors(("a", "b"), np.array([[0.0, -5.0]]), np.ones(1)), "2 names"),
     ],
 )
-def test_what_cannot_be_is_refused(impossible: object, message: str) -> None:
+def test_impossible_worlds_are_refused(impossible: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         impossible()  # type: ignore[operator]
 
 
-def test_the_reseau_is_drawn_anew_when_it_changes() -> None:
+def test_the_reseau_is_redrawn_after_a_change() -> None:
     world, fresh = World.standard(3), World.standard(3)
     light = np.ones(world.camera.shape)
     whole = world.plate.over(light, world.camera)

@@ -22,14 +22,14 @@ def test_the_paper_made_36_recordings_from_nine_positions() -> None:
     assert {s.phi for s in stations} == {0.0, 30.0, 45.0}
 
 
-def test_a_pixel_sees_the_paper_s_part_of_the_board() -> None:
+def test_the_pixel_footprint_is_that_of_the_paper() -> None:
     truth = FieldBench().truth(Station(0))
     step = np.hypot(*(truth.xy[1] - truth.xy[0]))
     # 57.5 mm over 5 m and 27 µm: 0.426 px/mm, within what the setting up leaves open.
     assert step / 30.0 == pytest.approx(57.5 / 5000 / 0.027, abs=0.002)
 
 
-def test_the_same_seed_and_station_give_the_same_frame_whatever_was_recorded_before() -> None:
+def test_the_same_seed_and_station_give_the_same_frame_in_any_order() -> None:
     bench, station = FieldBench(seed=3), Station(30, 90)
     first = bench.record(station)
     bench.record(Station(45))
@@ -45,7 +45,7 @@ def darkness_centroid(light: Array, level: float, at: Array, half: int) -> Array
 
 
 @pytest.mark.parametrize("station", [Station(0), Station(30, 180, 90), Station(45, 270, 180)])
-def test_a_lone_target_lies_where_the_truth_says(station: Station) -> None:
+def test_an_isolated_target_is_at_its_true_position(station: Station) -> None:
     field = coded_testfield()
     only = "28.06"  # somewhere in the middle, so that no line is near
     bench = FieldBench(design=field, missing=frozenset(field.ids) - {only}, sensor=QUIET)
@@ -70,7 +70,7 @@ def heights_in_mount(bench: FieldBench, station: Station) -> Array:
     return bench.surface(station)((mount @ turn).reshape(-1, 2))[0][:, 2].reshape(2, 5)
 
 
-def test_the_bend_keeps_its_direction_in_the_mount_when_the_board_turns() -> None:
+def test_the_mount_bend_does_not_rotate_with_the_board() -> None:
     bench = FieldBench()
     for kappa in (0, 90, 180, 270):
         across, along = heights_in_mount(bench, Station(45, kappa))
@@ -78,7 +78,7 @@ def test_the_bend_keeps_its_direction_in_the_mount_when_the_board_turns() -> Non
         np.testing.assert_allclose(along, 0, rtol=0, atol=1e-9)
 
 
-def test_a_bend_of_the_board_turns_with_it() -> None:
+def test_a_board_bend_rotates_with_the_board() -> None:
     bench = FieldBench(bend_with="board")
     across, along = heights_in_mount(bench, Station(45, 90))
     np.testing.assert_allclose(across, 0, rtol=0, atol=1e-9)
@@ -98,13 +98,13 @@ def test_noise_is_that_of_46_db() -> None:
     assert 20 * np.log10(255 / noise.std()) == pytest.approx(46.0, abs=0.1)
 
 
-def test_the_lens_moves_the_middle_of_an_edge_by_what_was_asked() -> None:
+def test_the_lens_distortion_at_the_middle_of_an_edge_is_as_requested() -> None:
     plain, bent = FieldBench(), FieldBench().distorted(-10.0)
     at = np.array([[120 * 0.027 / 57.5, 0.0]])
     np.testing.assert_allclose(bent.camera(at) - plain.camera(at), [[-10.0, 0.0]], rtol=0, atol=1e-9)
 
 
-def test_stains_hide_and_dazzle_and_a_mirror_mirrors() -> None:
+def test_stains_hide_or_saturate_targets_and_a_mirror_reflects_the_field() -> None:
     plain = FieldBench(sensor=QUIET)
     stained = replace(plain, stains=(Stain(60, 50, 20, 90.0), Stain(180, 190, 12, 300.0, opaque=False)))
     light = stained.light(Station(0))

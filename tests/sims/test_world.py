@@ -23,7 +23,7 @@ def frame(world: World) -> Frame:
     return world.photo_i()
 
 
-def test_same_seed_same_frame_whatever_was_photographed_before(world: World, frame: Frame) -> None:
+def test_the_same_seed_gives_the_same_frame_in_any_order(world: World, frame: Frame) -> None:
     again = World.standard(3)
     again.photograph("something else")
     assert again.photo_i().sha256 == frame.sha256
@@ -31,7 +31,7 @@ def test_same_seed_same_frame_whatever_was_photographed_before(world: World, fra
     assert World.standard(4).photo_i().sha256 != frame.sha256
 
 
-def test_two_photographs_differ_by_noise_alone(world: World, frame: Frame) -> None:
+def test_two_photographs_differ_only_by_noise(world: World, frame: Frame) -> None:
     other = world.photograph("PHOTO I again")
     difference = other.pixels.astype(float) - frame.pixels
     light = frame.pixels.astype(float)
@@ -62,7 +62,7 @@ def noise_free(world: World) -> Array:
     return world.plate.over(world.screen.seen(world.view(), world.camera.shape), world.camera)
 
 
-def test_wires_are_drawn_where_the_truth_has_them(world: World) -> None:
+def test_wires_are_drawn_at_their_true_positions(world: World) -> None:
     light, truth = noise_free(world), world.truth()
     background = world.screen.seen(world.view(), world.camera.shape)
     share = (1 - light / background) / world.plate.opacity
@@ -106,7 +106,7 @@ def test_marks_of_every_shape_are_centred_on_their_truth(mark: Mark, polarity: s
         np.testing.assert_allclose(centroid + np.array([column, row]), at, rtol=0, atol=2e-3)
 
 
-def test_faults_do_what_they_say() -> None:
+def test_faults_have_the_specified_effect() -> None:
     faults = Faults(missing=3, false_marks=4, bit_errors=500, lost_rows=6, scene=40.0)
     with_faults, without = World.standard(5, faults=faults), World.standard(5)
     assert len(with_faults.plate.missing) == 3
@@ -147,7 +147,7 @@ def test_a_film_is_the_identity_until_it_is_deformed() -> None:
     np.testing.assert_allclose(bent[:, 1], y + 1e-5 * x * y, rtol=1e-14)
 
 
-def test_designs_that_cannot_be_made_of_wires_are_refused() -> None:
+def test_designs_that_cannot_be_drawn_as_wires_are_refused() -> None:
     grid = standard_reseau()
     with_gap = grid.model_copy(update={"points": grid.points[1:]})
     with pytest.raises(UsageError, match="is no grid of wires"):

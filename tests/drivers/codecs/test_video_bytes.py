@@ -83,9 +83,9 @@ def test_format_fields_are_at_the_offsets_of_the_header() -> None:
     data[0:4] = b"\x01\0\0\0"
     data[8:12], data[12:16], data[16:20] = b"\x40\x06\0\0", b"\xb0\x04\0\0", b"Y16 "
     data[20:24], data[24:28], data[28:32] = b"\x01\0\0\0", b"\x80\x0c\0\0", b"\0\x98\x3a\0"
-    wanted = uapi.Format(1600, 1200, "Y16 ", 3200, 3840000)
-    assert uapi.Format.parse(data) == wanted
-    assert wanted.build() == data
+    expected = uapi.Format(1600, 1200, "Y16 ", 3200, 3840000)
+    assert uapi.Format.parse(data) == expected
+    assert expected.build() == data
 
 
 def test_buffer_fields_are_at_the_offsets_of_the_header() -> None:
@@ -166,8 +166,8 @@ def test_incomplete_frames_are_rejected(name: str, data: bytes) -> None:
 def test_a_jpeg_gives_the_luminance_of_its_decoder() -> None:
     pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
     data = cv2.imencode(".jpg", pixels)[1].tobytes()
-    wanted = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert (decode(VIDEO["MJPEG"], 24, 16, data + bytes(9)) == wanted).all()
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert (decode(VIDEO["MJPEG"], 24, 16, data + bytes(9)) == expected).all()
     with pytest.raises(ProtocolError, match="24×16"):
         decode(VIDEO["MJPEG"], 24, 17, data)
 
