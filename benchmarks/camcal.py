@@ -74,7 +74,7 @@ def measure(path: Path, design: ReseauDesign, theirs: dict[str, Array], channel:
 def ellipses(result: ReseauResult, design: ReseauDesign) -> tuple[Array, Array]:
     """Where the centre of each image lies beside the image of the centre (n, 2), and its radius in pixels."""
     assert design.mark.size is not None
-    pitch = of_the_tests("refine/camcal.py").PITCH
+    pitch = of_the_tests("measure/camcal.py").PITCH
     circle = Outline.circle(design.mark.size / 2, design.mark.size / 20)
     shift, radius = np.full((len(design.ids), 2), np.nan), np.full(len(design.ids), np.nan)
     for k in np.flatnonzero(result.ok):
@@ -233,7 +233,7 @@ def main() -> int:
     folder = arguments.data / "testfield_camcal"
     if not folder.is_dir():
         raise SystemExit(f"no photographs in {folder}")
-    camcal = of_the_tests("refine/camcal.py")
+    camcal = of_the_tests("measure/camcal.py")
     paths, theirs, design = camcal.photographs(folder), camcal.marks(folder), camcal.design(folder)
     n = len(paths)
     with ProcessPoolExecutor(arguments.workers) as pool:

@@ -17,7 +17,7 @@ from reseau.core.data import Array
 from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
 from reseau.sensor.edge import FREQUENCIES
 
-edges = of_the_tests("refine/sensor/edges.py")
+edges = of_the_tests("sensor/edges.py")
 SHOWN = FREQUENCIES[1:]
 
 

@@ -29,13 +29,12 @@ from scipy.stats import ncx2, norm
 from tables import ALPHA, SIZES, judged, print_power, rms
 
 from reseau.adjust import Adjustment, adjust
-from reseau.calibration import CameraCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau
 from reseau.measure import measure_reseau
 from reseau.measure.fitting import fit_mapping, mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
-from reseau.refine import CorrectionFit, correct_camera
+from reseau.refine import CorrectionFit, FittedCamera, correct_camera
 from reseau_sims import World
 
 COEFFICIENTS = RationalPolynomial.camera().names
@@ -77,14 +76,14 @@ def without_noise(
     return ImagePoints(points.names, mapping(np.array([exact[name] for name in points.names])), points.cov)
 
 
-def camera_without_noise(camera: CameraCorrection, exact: dict[str, Array]) -> Adjustment:
+def camera_without_noise(camera: FittedCamera, exact: dict[str, Array]) -> Adjustment:
     """The adjustment of noise-free positions: the same model, weights and common system."""
     assert camera.fit is not None
     used = without_noise(camera.fit.points, exact, camera.photo_system)
     return adjust(mapping_problem(camera.model, used, camera.fit.target)).required()
 
 
-def coefficient_errors(camera: CameraCorrection, true_fit: Adjustment) -> Array:
+def coefficient_errors(camera: FittedCamera, true_fit: Adjustment) -> Array:
     """Errors of the coefficients over their sigmas, in the order of `COEFFICIENTS`; NaN where dropped."""
     sigma = np.sqrt(np.diagonal(camera.cofactor))
     errors = dict(zip(camera.model.names, (camera.model.values - true_fit.values) / sigma, strict=True))

@@ -115,7 +115,7 @@ def main() -> int:
     parser.add_argument("--least", type=int, default=2000, help="marks per case")
     parser.add_argument("--only", default="", help="cases whose name holds this text")
     arguments = parser.parse_args()
-    formed = of_the_tests("refine/formed.py")
+    formed = of_the_tests("measure/formed.py")
     print(
         f"{'case (40 dB, psf 0.8 px, dark)':<34} {'marks':>6} {'not':>3} {'rms x/y px':>13} "
         f"{'rms/bound':>11} {'bias x/y 1e-3 px':>17} {'by phase':>12} {'norm. rms':>11}"

@@ -209,7 +209,7 @@ def main() -> int:
     parser.add_argument("--overlay", type=Path, help="folder for pictures of the frames with what was found")
     parser.add_argument("--seed", type=int, default=1, help="of the random systems of the design")
     arguments = parser.parse_args()
-    frames = of_the_tests("refine/frames.py")
+    frames = of_the_tests("measure/frames.py")
     directory = arguments.data / "reseau"
     cases = [frames.load(name, directory) for name in frames.names(directory)]
     if not cases:

@@ -1,4 +1,4 @@
-"""What benchmarks share with the tests: modules that read, form and compare, loaded by their path."""
+"""Load helper modules of the tests by their path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["of_the_tests"]
 
 
 def of_the_tests(path: str) -> ModuleType:
-    """Load a module of ``tests``, such as ``refine/frames.py``."""
+    """Load a module of ``tests``, such as ``measure/frames.py``."""
     file = Path(__file__).resolve().parents[1] / "tests" / path
     spec = importlib.util.spec_from_file_location(f"of_the_tests_{file.stem}", file)
     assert spec is not None

@@ -251,7 +251,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    fields = of_the_tests("refine/fields.py")
+    fields = of_the_tests("measure/fields.py")
     paper = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (0.0, 30.0, 45.0))]
     steep = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (60.0,))]
     kept = [counts("φ = 0, 30, 45°", paper), counts("φ = 60°", steep)]

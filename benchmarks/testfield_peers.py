@@ -27,7 +27,7 @@ from reseau.core.data import Array
 from reseau.measure import measure_reseau
 from reseau.optics.formation import rectangles
 
-sheets = of_the_tests("refine/sheets.py")
+sheets = of_the_tests("measure/sheets.py")
 ROLLS, TILTS = (0.0, 100.0, 200.0, 300.0), (0.0, 30.0, 45.0)
 NEAR_PX = 3.0
 CELLS = 8

@@ -6,6 +6,9 @@ import types
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from latex2mathml.converter import convert
+
 _ROOT = Path(__file__).resolve().parents[1]
 for _folder in ("src", "drivers", "sims"):
     sys.path.insert(0, str(_ROOT / _folder))
@@ -20,7 +23,6 @@ version = release = __version__
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "numpydoc",
     "myst_parser",
 ]
@@ -55,8 +57,8 @@ html_theme_options = {
 }
 html_static_path: list[str] = []
 html_show_sourcelink = False
-# Formulas are shown by the reader's browser; the build itself fetches nothing.
-mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@4/tex-mml-chtml.js"
+# Formulas are MathML in the pages: neither the build nor the reader's browser needs a network.
+html_math_renderer = "mathml"
 
 
 def _skip(app: Any, what: str, name: str, obj: object, skip: bool, options: Any) -> bool | None:
@@ -71,7 +73,29 @@ def _magnitudes(app: Any, what: str, name: str, obj: object, options: Any, lines
             lines[i] = re.sub(r"\|(\w)\|", r"\\|\1\\|", line)
 
 
+def _mathml(node: nodes.Node, display: str) -> str:
+    """Convert a formula from LaTeX to MathML; an unknown command is an error."""
+    found = convert(node.astext(), display=display)
+    if "\\" in found:
+        raise ValueError(f"{node.source}: formula with an unknown command: {node.astext()}")
+    return str(found)
+
+
+def _inline_math(translator: Any, node: nodes.Element) -> None:
+    translator.body.append(_mathml(node, "inline"))
+    raise nodes.SkipNode
+
+
+def _display_math(translator: Any, node: nodes.Element) -> None:
+    body = [translator.starttag(node, "div", CLASS="math notranslate"), _mathml(node, "block"), "</div>\n"]
+    if node.get("number"):
+        body.insert(1, f'<span class="eqno">({node["number"]})</span>')
+    translator.body.extend(body)
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
     """Connect to Sphinx."""
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.connect("autodoc-process-docstring", _magnitudes)
     app.connect("autodoc-skip-member", _skip)
