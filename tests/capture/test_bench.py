@@ -26,7 +26,7 @@ AXES = "[instruments.table.options.axes.tilt]\nper_unit = 1000.0\n"
     ("text", "message"),
     [
         ("", "schema"),
-        ("x = ", "no TOML"),
+        ("x = ", "is not TOML"),
         (HEAD, "instruments"),
         (HEAD + TABLE + "colour = 3\n", "unknown key"),
         (HEAD + "[instruments.table]\ndriver = 'zaber'\n", "address"),
@@ -200,5 +200,5 @@ def test_list_shows_found_instruments_and_why_a_search_failed(
 
 
 def test_missing_plugins_are_reported() -> None:
-    with pytest.raises(UsageError, match="there are"):
+    with pytest.raises(UsageError, match="no such entry point of reseau.instruments; installed: aravis"):
         plugin("reseau.instruments", "none")
