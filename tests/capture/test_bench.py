@@ -200,5 +200,5 @@ def test_list_shows_found_instruments_and_why_a_search_failed(
 
 
 def test_missing_plugins_are_reported() -> None:
-    with pytest.raises(UsageError, match="no such entry point of reseau.instruments; installed: aravis"):
+    with pytest.raises(UsageError, match=r"no such entry point of reseau\.instruments; installed: aravis"):
         plugin("reseau.instruments", "none")

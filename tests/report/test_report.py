@@ -139,7 +139,12 @@ def test_figures_and_tables_are_numbered_consecutively(bench: Bench) -> None:
 
 def test_the_page_of_photo_i_has_only_its_sections(bench: Bench) -> None:
     page = first_page(bench)
-    for there in ("camera and film, group A", "Check marks", "compared with the simulated truth", "Provenance"):
+    for there in (
+        "camera and film, group A",
+        "Check marks",
+        "compared with the simulated truth",
+        "Provenance",
+    ):
         assert there in page
     for absent in ("PHOTO II", "group B", "Factor by factor", "Wong", "ellipses"):
         assert absent not in page
@@ -204,7 +209,9 @@ def test_the_page_contains_the_numbers_of_the_comparison_for_each_factor(bench: 
         assert shown == pytest.approx([*factor.rods, *factor.body, *factor.ideal], abs=6e-4)
     both = bench.truth.factors[3]
     assert both.body is not None
-    assert f"a point of PHOTO III is {np.hypot(*both.body):.3f}\u00a0mm" in whole_page(bench).replace("&nbsp;", "\u00a0")
+    assert f"a point of PHOTO III is {np.hypot(*both.body):.3f}\u00a0mm" in whole_page(bench).replace(
+        "&nbsp;", "\u00a0"
+    )
 
 
 def test_without_the_truth_only_rods_are_listed(bench: Bench) -> None:
