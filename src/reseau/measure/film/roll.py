@@ -146,9 +146,15 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
 
     Examples
     --------
-    >>> found = roll_of([])
-    >>> bool(found), found.code
-    (False, <Code.TOO_FEW_IMAGES: 'too-few-images'>)
+    >>> from reseau.measure.film.lines import Lines
+    >>> corners = np.array([[20.0, 20.0], [164.0, 20.0], [164.0, 116.0], [20.0, 116.0]])
+    >>> lines = [Lines(corners + shift, 0.01 * np.eye(8), *np.zeros((7, 4)), 1.0, 8) for shift in range(4)]
+    >>> frames = [FrameResult("", "oriented", "", (36.0, 24.0), "grey", each, {}) for each in lines]
+    >>> roll = roll_of(frames)
+    >>> roll.frames, roll.px_per_mm, roll.corners.xy()[1].round(6) + 0.0
+    (4, 4.0, array([18., 12.]))
+    >>> roll_of(frames[:3]).code
+    <Code.TOO_FEW_IMAGES: 'too-few-images'>
     """
     sure = [r for r in results if r.status == "oriented" and r.lines is not None]
     lying = [r.format_mm for r in sure]

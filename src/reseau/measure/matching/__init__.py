@@ -1,4 +1,4 @@
-"""The one matcher: windows of a frame adjusted to the formed image of what they should show."""
+"""Least-squares matching: windows of a frame are adjusted to formed images of marks."""
 
 from .matcher import SIZE, Matches, MatchOptions, match
 from .noise import grey_variance

@@ -1,4 +1,4 @@
-"""Shapes of marks: the interface through which the matcher has images of marks formed.
+"""Shapes of marks: the interface through which the matcher forms images of marks.
 
 The image of a shape depends on its position, the width of the point-spread function, and parameters of form
 that start at 0.

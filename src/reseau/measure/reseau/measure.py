@@ -2,8 +2,8 @@
 
 1. Screen the frame and find candidates by matched filter.
 2. Fit the design to the candidates.
-3. Match every mark with its formed image, twice: the first round estimates what the marks of this frame look
-   like (width of the point-spread function, contrast, size); the second uses that as prior knowledge.
+3. Match every mark with its formed image, twice: the first round estimates the appearance of the marks
+   (width of the point-spread function, contrast, size); the second uses it as prior knowledge.
 4. Test each mark by its own image and by its neighbours. A mark that is missing or not distinct from its
    surroundings is reported as not found, with the reason.
 

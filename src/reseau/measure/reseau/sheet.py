@@ -161,7 +161,7 @@ def _numbered(design: ReseauDesign) -> tuple[Array, float, Array]:
     numbers = (xy - start) / step
     if not (np.abs(numbers - np.rint(numbers)) < 0.25).all():
         raise UsageError(
-            "disks with coded rings stand on no regular grid along the axes", where=f"design {design.name}"
+            "disks with coded rings are not on a regular grid along the axes", where=f"design {design.name}"
         )
     return np.rint(numbers), step, start
 

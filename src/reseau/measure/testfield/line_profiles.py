@@ -1,8 +1,8 @@
-"""Lines a pixel wide by their profiles: where they cross the rows or columns of a frame, and their images.
+"""Profiles of lines one pixel wide: their crossings with the rows or columns of a frame, and their images.
 
-Along a line nothing changes but slowly, so that its image is that of a strip: the difference of two blurred
-steps of the distance from it. Of a row (or a column, where the line is rather level) the pixels around the
-crossing tell level, depth and place of the profile by least squares.
+Along a line the image changes slowly, so that it is the image of a strip: the difference of two blurred steps
+as a function of the distance from the line. Level, depth and place of a profile are estimated by least
+squares from the pixels of a row around the crossing, or of a column for lines that are nearly horizontal.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Crossings:
         return np.stack(pair, axis=1).astype(np.float64) + shift[:, None] * self.normal
 
     def within(self, reach: int, shape: tuple[int, ...]) -> Crossings:
-        """Those no farther than `reach` off a frame of this height and width."""
+        """The crossings at most `reach` outside a frame of this height and width."""
         keep = (self.place > -reach) & (self.place < shape[self.axis] + reach)
         return Crossings(self.axis, self.step[keep], self.place[keep], self.normal[keep], self.along[keep])
 
