@@ -8,19 +8,20 @@ is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .bundle import Network, Result
+from .bundle import Network, Result, ResultDocument
 from .bundle import Options as AdjustmentOptions
 from .bundle import adjust_network as _adjust
 from .calibration import Calibration, InstrumentCorrection, SensorCorrection
 from .calibration import read_calibration as _read_calibration
 from .core.data import Frame, ImagePoints
+from .core.display import Display
 from .core.errors import UsageError
 from .core.failure import Failure
 from .exchange import read_network
@@ -44,7 +45,11 @@ from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .procedures.target_measurement import measurer_of
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = [
+    "Adjusted",
     "Refined",
     "adjust_network",
     "calibrate",
@@ -294,8 +299,8 @@ def orient(
     return orient_scan(opened, options)
 
 
-@dataclass(frozen=True, eq=False)
-class Refined:
+@dataclass(frozen=True, eq=False, repr=False)
+class Refined(Display):
     """The oscilloscope procedure's results, one for each photograph that was given.
 
     Parameters
@@ -311,6 +316,82 @@ class Refined:
     photo_i: PhotoI | None
     photo_ii: PhotoII | None
     photo_iii: tuple[PhotoIII, ...]
+    reseau: ReseauDesign
+    test_object: ReseauDesign | None = None
+
+    def calibration(self, name: str = "oscilloscope") -> Calibration:
+        """Return the calibration of groups A and, with PHOTO II, B.
+
+        Raises
+        ------
+        UsageError
+            When the photographs were corrected by a stored calibration.
+        """
+        if self.photo_ii is not None and self.test_object is not None:
+            return self.photo_ii.instrument.calibration(self.reseau, self.test_object, name=name)
+        if self.photo_i is None:
+            raise UsageError("was given and not computed", where="calibration")
+        return self.photo_i.camera.calibration(name=name)
+
+    def write(self, path: PathLike) -> None:
+        """Write the calibration, or true coordinates to a CSV file.
+
+        Parameters
+        ----------
+        path : str or Path
+            A file that ends in ``.json`` for the calibration, or ``.csv`` for the true coordinates of the
+            first body.
+
+        Raises
+        ------
+        UsageError
+            When there is no such result, or the file has another suffix.
+        InputError
+            When the file cannot be written.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".json":
+            self.calibration(Path(path).stem).write(path)
+        elif suffix == ".csv" and self.photo_iii:
+            self.photo_iii[0].true.write(path)
+        else:
+            raise UsageError("is neither .json nor, with PHOTO III, .csv", where=path)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the true coordinates of the first body, or the residuals of PHOTO I, with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        """
+        from .core.figures import Panel, draw_vectors, new_axes
+
+        if self.photo_iii:
+            return self.photo_iii[0].true.plot(axes, y_down=False)
+        fit = None if self.photo_i is None else self.photo_i.camera.fit
+        if fit is None:
+            raise UsageError("was not computed", where="PHOTO I")
+        axes = new_axes(axes)
+        check = (fit.check_target, fit.check.xy - fit.check_target)
+        draw_vectors(
+            axes, (fit.target, fit.residuals), check, Panel(self.reseau.unit), "residuals of PHOTO I"
+        )
+        return axes
+
+    def _facts(self) -> list[tuple[str, str]]:
+        facts = []
+        if self.photo_i is not None:
+            facts.append(("PHOTO I", f"{len(self.photo_i.points)} marks"))
+        if self.photo_ii is not None:
+            facts.append(("PHOTO II", f"{len(self.photo_ii.pins)} rods"))
+        facts += [("PHOTO III", f"{len(found.true)} points") for found in self.photo_iii]
+        return facts
+
+    def _columns(self) -> dict[str, list[Any]]:
+        if not self.photo_iii:
+            raise UsageError("has no PHOTO III", where="Refined")
+        return self.photo_iii[0].true._columns()
 
 
 def refine(
@@ -362,6 +443,7 @@ def refine(
     _checked(photo_i, reseau, photo_ii, test_object, further, calibration)
     held = tuple(check)
     first: PhotoI | Failure | None = None
+    rods: ReseauDesign | None = None
     second: PhotoII | Failure | None = None
     if calibration is not None:
         instrument, grid, _ = InstrumentCorrection.from_calibration(read_calibration(calibration))
@@ -374,7 +456,7 @@ def refine(
         if isinstance(first, Failure):
             return first
         if photo_ii is None or test_object is None:
-            return Refined(first, None, ())
+            return Refined(first, None, (), grid)
         rods = _reseau_design(test_object, "test_object")
         photo, marks = _split(_photo(photo_ii, "luma"), grid)
         second = _procedure.photo_ii(photo, grid, rods, first.camera, marks=marks, alpha=alpha, check=held)
@@ -390,10 +472,33 @@ def refine(
         bodies.append(found)
     assert not isinstance(first, Failure)
     assert not isinstance(second, Failure)
-    return Refined(first, second, tuple(bodies))
+    return Refined(first, second, tuple(bodies), grid, rods)
 
 
-def adjust_network(network: PathLike | Network, options: AdjustmentOptions | None = None) -> Result | Failure:
+class Adjusted(Result):
+    """The result of :func:`adjust_network`: a :class:`reseau.bundle.Result` that can be written."""
+
+    def write(self, path: PathLike, *, covariances: bool = False) -> None:
+        """Write the result, ``reseau-bundle/1``.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+        covariances : bool
+            Include the full covariances of the points.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        ResultDocument.of(self, covariances=covariances).write(path)
+
+
+def adjust_network(
+    network: PathLike | Network, options: AdjustmentOptions | None = None
+) -> Adjusted | Failure:
     """Adjust a network of images by the bundle method.
 
     Parameters
@@ -405,12 +510,25 @@ def adjust_network(network: PathLike | Network, options: AdjustmentOptions | Non
 
     Returns
     -------
-    Result or Failure
+    Adjusted or Failure
         Cameras, images and points with their covariances; a failure that names what is not determined.
+
+    Examples
+    --------
+    >>> import reseau
+    >>> from reseau.bundle import example_network
+    >>> found = reseau.adjust_network(example_network())
+    >>> found
+    <Adjusted: 8 images, 20 points, sigma0 1.005, redundancy 215, 0 image points left out, 1 warning>
+    >>> found.cameras["camera"].sigma.shape
+    (8,)
     """
     if not isinstance(network, Network):
         network = read_network(_path(network, "network", "a path or a Network"))
-    return _adjust(network, options or AdjustmentOptions())
+    found = _adjust(network, options or AdjustmentOptions())
+    if isinstance(found, Failure):
+        return found
+    return Adjusted(**{each.name: getattr(found, each.name) for each in fields(found)})
 
 
 def _checked(

@@ -1,7 +1,7 @@
 """The calibration: one document and one reader, which gives a mapping with covariance; apply, compare."""
 
-from .camera import CameraMapping
-from .compare import FieldDifference, ProjectionField, calibration_difference, projection_field
+from .camera import CameraMapping, ProjectionField, projection_field
+from .compare import FieldDifference, calibration_difference
 from .document import Calibration, Covariance, Quantity
 from .film import FilmFrameMapping, calibration_of_frame
 from .mapping import CalibratedMapping

@@ -1,9 +1,15 @@
-"""A calibrated camera: its mapping from directions to pixels, with the covariance of its parameters."""
+"""A calibrated camera: its mapping from directions to pixels, and its uncertainty over the image.
+
+A shift of the principal point and a small tilt of the camera move an image in the same way, up to the squares
+of directions. The standard deviations of single parameters contain this common part, which no ray shows.
+The uncertainty is therefore referred to the rotation that fits best over the image: with the derivatives G by
+a rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ) J (an S-transformation, Baarda 1973).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -14,7 +20,18 @@ from ..optics.cameras import additional_model, camera_model
 from .document import Calibration, readable_as
 from .mapping import CalibratedMapping, Target, extent_of, reasons
 
-__all__ = ["CameraMapping"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "CameraMapping",
+    "ProjectionField",
+    "by_rotation",
+    "places",
+    "projection_field",
+    "referred",
+    "worst",
+]
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional")
 """Keys of the model in a file; the others are options of the camera model."""
@@ -99,6 +116,10 @@ class CameraMapping(CalibratedMapping):
             for here, why in zip(inside.tolist(), found, strict=True)
         ]
 
+    def plot(self, axes: Axes | None = None, across: int = 45) -> Axes:
+        """Draw the uncertainty of the projection over the image; see :func:`projection_field`."""
+        return projection_field(self, across).plot(axes)
+
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> Self:
         """Read a camera from its calibration.
@@ -154,3 +175,112 @@ class CameraMapping(CalibratedMapping):
 
 
 readable_as("camera")(CameraMapping.from_calibration)
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectionField:
+    """Uncertainty of the projection over the image.
+
+    Parameters
+    ----------
+    xy : ndarray (rows, columns, 2)
+        Places, pixels.
+    cov : ndarray (rows, columns, 2, 2)
+        Covariances (px²) of the image of the ray that is imaged there; NaN where there is no ray.
+
+    Examples
+    --------
+    >>> field = ProjectionField(np.zeros((1, 1, 2)), np.array([[[[0.04, 0.0], [0.0, 0.01]]]]))
+    >>> field.sigma
+    array([[0.2]])
+    """
+
+    xy: Array
+    cov: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation in the worst direction (rows, columns), px."""
+        return worst(self.cov)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw contours of the standard deviation with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        """
+        from ..core.figures import draw_contours, image_axes, new_axes
+
+        axes = new_axes(axes)
+        draw_contours(axes, self.xy, self.sigma)
+        width, height = self.xy[-1, -1] + 1
+        image_axes(axes, width, height, "σ of the projection, worst direction / px")
+        return axes
+
+
+def projection_field(lens: CameraMapping, across: int = 25, down: int | None = None) -> ProjectionField:
+    """Uncertainty of the projection over the image.
+
+    Parameters
+    ----------
+    lens : CameraMapping
+        A calibrated camera.
+    across, down : int
+        Places along the axes, from edge to edge; `down` by default in proportion.
+
+    Notes
+    -----
+    It covers the noise of the observations only, not what the model cannot follow. In corners without points
+    it is an extrapolation by the model.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
+    >>> projection_field(camera, 3).sigma.shape
+    (2, 3)
+    """
+    xy, shape = places(lens, across, down)
+    uv = lens.mapping.inverse(xy)
+    known = np.isfinite(uv).all(axis=1)
+    seen = lens.mapping.derivatives(uv[known])
+    slope = referred(seen.d_xy @ by_rotation(uv[known]), seen.d_parameters[:, :, lens.rows])
+    cov = np.full((len(xy), 2, 2), np.nan)
+    cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
+    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+
+
+def places(lens: CameraMapping, across: int, down: int | None) -> tuple[Array, tuple[int, int]]:
+    """A grid over the image (g, 2), and its rows and columns."""
+    down = max(2, round(across * lens.height / lens.width)) if down is None else down
+    if across < 2 or down < 2:
+        raise UsageError(f"{across} × {down} places are no field", where="across, down")
+    x, y = np.meshgrid(np.linspace(0, lens.width - 1, across), np.linspace(0, lens.height - 1, down))
+    return np.column_stack([x.ravel(), y.ravel()]), (down, across)
+
+
+def by_rotation(uv: Array) -> Array:
+    """Derivatives (n, 2, 3) of directions by a small rotation of the rays about the camera's axes."""
+    u, v = uv.T
+    one = np.ones_like(u)
+    return np.stack(
+        [np.stack([-u * v, one + u * u, -v], axis=1), np.stack([-one - v * v, u * v, u], axis=1)], axis=1
+    )
+
+
+def referred(by_rotation: Array, slope: Array) -> Array:
+    """Derivatives (g, 2, u) without the part that a rotation explains."""
+    g, flat = by_rotation.reshape(-1, 3), slope.reshape(2 * len(slope), slope.shape[2])
+    part = np.linalg.lstsq(g, flat, rcond=None)[0]
+    free: Array = (flat - g @ part).reshape(slope.shape)
+    return free
+
+
+def worst(cov: Array) -> Array:
+    """Root of the larger eigenvalue of 2×2 covariances."""
+    a, b, c = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
+    worst: Array = np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))
+    return worst

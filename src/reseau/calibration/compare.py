@@ -1,11 +1,8 @@
-"""Uncertainty of a camera's calibration over the image, and differences of two calibrations.
+"""Differences of two calibrations of a camera over the image, with their significance.
 
-A shift of the principal point and a small tilt of the camera move an image in the same way, up to the squares
-of directions. The standard deviations of single parameters contain this common part, which no ray shows.
-Fields are therefore referred to the rotation that fits best over the image: with the derivatives G by a
-rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ) J (an S-transformation, Baarda 1973).
 Two calibrations are compared after the rotation that brings the rays of one nearest to those of the other
-(Kogan, *mrcal*: differences with the implied transformation, for points at infinity).
+(Kogan, *mrcal*: differences with the implied transformation, for points at infinity); see
+:mod:`reseau.calibration.camera` for the reason.
 """
 
 from __future__ import annotations
@@ -18,47 +15,13 @@ import scipy.special
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..optics.poses import rotation_matrix
-from .camera import CameraMapping
+from .camera import CameraMapping, by_rotation, places, referred, worst
 
-__all__ = [
-    "FieldDifference",
-    "ProjectionField",
-    "by_rotation",
-    "calibration_difference",
-    "places",
-    "projection_field",
-]
+__all__ = ["FieldDifference", "calibration_difference"]
 
 # Singular values of the covariance root, relative to the largest, that are rounding errors.
 _RANK = 1e-6
 _ROUNDS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class ProjectionField:
-    """Uncertainty of the projection over the image.
-
-    Parameters
-    ----------
-    xy : ndarray (rows, columns, 2)
-        Places, pixels.
-    cov : ndarray (rows, columns, 2, 2)
-        Covariances (px²) of the image of the ray that is imaged there; NaN where there is no ray.
-
-    Examples
-    --------
-    >>> field = ProjectionField(np.zeros((1, 1, 2)), np.array([[[[0.04, 0.0], [0.0, 0.01]]]]))
-    >>> field.sigma
-    array([[0.2]])
-    """
-
-    xy: Array
-    cov: Array
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviation in the worst direction (rows, columns), px."""
-        return _worst(self.cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +59,7 @@ class FieldDifference:
     @property
     def sigma(self) -> Array:
         """Standard deviation in the worst direction (rows, columns), px."""
-        return _worst(self.cov)
+        return worst(self.cov)
 
     @property
     def p(self) -> float:
@@ -112,39 +75,6 @@ class FieldDifference:
         square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])
         p[known] = np.exp(-0.5 * square)
         return p
-
-
-def projection_field(lens: CameraMapping, across: int = 25, down: int | None = None) -> ProjectionField:
-    """Uncertainty of the projection over the image.
-
-    Parameters
-    ----------
-    lens : CameraMapping
-        A calibrated camera.
-    across, down : int
-        Places along the axes, from edge to edge; `down` by default in proportion.
-
-    Notes
-    -----
-    It covers the noise of the observations only, not what the model cannot follow. In corners without points
-    it is an extrapolation by the model.
-
-    Examples
-    --------
-    >>> from reseau.optics import OpenCV
-    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
-    >>> camera = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
-    >>> projection_field(camera, 3).sigma.shape
-    (2, 3)
-    """
-    xy, shape = places(lens, across, down)
-    uv = lens.mapping.inverse(xy)
-    known = np.isfinite(uv).all(axis=1)
-    seen = lens.mapping.derivatives(uv[known])
-    slope = _referred(seen.d_xy @ by_rotation(uv[known]), seen.d_parameters[:, :, lens.rows])
-    cov = np.full((len(xy), 2, 2), np.nan)
-    cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
-    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
 
 
 def calibration_difference(
@@ -199,7 +129,7 @@ def calibration_difference(
     here = first.mapping.derivatives(uv)
     own = there.d_parameters[:, :, second.rows]
     carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
-    root = _joint_root(first, second, _referred(g, carried), _referred(g, own))
+    root = _joint_root(first, second, referred(g, carried), referred(g, own))
     statistic, degrees = _chi2(root.reshape(2 * len(root), root.shape[2]), off.ravel())
     difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
@@ -221,38 +151,12 @@ def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by
     return np.concatenate(parts, axis=2)
 
 
-def places(lens: CameraMapping, across: int, down: int | None) -> tuple[Array, tuple[int, int]]:
-    """A grid over the image (g, 2), and its rows and columns."""
-    down = max(2, round(across * lens.height / lens.width)) if down is None else down
-    if across < 2 or down < 2:
-        raise UsageError(f"{across} × {down} places are no field", where="across, down")
-    x, y = np.meshgrid(np.linspace(0, lens.width - 1, across), np.linspace(0, lens.height - 1, down))
-    return np.column_stack([x.ravel(), y.ravel()]), (down, across)
-
-
-def by_rotation(uv: Array) -> Array:
-    """Derivatives (n, 2, 3) of directions by a small rotation of the rays about the camera's axes."""
-    u, v = uv.T
-    one = np.ones_like(u)
-    return np.stack(
-        [np.stack([-u * v, one + u * u, -v], axis=1), np.stack([-one - v * v, u * v, u], axis=1)], axis=1
-    )
-
-
 def _turned(turn: Array, uv: Array) -> tuple[Array, Array]:
     """Directions of turned rays (n, 2), and their derivatives by the directions before (n, 2, 2)."""
     ray = np.column_stack([uv, np.ones(len(uv))]) @ turn.T
     turned = ray[:, :2] / ray[:, 2:]
     slope = (turn[:2, :2] - turned[:, :, None] * turn[2, :2]) / ray[:, 2, None, None]
     return turned, slope
-
-
-def _referred(by_rotation: Array, slope: Array) -> Array:
-    """Derivatives (g, 2, u) without the part that a rotation explains."""
-    g, flat = by_rotation.reshape(-1, 3), slope.reshape(2 * len(slope), slope.shape[2])
-    part = np.linalg.lstsq(g, flat, rcond=None)[0]
-    free: Array = (flat - g @ part).reshape(slope.shape)
-    return free
 
 
 def _root(covariance: Array) -> Array:
@@ -271,10 +175,3 @@ def _chi2(root: Array, off: Array) -> tuple[float, int]:
     u, s, _ = np.linalg.svd(root, full_matrices=False)
     keep = s > _RANK * s[0]
     return float((((u.T @ off)[keep] / s[keep]) ** 2).sum()), int(keep.sum())
-
-
-def _worst(cov: Array) -> Array:
-    """Root of the larger eigenvalue of 2×2 covariances."""
-    a, b, c = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
-    worst: Array = np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))
-    return worst

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, Literal, NotRequired, Self
+from html import escape
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, Self
 
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from ..core.data import Array
+from ..core.display import data_frame
 from ..core.errors import FormatError
+from ..core.numbers import measured
 from ..io import Document, Strict
 from .mapping import CalibratedMapping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "Calibration",
@@ -144,6 +150,16 @@ def readable_as(kind: Kind) -> Callable[[Callable[[Calibration], Any]], Callable
     return register
 
 
+def _table(calibration: Calibration) -> str:
+    """The parameters as an HTML table."""
+    shown = {
+        name: measured(q.value, q.sigma, "" if q.unit == "1" else q.unit)
+        for name, q in calibration.parameters.items()
+    }
+    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in shown.items())
+    return f"<table><caption>{escape(calibration.kind)} {escape(calibration.name)}</caption>{rows}</table>"
+
+
 class Calibration(Document):
     """A calibration: parameters with full covariance, the tests they passed, and where they hold.
 
@@ -202,6 +218,37 @@ class Calibration(Document):
         where = [row[name] for name in self.covariance.names]
         full[np.ix_(where, where)] = np.array(self.covariance.matrix).reshape(len(where), len(where))
         return full
+
+    def __repr__(self) -> str:
+        estimated = f"{len(self.covariance.names)} of {len(self.parameters)} parameters estimated"
+        sigma0 = "" if self.sigma0 is None else f", sigma0 {self.sigma0:.3f}"
+        return f"<Calibration: {self.kind} {self.name!r}, {estimated}{sigma0}>"
+
+    def _repr_html_(self) -> str:
+        return _table(self)
+
+    def to_dataframe(self) -> Any:
+        """Return the parameters as a pandas data frame with the columns name, value, sigma, unit.
+
+        Raises
+        ------
+        UsageError
+            When pandas is not installed.
+        """
+        rows = [(name, q.value, q.sigma, q.unit) for name, q in self.parameters.items()]
+        return data_frame(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the uncertainty of the calibration over the image with matplotlib.
+
+        See :meth:`CalibratedMapping.plot`.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        """
+        return self.mapping().plot(axes)
 
     def mapping(self) -> CalibratedMapping:
         """The mapping that this calibration describes.

@@ -11,6 +11,9 @@ from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import UsageError
 from ..optics import PlaneMapping
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["BEYOND", "CalibratedMapping", "Target", "beyond", "carried"]
 
 Target = Literal["points", "images", "scans", "frames"]
@@ -168,6 +171,43 @@ class CalibratedMapping(ABC):
             For each point the reason why the calibration does not hold there; empty where it does.
         """
         return tuple(self._why(points.xy, self.derivatives(points.xy)[0]))
+
+    def plot(self, axes: Axes | None = None, across: int = 25) -> Axes:
+        """Draw the standard deviation of mapped points, worst direction, over the image, with matplotlib.
+
+        The points themselves are taken as free of error.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        across : int
+            Number of places across the image.
+
+        Raises
+        ------
+        UsageError
+            When the size of the images is not known.
+        """
+        from ..core.figures import draw_contours, image_axes, new_axes
+
+        if self.size is None:
+            raise UsageError("does not contain the size of its images", where="calibration")
+        axes = new_axes(axes)
+        width, height = self.size
+        down = max(2, round(across * height / width))
+        grid = np.stack(
+            np.meshgrid(np.linspace(0, width - 1, across), np.linspace(0, height - 1, down)), axis=-1
+        )
+        _, _, by_parameters = self.derivatives(grid.reshape(-1, 2))
+        cov = by_parameters @ self.parameter_covariance @ np.swapaxes(by_parameters, 1, 2)
+        known = np.isfinite(cov).all(axis=(1, 2))
+        sigma = np.full(len(cov), np.nan)
+        sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(cov[known])[:, 1], 0.0))
+        draw_contours(axes, grid, sigma.reshape(down, across))
+        unit = "" if self.unit == "1" else f" / {self.unit}"
+        image_axes(axes, width, height, f"σ of the {self.system} coordinates{unit}")
+        return axes
 
     def check_size(self, width: int, height: int, where: object) -> None:
         """Refuse an image of another size than the calibrated one.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import cv2
 import numpy as np
@@ -15,6 +15,9 @@ from ..core.data import Array, Frame, Mask
 from ..core.errors import FormatError, UsageError
 from .document import Calibration, SensorModel, readable_as
 from .mapping import CalibratedMapping, Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Fields", "SensorCorrection", "packed", "unpacked"]
 
@@ -87,6 +90,16 @@ class SensorCorrection(CalibratedMapping):
     b3: float
     full_scale: float
     exposure_us: float
+
+    def plot(self, axes: Axes | None = None, across: int = 0) -> Axes:
+        """Draw the response of the pixels with matplotlib; defective ones are at the median."""
+        from ..core.figures import draw_picture, image_axes, new_axes
+
+        axes = new_axes(axes)
+        response, good = self.fields.response, ~self.fields.defects
+        draw_picture(axes, np.where(good, response, np.median(response[good])))
+        image_axes(axes, *self.size, f"response, {int(self.fields.defects.sum())} defective pixels")
+        return axes
 
     @property
     def size(self) -> tuple[int, int]:

@@ -182,11 +182,7 @@ def _processes(images: list[Path], jobs: int | None) -> int:
 
 def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:
     """The calibration, with how its model was found."""
-    from ..bundle import calibration_of, model_search_entries
-
-    calibration = calibration_of(done.result, "camera", name=name, provenance=provenance.to_dict())
-    more = model_search_entries(done.result)
-    return calibration.model_copy(update={"validity": calibration.validity | more}) if more else calibration
+    return done.calibration(name, provenance.to_dict())
 
 
 def _write_report(

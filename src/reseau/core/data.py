@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .display import Display
 from .errors import ImageError, UsageError
+from .files import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Array", "Frame", "ImagePoints", "Mask", "Rows"]
 
@@ -18,8 +24,8 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True, eq=False, repr=False)
+class Frame(Display):
     """One grey image from an instrument or a file, with unchanged grey values.
 
     Parameters
@@ -59,6 +65,29 @@ class Frame:
         if self.pixels.dtype.kind == "f" and not np.isfinite(self.pixels).all():
             raise ImageError("contains grey values that are not finite", where=self.name)
 
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            ("name", self.name),
+            ("size", f"{self.width} × {self.height} px"),
+            ("type", str(self.pixels.dtype)),
+            ("full scale", f"{self.full_scale:g}"),
+        ]
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the image with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        """
+        from .figures import draw_picture, image_axes, new_axes
+
+        axes = new_axes(axes)
+        draw_picture(axes, self.pixels)
+        image_axes(axes, self.width, self.height, self.name)
+        return axes
+
     @property
     def width(self) -> int:
         """Number of columns."""
@@ -70,8 +99,8 @@ class Frame:
         return int(self.pixels.shape[0])
 
 
-@dataclass(frozen=True, eq=False)
-class ImagePoints:
+@dataclass(frozen=True, eq=False, repr=False)
+class ImagePoints(Display):
     """Named points in a plane with their covariances, in columns.
 
     Parameters
@@ -123,6 +152,56 @@ class ImagePoints:
         """Standard deviations of the coordinates, (n, 2)."""
         sigma: Array = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
         return sigma
+
+    def _facts(self) -> list[tuple[str, str]]:
+        if not len(self):
+            return [("points", "0")]
+        low, high = self.xy.min(axis=0), self.xy.max(axis=0)
+        return [
+            ("points", str(len(self))),
+            ("x", f"{low[0]:.6g} to {high[0]:.6g}"),
+            ("y", f"{low[1]:.6g} to {high[1]:.6g}"),
+            ("median sigma", f"{np.median(self.sigma):.2g}"),
+        ]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        s = self.sigma
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rho = self.cov[:, 0, 1] / (s[:, 0] * s[:, 1])
+        columns = {"x": self.xy[:, 0], "y": self.xy[:, 1], "sx": s[:, 0], "sy": s[:, 1], "rho": rho}
+        return {"id": list(self.names)} | {name: column.tolist() for name, column in columns.items()}
+
+    def plot(self, axes: Axes | None = None, *, y_down: bool = True) -> Axes:
+        """Draw the points with their standard ellipses, enlarged, with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        y_down : bool
+            Direction of the y-axis: down in images, up in object space.
+        """
+        from .figures import BLUE, draw_ellipses, new_axes
+
+        axes = new_axes(axes)
+        axes.plot(*self.xy.T, ".", color=BLUE, markersize=3)
+        axes.set_aspect("equal")
+        axes.margins(0.08)
+        if y_down and not axes.yaxis_inverted():
+            axes.invert_yaxis()
+        enlarged = draw_ellipses(axes, self.xy, self.cov)
+        axes.set_title(f"{len(self)} points, ellipses × {enlarged:g}", loc="left")
+        return axes
+
+    def write(self, path: Path | str) -> None:
+        """Write the points as CSV ``id,x,y,sx,sy``.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        write_whole(Path(path), self.to_csv())
 
     def to_csv(self) -> str:
         """The points as lines ``id,x,y,sx,sy``."""

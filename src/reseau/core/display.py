@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Self
 
 from .errors import UsageError
 
-__all__ = ["Display"]
+__all__ = ["Display", "data_frame"]
 
 Facts = Sequence[tuple[str, str]]
 Columns = Mapping[str, Sequence[Any]]
@@ -36,6 +36,10 @@ class Display:
         """Columns of equal length by their names, with the unit in the name."""
         raise UsageError("has no table", where=type(self).__name__)
 
+    def required(self) -> Self:
+        """Return the result itself; a :class:`~reseau.core.failure.Failure` raises instead."""
+        return self
+
     def __repr__(self) -> str:
         facts = ", ".join(f"{name} {value}".strip() for name, value in self._facts())
         return f"<{type(self).__name__}: {facts}>"
@@ -55,9 +59,19 @@ class Display:
         UsageError
             When the result has no rows, or pandas is not installed.
         """
-        columns = self._columns()
-        try:
-            import pandas as pd
-        except ImportError:
-            raise UsageError("needs pandas", where="to_dataframe", do="run `pip install pandas`") from None
-        return pd.DataFrame(dict(columns))
+        return data_frame(self._columns())
+
+
+def data_frame(columns: Columns) -> Any:
+    """Return columns as a pandas data frame.
+
+    Raises
+    ------
+    UsageError
+        When pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError:
+        raise UsageError("needs pandas", where="to_dataframe", do="run `pip install pandas`") from None
+    return pd.DataFrame({name: list(column) for name, column in columns.items()})

@@ -6,12 +6,15 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from .data import Array
 
@@ -22,11 +25,15 @@ __all__ = [
     "INK",
     "PALE",
     "Panel",
+    "draw_contours",
     "draw_ellipses",
+    "draw_picture",
     "draw_vectors",
     "drawing",
     "frame_of",
+    "image_axes",
     "length",
+    "new_axes",
     "nice",
     "plane_axes",
     "to_svg",
@@ -59,6 +66,11 @@ _STYLE = {
     "figure.facecolor": "none",
     "axes.facecolor": "none",
 }
+
+
+_SHADES = LinearSegmentedColormap.from_list("reseau", ["#ffffff", "#c9d8e3", BLUE])
+_LEVELS, _SPAN = 8, 25.0
+"""Number of contours, and largest ratio of their levels."""
 
 
 @contextmanager
@@ -249,3 +261,97 @@ def _scale_arrow(axes: Axes, scale: float, shown: float, unit: str) -> None:
         va="center",
         fontsize=8.5,
     )
+
+
+def new_axes(axes: Axes | None, size: tuple[float, float] = (6.4, 4.8)) -> Axes:
+    """Return the axes of a caller, or those of a new figure of pyplot.
+
+    Parameters
+    ----------
+    axes : Axes or None
+        Axes to draw into.
+    size : (float, float)
+        Width and height of a new figure in inches.
+    """
+    if axes is not None:
+        return axes
+    import matplotlib.pyplot as plt
+
+    _, made = plt.subplots(figsize=size, layout="constrained")
+    return made
+
+
+def image_axes(axes: Axes, width: float, height: float, title: str = "") -> None:
+    """Set the limits of an image in pixels, y down, with equal scales.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to set up.
+    width, height : float
+        Size of the image in pixels.
+    title : str
+        Title of the axes.
+    """
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x / px")
+    axes.set_ylabel("y / px")
+    axes.set_title(title, loc="left")
+
+
+def draw_picture(axes: Axes, pixels: NDArray[Any]) -> None:
+    """Draw grey values between their 0.1 and 99.9 percentiles.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    pixels : ndarray (h, w)
+        Grey values.
+    """
+    sample = pixels.reshape(-1)[:: max(1, pixels.size // 1_000_000)]
+    low, high = np.percentile(sample, [0.1, 99.9])
+    h, w = pixels.shape
+    axes.imshow(
+        pixels, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), extent=(-0.5, w - 0.5, h - 0.5, -0.5)
+    )
+
+
+def draw_contours(axes: Axes, xy: Array, sigma: Array) -> None:
+    """Draw contours of positive values over an image, y down, at rounded levels in geometric steps.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    xy : ndarray (rows, columns, 2)
+        Places, pixels.
+    sigma : ndarray (rows, columns)
+        Values; NaN where there is none.
+    """
+    x, y = xy[0, :, 0], xy[:, 0, 1]
+    levels, digits = _levels(sigma)
+    shown = np.ma.masked_invalid(sigma)
+    axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, extend="both")
+    lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)
+    axes.clabel(lines, fontsize=7.5, fmt=f"%.{digits}g")
+    axes.set_aspect("equal")
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[-1], y[0])
+
+
+def _levels(sigma: Array) -> tuple[list[float], int]:
+    """Rounded levels in geometric steps over the range of the values, and their significant digits."""
+    known = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(known):
+        return [0.0, 1.0], 1
+    high = float(np.quantile(known, 0.995))
+    low = max(float(known.min()), high / _SPAN)
+    steps = np.geomspace(1.1 * low, max(high, 1.2 * low), _LEVELS)
+    for digits in (2, 3, 4):
+        rounded = sorted({float(f"{step:.{digits}g}") for step in steps})
+        if len(rounded) == _LEVELS:
+            break
+    return rounded, digits

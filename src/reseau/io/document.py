@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..core.errors import FormatError, InputError
+from ..core.files import write_whole
 from ..core.provenance import canonical_json
 
 __all__ = ["Document", "Strict", "read_text", "write_whole"]
@@ -58,36 +57,6 @@ def read_text(path: Path) -> str:
         raise InputError("is not UTF-8 text", where=path, do="check the file name") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-
-
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file completely or not at all.
-
-    Raises
-    ------
-    InputError
-        When the folder does not exist or cannot be written to.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_whole(Path(folder) / "note.txt", b"21")
-    ...     (Path(folder) / "note.txt").stat().st_size
-    2
-    """
-    data = content.encode("utf-8") if isinstance(content, str) else content
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with draft.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        draft.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)
-        raise InputError(f"cannot be written ({error.strerror})", where=path) from None
 
 
 def _one_line(error: ValidationError) -> str:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from ..core.data import Array, ImagePoints, Mask
+from ..core.data import Array, Frame, ImagePoints, Mask
+from ..core.display import Display
+from ..core.errors import UsageError
 from ..core.failure import Code
 from ..io import ReseauMeasurement
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Measured", "Reason"]
 
@@ -49,8 +55,8 @@ class Reason(str):
         return str(self), self.code
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measured(Display):
     """Points of a design measured in one frame, in columns over all n points of the design.
 
     Parameters
@@ -87,6 +93,72 @@ class Measured:
     contrast: Array
     t: Array
     noise: Array
+
+    def _facts(self) -> list[tuple[str, str]]:
+        sigma = self.points.sigma
+        return [
+            ("image", self.image),
+            ("measured", f"{self.found} of {len(self.ids)}"),
+            ("median sigma", f"{np.median(sigma):.2g} px" if len(sigma) else "–"),
+        ]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        s = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+        columns = {"x_px": self.xy[:, 0], "y_px": self.xy[:, 1], "sx_px": s[:, 0], "sy_px": s[:, 1]}
+        table: dict[str, list[Any]] = {"id": list(self.ids)}
+        table |= {name: column.tolist() for name, column in columns.items()}
+        return table | {"ok": self.ok.tolist(), "why": [str(why) for why in self.why]}
+
+    def plot(self, axes: Axes | None = None, frame: Frame | None = None) -> Axes:
+        """Draw measured points as circles, others as crosses where they are predicted, with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        frame : Frame, optional
+            The image, drawn beneath.
+        """
+        from ..core.figures import ACCENT, BLUE, draw_picture, image_axes, new_axes
+
+        axes = new_axes(axes)
+        if frame is not None:
+            draw_picture(axes, frame.pixels)
+        axes.plot(
+            *self.xy[self.ok].T, "o", markerfacecolor="none", color=BLUE, markersize=4, markeredgewidth=0.8
+        )
+        axes.plot(*self.predicted[~self.ok].T, "x", color=ACCENT, markersize=4, markeredgewidth=0.8)
+        if frame is not None:
+            image_axes(axes, frame.width, frame.height)
+        else:
+            axes.set_aspect("equal")
+            if not axes.yaxis_inverted():
+                axes.invert_yaxis()
+        axes.set_title(f"{self.image}: {self.found} of {len(self.ids)} measured", loc="left")
+        return axes
+
+    def write(self, path: Path | str) -> None:
+        """Write the result: ``reseau-measurement/1``, or CSV ``id,x,y,sx,sy`` of the measured points.
+
+        Parameters
+        ----------
+        path : str or Path
+            A file that ends in ``.json`` or ``.csv``.
+
+        Raises
+        ------
+        UsageError
+            When the file has another suffix.
+        InputError
+            When the file cannot be written.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix not in (".json", ".csv"):
+            raise UsageError(f"ends in {suffix or 'no suffix'!r}", where=path, do="use .json or .csv")
+        if suffix == ".json":
+            self.measurement().write(path)
+        else:
+            self.points.write(path)
 
     @property
     def found(self) -> int:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
@@ -25,8 +26,12 @@ from ..bundle import (
     Options,
     PointEstimates,
     Result,
+    calibration_of,
+    camera_mapping,
+    model_search_entries,
     search_model,
 )
+from ..calibration import Calibration
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
@@ -35,6 +40,9 @@ from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
 from .target_measurement import Measurer, measured_in_order, measurer_of
 from .z_stage import Heights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "Calibrated",
@@ -205,6 +213,60 @@ class Calibrated(Display):
     def points(self) -> PointEstimates:
         """Points of the target."""
         return self.result.points
+
+    def calibration(self, name: str = "camera", provenance: Mapping[str, Any] | None = None) -> Calibration:
+        """Return the calibration of the camera as a document, with how its model was found.
+
+        Parameters
+        ----------
+        name : str
+            Name of the calibration.
+        provenance : mapping, optional
+            Inputs and options, see :class:`reseau.core.provenance.Provenance`.
+        """
+        found = calibration_of(self.result, "camera", name=name, provenance=provenance)
+        more = model_search_entries(self.result)
+        return found.model_copy(update={"validity": found.validity | more}) if more else found
+
+    def write(self, path: Path | str) -> None:
+        """Write the calibration, ``reseau-calibration/1``.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        self.calibration(Path(path).stem).write(path)
+
+    def plot(self, photo: Frame | None = None) -> Sequence[Axes]:
+        """Draw residuals over the image and the uncertainty of the projection side by side, with matplotlib.
+
+        Parameters
+        ----------
+        photo : Frame, optional
+            One of the photographs; drawn first, with the points measured in it.
+
+        Returns
+        -------
+        sequence of matplotlib Axes
+            Of the two or three panels.
+        """
+        import matplotlib.pyplot as plt
+
+        from ..core.figures import BLUE
+
+        count = 2 if photo is None else 3
+        _, row = plt.subplots(1, count, figsize=(4.6 * count, 3.9), layout="constrained")
+        panels = list(row)
+        if photo is not None:
+            photo.plot(panels[0])
+            points = self.measured.get(photo.name)
+            if points is not None:
+                panels[0].plot(*points.xy.T, "o", color=BLUE, markerfacecolor="none", markersize=4)
+                panels[0].set_title(f"{photo.name}: {len(points)} points", loc="left")
+        self.result.plot(panels[-2])
+        camera_mapping(self.result, 0).plot(panels[-1])
+        return panels
 
     def _facts(self) -> list[tuple[str, str]]:
         camera = self.cameras["camera"]

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from ..calibration import FieldDifference, ProjectionField
 from ..core.data import Array
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, nice, to_svg
+from ..core.figures import ACCENT, FAINT, INK, draw_contours, drawing, nice, to_svg
 
 __all__ = ["difference_figure", "uncertainty_figure"]
 
-_SHADES = LinearSegmentedColormap.from_list("reseau", ["#ffffff", "#c9d8e3", BLUE])
-_LEVELS, _SPAN = 8, 25.0
 _SIZE = (8.6, 5.2)
 """Inches."""
 _ARROWS = 13
@@ -42,7 +38,7 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
         axes = figure.subplots()
         if points is not None:
             axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
-        _contours(axes, field.xy, field.sigma)
+        draw_contours(axes, field.xy, field.sigma)
         axes.set_title("σ of the projection in the worst direction [px]")
         return to_svg(figure)
 
@@ -65,7 +61,7 @@ def difference_figure(found: FieldDifference) -> str:
     with drawing():
         figure = Figure(figsize=_SIZE, layout="constrained")
         axes = figure.subplots()
-        _contours(axes, found.xy, found.sigma)
+        draw_contours(axes, found.xy, found.sigma)
         step = max(1, found.xy.shape[1] // _ARROWS)
         xy, d = (
             values[step // 2 :: step, step // 2 :: step].reshape(-1, 2)
@@ -84,31 +80,3 @@ def difference_figure(found: FieldDifference) -> str:
             )  # fmt: skip
         axes.set_title(f"difference × {enlarged:g} over its σ [px]; longest {longest:.2g} px")
         return to_svg(figure)
-
-
-def _contours(axes: Axes, xy: Array, sigma: Array) -> None:
-    """Draw contours over the image, y down."""
-    x, y = xy[0, :, 0], xy[:, 0, 1]
-    levels, digits = _levels(sigma)
-    shown = np.ma.masked_invalid(sigma)
-    axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, extend="both")
-    lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)
-    axes.clabel(lines, fontsize=7.5, fmt=f"%.{digits}g")
-    axes.set_aspect("equal")
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(y[-1], y[0])
-
-
-def _levels(sigma: Array) -> tuple[list[float], int]:
-    """Rounded levels in geometric steps over the range of the values, and their significant digits."""
-    known = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if not len(known):
-        return [0.0, 1.0], 1
-    high = float(np.quantile(known, 0.995))
-    low = max(float(known.min()), high / _SPAN)
-    steps = np.geomspace(1.1 * low, max(high, 1.2 * low), _LEVELS)
-    for digits in (2, 3, 4):
-        rounded = sorted({float(f"{step:.{digits}g}") for step in steps})
-        if len(rounded) == _LEVELS:
-            break
-    return rounded, digits

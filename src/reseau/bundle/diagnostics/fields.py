@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...calibration.camera import CameraMapping
-from ...calibration.compare import ProjectionField, by_rotation, places
+from ...calibration.camera import CameraMapping, ProjectionField, by_rotation, places
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from .result import Result

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
 from ..solver import BundleFit
 from .estimates import CameraEstimate, ImageEstimates, PointEstimates
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Eliminated", "Result"]
 
@@ -143,6 +147,41 @@ class Result(Display):
             unit = "_px" if name == "v" else ""
             columns |= {f"{name}{axis}{unit}": values[:, k].tolist() for k, axis in enumerate("xy")}
         return columns | {"rejected": self.rejected.tolist()}
+
+    def plot(self, axes: Axes | None = None, camera: int = 0) -> Axes:
+        """Draw the image points of a camera and their residuals, enlarged, with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        camera : int
+            Number of the camera.
+        """
+        from ...core.figures import ACCENT, FAINT, image_axes, new_axes, nice
+
+        network, entry = self.network, self.network.cameras[camera]
+        seen = network.camera_of[network.image_of] == camera
+        rows = np.flatnonzero(seen & np.isfinite(self.residuals).all(axis=1) & ~self.rejected)
+        xy, v = network.xy[rows], self.residuals[rows]
+        axes = new_axes(axes)
+        axes.plot(*xy.T, ".", color=FAINT, markersize=1.5)
+        size = np.hypot(*v.T)
+        typical = float(np.quantile(size, 0.9)) if len(size) else 0.0
+        enlarged = nice(0.03 * entry.width / typical) if typical > 0 else 1.0
+        shown = slice(None, None, max(1, len(xy) // 3000))
+        axes.quiver(
+            *xy[shown].T,
+            *(enlarged * v[shown]).T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color=ACCENT,
+            width=0.002,
+        )
+        rms = float(np.sqrt((v**2).mean())) if len(v) else float("nan")
+        image_axes(axes, entry.width, entry.height, f"residuals × {enlarged:g}, rms {rms:.2g} px")
+        return axes
 
     # -- estimates in columns
 

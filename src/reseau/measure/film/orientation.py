@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ...core.data import Array
+from ...core.data import Array, Frame
+from ...core.display import Display
 from ...core.failure import Code, Failure
 from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...io.scans import Scan
@@ -17,6 +19,9 @@ from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
 from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
 from .search import FrameGuess, search_frames
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
 
@@ -78,8 +83,8 @@ class FrameOptions:
     shape: FrameShape | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class FrameResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameResult(Display):
     """One oriented frame, or the reason for declining it; falsy if declined.
 
     Parameters
@@ -120,6 +125,54 @@ class FrameResult:
 
     def __bool__(self) -> bool:
         return self.status != "declined"
+
+    def _facts(self) -> list[tuple[str, str]]:
+        if self.lines is None or self.format_mm is None:
+            return [("image", self.image), ("status", self.status), ("reason", self.why)]
+        sigma = np.sqrt(np.diag(self.lines.covariance))
+        return [
+            ("image", self.image),
+            ("status", self.status),
+            ("format", f"{self.format_mm[0]:g} × {self.format_mm[1]:g} mm"),
+            ("largest sigma of a corner", f"{sigma.max():.2g} px"),
+        ]
+
+    def plot(self, axes: Axes | None = None, frame: Frame | None = None) -> Axes:
+        """Draw the corners and edges with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        frame : Frame, optional
+            The scan, drawn beneath.
+        """
+        from ...core.figures import ACCENT, draw_picture, image_axes, new_axes
+
+        axes = new_axes(axes)
+        if frame is not None:
+            draw_picture(axes, frame.pixels)
+            image_axes(axes, frame.width, frame.height)
+        if self.lines is not None:
+            corners = self.lines.corners
+            axes.plot(
+                *np.concatenate([corners, corners[:1]]).T, "o-", color=ACCENT, markersize=4, linewidth=0.9
+            )
+        if frame is None:
+            axes.set_aspect("equal")
+            axes.invert_yaxis()
+        axes.set_title(f"{self.image}: {self.status}", loc="left")
+        return axes
+
+    def write(self, path: Path | str) -> None:
+        """Write ``reseau-orientation/1``.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        self.document().write(path)
 
     @property
     def px_per_mm(self) -> tuple[float, float] | None:

@@ -39,7 +39,7 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PinResult(Measured):
     """Rods of a design in one frame: y is measured on the line, x at its centre.
 

@@ -34,7 +34,7 @@ _DISTORTED = 0.03
 """Largest rms deviation of marks from their prediction, as a share of their spacing."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ReseauResult(Measured):
     """Marks of a reseau in one frame; `deviation` is from the prediction by all other marks.
 

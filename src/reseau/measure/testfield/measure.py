@@ -83,7 +83,7 @@ class TestfieldOptions:
     neighbour_px: float = 0.03
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TestfieldResult(Measured):
     """Targets of a testfield in one frame: `xy` are images of centroids, `deviation` is from a mapping.
 

@@ -1,0 +1,50 @@
+"""Draws `docs/images/calibration.png`: python docs/figures.py."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import reseau
+from reseau.core.figures import drawing
+from reseau.optics import Brown, PixelGrid, Sensor
+from reseau_sims import FieldBench, paper_stations
+
+WIDTH, HEIGHT, PITCH_MM = 800, 600, 0.006
+
+
+def bench() -> FieldBench:
+    """The coded testfield in front of a camera of 800 × 600 pixels with barrel distortion."""
+    camera = Brown(side="object", grid=PixelGrid(WIDTH, HEIGHT, (PITCH_MM, PITCH_MM)))
+    values = {"c": 4.6, "x0": 0.02, "y0": -0.015, "K1": -8e-4, "P1": 2e-5}
+    return FieldBench(
+        seed=7,
+        camera=camera.with_values(values),
+        sensor=Sensor(WIDTH, HEIGHT, read_noise=1.2),
+        bend_mm=0.0,
+        distance_mm=1300.0,
+        gradient=(0.15, -0.1),
+    )
+
+
+def main() -> None:
+    """Simulate photographs, calibrate, draw."""
+    world = bench()
+    stations = paper_stations()[::3]
+    frames = [world.record(station) for station in stations]
+    calibrated = reseau.calibrate(frames, world.design, pitch_mm=PITCH_MM).required()
+    with drawing():
+        shown = max(range(len(frames)), key=lambda k: len(calibrated.measured.get(frames[k].name, ())))
+        panels = calibrated.plot(frames[shown])
+        panels[0].set_title(f"measured: {len(calibrated.measured[frames[shown].name])} targets", loc="left")
+        figure = panels[0].figure
+        figure.set_facecolor("white")
+        path = Path(__file__).with_name("images") / "calibration.png"
+        figure.savefig(path, dpi=110, metadata={"Software": None})
+    print(calibrated, path)
+    assert np.isfinite(calibrated.sigma0)
+
+
+if __name__ == "__main__":
+    main()
