@@ -132,8 +132,8 @@ def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign:
     --------
     >>> import reseau
     >>> from reseau.designs import coded_sheet
-    >>> len(reseau.read_design(coded_sheet()).ids) > 50
-    True
+    >>> len(reseau.read_design(coded_sheet(10, 8, 25.0)).ids)
+    80
     """
     if isinstance(source, ReseauDesign | TestfieldDesign):
         return source
@@ -154,6 +154,17 @@ def read_calibration(source: CalibrationLike) -> Calibration:
         When the file cannot be read.
     FormatError
         When it is no calibration.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import reseau
+    >>> from reseau.bundle import calibration_of, example_network
+    >>> result = reseau.adjust_network(example_network())
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     calibration_of(result, "camera", name="example").write(f"{folder}/camera.json")
+    ...     reseau.read_calibration(f"{folder}/camera.json")
+    <Calibration: camera 'example', 4 of 10 parameters estimated, sigma0 1.005>
     """
     if isinstance(source, Calibration):
         return source
@@ -240,6 +251,24 @@ def calibrate(
     Calibrated or Failure
         The calibration with everything it was made of; a failure when fewer than three images show the
         target, or the adjustment has no solution.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import reseau
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> from reseau.optics import OpenCV, Pose, project
+    >>> design = regular_reseau(7, 5, 20.0, Mark(shape="disk", size=5.0), name="disks")
+    >>> camera = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5})
+    >>> xyz = np.column_stack([design.xy, np.zeros(len(design.ids))])
+    >>> images = []
+    >>> for omega, phi, kappa in ((0.4, 0.0, 0.0), (-0.4, 0.1, 1.5), (0.0, 0.5, 3.0), (0.1, -0.4, 4.5)):
+    ...     turned = Pose.from_angles(omega, phi, kappa, [0.0, 0.0, 0.0])
+    ...     seen = project(camera, Pose(turned.rotation, -turned.matrix.T @ [0.0, 0.0, 300.0]), xyz)
+    ...     images.append(reseau.ImagePoints.with_sigma(design.ids, seen.xy, 0.01))
+    >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), size=(640, 480))
+    <Calibrated: 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
     photos = _several(images, "images")
     target = read_design(design)
@@ -285,6 +314,13 @@ def orient(
     -------
     list of FrameResult
         One for each frame; falsy ones are declined, with the reason in `why`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import reseau
+    >>> reseau.orient(np.full((60, 90), 128, np.uint8))
+    [<FrameResult: image scan, status declined, reason is of one tone; scan it with more exposure>]
     """
     if isinstance(scan, Frame):
         opened = scan_of(scan.pixels, scan.name)
@@ -521,7 +557,7 @@ def adjust_network(
     >>> found
     <Adjusted: 8 images, 20 points, sigma0 1.005, redundancy 215, 0 image points left out, 1 warning>
     >>> found.cameras["camera"].sigma.shape
-    (8,)
+    (4,)
     """
     if not isinstance(network, Network):
         network = read_network(_path(network, "network", "a path or a Network"))

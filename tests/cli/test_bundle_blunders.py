@@ -220,7 +220,7 @@ def test_needless_parameters_are_dropped_and_cross_validated(reseau: Run, tmp_pa
     found = json.loads(out)
     assert {step["name"] for step in found["eliminated"]} == {"K2", "K3", "P1", "P2", "B1", "B2"}
     assert found["cross_validation"]["kept"] < found["cross_validation"]["all"]
-    assert "Parameters dropped" in report.read_text()
+    assert "Dropped parameters" in report.read_text()
     status, out, _ = reseau("bundle", path, "--eliminate", 0.001)
     assert "dropped: B1 of camera cam" in out
     assert "cross-validation" in out

@@ -187,7 +187,7 @@ def test_the_model_is_searched(reseau: Run, measured: tuple[Path, ...], tmp_path
     for factor, sigma in zip(*(content["variance_components"][k] for k in ("factors", "sigma")), strict=True):
         assert abs(factor - 1.0) < 4 * sigma
     page = (tmp_path / "F.html").read_text()
-    for words in ("Variance components", "Parameters dropped", "points at 1.5e+03 mm", "points at 9e+03 mm"):
+    for words in ("Variance components", "Dropped parameters", "points at 1.5e+03 mm", "points at 9e+03 mm"):
         assert words in page
 
 

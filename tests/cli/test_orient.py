@@ -92,6 +92,19 @@ def test_calibrated_corners_give_a_transformation_and_its_residuals_if_there_are
             assert np.abs(left).max() < 0.05
 
 
+def test_a_scan_in_floating_point_is_oriented_as_the_same_one_in_8_bits(tmp_path: Path, reseau: Run) -> None:
+    pixels = FilmFrame(0, dpi=300).scan()
+    found = []
+    for name, kind in (("bytes.tif", np.uint8), ("floats.tif", np.float32)):
+        tifffile.imwrite(tmp_path / name, pixels.astype(kind))
+        status, out, _ = reseau("orient", tmp_path / name, "--frame", "36x24", "--json")
+        assert status == 0
+        found.append(json.loads(out)["corners"])
+    for corner in ("ul", "ur", "lr", "ll"):
+        for axis in "xy":
+            assert abs(found[0][corner][axis] - found[1][corner][axis]) < 0.02
+
+
 def one_bad(name: str, path: Path) -> None:
     """Write a scan of a kind that cannot be oriented."""
     frame = FilmFrame(0, dpi=300)
@@ -113,10 +126,10 @@ def one_bad(name: str, path: Path) -> None:
         tifffile.imwrite(path, np.zeros((30, 30, 4), np.uint8), photometric="separated")
     elif name == "palette":
         tifffile.imwrite(path, frame.scan(), photometric="palette", colormap=np.zeros((3, 256), np.uint16))
-    elif name == "1 bit":
-        tifffile.imwrite(path, frame.scan() > 80)
+    elif name == "32 bit integer":
+        tifffile.imwrite(path, frame.scan().astype(np.uint32))
     else:
-        tifffile.imwrite(path, frame.scan().astype(np.float32))
+        tifffile.imwrite(path, frame.scan().astype(np.complex64))
 
 
 @pytest.mark.parametrize(
@@ -125,11 +138,11 @@ def one_bad(name: str, path: Path) -> None:
         ("without borders", 1, "no frame of the format", "scan it with a margin of film around"),
         ("overlapping", 1, "no frame of the format", "overlapping frames cannot be separated"),
         ("blank", 1, "of one tone", "scan it with more exposure"),
-        ("truncated", 2, "is a truncated TIFF", "copy or scan it anew"),
+        ("truncated", 2, "is a truncated TIFF", "copy or scan it again"),
         ("CMYK", 2, "colour CMYK", "convert it to grey or RGB of 8 or 16 bit"),
         ("palette", 2, "a palette", "convert it to grey or RGB of 8 or 16 bit"),
-        ("1 bit", 2, "1 bit", "convert it to grey or RGB of 8 or 16 bit"),
-        ("32 bit floating point", 2, "32 bit floating point", "convert it to grey or RGB of 8 or 16 bit"),
+        ("32 bit integer", 2, "type uint32", "convert it to grey or RGB of 8 or 16 bit"),
+        ("complex", 2, "type complex64", "convert it to grey or RGB of 8 or 16 bit"),
     ],
 )
 def test_bad_input_is_reported_with_a_remedy(
@@ -174,7 +187,7 @@ def test_frames_that_cannot_be_oriented_are_reported_in_one_line(
     tifffile.imwrite(tmp_path / "blank.tif", np.full((300, 400), 9, np.uint8))
     status, out, err = reseau("orient", tmp_path / "blank.tif")
     assert (status, err) == (1, "")
-    assert out.startswith("blank.tif: declined: shows nothing")
+    assert out.startswith("blank.tif: declined: is of one tone")
     (tmp_path / "cut.tif").write_bytes((roll / "0.tif").read_bytes()[:9000])
     tifffile.imwrite(tmp_path / "cmyk.tif", np.zeros((30, 30, 4), np.uint8), photometric="separated")
     for name, words in (("cut.tif", "truncated"), ("cmyk.tif", "CMYK"), ("none.tif", "cannot be read")):
