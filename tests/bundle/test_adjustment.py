@@ -44,7 +44,7 @@ def disturbed(network: Network, part: float, seed: int) -> tuple[Network, set[in
 
 
 @pytest.mark.parametrize("part", [0.01, 0.1, 0.2])
-def test_gross_errors_are_found_and_hardly_anything_else(part: float) -> None:
+def test_gross_errors_are_found_with_few_false_rejections(part: float) -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, bad = disturbed(world.noisy(1), part, 1)
     result = required(adjust_network(network, Options(outliers="reject", max_fraction=0.4)))
@@ -61,13 +61,13 @@ def test_gross_errors_that_are_kept_are_named() -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, bad = disturbed(world.noisy(1), 0.01, 1)
     result = required(adjust_network(network))
-    said = next(w.text for w in result.warnings if w.text.startswith("gross errors are likely in"))
+    remark = next(w.text for w in result.warnings if w.text.startswith("gross errors are likely in"))
     for k in bad:
         where = f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}"
-        assert where in said
+        assert where in remark
 
 
-def test_too_many_blunders_are_refused() -> None:
+def test_too_many_gross_errors_are_refused() -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, _ = disturbed(world.noisy(1), 0.2, 1)
     result = adjust_network(network, Options(outliers="reject", max_fraction=0.1))
@@ -77,7 +77,7 @@ def test_too_many_blunders_are_refused() -> None:
     assert "check the model" in result.reason
 
 
-def test_rows_are_told_apart_from_columns_by_variance_components() -> None:
+def test_variance_components_distinguish_rows_from_columns() -> None:
     world = networks.world(images=8, points=60, seed=2)
     noise = np.random.default_rng(3).normal(size=world.network.xy.shape) * [0.05, 0.08]
     cov = np.tile(np.diag([0.05, 0.05]) ** 2, (len(noise), 1, 1))
@@ -88,7 +88,7 @@ def test_rows_are_told_apart_from_columns_by_variance_components() -> None:
     assert abs(found["rows"] - 1.6) < 3 * found.sigma[1]
 
 
-def test_needless_parameters_are_dropped_and_needed_ones_stay() -> None:
+def test_unnecessary_parameters_are_dropped_and_necessary_ones_kept() -> None:
     cam = networks.camera(free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"))
     values = cam.values.copy()
     values[4:] = 0.0
@@ -103,7 +103,7 @@ def test_needless_parameters_are_dropped_and_needed_ones_stay() -> None:
     assert reduced < full
 
 
-def test_a_camera_nothing_determines_is_named() -> None:
+def test_an_undetermined_camera_is_named() -> None:
     """Affinity B1 and the principal distance with the scale of y are one and the same in one view only."""
     cam = networks.camera(free=("c", "K1"))
     world = networks.world(images=4, points=20, cameras=(cam,), control=20)
@@ -146,7 +146,7 @@ def test_predicted_covariances_cover(datum: str) -> None:
         assert abs(squares.mean() - 1.0) < 4 * squares.std() / np.sqrt(60), name
 
 
-def test_check_points_are_compared_and_change_nothing() -> None:
+def test_check_points_are_compared_and_do_not_change_the_result() -> None:
     world = networks.world(images=6, points=25)
     network = world.noisy(4)
     role = tuple("check" if k in (20, 21) else r for k, r in enumerate(network.role))
@@ -174,7 +174,7 @@ def test_the_calibration_of_a_camera_is_a_document_with_its_covariance() -> None
 
 
 def said(result: object) -> str:
-    """What the result warns of, or why there is none."""
+    """The warnings of a result, or the reason of a failure."""
     return " ".join(map(str, result.warnings)) if isinstance(result, Result) else result.reason  # type: ignore[attr-defined]
 
 

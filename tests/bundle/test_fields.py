@@ -39,7 +39,7 @@ def squares(found: list[FieldDifference]) -> np.ndarray:
     return np.array([-np.log(d.p_at) for d in found])
 
 
-def test_normalised_errors_of_the_projection_have_the_mean_square_one_at_every_place(
+def test_normalised_errors_of_the_projection_have_mean_square_one_everywhere(
     against_truth: list[FieldDifference],
 ) -> None:
     mean = squares(against_truth).mean(axis=0)
@@ -49,7 +49,7 @@ def test_normalised_errors_of_the_projection_have_the_mean_square_one_at_every_p
     assert mean.mean() == pytest.approx(1.0, abs=3 * SIGMA)
 
 
-def test_the_test_of_the_whole_field_keeps_its_level(against_truth: list[FieldDifference]) -> None:
+def test_the_test_of_the_whole_field_has_its_significance_level(against_truth: list[FieldDifference]) -> None:
     assert {d.degrees for d in against_truth} == {9}
     p = np.array([d.p for d in against_truth])
     # 5 % of 120 with a standard deviation of 2.4.
@@ -57,7 +57,7 @@ def test_the_test_of_the_whole_field_keeps_its_level(against_truth: list[FieldDi
     assert p.mean() == pytest.approx(0.5, abs=3.5 * 0.29 / np.sqrt(RUNS))
 
 
-def test_two_independent_calibrations_differ_as_their_covariances_say() -> None:
+def test_two_independent_calibrations_differ_as_their_covariances_predict() -> None:
     world = networks.world(points=40, datum="free", control=0)
     lenses = [lens_of(world, 1000 + seed) for seed in range(80)]
     found = [calibration_difference(a, b, 5) for a, b in zip(lenses[::2], lenses[1::2], strict=True)]
@@ -79,7 +79,7 @@ def test_a_lens_that_changed_is_found_significant() -> None:
     assert np.nanmin(found.p_at) < 1e-6
 
 
-def test_the_rotation_that_a_principal_point_hides_is_no_difference() -> None:
+def test_a_rotation_compensated_by_the_principal_point_is_no_difference() -> None:
     """Of a lens without distortion a small shift of the image is a tilt but for the squares of directions."""
     plain = networks.camera()
     values = np.array([8.0] + 9 * [0.0])
@@ -92,7 +92,7 @@ def test_the_rotation_that_a_principal_point_hides_is_no_difference() -> None:
     assert abs(found.rotation[1]) == pytest.approx(0.001, abs=2e-4)
 
 
-def test_a_field_is_worse_where_no_points_were() -> None:
+def test_uncertainty_is_larger_where_there_are_no_points() -> None:
     world = networks.world(points=40)
     network = world.network
     left = network.select(network.xy[:, 0] < 400)
@@ -119,11 +119,11 @@ def test_the_field_of_additional_parameters_has_derivatives_of_its_mapping(per: 
     assert np.isfinite(projection_field(lens, 5).sigma).all()
 
 
-def test_a_set_of_several_must_be_named() -> None:
+def test_one_of_several_sets_must_be_named() -> None:
     world = networks.world(points=40, cameras=(networks.with_ebner("group"),), images=8)
     result = adjust_network(world.noisy(0))
     assert isinstance(result, Result)
-    with pytest.raises(UsageError, match="no set of additional parameters"):
+    with pytest.raises(UsageError, match="not a set of additional parameters"):
         camera_mapping(result, 0)
 
 
@@ -139,7 +139,7 @@ def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
 
 @pytest.mark.parametrize("datum", ["control", "free"])
 @pytest.mark.parametrize("distance", [3.0, 40.0])
-def test_normalised_errors_at_a_distance_have_the_mean_square_one(datum: str, distance: float) -> None:
+def test_normalised_errors_at_a_distance_have_mean_square_one(datum: str, distance: float) -> None:
     """Points before the camera, carried into object space by the true poses and back by the estimates."""
     world = networks.world(points=40, datum=datum, control=0 if datum == "free" else 6)
     network, n = world.network, 4
@@ -168,9 +168,9 @@ def test_normalised_errors_at_a_distance_have_the_mean_square_one(datum: str, di
     assert mean.mean() == pytest.approx(1.0, abs=3 * 0.13 / 2)
 
 
-def test_a_distance_that_is_none_is_refused() -> None:
+def test_a_distance_that_is_not_positive_is_refused() -> None:
     world = networks.world(points=20, datum="free", control=0)
     fit = world.problem(world.noisy(0)).adjusted().required()
     result = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool))
-    with pytest.raises(UsageError, match="not above zero"):
+    with pytest.raises(UsageError, match="not positive"):
         projection_field_at(result, 0, 0.0)

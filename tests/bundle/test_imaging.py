@@ -72,7 +72,7 @@ def by_differences(system: System, values: Values) -> Array:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_images_are_those_of_optics(model: str) -> None:
+def test_image_points_agree_with_optics(model: str) -> None:
     world = networks.world(cameras=(networks.camera(model),))
     network = replace(world.network, xy=np.zeros_like(world.network.xy))
     system, values = system_of(replace(world, network=network))
@@ -80,7 +80,7 @@ def test_images_are_those_of_optics(model: str) -> None:
     np.testing.assert_allclose(ours, world.network.xy, rtol=0, atol=1e-9)
 
 
-def test_image_side_reckons_with_the_corrected_image_point() -> None:
+def test_image_side_uses_the_corrected_image_point() -> None:
     """The published convention: v = xs − (xm + Δ(xm)), so that the true image has no residual."""
     world = networks.world(cameras=(networks.camera("brown-image"),))
     system, values = system_of(world)
@@ -115,7 +115,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_derivatives_by_every_unknown_are_those_of_differences(name: str) -> None:
+def test_derivatives_by_every_unknown_agree_with_differences(name: str) -> None:
     world = networks.world(images=4, points=8, cameras=CASES[name])
     network = replace(
         world.network, distance_of=np.array([[0, 6], [6, 7]]), distance=np.array([[1.0, 0.1], [1.0, 0.1]])
@@ -155,7 +155,7 @@ def test_ebner_is_orthogonal_over_its_grid_and_as_defined() -> None:
     np.testing.assert_allclose(effects.reshape(9, 2, 12)[:, 0, 2], -(2 * x**2 - 4 / 3), atol=1e-12)
 
 
-def test_ebner_of_the_bundle_is_that_of_optics() -> None:
+def test_ebner_of_the_bundle_agrees_with_optics() -> None:
     values = np.random.default_rng(2).normal(0, 1e-4, 12)
     camera = networks.with_ebner("camera", 1.2)
     world = networks.world(images=3, points=10, cameras=(camera,))

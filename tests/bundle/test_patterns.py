@@ -1,4 +1,4 @@
-"""Residual patterns that images have in common: found where there are any, and only there."""
+"""Common residual patterns of images: found where there are any, and only there."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from reseau.bundle import Network, Result, by_place, by_point, common_pattern
 from reseau.bundle.diagnostics import patterns
 from reseau.core.errors import UsageError
+from reseau.core.failure import Code
 
 from . import networks
 from .test_testfield import adjusted, paper
@@ -21,7 +22,7 @@ def kinds(network: Network) -> list[str | None]:
 
 
 def with_pattern(network: Network, size_px: float) -> Network:
-    """The network with errors that the images of a kind have in common, point by point."""
+    """The network with common errors of each point in the images of one kind."""
     rng = np.random.default_rng(77)
     names = sorted(set(kinds(network)), key=str)
     pattern = rng.normal(0, size_px, (len(names), len(network.points), 2))
@@ -29,7 +30,7 @@ def with_pattern(network: Network, size_px: float) -> Network:
     return replace(network, xy=network.xy + pattern[of, network.point_of])
 
 
-def test_noise_has_nothing_in_common() -> None:
+def test_noise_has_no_common_pattern() -> None:
     """The test keeps its level: of thirty small networks with a level of 5 % not more than six fail it."""
     world = networks.world(points=30, images=8)
     p = []
@@ -42,7 +43,7 @@ def test_noise_has_nothing_in_common() -> None:
 
 
 def test_a_pattern_of_pairs_of_images_is_found_and_measured() -> None:
-    """0.02 px in common beside 0.04 px of noise: what is found of it is 0.02 px, and sigma0 is one again."""
+    """Common shifts of 0.02 px with noise of 0.04 px: 0.02 px are found, and sigma0 is one with them."""
     network = with_pattern(paper(seed=4), 0.02)
     result = adjusted(network)
     found = common_pattern(result, by_point(result, kinds(network)))
@@ -78,7 +79,7 @@ def test_the_statistic_is_that_of_an_adjustment_with_the_shifts_as_parameters() 
     assert c0 - least == pytest.approx(explained, rel=0.01)
 
 
-def test_a_pattern_of_the_frame_is_found_by_place() -> None:
+def test_a_pattern_of_the_frame_is_found_by_position() -> None:
     network = paper()
     offset = 0.03 * np.sign(np.sin(network.xy / 20.0))
     result = adjusted(replace(network, xy=network.xy + offset))
@@ -88,9 +89,9 @@ def test_a_pattern_of_the_frame_is_found_by_place() -> None:
     assert common_pattern(clean, by_place(clean, 0, 16)).p > 0.001
 
 
-def test_classes_of_single_points_are_no_classes() -> None:
+def test_classes_of_single_points_are_ignored() -> None:
     result = adjusted(paper())
-    with pytest.raises(UsageError, match="no two image points"):
+    with pytest.raises(UsageError, match="no class has two image points"):
         common_pattern(result, np.arange(len(result.network.xy)))
 
 
@@ -131,9 +132,9 @@ def test_a_network_of_any_size_is_tested(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_allclose(found.cov, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
 
 
-def test_a_pattern_of_the_frame_is_a_remark() -> None:
+def test_a_pattern_of_the_frame_gives_a_warning() -> None:
     network = paper()
     offset = 0.05 * np.sign(np.sin(network.xy / 20.0))
     result = adjusted(replace(network, xy=network.xy + offset))
-    assert any("have a pattern in common by place" in warning.text for warning in result.warnings)
-    assert not any("have a pattern in common" in warning.text for warning in adjusted(network).warnings)
+    assert any(warning.code is Code.UNMODELLED for warning in result.warnings)
+    assert not any(warning.code is Code.UNMODELLED for warning in adjusted(network).warnings)

@@ -134,7 +134,7 @@ def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> N
     np.testing.assert_allclose(fit.w[n:], twin.prior_w, rtol=0, atol=1e-5)
 
 
-def test_the_joint_covariance_of_anything_is_that_of_the_dense_engine() -> None:
+def test_the_joint_covariance_of_any_unknowns_is_that_of_the_dense_engine() -> None:
     world = mixed()
     network = world.noisy(3)
     result = adjust_network(network, Options(tolerance=1e-10))
@@ -198,7 +198,7 @@ def test_estimates_are_within_their_covariances_of_the_truth(model: str) -> None
     assert scipy.stats.chi2.cdf(square, len(off)) > 1e-4
 
 
-def test_parameters_of_each_image_are_those_of_the_image() -> None:
+def test_parameters_per_image_are_estimated_for_their_image() -> None:
     """Image-variant: every image with twelve parameters of its own, bent by another of them."""
     cam = networks.with_ebner("image")
     world = networks.world(images=6, points=60, cameras=(cam,), control=30)
@@ -219,7 +219,7 @@ def test_parameters_of_each_image_are_those_of_the_image() -> None:
     assert 1e-3 < scipy.stats.chi2.sf(square, 72) < 1 - 1e-3
 
 
-def test_an_observed_interior_orientation_is_drawn_to_what_was_observed() -> None:
+def test_an_observed_interior_orientation_is_pulled_towards_the_observation() -> None:
     """With a sigma far below what the images tell the estimate is the observation; far above, theirs."""
     world = networks.world()
     network, cam = world.noisy(1), world.network.cameras[0]
@@ -248,7 +248,7 @@ def test_a_mapping_gives_what_the_compiled_camera_gives(model: str) -> None:
     np.testing.assert_allclose(plain.redundancy_numbers, compiled.redundancy_numbers, rtol=0, atol=1e-8)
 
 
-def test_the_measured_point_of_an_image_side_camera_is_had_by_its_mapping() -> None:
+def test_the_mapping_gives_the_measured_point_of_an_image_side_camera() -> None:
     """Residuals of the measured and of the corrected point differ by the stretch of the correction."""
     cam = networks.camera("brown-image")
     world = networks.world(cameras=(cam,))
@@ -260,7 +260,7 @@ def test_the_measured_point_of_an_image_side_camera_is_had_by_its_mapping() -> N
     assert abs(measured.sigma0 - corrected.sigma0) > 1e-4
 
 
-def test_the_careful_inverse_is_that_of_the_normal_equations() -> None:
+def test_the_inverse_from_rows_is_that_of_the_normal_equations() -> None:
     """From the rows of the observations of all kinds, never multiplied out."""
     world = mixed()
     fit = required(world.problem(world.noisy(3), **TOLERANCE))
@@ -275,7 +275,7 @@ def test_the_careful_inverse_is_that_of_the_normal_equations() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_redundancy_numbers_sum_where_parameters_are_hardly_determined(seed: int) -> None:
+def test_redundancy_numbers_sum_to_the_redundancy_with_poorly_determined_parameters(seed: int) -> None:
     """Three images and all parameters of the camera: correlations near one."""
     cam = networks.camera(free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"))
     world = networks.world(images=3, points=14, cameras=(cam,), control=4, seed=seed)
@@ -306,7 +306,7 @@ def test_inner_constraints_have_the_least_trace_over_the_chosen_points() -> None
     assert np.abs(np.cross(about, off).sum(axis=0)).max() < 1e-9
 
 
-def test_weak_points_carry_no_datum_unless_they_are_chosen() -> None:
+def test_weak_points_are_left_out_of_the_datum_unless_they_are_chosen() -> None:
     """Two points far behind the others spoil no one's covariance, and are named."""
     world = networks.world(datum="free", control=0, points=26, images=12)
     # Seen by two neighbouring images alone, from nearly the same place.
@@ -339,10 +339,10 @@ def test_weak_points_carry_no_datum_unless_they_are_chosen() -> None:
     np.testing.assert_allclose(fit.residuals, chosen.residuals, atol=1e-5)
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
     result = Result(world.network, fit, np.zeros(len(xy), dtype=bool))
-    assert any("2 weak points left out of the datum: p24, p25" in said.text for said in checks(result))
+    assert any("2 weak points left out of the datum: p24, p25" in remark.text for remark in checks(result))
 
 
-def test_large_coordinates_lose_nothing() -> None:
+def test_large_coordinates_lose_no_precision() -> None:
     near, far = networks.world(), networks.world(shift=(4.5e6, 5.6e6, 300.0))
     one = required(near.problem(near.noisy(5), **TOLERANCE))
     network = replace(far.network, xy=near.noisy(5).xy)
@@ -353,7 +353,7 @@ def test_large_coordinates_lose_nothing() -> None:
     np.testing.assert_allclose(other.cofactors.points, one.cofactors.points, atol=1e-12)
 
 
-def test_camcal_has_its_published_result_from_no_initial_poses(published: Callable[[str], Network]) -> None:
+def test_camcal_has_its_published_result_without_initial_poses(published: Callable[[str], Network]) -> None:
     fit = required(networks.by_itself(published("camcal")))
     assert fit.counts == (4148, 422, 0)
     assert fit.redundancy == 3726
@@ -388,7 +388,7 @@ def test_roma_has_its_published_result(published: Callable[[str], Network]) -> N
     assert fit.redundancy_numbers.sum() == pytest.approx(101801, abs=1e-6)
 
 
-def test_a_block_without_datum_is_refused_with_what_is_missing(published: Callable[[str], Network]) -> None:
+def test_a_block_without_datum_fails_and_names_what_is_missing(published: Callable[[str], Network]) -> None:
     network = published("camcal")
     nothing = np.full_like(network.sigma, np.nan)
     fit = networks.by_itself(replace(network, xyz=nothing, sigma=nothing)).adjusted()
@@ -397,7 +397,7 @@ def test_a_block_without_datum_is_refused_with_what_is_missing(published: Callab
         assert word in fit.reason
 
 
-def test_held_coordinates_are_no_weakness_of_their_points() -> None:
+def test_held_coordinates_do_not_make_a_point_weak() -> None:
     """A free network some of whose coordinates are held all the same: none of its points leaves the datum."""
     world = networks.world(datum="free", control=0)
     sigma = world.network.sigma.copy()
@@ -411,7 +411,7 @@ def test_held_coordinates_are_no_weakness_of_their_points() -> None:
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-6)
 
 
-def test_options_of_the_engine_are_honoured() -> None:
+def test_options_of_the_engine_take_effect() -> None:
     world = networks.world()
     network = world.noisy(3)
     fit = required(world.problem(network))
@@ -433,7 +433,7 @@ def test_options_of_the_engine_are_honoured() -> None:
     ("name", "value"),
     [("method", "gauss-newton"), ("curvature", 0.5), ("rank_tolerance", 1e-9), ("check_jacobian", 1e-3)],
 )
-def test_an_option_that_the_sparse_solver_does_not_have_is_refused(name: str, value: Any) -> None:
+def test_an_option_that_the_sparse_solver_does_not_support_is_refused(name: str, value: Any) -> None:
     options: dict[str, Any] = {name: value}
     with pytest.raises(UsageError, match=rf"Options\.{name}"):
         networks.world().problem().adjusted(AdjustOptions(**options))

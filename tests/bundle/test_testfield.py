@@ -116,13 +116,13 @@ def test_observations_and_redundancy_are_those_of_the_paper() -> None:
     assert 0.94 < result.sigma0 < 1.06
 
 
-def test_all_36_images_converge_too() -> None:
+def test_all_36_images_converge() -> None:
     result = adjusted(paper(all_images=True))
     assert result.fit.usable.images.all()
     assert 0.94 < result.sigma0 < 1.06
 
 
-def test_a_bend_that_turns_with_the_mount_is_removed_by_groups() -> None:
+def test_a_bend_that_rotates_with_the_mount_is_removed_by_groups() -> None:
     """0.8 mm: significant with one set of parameters for all, gone with a set per group."""
     network = paper(bend_mm=0.8)
     camera = network.cameras[0]
@@ -133,7 +133,7 @@ def test_a_bend_that_turns_with_the_mount_is_removed_by_groups() -> None:
     assert any(test.significant for test in groups.camera_tests(0, alpha=0.001))
 
 
-def test_the_bend_of_the_mount_is_seen_in_residuals_that_images_have_in_common() -> None:
+def test_the_bend_of_the_mount_appears_in_common_residuals_of_images() -> None:
     network = paper(bend_mm=0.8)
     camera = network.cameras[0]
     one = adjusted(replace(network, cameras=(replace(camera, additional=Additional(BASE, True, "camera")),)))

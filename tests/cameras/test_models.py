@@ -347,7 +347,7 @@ def test_an_unknown_model_or_option_is_named_in_one_line(reseau: Run, tmp_path: 
     for arguments, words in (
         (("--model", "pinhole"), f"camera model 'pinhole': is unknown; use one of {known}"),
         (("--side", "image"), "camera model opencv: has no option `side`"),
-        (("--model", "brown"), "brown: needs the size of a pixel"),
+        (("--model", "brown"), "brown: requires the pixel size"),
         (("--pitch", 0.01, "--model-option", "balance_radius_mm=-1"), "write a number that is not negative"),
         (("--pitch", 0.01, "--model-option", "side"), "write name=value"),
     ):

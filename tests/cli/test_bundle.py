@@ -1,4 +1,4 @@
-"""`reseau bundle`: the result, and what is said about networks that cannot be adjusted."""
+"""`reseau bundle`: the result, and the messages for networks that cannot be adjusted."""
 
 from __future__ import annotations
 
@@ -111,9 +111,7 @@ def test_the_result_has_the_columns_of_its_schema(reseau: Run, network: Callable
     assert found["points"]["sigma"][0] == [0, 0, 0]
 
 
-def test_the_summary_says_what_was_estimated(
-    reseau: Run, network: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_summary_lists_the_estimates(reseau: Run, network: Callable[..., Path], tmp_path: Path) -> None:
     status, out, _ = reseau("bundle", network(), "-o", tmp_path / "result.json")
     assert status == 0
     assert "redundancy" in out
@@ -121,7 +119,7 @@ def test_the_summary_says_what_was_estimated(
     assert json.loads((tmp_path / "result.json").read_text())["schema"] == "reseau-bundle/1"
 
 
-def test_the_report_stands_alone_and_names_what_deserves_attention(
+def test_the_report_is_self_contained_and_lists_the_warnings(
     reseau: Run, network: Callable[..., Path], tmp_path: Path
 ) -> None:
     status, _, err = reseau("bundle", network(idle_camera), "--report", tmp_path / "report.html")
@@ -142,7 +140,7 @@ def test_the_same_network_gives_the_same_bytes(reseau: Run, network: Callable[..
     assert reseau("bundle", path, "--json") == reseau("bundle", path, "--json")
 
 
-def test_blunders_are_named_and_left_out(reseau: Run, network: Callable[..., Path]) -> None:
+def test_gross_errors_are_named_and_rejected(reseau: Run, network: Callable[..., Path]) -> None:
     def blunder(document: dict[str, Any]) -> None:
         document["observations"]["x"][17] += 40.0
 
@@ -182,7 +180,7 @@ def idle_camera(document: dict[str, Any]) -> None:
     document["cameras"].append(document["cameras"][0] | {"id": "spare"})
 
 
-SAID = {
+REFUSED = {
     "no datum": (without_control, 1, "rank defect 7"),
     "an unknown key": (lambda d: d.update(colour="red"), 2, "unknown key `colour`"),
     "a missing key": (lambda d: d.pop("datum"), 2, "missing key `datum`"),
@@ -196,11 +194,11 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize("case", SAID)
-def test_what_cannot_be_adjusted_is_refused_in_one_line(
+@pytest.mark.parametrize("case", REFUSED)
+def test_networks_that_cannot_be_adjusted_are_refused_in_one_line(
     case: str, reseau: Run, network: Callable[..., Path]
 ) -> None:
-    change, expected, words = SAID[case]
+    change, expected, words = REFUSED[case]
     status, out, err = reseau("bundle", network(change), "--json")
     assert (status, out) == (expected, "")
     assert err.count("\n") == 1
@@ -214,14 +212,14 @@ WARNED = {
 
 
 @pytest.mark.parametrize("case", WARNED)
-def test_what_takes_no_part_is_named(case: str, reseau: Run, network: Callable[..., Path]) -> None:
+def test_unused_images_and_cameras_are_named(case: str, reseau: Run, network: Callable[..., Path]) -> None:
     change, words = WARNED[case]
     status, out, _ = reseau("bundle", network(change), "--json")
     assert status == 0
     assert any(words in warning for warning in json.loads(out)["warnings"])
 
 
-def test_the_document_comes_back_as_it_was_written() -> None:
+def test_the_document_is_read_back_as_it_was_written() -> None:
     document = Network1.parse(json.dumps(content()), where="network")
     again = Network1.parse(document.to_json(), where="network")
     assert again == document
@@ -229,14 +227,14 @@ def test_the_document_comes_back_as_it_was_written() -> None:
 
 
 @pytest.mark.parametrize("pair", [(0, 4), (0, 14), (4, 10)])
-def test_swapped_control_points_are_no_silent_nonsense(
+def test_swapped_control_points_are_reported(
     pair: tuple[int, int], reseau: Run, network: Callable[..., Path]
 ) -> None:
     status, out, err = reseau("bundle", network(swap("xyz", *pair)), "--json")
-    said = " ".join(json.loads(out)["warnings"]) if status == 0 else err
+    message = " ".join(json.loads(out)["warnings"]) if status == 0 else err
     # The control is a symmetric plane figure: the other pair would do as well.
-    assert f"p{pair[0]} and p{pair[1]}" in said
-    assert "exchanged" in said
+    assert f"p{pair[0]} and p{pair[1]}" in message
+    assert "exchanged" in message
 
 
 def test_the_document_is_read_back_with_its_provenance(

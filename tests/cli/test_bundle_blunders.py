@@ -66,7 +66,7 @@ def said(status: int, out: str, err: str) -> str:
 
 
 @pytest.mark.parametrize("part", [0.01, 0.05, 0.1, 0.2])
-def test_gross_errors_are_left_out_and_listed_with_their_test_values(
+def test_gross_errors_are_rejected_and_listed_with_their_test_values(
     part: float, reseau: Run, tmp_path: Path
 ) -> None:
     document, rng = block(), np.random.default_rng(int(100 * part))
@@ -111,7 +111,7 @@ def test_gross_errors_that_are_kept_are_named(part: float, reseau: Run, tmp_path
     assert len(named) == min(8, len(bad))
 
 
-def test_swapped_point_names_are_named_and_left_out(reseau: Run, tmp_path: Path) -> None:
+def test_swapped_point_names_are_named_and_rejected(reseau: Run, tmp_path: Path) -> None:
     document = block()
     table = document["observations"]
     rows = [k for k, image in enumerate(table["image"]) if image == "i5"][20:22]
@@ -128,7 +128,7 @@ def test_swapped_point_names_are_named_and_left_out(reseau: Run, tmp_path: Path)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_mirrored_control_is_said_to_be_mirrored(axis: int, reseau: Run, tmp_path: Path) -> None:
+def test_mirrored_control_is_reported(axis: int, reseau: Run, tmp_path: Path) -> None:
     document = block()
     for j in CONTROL:
         document["points"]["xyz"][j][axis] *= -1
@@ -167,7 +167,7 @@ def test_an_image_with_two_points_and_a_camera_without_image_are_named(reseau: R
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_variance_components_tell_rows_from_columns(rho: float, reseau: Run, tmp_path: Path) -> None:
+def test_variance_components_distinguish_rows_from_columns(rho: float, reseau: Run, tmp_path: Path) -> None:
     """True sigmas of 1.0 and 1.8 times those given, whatever the correlation."""
     path = written(tmp_path, block((1.0, 1.8), rho))
     status, out, _ = reseau("bundle", path, "--components", "axes", "--json")
@@ -183,7 +183,7 @@ def test_variance_components_tell_rows_from_columns(rho: float, reseau: Run, tmp
     assert "y scatters 1." in " ".join(json.loads(out)["warnings"])
 
 
-def test_an_image_that_scatters_more_is_named_and_has_its_factor(reseau: Run, tmp_path: Path) -> None:
+def test_an_image_with_larger_scatter_is_named_with_its_factor(reseau: Run, tmp_path: Path) -> None:
     document, rng = block(), np.random.default_rng(1)
     table = document["observations"]
     for k, image in enumerate(table["image"]):
@@ -202,7 +202,7 @@ def test_an_image_that_scatters_more_is_named_and_has_its_factor(reseau: Run, tm
     assert "sigmas of image i2 times " in out
 
 
-def test_reliability_stands_in_columns(reseau: Run, tmp_path: Path) -> None:
+def test_reliability_is_in_columns(reseau: Run, tmp_path: Path) -> None:
     """The error that is found: 4.13 σ / √r, what it does at most: 4.13 √((1 − r)/r), without correlations."""
     _, out, _ = reseau("bundle", written(tmp_path, block()), "--json")
     table = json.loads(out)["image_points"]
@@ -211,7 +211,7 @@ def test_reliability_stands_in_columns(reseau: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(effect, 4.1321 * np.sqrt((1 - r) / r), rtol=1e-3)
 
 
-def test_needless_parameters_are_dropped_and_cross_validated(reseau: Run, tmp_path: Path) -> None:
+def test_unnecessary_parameters_are_dropped_and_cross_validated(reseau: Run, tmp_path: Path) -> None:
     document = block()
     document["cameras"][0]["free"] += ["K2", "K3", "P1", "P2", "B1", "B2"]
     path, report = written(tmp_path, document), tmp_path / "report.html"
@@ -227,7 +227,7 @@ def test_needless_parameters_are_dropped_and_cross_validated(reseau: Run, tmp_pa
 
 
 @pytest.mark.parametrize("option", ["--eliminate", "--alpha"])
-def test_a_level_that_is_none_is_refused(option: str, reseau: Run, tmp_path: Path) -> None:
+def test_an_invalid_significance_level_is_refused(option: str, reseau: Run, tmp_path: Path) -> None:
     status, out, err = reseau("bundle", written(tmp_path, block()), option, 1.5)
     assert (status, out) == (2, "")
     assert "is not between 0 and 1" in err

@@ -52,7 +52,7 @@ def test_the_calibration_is_within_its_sigmas_of_the_truth(
     status, out, err = reseau(*common(measured), "--free", "c,x0,y0,K1", *files)
     assert (status, err) == (0, "")
     assert out.startswith("12 images, ")
-    assert "projection known to" in out
+    assert "uncertainty of the projection: median" in out
     found = Calibration.read(tmp_path / "K.json")
     assert found.sigma0 == pytest.approx(1.0, abs=0.05)
     true = dict(zip(BENCH.camera.names, BENCH.camera.values, strict=True))
@@ -99,13 +99,15 @@ def test_two_calibrations_are_compared_as_a_field(
     assert json.loads(out)["p"] < 1e-6
 
 
-def test_what_cannot_be_compared_is_refused(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+def test_files_that_are_not_calibrations_are_not_compared(
+    reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
     status, out, err = reseau("compare", measured[0], measured[0])
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
 
 
-def test_control_points_are_the_datum(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+def test_control_points_define_the_datum(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
     """Three corners of the board, one of them in its height alone: no freedom left, nothing redundant."""
     names, xy = BENCH.design.targets.id, BENCH.design.xy
     seen = np.abs(xy).max(axis=1) < 250
@@ -131,13 +133,13 @@ def test_control_points_are_the_datum(reseau: Run, measured: tuple[Path, ...], t
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("id,x,y\na,1,2\n", "begin it with id,x,y,z"),
-        ("id,x,y,z\na,1,2,3\na,1,2,3\n", "line 3: names point a a second time"),
+        ("id,x,y\na,1,2\n", "start with the header id,x,y,z"),
+        ("id,x,y,z\na,1,2,3\na,1,2,3\n", "line 3: point a appears twice"),
         ("id,x,y,z\na,1,2\n", "line 2: has 3 fields, not 4"),
-        ("id,x,y,z\na,1,two,3\n", "line 2: 'two' is no number"),
-        ("id,x,y,z,sx,sy,sz\na,1,2,3,0,-1,0\n", "gives point a a sigma below zero"),
+        ("id,x,y,z\na,1,two,3\n", "line 2: 'two' is not a number"),
+        ("id,x,y,z,sx,sy,sz\na,1,2,3,0,-1,0\n", "the sigma of point a is negative"),
         ("id,x,y,z\nnowhere,1,2,3\n", "control point nowhere: was measured in no image"),
-        ("id,x,y,z\n", "has no points"),
+        ("id,x,y,z\n", "contains no points"),
     ],
 )
 def test_a_bad_table_of_control_points_is_refused(
@@ -163,7 +165,9 @@ def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]
         assert words in err
 
 
-def test_the_model_is_searched(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
+def test_components_and_elimination_search_the_model(
+    reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
     """Without K2, P1 and P2, that the lens has not; x and y are as good as given; fields at distances."""
     files = (
         "-o",
@@ -218,7 +222,7 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     assert again[1] == (tmp_path / "K.json").read_text()
 
 
-def test_what_a_process_raises_is_said_in_one_line(reseau: Run, tmp_path: Path) -> None:
+def test_an_error_in_a_worker_process_is_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
     FieldBench(seed=4).design.write(tmp_path / "field.json")
     for name in "abc":
         write_image(tmp_path / f"{name}.png", np.full((240, 240), 80, dtype=np.uint8))
@@ -229,8 +233,8 @@ def test_what_a_process_raises_is_said_in_one_line(reseau: Run, tmp_path: Path) 
     assert "a.png" in err
 
 
-def test_sigma_naught_is_that_of_the_sigma_given(reseau: Run, measured: tuple[Path, ...]) -> None:
-    """Twice the sigma that the coordinates have, and half the sigma naught."""
+def test_sigma_naught_refers_to_the_given_sigma(reseau: Run, measured: tuple[Path, ...]) -> None:
+    """Twice the sigma of the coordinates gives half the sigma naught."""
     status, out, _ = reseau(*common(measured), "--free", "c,x0,y0,K1", "--sigma", 2 * SIGMA)
     assert status == 0
     sigma0 = float(out.partition("sigma0 ")[2].partition(",")[0])
@@ -250,7 +254,7 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
         (("--pitch", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
         (("--side", "inner", "--pitch", 0.027), "write `object` or `image`"),
         (("--size", "large"), "write 640x480"),
-        (("--distance", -3), "-3 is not above zero"),
+        (("--distance", -3), "-3 is not positive"),
     ],
 )
 def test_wrong_options_are_named(
@@ -267,7 +271,7 @@ def test_coordinates_without_a_size_are_refused(reseau: Run, measured: tuple[Pat
     assert "size of the images" in err
 
 
-def test_documents_of_measurements_serve_as_images(
+def test_documents_of_measurements_are_accepted_as_images(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
     files: list[Path] = []

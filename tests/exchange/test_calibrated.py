@@ -71,14 +71,14 @@ def test_a_camera_entry_names_its_calibration(first: Result, use: str, tmp_path:
     assert (found.cameras["cam"].sigma < 0.85 * before.sigma).all()
 
 
-def test_the_command_line_gives_the_calibration_of_a_camera(first: Result, tmp_path: Path) -> None:
+def test_a_given_calibration_replaces_the_entry_of_a_camera(first: Result, tmp_path: Path) -> None:
     calibration_of(first, "camera", name="front").write(tmp_path / "front.json")
     entry = {"id": "cam", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01], "model": "brown",
              "side": "object", "parameters": {"c": 7.7}, "free": ["c"]}  # fmt: skip
     path = tmp_path / "network.json"
     path.write_text(json.dumps(as_document(example_network(seed=1), entry)))
     assert read_network(path, {"cam": tmp_path / "front.json"}).cameras[0].free == ("c", "x0", "y0", "K1")
-    with pytest.raises(UsageError, match="no camera of the network"):
+    with pytest.raises(UsageError, match="other: is not a camera of the network"):
         read_network(path, {"other": tmp_path / "front.json"})
 
 
@@ -106,13 +106,13 @@ def test_entries_that_cannot_be_read_are_refused(first: Result) -> None:
 
 
 PRINCIPAL_POINT = (321.5, 240.5)
-"""Pixels of x0 = 0.02 mm, y0 = -0.01 mm in the image of the example, whose pixels are 0.01 mm."""
+"""Pixel coordinates of x0 = 0.02 mm, y0 = -0.01 mm in the example, with pixels of 0.01 mm."""
 
 
 def orientation(
     turned: float = 0.0, mirrored: bool = False, px_per_mm: tuple[float, float] = (100.0, 100.0)
 ) -> FrameOrientation:
-    """A frame of 6 mm × 4.4 mm about the principal point, turned clockwise by an angle in degrees."""
+    """A frame of 6 mm × 4.4 mm around the principal point, rotated clockwise by an angle in degrees."""
     c, s = np.cos(np.radians(turned)), np.sin(np.radians(turned))
     half = np.array([3.0, 2.2]) * px_per_mm
     xy = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * ([-1, 1] if mirrored else [1, 1])
@@ -177,7 +177,7 @@ def test_other_parameters_of_a_camera_on_film_can_be_observed_too(tmp_path: Path
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.4, 90.0, 180.0])
-def test_the_frame_may_be_turned_in_the_scan(turned: float, tmp_path: Path) -> None:
+def test_the_frame_may_be_rotated_in_the_scan(turned: float, tmp_path: Path) -> None:
     frame = orientation(turned, px_per_mm=(100.0, 98.0))
     entry = FILM | {"width": 800, "height": 800}
     camera = read_network(written(tmp_path, entry, frame)).cameras[0]
@@ -187,7 +187,7 @@ def test_the_frame_may_be_turned_in_the_scan(turned: float, tmp_path: Path) -> N
     np.testing.assert_allclose(at, [PRINCIPAL_POINT], atol=1e-9)
 
 
-def test_the_calibration_of_a_film_frame_serves_as_its_orientation(tmp_path: Path) -> None:
+def test_the_calibration_of_a_film_frame_is_accepted_as_its_orientation(tmp_path: Path) -> None:
     frame = orientation()
     calibration = calibration_of_frame(frame, size=(640, 480))
     camera = read_network(written(tmp_path, FILM, calibration)).cameras[0]

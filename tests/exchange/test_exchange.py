@@ -67,7 +67,7 @@ def test_points_in_no_image_are_named(reference_data: Find) -> None:
     assert result.redundancy == 4064 - (8 + 126 + 282)
 
 
-def test_bal_begins_at_its_published_cost(reference_data: Find) -> None:
+def test_bal_starts_at_its_published_cost(reference_data: Find) -> None:
     network = read_foreign(reference_data("networks/bal-ladybug-49.txt"))
     assert (len(network.images), len(network.points), len(network.xy)) == (49, 7776, 31843)
     from reseau.bundle import problem_of
@@ -125,7 +125,7 @@ def test_a_colmap_model_projects_to_its_own_features(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen.xy, network.xy, rtol=0, atol=1e-9)
 
 
-def test_mistakes_are_named_with_their_line(tmp_path: Path) -> None:
+def test_errors_are_reported_with_their_line(tmp_path: Path) -> None:
     folder, _ = colmap(tmp_path)
     (folder / "cameras.txt").write_text("1 FISHEYE 640 480 500\n")
     with pytest.raises(FormatError, match=r"cameras.txt: line 1"):

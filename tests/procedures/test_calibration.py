@@ -48,7 +48,7 @@ def test_any_function_that_measures_a_frame_is_accepted() -> None:
 
 def test_photographs_of_one_name_are_refused() -> None:
     twice = [blank(next(iter(STATIONS)))] * 2
-    with pytest.raises(UsageError, match="name of two photographs"):
+    with pytest.raises(UsageError, match="two photographs have this name"):
         calibrate_camera(twice, BENCH.design, measure)
 
 

@@ -34,5 +34,5 @@ def test_each_image_is_measured_or_declined_by_name() -> None:
 def test_two_images_of_one_name_are_refused() -> None:
     frame = FieldBench().record(Station(30))
     design = FieldBench().design
-    with pytest.raises(UsageError, match="name of two photographs"):
+    with pytest.raises(UsageError, match="two photographs have this name"):
         calibrate_camera([frame, frame], design, measurer_of(design), None, CameraOptions())

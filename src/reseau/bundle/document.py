@@ -1,4 +1,4 @@
-"""The result of an adjustment as a document ``reseau-bundle/1``."""
+"""The result of a bundle adjustment as a document, ``reseau-bundle/1``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Matrix = tuple[tuple[float, ...], ...]
 
 
 class Estimate(Strict):
-    """A parameter with its standard deviation; zero for a parameter that is held."""
+    """A parameter with its standard deviation; zero for held parameters."""
 
     value: float
     sigma: float
@@ -51,7 +51,7 @@ class CameraResult(Strict):
 
     id: str
     parameters: dict[str, Estimate]
-    # By the scatter between images; null where there are too few.
+    # Null with too few images.
     sigma_between_images: dict[str, float | None]
     correlation: Correlation
     tests: dict[str, Significance]
@@ -60,7 +60,7 @@ class CameraResult(Strict):
 class ImagesResult(Strict):
     """Images in columns; `sigma` is that of X0, Y0, Z0 and of the rotation vector (rad).
 
-    `factors` are those by which the standard deviations given for x and y should have been multiplied.
+    `factors` are the factors by which the input standard deviations of x and y are too small.
     """
 
     id: tuple[str, ...]
@@ -74,7 +74,7 @@ class ImagesResult(Strict):
 
 
 class PointsResult(Strict):
-    """Points in columns; `check` are differences at check points, computed less given."""
+    """Points in columns; `check` are differences at check points, estimated minus given."""
 
     id: tuple[str, ...]
     role: tuple[str, ...]
@@ -167,9 +167,9 @@ class CrossValidation(Strict):
 
 
 class ResultDocument(Document):
-    """The result of a bundle adjustment, ``reseau-bundle/1``: everything in columns, null if not determined.
+    """The result of a bundle adjustment, ``reseau-bundle/1``, in columns; null for undetermined values.
 
-    Keys after `warnings` are missing where they do not apply. Files written before they existed have neither
+    Keys after `warnings` are omitted where they do not apply. Files of earlier versions have neither
     `warning_codes` nor `provenance`.
 
     Examples
@@ -203,14 +203,14 @@ class ResultDocument(Document):
 
     @classmethod
     def of(cls, result: Result, *, covariances: bool = False, provenance: Provenance | None = None) -> Self:
-        """Collect the numbers of a result.
+        """Create the document of a result.
 
         Parameters
         ----------
         result : Result
-            Of a bundle adjustment.
+            Result of a bundle adjustment.
         covariances : bool
-            Whether points have their full covariances.
+            Whether to include the full covariances of the points.
         provenance : Provenance, optional
             Inputs and options.
         """
@@ -245,13 +245,13 @@ class ResultDocument(Document):
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as it stands in the file; keys that do not apply are left out."""
+        """Return the content of the file; keys that do not apply are omitted."""
         content = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
         return {"schema": self.SCHEMA} | content
 
 
 def model_search_entries(result: Result) -> dict[str, Any]:
-    """Return how the model of a result was found, as JSON values; empty where none was searched.
+    """Return the model search of a result as JSON values; empty where no model was searched.
 
     Examples
     --------
@@ -270,7 +270,7 @@ def model_search_entries(result: Result) -> dict[str, Any]:
 
 
 def _model_search(result: Result) -> dict[str, Any]:
-    """How the model was found; empty where none was searched."""
+    """Entries of the model search; empty where no model was searched."""
     found: dict[str, Any] = {}
     components = result.components
     if components is not None:

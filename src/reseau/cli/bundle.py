@@ -1,4 +1,4 @@
-"""`reseau bundle`: the adjustment of a network of images."""
+"""`reseau bundle`: adjust a network of images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ __all__ = ["bundle"]
 
 def bundle(
     network: Annotated[
-        Path, typer.Argument(help="Network: reseau-network/1, or a file of PhotoModeler, BAL or COLMAP.")
+        Path,
+        typer.Argument(
+            help="Network: reseau-network/1, a file of PhotoModeler or BAL, or a folder of COLMAP."
+        ),
     ],
     out: Out = None,
     reject: Reject = False,
@@ -52,7 +55,7 @@ def bundle(
     distance: Distances = None,
     as_json: AsJson = False,
 ) -> None:
-    """Adjust a network of images: orientation, calibration and object points, with their quality."""
+    """Adjust a network of images: orientation, calibration and object points, with their uncertainty."""
     from ..bundle import Options, ResultDocument, search_model
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import read_network
@@ -88,7 +91,7 @@ def bundle(
 
 
 def _hashes(path: Path) -> dict[str, str]:
-    """SHA-256 of a network file and the calibrations it names, or of the text files in a folder."""
+    """SHA-256 of a network file and its calibrations, or of the text files in a folder."""
     from ..core.provenance import sha256_of
     from ..exchange import calibration_files
 
@@ -99,7 +102,7 @@ def _hashes(path: Path) -> dict[str, str]:
 
 
 def _calibrations(texts: list[str]) -> dict[str, Path]:
-    """Calibration files by camera, from ``ID=file``."""
+    """Calibration files by camera, from options ``ID=file``."""
     from ..core.errors import UsageError
 
     found: dict[str, Path] = {}

@@ -1,4 +1,4 @@
-"""`reseau compare`: the difference of two calibrations of a camera over its image."""
+"""`reseau compare`: map the difference of two calibrations of a camera over the image."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def compare(
     first: Annotated[Path, typer.Argument(help="Calibration of a camera, reseau-calibration/1.")],
     second: Annotated[Path, typer.Argument(help="Another calibration of the same camera.")],
     out: Out = None,
-    figure: Annotated[Path | None, typer.Option(help="Map of the difference to draw, SVG.")] = None,
-    places: Annotated[int, typer.Option(min=2, help="Number of places across the image.")] = 25,
+    figure: Annotated[Path | None, typer.Option(help="Write a map of the difference, SVG.")] = None,
+    places: Annotated[int, typer.Option(min=2, help="Number of positions across the image.")] = 25,
     as_json: AsJson = False,
 ) -> None:
-    """Compare two calibrations: their difference over the image, with its significance."""
+    """Compare two calibrations of a camera: map their difference over the image and test its significance."""
     from ..calibration import calibration_difference
     from ..core.provenance import canonical_json
     from ..io import write_whole
@@ -49,14 +49,14 @@ def compare(
 
 
 def read_lens(path: Path) -> CameraMapping:
-    """A camera from its calibration."""
+    """Read the camera mapping of a calibration file."""
     from ..calibration import CameraMapping, read_calibration
 
     return CameraMapping.from_calibration(read_calibration(path))
 
 
 def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, Any]:
-    """The field in rows of the image; null where no ray is imaged by both cameras."""
+    """The difference in rows of the image; null where a camera images no ray."""
     import numpy as np
 
     from ..core.provenance import sha256_of

@@ -33,7 +33,7 @@ __all__ = [
 
 
 class Components(StrEnum):
-    """Groups of image coordinates with a variance component of their own."""
+    """Groups of image coordinates with separate variance components."""
 
     AXES = "axes"
     IMAGES = "images"
@@ -50,7 +50,9 @@ ComponentsOf = Annotated[
 ]
 Eliminate = Annotated[
     float | None,
-    typer.Option(help="Drop distortion parameters not significant at this level, as 0.05; cross-validate."),
+    typer.Option(
+        help="Drop distortion parameters that are not significant at this level, e.g. 0.05; cross-validate."
+    ),
 ]
 Distances = Annotated[
     list[float] | None,
@@ -101,13 +103,13 @@ def positive(distances: list[float] | None) -> list[float]:
     Raises
     ------
     UsageError
-        When one is not above zero.
+        When a distance is not positive.
     """
     from ..core.errors import UsageError
 
     for distance in distances or []:
         if not distance > 0:
-            raise UsageError(f"{distance:g} is not above zero", where="--distance")
+            raise UsageError(f"{distance:g} is not positive", where="--distance")
     return distances or []
 
 
@@ -154,7 +156,7 @@ def say_model(result: Result) -> None:
 
 
 def say_difference(name: str, found: FieldDifference) -> None:
-    """A difference of calibrations in one line."""
+    """Print the difference of two calibrations."""
     import numpy as np
 
     size = np.sqrt(np.nanmean((found.difference**2).sum(axis=2)))
@@ -162,6 +164,6 @@ def say_difference(name: str, found: FieldDifference) -> None:
     share = float((found.p_at[known] < 0.01).mean()) if known.any() else 0.0
     test = f"χ² {found.statistic:.4g} with {found.degrees} degrees of freedom, p = {found.p:.2g}"
     say(
-        f"beside {name}: {size:.2g} px rms, {test}\n"
+        f"difference to {name}: {size:.2g} px rms, {test}\n"
         f"  significant at 1 % over {100 * share:.0f} % of the image\n"
     )

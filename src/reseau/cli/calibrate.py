@@ -1,4 +1,4 @@
-"""`reseau calibrate`: from photographs of a target to the calibration of a camera."""
+"""`reseau calibrate`: calibrate a camera from photographs of a target."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ __all__ = ["calibrate"]
 
 Sigma = Annotated[
     float | None,
-    typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels, instead of those measured."),
+    typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels; replaces the measured sigmas."),
 ]
 Control = Annotated[
     Path | None,
-    typer.Option(help="Known points of the target, CSV id,x,y,z[,sx,sy,sz]; without, a free network."),
+    typer.Option(help="Control points of the target, CSV id,x,y,z[,sx,sy,sz]; by default a free network."),
 ]
 LeaveOut = Annotated[
-    list[str] | None, typer.Option(help="Image point to leave out, as photo.jpg:A1; repeatable.")
+    list[str] | None, typer.Option(help="Image point to leave out, e.g. photo.jpg:A1; repeatable.")
 ]
 
 
 def calibrate(
     images: Annotated[
-        list[Path], typer.Argument(help="Photographs of the target, or coordinates measured in them.")
+        list[Path], typer.Argument(help="Photographs of the target, or files of measured image coordinates.")
     ],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
     out: Out = None,
@@ -70,22 +70,22 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="Camera model; by default brown with --pitch, opencv without. An unknown name lists all.",
+            help="Camera model; by default brown with --pitch, otherwise opencv. An unknown name lists all.",
         ),
     ] = "",
-    pitch: Annotated[
-        float | None, typer.Option(min=1e-6, help="Size of a pixel, mm; brown needs it.")
-    ] = None,
+    pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm; required by brown.")] = None,
     side: Annotated[
         str | None, typer.Option(help="Side of Brown's distortion: object (default) or image.")
     ] = None,
     model_option: Annotated[
         list[str] | None,
-        typer.Option(help="Option of the camera model, as balance_radius_mm=8; repeatable."),
+        typer.Option(help="Option of the camera model, e.g. balance_radius_mm=8; repeatable."),
     ] = None,
-    free: Annotated[str, typer.Option(help="Parameters to estimate, as c,x0,y0,K1.")] = "",
-    size: Annotated[str, typer.Option(help="Width×height in pixels, where no photograph tells.")] = "",
-    channel: Annotated[Channel, typer.Option(help="What to take of a colour image.")] = Channel.LUMA,
+    free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
+    size: Annotated[
+        str, typer.Option(help="Width×height in pixels, e.g. 640x480; required without photographs.")
+    ] = "",
+    channel: Annotated[Channel, typer.Option(help="Channel of colour images.")] = Channel.LUMA,
     sensor: SensorFile = None,
     sigma: Sigma = None,
     control: Control = None,
@@ -94,15 +94,17 @@ def calibrate(
     components: ComponentsOf = None,
     eliminate: Eliminate = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive part of the pixels.")] = 1.0,
+    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
     against: Annotated[
-        list[Path] | None, typer.Option(help="Calibration of the same camera to compare with.")
+        list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
     ] = None,
     distance: Distances = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores by default.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes; by default the number of cores.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate a camera from photographs of a target, in one command."""
+    """Calibrate a camera from photographs of a target."""
     workers = _processes(images, jobs)
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
@@ -152,7 +154,7 @@ def _options(
     level: float | None,
     workers: int,
 ) -> CalibrationOptions:
-    """The options as the procedure takes them."""
+    """Options of the procedure, from the options of the command."""
     from ..bundle import Options
     from ..core.errors import UsageError
     from ..exchange import read_control
@@ -171,7 +173,7 @@ def _options(
 
 
 def _processes(images: list[Path], jobs: int | None) -> int:
-    """Processes for the photographs, none for what was measured before; their imports begin at once."""
+    """Number of processes for the photographs; start them early so that they import in the background."""
     from ..core.processes import cores, start_early
 
     count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
@@ -181,7 +183,7 @@ def _processes(images: list[Path], jobs: int | None) -> int:
 
 
 def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:
-    """The calibration, with how its model was found."""
+    """The calibration, with the entries of the model search."""
     return done.calibration(name, provenance.to_dict())
 
 
@@ -205,7 +207,7 @@ def _write_report(
 def _frames(
     paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
-    """Photographs one after the other, or what was measured in them."""
+    """Photographs, or measured image coordinates, in order."""
     from ..io.images import read_image
 
     for path in paths:
@@ -217,7 +219,7 @@ def _frames(
 
 
 def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:
-    """Model and parameters of the camera, from the options of the command."""
+    """Camera model and parameters from the options of the command."""
     from ..core.errors import UsageError
     from ..procedures.calibration import CameraOptions
 
@@ -267,11 +269,11 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     say_parameters(result.camera(0), sigma_between_images(result, 0))
     sigma = projection_field(camera_mapping(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
-    say(f"projection known to {middle:.2g} px in the median over the image, {worst:.2g} px at worst\n")
+    say(f"uncertainty of the projection: median {middle:.2g} px over the image, at most {worst:.2g} px\n")
     for away in distances:
         sigma = projection_field_at(result, 0, away).sigma
         middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
-        say(f"  of points at {away:g} {result.network.unit} to {middle:.2g} px, {worst:.2g} px at worst\n")
+        say(f"  at {away:g} {result.network.unit}: median {middle:.2g} px, at most {worst:.2g} px\n")
     say_model(done.result)
     for name, found in differences.items():
         say_difference(name, found)

@@ -1,4 +1,4 @@
-"""Networks and control points in files, of this project and of other programs."""
+"""Read networks and control points from files of this project and of other programs."""
 
 from __future__ import annotations
 

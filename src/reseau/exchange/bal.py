@@ -1,8 +1,8 @@
 """Bundle Adjustment in the Large: one file of cameras, points and observations.
 
-A camera there looks along −z, y up; its image coordinates are in pixels about the centre of the image, y up,
+A BAL camera looks along −z, y up. Image coordinates are in pixels from the centre of the image, y up:
 f·(1 + k1 r² + k2 r⁴)·p with p = −(X, Y)/Z (Agarwal, Snavely, Seitz & Szeliski 2010, *Bundle adjustment in the
-large*). It is Brown's camera on the object side with a pitch of one and K1 = k1/f², K2 = k2/f⁴.
+large*). This is Brown's camera on the object side with a pitch of one and K1 = k1/f², K2 = k2/f⁴.
 """
 
 from __future__ import annotations
@@ -23,14 +23,19 @@ _VIEW = np.diag([1.0, -1.0, -1.0])
 
 
 def read_bal(path: Path | str) -> Network:
-    """A network from a BAL file.
+    """Read a network from a BAL file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
 
     Raises
     ------
     InputError
-        When it cannot be read.
+        When the file cannot be read.
     FormatError
-        When it holds other than the numbers its first line promises.
+        When the content does not match the numbers in the first line.
 
     Examples
     --------
@@ -47,17 +52,17 @@ def read_bal(path: Path | str) -> Network:
         cameras, points, observations = (int(word) for word in words[:3])
         values = np.array(words[3:], dtype=np.float64)
     except ValueError:
-        raise FormatError("holds words that are no numbers", where=path) from None
+        raise FormatError("contains words that are not numbers", where=path) from None
     expected = 4 * observations + 9 * cameras + 3 * points
     if min(cameras, points, observations) < 1 or len(values) != expected:
-        raise FormatError(f"holds {len(values)} numbers after the first line, not {expected}", where=path)
+        raise FormatError(f"has {len(values)} numbers after the first line, not {expected}", where=path)
     if not np.isfinite(values).all():
-        raise FormatError("holds numbers that are not finite", where=path)
+        raise FormatError("contains numbers that are not finite", where=path)
     table = values[: 4 * observations].reshape(-1, 4)
     poses = values[4 * observations : 4 * observations + 9 * cameras].reshape(-1, 9)
     image, point = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
     if not (0 <= image.min() <= image.max() < cameras and 0 <= point.min() <= point.max() < points):
-        raise FormatError("has an observation of a camera or point that is not there", where=path)
+        raise FormatError("has an observation of an undefined camera or point", where=path)
     half = int(np.ceil(np.abs(table[:, 2:]).max()))
     matrices = rotation_matrix(poses[:, :3])
     entries = tuple(_camera(str(i), 2 * half + 1, *row) for i, row in enumerate(poses[:, 6:]))

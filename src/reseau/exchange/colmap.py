@@ -1,7 +1,7 @@
 """COLMAP's text files: ``cameras.txt``, ``images.txt``, ``points3D.txt`` in one folder.
 
-Pixels there have their origin at the corner of the top-left pixel, ours at its centre: half a pixel less.
-Poses are quaternions (scalar first) and translations, x_c = R X + t.
+COLMAP's pixel coordinates have their origin at the corner of the top-left pixel, ours at its centre: half a
+pixel is subtracted. Poses are quaternions (scalar first) and translations, x_c = R X + t.
 """
 
 from __future__ import annotations
@@ -33,17 +33,22 @@ _MODELS = {
 
 
 def read_colmap(folder: Path | str) -> Network:
-    r"""A network from a folder of COLMAP's text files.
+    r"""Read a network from a folder of COLMAP's text files.
 
-    Principal distance and distortion are free, the principal point is held, as COLMAP does by itself; image
-    coordinates get a standard deviation of one pixel.
+    Principal distance and distortion are free and the principal point is held, as in COLMAP by default; image
+    coordinates have a standard deviation of one pixel.
+
+    Parameters
+    ----------
+    folder : path
+        Folder with the three files.
 
     Raises
     ------
     InputError
         When a file cannot be read.
     FormatError
-        When a line is not what it should be; the message names it.
+        When a line is invalid; the message names it.
 
     Examples
     --------
@@ -76,18 +81,18 @@ def read_colmap(folder: Path | str) -> Network:
             if not words:
                 continue
             if len(words) < 10 or words[8] not in order:
-                raise FormatError(f"line {number}: is no image of a camera that is there", where=seen.path)
+                raise FormatError(f"line {number}: not an image of a camera in cameras.txt", where=seen.path)
             poses.append(numbers(words[1:8], 7, seen.path, number))
             cameras_of.append(order[words[8]])
             names.append(" ".join(words[9:]))
         else:
             seen.take(words, number)
     if not names or not points:
-        raise FormatError("holds no images or no points", where=folder)
+        raise FormatError("contains no images or no points", where=folder)
     table = np.array(poses)
     matrices = _rotations(table[:, :4])
     if len(seen.image) == 0:
-        raise FormatError("holds no observations of its points", where=seen.path)
+        raise FormatError("contains no observations of points", where=seen.path)
     xy = np.array(seen.xy) - 0.5
     return network_of(
         tuple(cameras.values()),
@@ -103,7 +108,7 @@ def read_colmap(folder: Path | str) -> Network:
 
 
 class _Seen:
-    """Observations of one image after the other."""
+    """Observations of the images, in order."""
 
     def __init__(self, path: Path, rows: dict[str, int]) -> None:
         self.path, self.rows = path, rows
@@ -113,12 +118,12 @@ class _Seen:
         self.done: list[int] = []
 
     def take(self, words: list[str], number: int) -> None:
-        """The line of an image's observations; features without a point are passed over."""
+        """Read the observations of an image from its line; features without a point are ignored."""
         if len(words) % 3:
-            raise FormatError(f"line {number}: is not x, y, point in turn", where=self.path)
+            raise FormatError(f"line {number}: not triples of x, y, point", where=self.path)
         known: set[str] = set()
         for x, y, name in zip(words[::3], words[1::3], words[2::3], strict=True):
-            # A point seen twice in an image is a mistake of matching: its first is as good as its second.
+            # A point with two observations in an image is a wrong match: only the first is used.
             if name in self.rows and name not in known:
                 known.add(name)
                 self.image.append(len(self.done))
@@ -128,7 +133,7 @@ class _Seen:
 
 
 def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]]:
-    """Words of the lines that are no comments; empty ones only when asked for."""
+    """Words of each line except comments; empty lines only with `every`."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
         if (words or every) and not line.startswith("#"):
@@ -138,7 +143,7 @@ def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]
 def _camera(words: list[str], path: Path, number: int) -> Camera:
     if len(words) < 4 or words[1] not in _MODELS:
         known = ", ".join(_MODELS)
-        raise FormatError(f"line {number}: is no camera of the models {known}", where=path)
+        raise FormatError(f"line {number}: not a camera of a known model: {known}", where=path)
     name, model = words[:2]
     names = _MODELS[model]
     width, height, *values = numbers(words[2:], 2 + len(names), path, number)
@@ -148,7 +153,7 @@ def _camera(words: list[str], path: Path, number: int) -> Camera:
     size = int(width), int(height)
     if "f" in given:
         f = given["f"]
-        # One principal distance for both axes: Brown's camera with a pitch of one.
+        # One principal distance for both axes: Brown's model with a pitch of one.
         brown = [f, given["cx"] - (width - 1) / 2, (height - 1) / 2 - given["cy"]]
         radial = [given.get("k1", 0.0) / f**2, given.get("k2", 0.0) / f**4]
         free = ("c", *(f"K{k}" for k in (1, 2) if f"k{k}" in given))

@@ -1,4 +1,4 @@
-"""Control points in a table: coordinates of an object that were measured otherwise."""
+"""Control points in a table: known object coordinates."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
 
 def read_control(path: Path | str) -> ControlPoints:
-    r"""Control points from a CSV ``id,x,y,z[,sx,sy,sz]`` with a header.
+    r"""Read control points from a CSV file ``id,x,y,z[,sx,sy,sz]`` with a header.
 
-    Without columns of standard deviations all coordinates are held, as with a standard deviation of 0. A
-    field that is empty leaves its coordinate free.
+    Without standard deviations, or where they are 0, coordinates are held. An empty field leaves its
+    coordinate free.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ def read_control(path: Path | str) -> ControlPoints:
     Raises
     ------
     InputError
-        When it cannot be read.
+        When the file cannot be read.
     FormatError
-        When it is no such table, names a point twice, or holds what is no number or a negative sigma.
+        When the header is wrong, a point appears twice, a field is not a number, or a sigma is negative.
 
     Examples
     --------
@@ -49,7 +49,9 @@ def read_control(path: Path | str) -> ControlPoints:
     lines = [line for line in csv.reader(read_text(path).splitlines()) if any(word.strip() for word in line)]
     header = [word.strip().lower() for word in lines[0]] if lines else []
     if header not in (_COLUMNS[:4], _COLUMNS):
-        raise FormatError("is no table of control points", where=path, do="begin it with id,x,y,z[,sx,sy,sz]")
+        raise FormatError(
+            "is not a table of control points", where=path, do="start with the header id,x,y,z[,sx,sy,sz]"
+        )
     names, rows = list[str](), list[list[float]]()
     for number, line in enumerate(lines[1:], start=2):
         where = f"{path}, line {number}"
@@ -57,17 +59,17 @@ def read_control(path: Path | str) -> ControlPoints:
             raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
         name = line[0].strip()
         if name in names:
-            raise FormatError(f"names point {name} a second time", where=where)
+            raise FormatError(f"point {name} appears twice", where=where)
         names.append(name)
         rows.append([_number(word, where) for word in line[1:]])
     if not names:
-        raise FormatError("has no points", where=path)
+        raise FormatError("contains no points", where=path)
     values = np.array(rows, dtype=np.float64)
     sigma = values[:, 3:] if len(header) == len(_COLUMNS) else np.zeros_like(values)
     sigma = np.where(np.isnan(values[:, :3]), np.nan, sigma)
     if (sigma < 0).any():
         name = names[int(np.flatnonzero((sigma < 0).any(axis=1))[0])]
-        raise FormatError(f"gives point {name} a sigma below zero", where=path)
+        raise FormatError(f"the sigma of point {name} is negative", where=path)
     return ControlPoints(tuple(names), values[:, :3], sigma)
 
 
@@ -77,7 +79,7 @@ def _number(word: str, where: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise FormatError(f"{word.strip()!r} is no number", where=where) from None
+        raise FormatError(f"{word.strip()!r} is not a number", where=where) from None
     if not np.isfinite(value):
-        raise FormatError(f"{word.strip()!r} is no number", where=where)
+        raise FormatError(f"{word.strip()!r} is not a number", where=where)
     return value

@@ -1,4 +1,4 @@
-"""Lines of numbers, and what is said when one is not."""
+"""Numbers in lines of text files, and the network of such a file."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["network_of", "numbers"]
 
 
 def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
-    """`count` finite numbers.
+    """Convert words to `count` finite numbers.
 
     Raises
     ------
     FormatError
-        When there are others; names the line, counted from one.
+        When the words are not that; names the line, counted from one.
     """
     try:
         values = [float(word) for word in words]
@@ -45,7 +45,7 @@ def network_of(
     files: tuple[str | None, ...] | None = None,
     unit: str = "",
 ) -> Network:
-    """A free network: every coordinate and pose approximate, as other programs leave them.
+    """Create a free network with approximate coordinates and poses of another program.
 
     Parameters
     ----------

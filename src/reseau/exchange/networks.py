@@ -1,4 +1,4 @@
-"""Networks from files: of this project with their calibrations, and of other programs."""
+"""Read networks of this project, with their calibrations, and of other programs."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
     FormatError
         When the file is not a network, or a calibration is not one.
     UsageError
-        When a calibration is given for a camera that the network does not have, is not that of a camera or a
-        film frame, or the principal distance of a camera on film is not known.
+        When a calibration is given for a camera that is not in the network, is not that of a camera or a film
+        frame, or the principal distance for a film frame is not known.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
     path, given = Path(path), dict(calibrations or {})
     if path.is_dir() or path.suffix.lower() != ".json":
         network = read_foreign(path)
-        # Where a pixel has no size, the principal distance is in pixels.
+        # With a pitch of one, the principal distance is in pixels.
         known = {camera.id: camera for camera in network.cameras}
         with_size = {name: camera for name, camera in known.items() if camera.pitch_mm != (1.0, 1.0)}
         return network.with_cameras(_chosen(given, set(known), with_size))
@@ -78,28 +78,28 @@ def _chosen(
     """Cameras from the calibration files that the caller gives."""
     for name in given:
         if name not in ids:
-            raise UsageError("is no camera of the network", where=name)
+            raise UsageError("is not a camera of the network", where=name)
     return {name: _from_file(name, Path(file), with_size.get(name)) for name, file in given.items()}
 
 
 def _from_file(
     name: str, file: Path, entry: Camera | None, *, held: bool = False, film: bool = False
 ) -> Camera:
-    """A camera from a calibration file; `entry` gives a film camera its principal distance."""
+    """Read a camera from a calibration file; `entry` has the principal distance for a film frame."""
     calibration = read_calibration(file)
     if calibration.kind != "film_frame":
         if film and calibration.kind == "camera":
             raise UsageError(
                 f"{file.name} is a calibration of a camera, not of a film frame",
                 where=f"camera {name}",
-                do="leave out all keys but id, calibration and use",
+                do="use only the keys id, calibration and use",
             )
         return calibrated_camera(name, calibration, held=held)
     if entry is None:
         raise UsageError(
-            f"{file.name} is a film frame and does not give the principal distance",
+            f"the film frame {file.name} does not give the principal distance",
             where=f"camera {name}",
-            do="give width, height and parameters with c in mm in the network",
+            do="add width, height and parameters with c in mm to the entry of the network",
         )
     oriented = json.loads(read_text(file))["schema"] == FrameOrientation.SCHEMA
     return film_camera(entry, FrameOrientation.read(file) if oriented else calibration, held=held)
@@ -121,19 +121,19 @@ def calibration_files(path: Path | str) -> tuple[Path, ...]:
 
 
 def read_foreign(path: Path | str) -> Network:
-    r"""A network of another program, told apart by what the file holds.
+    r"""Read a network of another program; its format is recognised by the content.
 
     Parameters
     ----------
     path : Path or str
-        Text export of PhotoModeler, a BAL file, or a folder of COLMAP's text files.
+        Text export of PhotoModeler, BAL file, or folder with COLMAP's text files.
 
     Raises
     ------
     InputError
-        When it cannot be read.
+        When a file cannot be read.
     FormatError
-        When it is none of these.
+        When the format is not known.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def read_foreign(path: Path | str) -> Network:
     if len(lines) > 4 and len(lines[1].split()) == 4 and len(lines[3].split()) == 10:
         return read_photomodeler(path)
     raise FormatError(
-        "is no network of a program known here",
+        "is not a network of a known program",
         where=path,
-        do="give reseau-network/1, PhotoModeler, BAL, COLMAP",
+        do="use reseau-network/1, PhotoModeler, BAL or COLMAP",
     )

@@ -1,11 +1,11 @@
-"""PhotoModeler's text export, as DBAT reads it.
+"""PhotoModeler's text export, as read by DBAT.
 
-Title; tolerance, iterations, image width and height; default sigmas; the camera (c, principal point from
-the upper left corner, format, K1, K2, K3, P1, P2; mm) and its sigmas. Then for each image three lines (number
-and file; X, Y, Z, kappa, phi, omega in degrees; their sigmas) and two with its camera. Then points (id, X, Y,
-Z, sigmas) and observations (image, id, x, y, sigmas), blank lines between. Pixels have their origin at the
-corner of the top-left pixel, ours at its centre. Which points are control stands in another file: the network
-is read as a free one.
+The file has a title; tolerance, iterations, image width and height; default sigmas; the camera (c, principal
+point from the upper left corner, format, K1, K2, K3, P1, P2; mm) and its sigmas. Then each image has three
+lines (number and file; X, Y, Z, kappa, phi, omega in degrees; their sigmas) and two for its camera. Points
+(id, X, Y, Z, sigmas) and observations (image, id, x, y, sigmas) follow, separated by blank lines. Pixel
+coordinates have their origin at the corner of the top-left pixel, ours at its centre. Control points are in
+another file: the network is read as a free network.
 """
 
 from __future__ import annotations
@@ -26,16 +26,21 @@ _FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 
 
 def read_photomodeler(path: Path | str) -> Network:
-    r"""A network from PhotoModeler's text export.
+    r"""Read a network from PhotoModeler's text export.
 
-    Images whose cameras agree to the printed digits share one.
+    Images with equal camera parameters, to the printed digits, have one camera.
+
+    Parameters
+    ----------
+    path : path
+        The file.
 
     Raises
     ------
     InputError
-        When it cannot be read.
+        When the file cannot be read.
     FormatError
-        When a line is not what it should be; the message names it.
+        When a line is invalid; the message names it.
 
     Examples
     --------
@@ -80,19 +85,20 @@ def read_photomodeler(path: Path | str) -> Network:
     rows, images = {name: j for j, name in enumerate(points)}, {name: i for i, name in enumerate(ids)}
     while words := lines.peek():
         if table and len(words) == 3:
-            break  # tables of features follow, which say nothing new
+            break  # tables of features follow, which are not needed
         lines.next()
         if len(words) != 6 or words[0] not in images or words[1] not in rows:
             raise FormatError(
-                f"line {lines.number}: `{' '.join(words)[:60]}` is no observation of an image and a point",
+                f"line {lines.number}: `{' '.join(words)[:60]}` is not an observation of a known image "
+                "and point",
                 where=path,
             )
         table.append([images[words[0]], rows[words[1]], *numbers(words[2:], 4, path, lines.number)])
     if not table:
-        raise FormatError("holds no observations", where=path)
+        raise FormatError("contains no observations", where=path)
     values, table_of = np.array(poses), np.array(table)
     omega, phi, kappa = np.radians(values[:, [5, 4, 3]]).T
-    # PhotoModeler counts images from zero, its users from one.
+    # The file counts images from zero, the user interface of PhotoModeler from one.
     return network_of(
         tuple(cameras),
         tuple(str(int(name) + 1) if name.isdigit() else name for name in ids),
@@ -112,22 +118,22 @@ def read_photomodeler(path: Path | str) -> Network:
 
 
 class _Lines:
-    """Lines one after the other, blank ones passed over."""
+    """Lines in order, without blank lines."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.lines, self.number = path, read_text(path).splitlines(), 0
 
     def peek(self) -> list[str]:
-        """Words of the next line; empty at the end."""
+        """Return the words of the next line; empty at the end."""
         while self.number < len(self.lines) and not self.lines[self.number].split():
             self.number += 1
         return self.lines[self.number].split() if self.number < len(self.lines) else []
 
     def next(self) -> list[str]:
-        """Words of the next line, which must be there."""
+        """Return the words of the next line and move on."""
         words = self.peek()
         if not words:
-            raise FormatError("ends too soon", where=self.path)
+            raise FormatError("the file is incomplete", where=self.path)
         self.number += 1
         return words
 
@@ -141,7 +147,7 @@ def _is_number(word: str) -> bool:
 
 
 def _printed(values: list[float]) -> tuple[float, ...]:
-    """A camera as the lines of the images print it: three digits of c and the principal point."""
+    """Camera parameters as printed for the images: three digits of c and the principal point."""
     return tuple(round(v, 3) if k < 3 else v for k, v in enumerate(values))
 
 

@@ -136,7 +136,7 @@ class CalibratedCameraEntry(Strict):
 
 
 class FilmCameraEntry(CameraEntry):
-    """A camera on film: pixel size and principal point are those of a scanned frame's orientation.
+    """A film camera with the pixel size and the principal point of a scanned frame.
 
     `calibration` is the path of a ``reseau-orientation/1``, or of the ``reseau-calibration/1`` of a film
     frame, relative to the network file; `width` and `height` are the pixels of the scan. With `use`

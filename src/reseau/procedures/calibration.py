@@ -1,9 +1,9 @@
-"""A camera calibrated from photographs of a target: measured, oriented, adjusted.
+"""Calibration of a camera from photographs of a target.
 
-The target is not taken at its word: the coordinates of its design are approximate, all points are unknowns,
-and the network has inner constraints over them (a free network). Size and place of object space are those of
-the design in the mean of its points; its unevenness comes out as heights. Points of the target that were
-measured otherwise may be given as control points instead.
+The coordinates of the design are only approximate values: all points of the target are unknowns, and the
+network has inner constraints over them (a free network). Scale and datum are those of the design on average
+over its points; the unevenness of the target is estimated as heights. Points with known coordinates may be
+given as control points instead.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _LEAST_IMAGES = 3
 
 
 class PlaneDesign(Protocol):
-    """A plane target: the names of its points, and where they are."""
+    """A plane target: names and coordinates of its points."""
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -72,29 +72,29 @@ class PlaneDesign(Protocol):
 
     @property
     def unit(self) -> str:
-        """Of the coordinates; a label."""
+        """Unit of the coordinates; a label."""
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Model of a camera that is to be calibrated, and what is estimated of it.
+    """Camera model of a calibration, and the parameters to estimate.
 
     Parameters
     ----------
     model : str, optional
-        Name of a registered model, see :func:`reseau.optics.camera_models`. By default ``brown`` where the
-        size of a pixel is given, and ``opencv`` where it is not.
+        Name of a registered model, see :func:`reseau.optics.camera_models`. By default ``brown`` if the pixel
+        size is given, otherwise ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.
     pitch_mm : (float, float), optional
-        Size of a pixel; needed for models whose parameters are in millimetres.
+        Pixel size; required for models whose parameters are in millimetres.
     options : mapping of str to str or float
-        Options of the model, as the side of Brown's distortion.
+        Options of the model, such as the side of Brown's distortion.
 
     Raises
     ------
     UsageError
-        When the model, a parameter or an option is unknown, or the size of a pixel is missing.
+        When the model, a parameter or an option is unknown, or the pixel size is missing.
 
     Examples
     --------
@@ -112,7 +112,7 @@ class CameraOptions:
             object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
         model = self.registered
         if model.needs_pitch and self.pitch_mm is None:
-            raise UsageError("needs the size of a pixel", where=model.name)
+            raise UsageError("requires the pixel size", where=model.name)
         unknown = [name for name in self.free if name not in model.names]
         if unknown:
             raise UsageError(f"is not one of {', '.join(model.names)}", where=unknown[0])
@@ -131,27 +131,27 @@ class CameraOptions:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationOptions:
-    """How a camera is calibrated.
+    """Options of a camera calibration.
 
     Parameters
     ----------
     adjustment : Options
-        How to adjust.
+        Options of the adjustment.
     sigma_px : float, optional
-        Standard deviation of all image coordinates, where those of the measurement are not what they scatter
-        by: a target that is not what it was designed, a lens that the model does not follow.
+        Standard deviation of all image coordinates. Replaces the measured ones where the residuals are
+        larger, because the target or the lens deviates from its model.
     control : ControlPoints, optional
-        Where the datum comes from; without, inner constraints over all points.
+        Control points for the datum; by default inner constraints over all points.
     without : tuple of (str, str)
-        Image points to be left out, by image and point.
+        Image points to leave out, by image and point.
     components : {"axes", "images", "cameras"}, optional
-        What gets a factor of its own on its standard deviations; see :func:`reseau.bundle.search_model`.
+        Groups with separate factors on their standard deviations; see :func:`reseau.bundle.search_model`.
     level : float, optional
-        Level of the tests by which distortion parameters that are not needed are dropped.
+        Significance level of the tests by which distortion parameters are dropped.
     workers : int
-        Processes that measure.
+        Number of processes for the measurement.
     heights : Heights, optional
-        Of the target on a z-stage.
+        Heights of the target on a z-stage.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -166,16 +166,16 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibrated(Display):
-    """A calibration with what it was made of; truthy.
+    """A camera calibration with its measurements; truthy.
 
     Parameters
     ----------
     result : Result
-        The adjustment, and how its model was found; its network has one camera, `camera`.
+        Result of the adjustment; its network has one camera, `camera`.
     measured : dict
-        What was measured, by image.
+        Measured image points, by image.
     declined : dict
-        Why images do not take part.
+        Reasons why images were left out, by image.
     """
 
     result: Result
@@ -186,7 +186,7 @@ class Calibrated(Display):
         return True
 
     def required(self) -> Calibrated:
-        """The calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
+        """Return the calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     @property
@@ -296,28 +296,29 @@ def calibrate_camera(
     Parameters
     ----------
     frames : iterable of Frame, or of (name, ImagePoints)
-        The photographs, all of one size; or what was measured in them before.
+        Photographs of one size, or measured image points.
     design : PlaneDesign
         The target.
     measure : callable
-        What measures it in a frame; see :func:`~reseau.procedures.target_measurement.measurer_of`.
+        Function that measures the target in a frame; see
+        :func:`~reseau.procedures.target_measurement.measurer_of`.
     size : (int, int), optional
-        Width and height in pixels, where no frame tells.
+        Width and height in pixels; required without frames.
     model : CameraOptions, optional
-        What is to be estimated.
+        Camera model and parameters to estimate.
     options : CalibrationOptions, optional
-        How.
+        Options of the calibration.
 
     Returns
     -------
     Calibrated or Failure
-        A failure where fewer than three images show the target, or the adjustment fails.
+        A failure when fewer than three images show the target, or the adjustment fails.
 
     Raises
     ------
     UsageError
-        When two photographs have one name or differ in size, no size is known, or a point to be left out was
-        not measured.
+        When two photographs have the same name or different sizes, the size is not known, or a point to leave
+        out was not measured.
     """
     options = options or CalibrationOptions()
     measured, declined, size = _measured(frames, measure, size, options.workers)
@@ -328,7 +329,9 @@ def calibrate_camera(
             f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}", Code.TOO_FEW_IMAGES
         )
     if size is None:
-        raise UsageError("is not known without an image", where="size of the images")
+        raise UsageError(
+            "is not known without a photograph", where="size of the images", do="give width and height"
+        )
     camera = first_camera(measured, design, size, model or CameraOptions())
     network = network_of(measured, design, camera)
     if options.heights is not None:
@@ -347,7 +350,7 @@ def _measured(
     size: tuple[int, int] | None,
     workers: int,
 ) -> tuple[dict[str, ImagePoints], dict[str, str], tuple[int, int] | None]:
-    """What is measured in each photograph, why others do not take part, and the size of all."""
+    """Return the image points of each photograph, the reasons of declined ones, and the image size."""
     names = set[str]()
 
     def checked() -> Iterator[Frame | tuple[str, ImagePoints]]:
@@ -355,7 +358,7 @@ def _measured(
         for frame in frames:
             name = frame.name if isinstance(frame, Frame) else frame[0]
             if name in names:
-                raise UsageError("is the name of two photographs", where=name)
+                raise UsageError("two photographs have this name", where=name)
             names.add(name)
             if isinstance(frame, Frame):
                 if size is not None and size != (frame.width, frame.height):
@@ -378,11 +381,13 @@ def _measured(
 def _without(
     measured: dict[str, ImagePoints], leave_out: Sequence[tuple[str, str]]
 ) -> dict[str, ImagePoints]:
-    """What was measured without some of it."""
+    """Leave out image points."""
     for image, point in leave_out:
         points = measured.get(image)
         if points is None or point not in points.names:
-            raise UsageError("was not measured", where=f"point {point} in image {image}", do="name what was")
+            raise UsageError(
+                "was not measured", where=f"point {point} in image {image}", do="name a measured image point"
+            )
         keep = np.array([name != point for name in points.names])
         names = tuple(name for name in points.names if name != point)
         measured = measured | {image: ImagePoints(names, points.xy[keep], points.cov[keep])}
@@ -390,7 +395,7 @@ def _without(
 
 
 def _controlled(network: Network, control: ControlPoints) -> Network:
-    """The network with known points, and its datum from them."""
+    """Return the network with control points, which define the datum."""
     row = {name: k for k, name in enumerate(network.points)}
     xyz, sigma, role = network.xyz.copy(), network.sigma.copy(), list(network.role)
     for name, given, own in zip(control.names, control.xyz, control.sigma, strict=True):
@@ -408,16 +413,16 @@ def network_of(
     camera: Camera,
     groups: Sequence[str] | None = None,
 ) -> Network:
-    """The network of images of a plane target, all its points unknown, with inner constraints over them.
+    """Create the free network of images of a plane target, with inner constraints over all its points.
 
     Parameters
     ----------
     measured : mapping of str to ImagePoints
         Measured points of each image, named as in the design.
     design : PlaneDesign
-        Approximate coordinates; heights are zero.
+        Target with the approximate coordinates; heights are zero.
     camera : Camera
-        Of all images.
+        Camera of all images.
     groups : sequence of str, optional
         Group of each image.
     """
@@ -457,7 +462,7 @@ def network_of(
 def first_camera(
     measured: Mapping[str, ImagePoints], design: PlaneDesign, size: tuple[int, int], model: CameraOptions
 ) -> Camera:
-    """A camera to begin with: the principal distance from the projectivities of the images (Zhang 2000)."""
+    """Return a camera with approximate values, from the homographies of the images (Zhang 2000)."""
     known = dict(zip(design.ids, design.xy, strict=True))
     object_points, image_points = [], []
     for points in measured.values():

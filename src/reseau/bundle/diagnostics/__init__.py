@@ -1,4 +1,4 @@
-"""Diagnostics of an adjusted network: result, residual patterns, uncertainty over the image, checks."""
+"""Results of an adjusted network: estimates, residual patterns, uncertainty over the image, warnings."""
 
 from .checks import checks
 from .control_check import doubtful_control

@@ -1,4 +1,4 @@
-"""What deserves attention in an adjustment: each remark names what it is about."""
+"""Warnings about an adjustment; each names the points, images or parameters that it concerns."""
 
 from __future__ import annotations
 
@@ -21,27 +21,28 @@ __all__ = ["LISTED", "checks", "gaps", "listed"]
 
 LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
-# Corrections still to come that are none, in standard deviations.
+# Size of the next correction, in standard deviations, that counts as converged.
 _NEAR = 1e-3
-# Redundancy from which on the scatter of an image is compared with that of the others.
-_LEAST = 5.0
-# Uncertainty between images over that of independent errors that is remarked; by noise alone it is 1.1 or so.
+# Minimum redundancy of an image for comparing its scatter with that of the other images.
+_MIN_REDUNDANCY = 5.0
+# Ratio of the sigma between images to the sigma for independent errors above which a warning is given; noise
+# alone gives about 1.1.
 _SCATTERED = 2.0
-# Images of a camera from which on they are asked for what they have in common.
-_IN_COMMON = 3
-# A corner is this part of width and height.
+# Minimum number of images of a camera for the search for a common residual pattern.
+_MIN_IMAGES = 3
+# Size of a corner as a fraction of width and height.
 _CORNER = 0.2
 
 
 def listed(names: Iterable[object]) -> str:
-    """Names, the first few of many."""
+    """Join names with commas; of many names only the first, and the number of the others."""
     every = [str(name) for name in names]
     more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
     return ", ".join(every[:LISTED]) + more
 
 
 def gaps(network: Network, fit: BundleFit) -> list[Remark]:
-    """Points, images and cameras that were left out, and why."""
+    """Return remarks on points, images and cameras that were left out, with the reasons."""
     found = []
     part, rays = fit.usable.points, network.rays
     lost = ~part & ~network.held.all(axis=1)
@@ -70,7 +71,7 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
         names = listed(network.points[j] for j in parallel)
         found.append(
             Remark(
-                f"{_plural('point', parallel)} {names} left out: rays are parallel, or blunders",
+                f"{_plural('point', parallel)} {names} left out: rays are parallel or have gross errors",
                 Code.NOT_IDENTIFIED,
             )
         )
@@ -78,7 +79,7 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
     if len(few):
         found.append(
             Remark(
-                f"{_points(network, few)} not seen by two images that are oriented; left out",
+                f"{_points(network, few)} in fewer than two oriented images; left out",
                 Code.NOT_IDENTIFIED,
             )
         )
@@ -86,7 +87,7 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
     for i in images[:LISTED]:
         name, seen = network.images[i], int(network.seen[i])
         why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
-        enough = "three are needed" if seen < 3 else "no position could be computed from them"
+        enough = "three are needed" if seen < 3 else "its position could not be computed"
         found.append(Remark(f"image {name} has {why}; {enough}; left out", Code.TOO_FEW_POINTS))
     if len(images) > LISTED:
         found.append(Remark(f"{len(images) - LISTED} more images are left out", Code.TOO_FEW_POINTS))
@@ -94,7 +95,7 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
     for c in np.flatnonzero(used == 0):
         found.append(
             Remark(
-                f"{network.cameras[c].label} has no image; its parameters stay as they are given",
+                f"{network.cameras[c].label} has no image; its parameters are unchanged",
                 Code.TOO_FEW_IMAGES,
             )
         )
@@ -102,7 +103,17 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
 
 
 def checks(result: Result) -> list[Remark]:
-    """Correlations, weak points, uncovered corners, test values, and the global test.
+    """Check an adjustment: what was left out, convergence, global test, weak points, residual patterns.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+
+    Returns
+    -------
+    list of Remark
+        A text and a code for each finding; empty where nothing was found.
 
     Examples
     --------
@@ -114,7 +125,7 @@ def checks(result: Result) -> list[Remark]:
     network, fit = result.network, result.fit
     return [
         *gaps(network, fit),
-        *_creeping(result),
+        *_not_converged(result),
         *_global(result),
         *_large(result),
         *_correlations(result),
@@ -142,34 +153,38 @@ def _global(result: Result) -> list[Remark]:
     if test is None:
         return [
             Remark(
-                "no observation is redundant: nothing is checked, and sigmas are a priori", Code.NO_REDUNDANCY
+                "no redundant observations: no checks are possible, and sigmas are a priori",
+                Code.NO_REDUNDANCY,
             )
         ]
     if test.passed:
         return []
-    side = "larger" if test.statistic > test.upper else "smaller"
+    side, why = (
+        ("larger", "input sigmas are too small, or the model does not fit")
+        if test.statistic > test.upper
+        else ("smaller", "input sigmas are too large")
+    )
     return [
         Remark(
-            f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; "
-            "the sigmas of the observations are not true, or the model is not",
+            f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; {why}",
             Code.SIGMAS_DOUBTFUL,
         )
     ]
 
 
-def _creeping(result: Result) -> list[Remark]:
+def _not_converged(result: Result) -> list[Remark]:
     if result.fit.offset < _NEAR:
         return []
     return [
         Remark(
-            f"the adjustment creeps: corrections of {result.fit.offset:.2g} standard deviations were to come",
+            f"not fully converged: the next correction would be {result.fit.offset:.2g} standard deviations",
             Code.NOT_CONVERGED,
         )
     ]
 
 
 def _large(result: Result) -> list[Remark]:
-    """Image points whose test value is too large for the best of so many."""
+    """Image points whose test value exceeds the critical value for the maximum of all test values."""
     w = np.nan_to_num(result.test_values).max(axis=1)
     critical = critical_w(_ALPHA / max(1, 2 * len(w)))
     rows = np.flatnonzero(w > critical)
@@ -203,14 +218,16 @@ def _correlations(result: Result) -> list[Remark]:
         for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
             found.append(
                 Remark(
-                    f"{camera.label}: {names[k]} and {names[i]} correlate by {r[i, k]:.3f}", Code.CORRELATED
+                    f"{camera.label}: correlation of {names[k]} and {names[i]} is {r[i, k]:.3f}",
+                    Code.CORRELATED,
                 )
             )
     if len(found) > LISTED:
         found = [
             *found[:LISTED],
             Remark(
-                f"{len(found) - LISTED} more camera parameters correlate above {_CORRELATED}", Code.CORRELATED
+                f"{len(found) - LISTED} more pairs of camera parameters correlated above {_CORRELATED}",
+                Code.CORRELATED,
             ),
         ]
     q = result.pose_covariance[result.fit.usable.images]
@@ -222,7 +239,7 @@ def _correlations(result: Result) -> list[Remark]:
         names_of = listed(result.network.images[i] for i in images)
         found.append(
             Remark(
-                f"position and rotation correlate above {_CORRELATED} in "
+                f"correlation of position and rotation above {_CORRELATED} in "
                 f"{_plural('image', images)} {names_of}",
                 Code.CORRELATED,
             )
@@ -231,7 +248,7 @@ def _correlations(result: Result) -> list[Remark]:
 
 
 def _weak(result: Result) -> list[Remark]:
-    """Points much less certain than the others."""
+    """Points with much larger standard deviations than the others."""
     network = result.network
     free = result.fit.usable.points & ~network.held.all(axis=1)
     sigma = np.sqrt((result.point_sigma**2).sum(axis=1))
@@ -252,7 +269,7 @@ def _weak(result: Result) -> list[Remark]:
 
 
 def _datum(result: Result) -> list[Remark]:
-    """Points that inner constraints over all do not hold for."""
+    """Weak points that inner constraints over all points leave out."""
     network, fit = result.network, result.fit
     if fit.datum is None or not network.datum_points.all():
         return []
@@ -268,13 +285,15 @@ def _datum(result: Result) -> list[Remark]:
 
 
 def _scatter(result: Result) -> list[Remark]:
-    """Images, and axes, whose coordinates scatter more than the others."""
+    """Images, and the axis, whose coordinates scatter more than the others."""
     if not result.redundancy > 0 or not result.sigma0 > 0:
         return []
     squares, number = result.scatter
     own, r = squares.sum(axis=1), number.sum(axis=1)
     others, rest = own.sum() - own, r.sum() - r
-    rows = np.flatnonzero(result.fit.usable.images & (r > _LEAST) & (rest > _LEAST) & (others > 0))
+    rows = np.flatnonzero(
+        result.fit.usable.images & (r > _MIN_REDUNDANCY) & (rest > _MIN_REDUNDANCY) & (others > 0)
+    )
     ratio = own[rows] / r[rows] / (others[rows] / rest[rows])
     more = scipy.special.fdtrc(r[rows], rest[rows], ratio) < _ALPHA / max(1, len(rows))
     rows, size = rows[more], np.sqrt(ratio[more])
@@ -283,14 +302,13 @@ def _scatter(result: Result) -> list[Remark]:
     if names:
         found.append(
             Remark(
-                "image coordinates scatter more than those of the other images, by the factor in "
-                "brackets, in "
+                f"image coordinates scatter more than in other images, by the factor in brackets, in "
                 f"{_plural('image', rows)} {listed(names)}",
                 Code.SIGMAS_DOUBTFUL,
             )
         )
     total, count = squares.sum(axis=0), number.sum(axis=0)
-    if count.min() > _LEAST and total.min() > 0:
+    if count.min() > _MIN_REDUNDANCY and total.min() > 0:
         mean = total / count
         a = int(mean.argmax())
         times = mean[a] / mean[1 - a]
@@ -298,7 +316,7 @@ def _scatter(result: Result) -> list[Remark]:
             found.append(
                 Remark(
                     f"{'xy'[a]} scatters {np.sqrt(times):.2f} times as much as "
-                    f"{'xy'[1 - a]}, by the sigmas given",
+                    f"{'xy'[1 - a]}, relative to the input sigmas",
                     Code.SIGMAS_DOUBTFUL,
                 )
             )
@@ -306,10 +324,10 @@ def _scatter(result: Result) -> list[Remark]:
 
 
 def _patterns(result: Result) -> list[Remark]:
-    """Cameras whose residuals have a pattern in common, by place in the image."""
+    """Cameras whose images have a common residual pattern, by position in the image."""
     network, found = result.network, []
     images = np.bincount(network.camera_of[result.fit.usable.images], minlength=len(network.cameras))
-    for c in np.flatnonzero(images >= _IN_COMMON)[:LISTED]:
+    for c in np.flatnonzero(images >= _MIN_IMAGES)[:LISTED]:
         try:
             pattern = common_pattern(result, by_place(result, int(c)))
         except UsageError:
@@ -317,9 +335,9 @@ def _patterns(result: Result) -> list[Remark]:
         if pattern.p < _ALPHA:
             found.append(
                 Remark(
-                    f"{network.cameras[c].label}: residuals of its images have a pattern in common by place "
-                    f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px): what its model does not follow, the "
-                    "sigmas do not cover",
+                    f"{network.cameras[c].label}: common residual pattern of its images "
+                    f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px rms): the model does not describe it, "
+                    "and the sigmas do not include it",
                     Code.UNMODELLED,
                 )
             )
@@ -327,7 +345,7 @@ def _patterns(result: Result) -> list[Remark]:
 
 
 def _between(result: Result) -> list[Remark]:
-    """Parameters that differ between the images of a camera by more than their sigmas."""
+    """Parameters that vary between the images of a camera by more than their sigmas."""
     found = []
     for c, camera in enumerate(result.network.cameras):
         names, _, _ = result.camera_columns(c)
@@ -335,11 +353,11 @@ def _between(result: Result) -> list[Remark]:
         ratio = np.nan_to_num(sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf))
         rows = np.flatnonzero(ratio > _SCATTERED)
         if len(rows):
-            said = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
+            factors = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
             found.append(
                 Remark(
-                    f"{camera.label}: by the scatter between its images parameters are less certain than "
-                    f"their sigmas say, by the factor: {said}; the camera may not be the same in all of them",
+                    f"{camera.label}: the scatter between images is larger than the sigmas, by the factor: "
+                    f"{factors}; the camera may have changed between images",
                     Code.CAMERA_UNSTABLE,
                 )
             )
@@ -360,7 +378,7 @@ def _behind(network: Network, fit: BundleFit) -> list[Remark]:
 
 
 def _corners(network: Network, fit: BundleFit) -> list[Remark]:
-    """Corners of the image in which a camera to be calibrated has no points."""
+    """Image corners without points, for cameras with free parameters."""
     found, used = [], fit.usable.observations
     for c, camera in enumerate(network.cameras):
         rows = used & (network.camera_of[network.image_of] == c)

@@ -1,4 +1,4 @@
-"""Whether the control points agree with the shape that the images give by themselves."""
+"""Check the control points against the shape determined by the images alone."""
 
 from __future__ import annotations
 
@@ -18,21 +18,26 @@ from ..solver.values import Values
 __all__ = ["doubtful_control"]
 
 _TRIPLES, _SIGMAS, _LEAST = 500, 8.0, 4
-# Part of the extent of the control that a point may be off anyway.
+# Tolerated error of a control point, as a fraction of their extent.
 _LOOSE = 2e-3
 
 
 def doubtful_control(network: Network) -> str:
-    """What is wrong with the control points, if the images alone can tell; otherwise nothing.
+    """Find wrong control points by a free network adjustment.
 
-    The network is adjusted without control, as a free one, and carried onto the control by the similarity of
-    the three points with which the most others agree. Those that do not agree are named, or the pair whose
-    exchange makes all agree.
+    The network is adjusted without control, as a free network, and transformed to the control points by the
+    similarity of three points with which most others agree. The points that do not agree are reported, or the
+    pair whose exchange makes all agree.
 
     Parameters
     ----------
     network : Network
-        With four control points at least whose three coordinates are known.
+        Network with at least four control points with three known coordinates.
+
+    Returns
+    -------
+    str
+        What is wrong with the control points; empty where nothing was found.
 
     Examples
     --------
@@ -67,15 +72,17 @@ def doubtful_control(network: Network) -> str:
     if agree.sum() < _LEAST:
         mirrored = _largest_agreement(found * [1.0, 1.0, -1.0], given, limit)
         if mirrored.sum() > max(_LEAST - 1, agree.sum()):
-            return "the control points are mirrored: their system is left-handed"
-        return f"the control points {', '.join(names_of)} do not agree on the shape of the object"
+            return "the control points are mirrored: their coordinate system is left-handed"
+        return (
+            f"the control points {', '.join(names_of)} do not agree with the shape determined by the images"
+        )
     wrong = np.flatnonzero(~agree)
     names = ", ".join(names_of[k] for k in wrong)
     return f"control point{'s' * (len(wrong) > 1)} {names} contradict{'s' * (len(wrong) == 1)} the others"
 
 
 def _free(network: Network) -> BundleFit | None:
-    """The network adjusted without any control."""
+    """Adjust the network without control."""
     nothing = np.full(network.xyz.shape, np.nan)
     posed = np.full(network.x0.shape, np.nan)
     none: Rows = np.zeros((0, 2), dtype=np.intp)
@@ -94,7 +101,7 @@ def _free(network: Network) -> BundleFit | None:
 
 
 def _exchanged(found: Array, given: Array, limit: Array) -> list[tuple[int, int]]:
-    """Pairs whose exchange makes all points agree; more than one where the control is symmetric."""
+    """Return pairs whose exchange makes all points agree; several pairs where the control is symmetric."""
     pairs = []
     for a, b in combinations(range(len(found)), 2):
         order = np.arange(len(found))
@@ -105,7 +112,7 @@ def _exchanged(found: Array, given: Array, limit: Array) -> list[tuple[int, int]
 
 
 def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
-    """Points near the similarity of the chosen ones."""
+    """Return which points agree with the similarity of the chosen ones."""
     nothing = np.zeros((1, 12))
     values = Values(np.zeros((0, 3, 3)), np.zeros((0, 3)), found, nothing, nothing)
     moved = similarity_onto(values, given, chosen, scaled=True)(values).xyz
@@ -113,7 +120,7 @@ def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
 
 
 def _largest_agreement(found: Array, given: Array, limit: Array) -> Mask:
-    """Points that agree with the best similarity of three."""
+    """Return the points that agree with the best similarity of three points."""
     best = np.zeros(len(found), dtype=bool)
     for three in islice(combinations(range(len(found)), 3), _TRIPLES):
         chosen = np.zeros(len(found), dtype=bool)

@@ -22,13 +22,13 @@ class CameraEstimate(Display):
     id : str
         Name of the camera.
     parameters : tuple of str (u,)
-        Names of the estimated parameters; those of additional sets per group or image carry its name.
+        Names of the estimated parameters, with the group or image for sets of additional parameters.
     values : ndarray (u,)
         Estimates, in the units of `units`.
     covariance : ndarray (u, u)
         Their covariance.
     units : tuple of str (u,)
-        Units; empty for numbers.
+        Units; empty for dimensionless parameters.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class CameraEstimate(Display):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImageEstimates(Display):
-    """Exterior orientations of all images; NaN where an image has none.
+    """Exterior orientations of all images; NaN for images that are not oriented.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class ImageEstimates(Display):
     rotation : ndarray (m, 3)
         Rotation vectors, rad; x_c = R(X − X0).
     cov : ndarray (m, 6, 6)
-        Covariances of X0, Y0, Z0 and of the rotation vector.
+        Covariances of X0, Y0, Z0 and the rotation vector.
     unit : str
         Unit of object space.
 
@@ -135,14 +135,14 @@ class ImageEstimates(Display):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointEstimates(Display):
-    """Object points; NaN where a point is not determined, a covariance of zero where it is held.
+    """Object points; NaN for undetermined points, covariance zero for held points.
 
     Parameters
     ----------
     names : tuple of str (p,)
         Names of the points.
     roles : tuple of {"tie", "control", "check"} (p,)
-        What each point is for.
+        Use of each point.
     xyz : ndarray (p, 3)
         Coordinates, in the unit of object space.
     cov : ndarray (p, 3, 3)
@@ -192,7 +192,7 @@ class PointEstimates(Display):
 
 
 def _median(sigma: Array, unit: str) -> str:
-    """Median standard deviation in space (k, 3), of those that are estimated."""
+    """Median of the spatial standard deviations (k, 3) of estimated points, with unit."""
     size = np.linalg.norm(sigma, axis=1)
     known = size[np.isfinite(size) & (size > 0)]
     return f"{np.median(known):.2g} {unit} in the median" if len(known) else "held"

@@ -1,4 +1,4 @@
-"""Uncertainty of the projection at finite distances, and a camera of an adjustment by itself."""
+"""The mapping of an adjusted camera, and the uncertainty of its projection at finite distances."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import numpy as np
 from ...calibration.camera import CameraMapping, ProjectionField, by_rotation, places
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
+from .checks import listed
 from .result import Result
 
 __all__ = ["camera_mapping", "projection_field_at"]
 
 
 def camera_mapping(result: Result, c: int, additional: str | None = None) -> CameraMapping:
-    """A camera as an adjustment left it.
+    """Return the mapping of an adjusted camera with its covariance.
 
     Parameters
     ----------
@@ -22,12 +23,12 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
     c : int
         Row of the camera.
     additional : str, optional
-        Which set of additional parameters, ``group G`` or ``image I``, where there are several.
+        Set of additional parameters, ``group G`` or ``image I``; required where there are several.
 
     Raises
     ------
     UsageError
-        When there is no such set, or several and none is named.
+        When there is no such set, or there are several sets and none is named.
 
     Examples
     --------
@@ -46,7 +47,7 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
 
 
 def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:
-    """Names, columns and values of what was estimated of a camera, of its additional parameters one set."""
+    """Return names, columns and values of the estimated parameters of a camera, with one additional set."""
     names, columns, values = result.camera_columns(c)
     camera = result.network.cameras[c]
     if camera.additional is None or camera.additional.per == "camera":
@@ -54,7 +55,12 @@ def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[s
     keep = [k for k, name in enumerate(names) if " of " not in name]
     own = [k for k, name in enumerate(names) if name.endswith(f" of {additional}")]
     if not own:
-        raise UsageError("is no set of additional parameters of it", where=f"{additional or 'none'}")
+        sets = dict.fromkeys(name.partition(" of ")[2] for name in names if " of " in name)
+        raise UsageError(
+            "is not a set of additional parameters of this camera",
+            where=f"{additional or 'none'}",
+            do="name one of " + listed(sets),
+        )
     keep += own
     return tuple(names[k].partition(" of ")[0] for k in keep), columns[keep], values[keep]
 
@@ -67,7 +73,7 @@ def projection_field_at(
     across: int = 25,
     down: int | None = None,
 ) -> ProjectionField:
-    """Uncertainty of where a camera images points of the object's space at a finite distance.
+    """Compute the uncertainty of the projection of object points at a finite distance.
 
     Parameters
     ----------
@@ -76,23 +82,23 @@ def projection_field_at(
     c : int
         Row of the camera.
     distance : float
-        Of the points from the projection centre, in the unit of object space.
+        Distance of the points from the projection centre, in the unit of object space.
     additional : str, optional
-        Which set of additional parameters, where there are several.
+        Set of additional parameters; required where there are several.
     across, down : int
-        Places along the axes, from edge to edge; `down` by default in proportion.
+        Number of positions along the axes, from edge to edge; `down` is proportional by default.
 
     Raises
     ------
     UsageError
-        For a distance that is not above zero, a camera without images, places without a field.
+        For a distance that is not positive, a camera without images, or fewer than two positions.
 
     Notes
     -----
-    A point p before the camera is carried into object space by the pose of each of its images, and comes back
-    by the estimate of it: dp = mean(δᵢ × p − Rᵢ dX0ᵢ). What the errors of all poses together make up for in
-    those of the interior orientation does not count; their joint covariance is used (Kogan, *mrcal*:
-    projection uncertainty by the mean of p over the frames). It is in the datum of the network.
+    A point p in the camera system is transformed to object space with the true pose of each image and back
+    with the estimated one: dp = mean(δᵢ × p − Rᵢ dX0ᵢ). Errors of the interior orientation that the poses
+    compensate cancel; the joint covariance of both is used (Kogan, *mrcal*: projection uncertainty by the
+    mean of p over the frames). It refers to the datum of the network.
 
     Examples
     --------
@@ -104,7 +110,7 @@ def projection_field_at(
            [0.18, 0.02, 0.18]])
     """
     if not distance > 0:
-        raise UsageError(f"{distance:g} is not above zero", where="distance")
+        raise UsageError(f"{distance:g} is not positive", where="distance")
     camera = camera_mapping(result, c, additional)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)
@@ -131,7 +137,7 @@ def projection_field_at(
 
 
 def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:
-    """Joint covariance of parameters of a camera, and of the means of δᵢ and of −Rᵢ dX0ᵢ over its images."""
+    """Joint covariance of camera parameters and of the means of δᵢ and −Rᵢ dX0ᵢ over the images."""
     unknowns, rotation = result.fit.unknowns, result.fit.values.rotation
     images = np.flatnonzero((unknowns.pose >= 0) & (result.network.camera_of == c))
     if not len(images):

@@ -1,9 +1,9 @@
-"""Uncertainty of cameras by the scatter between their images: errors within one need not be independent.
+"""Uncertainty of cameras from the scatter between their images.
 
-Each image i moves the estimates by dxᵢ = Q Aᵢᵀ Pᵢ vᵢ, and these sum to zero. Where errors are independent
-from one image to another, whatever they are within an image, Σ dxᵢ dxᵢᵀ estimates the covariance of the
-estimates (Huber 1967; Liang & Zeger 1986, *Biometrika* 73). It tells a camera that changes, or marks that are
-off in common, from noise.
+Each image i contributes dxᵢ = Q Aᵢᵀ Pᵢ vᵢ to the estimates, and the contributions sum to zero. If errors of
+different images are independent, Σ dxᵢ dxᵢᵀ estimates the covariance of the estimates, also with dependent
+errors within an image (Huber 1967; Liang & Zeger 1986, *Biometrika* 73). It reveals a camera that changes
+between images, or marks with a common error.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from .result import Result
 
 __all__ = ["sigma_between_images"]
 
-# Images worked on at once, and the least number that says anything of the scatter between them.
+# Images processed at once, and minimum number of images for an estimate.
 _AT_ONCE, LEAST_IMAGES = 64, 6
 
 
 def sigma_between_images(result: Result, c: int) -> Array:
-    """Standard deviations of what was estimated of a camera, by the scatter between its images.
+    """Compute standard deviations of the parameters of a camera from the scatter between its images.
 
     Parameters
     ----------
@@ -33,12 +33,12 @@ def sigma_between_images(result: Result, c: int) -> Array:
     Returns
     -------
     ndarray (k,)
-        In the order of :meth:`Result.camera_columns`; NaN where less than six images say something.
+        In the order of :meth:`Result.camera_columns`; NaN with fewer than six images.
 
     Notes
     -----
-    The residuals of an image are too small by what its own unknowns take up of them: its part is divided by
-    its mean redundancy number, and the whole multiplied by m/(m − 1) of m images.
+    The unknowns of an image absorb part of its residuals: its contribution is divided by its mean redundancy
+    number, and the sum is multiplied by m/(m − 1) for m images.
 
     Examples
     --------

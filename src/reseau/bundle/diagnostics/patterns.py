@@ -1,16 +1,15 @@
-"""Residual patterns that several images have in common, tested and mapped.
+"""Common residual patterns of several images: test and map.
 
-Vosselman and Förstner (1988, sect. 4.3) saw that residuals which look random in one image are those of
-another image of the same camera and board rotation. The hypothesis is that the measured coordinates of a
-class of observations (one point in images of a kind; one place of the frame in all images) are off by a
-common shift. All these shifts together are parameters C s that the adjustment has not got; with the weighted
-residuals w and their cofactors I − A Q Aᵀ they lower wᵀw by
+Vosselman and Förstner (1988, sect. 4.3) found that residuals which look random in one image repeat in other
+images of the same camera and board rotation. The hypothesis is that the measured coordinates of a class of
+observations (one point in images of one kind; one cell of the frame in all images) have a common shift. The
+shifts s are parameters C s that are missing in the adjustment; with the weighted residuals w and their
+cofactors I − A Q Aᵀ they reduce wᵀw by
 
     T = gᵀ M⁻ g,   g = Cᵀ w,   M = Cᵀ (I − A Q Aᵀ) C,
 
-exactly as much as an adjustment with them would to first order (Koch 1999, ch. 4; Förstner & Wrobel 2016,
-sect. 4.6). What orientation, calibration and points take up of a common shift does not count: M has no rank
-there.
+to first order the same as an adjustment with these parameters (Koch 1999, ch. 4; Förstner & Wrobel 2016,
+sect. 4.6). Shifts that orientation, calibration and points absorb are not tested: M is singular there.
 """
 
 from __future__ import annotations
@@ -30,38 +29,37 @@ from .result import Result
 
 __all__ = ["CommonPattern", "by_place", "by_point", "common_pattern"]
 
-# Part of a shift that the unknowns leave, below which they have taken it up.
+# Eigenvalues of the scaled M below this belong to shifts that the unknowns absorb.
 _RANK = 1e-6
-# Shifts from which on their full matrices take too long, and columns of them that are worked on at once.
+# Maximum number of shift components, because of their full matrices, and columns processed at once.
 _MOST, _AT_ONCE = 6000, 128
 
 
 @dataclass(frozen=True, eq=False)
 class CommonPattern:
-    """Shifts that classes of observations have in common.
+    """Common shifts of classes of observations.
 
     Parameters
     ----------
     key : ndarray of int (n,)
         Class of each image point, −1 for none.
     xy : ndarray (k, 2)
-        Mean place of each class in its images, px.
+        Mean position of each class in its images, px.
     shift : ndarray (k, 2)
-        By how much its measured points are off in the mean, px: the weighted mean of the residuals with the
-        sign of errors.
+        Mean error of the measured points of each class, px: the negative weighted mean of their residuals.
     cov : ndarray (k, 2, 2)
-        Covariances of the shifts by noise alone.
+        Covariances of the shifts due to noise.
     count : ndarray of int (k,)
         Image points in each class.
     statistic : float
         F of all shifts together.
     degrees : (int, int)
-        Of it.
+        Degrees of freedom of F.
     sigma0 : float
         Standard deviation of unit weight when the shifts are estimated too.
     rms : float
-        Root mean square of the shifts per coordinate without what noise makes of them, px, as far as they are
-        of one size everywhere; 0 where noise makes more.
+        Root mean square of the shifts per coordinate after subtraction of the noise, px, assuming the same
+        size everywhere; 0 where the noise is larger.
 
     Examples
     --------
@@ -84,12 +82,12 @@ class CommonPattern:
 
     @property
     def p(self) -> float:
-        """Probability of as much in common by chance."""
+        """Probability of an F at least as large without common shifts."""
         return float(scipy.special.fdtrc(*self.degrees, self.statistic)) if all(self.degrees) else 1.0
 
     @property
     def p_at(self) -> Array:
-        """The same of each class by itself (k,); one where the unknowns take its shift up."""
+        """Probability for each class separately (k,); one where the unknowns absorb its shift."""
         known = np.linalg.det(self.cov) > 0
         p = np.ones(len(self.cov))
         s = self.shift[known]
@@ -99,14 +97,14 @@ class CommonPattern:
 
 
 def by_point(result: Result, kinds: Sequence[str | None]) -> Rows:
-    """Classes of one point in images of one kind.
+    """Form classes of each point in images of each kind.
 
     Parameters
     ----------
     result : Result
         Of the adjustment.
     kinds : sequence of str or None (m,)
-        What kind each image is of; None for images that are not looked at.
+        Kind of each image; None for images to ignore.
 
     Returns
     -------
@@ -129,7 +127,7 @@ def by_point(result: Result, kinds: Sequence[str | None]) -> Rows:
 
 
 def by_place(result: Result, camera: int, across: int = 12, down: int | None = None) -> Rows:
-    """Classes of one place of the frame in all images of a camera: cells of a grid.
+    """Form classes of image points in each cell of a grid over all images of a camera.
 
     Parameters
     ----------
@@ -162,15 +160,15 @@ def by_place(result: Result, camera: int, across: int = 12, down: int | None = N
 
 
 def common_pattern(result: Result, key: Rows) -> CommonPattern:
-    """Test and map what classes of image points have in common.
+    """Test and map the common shifts of classes of image points.
 
     Parameters
     ----------
     result : Result
         Of the adjustment.
     key : ndarray of int (n,)
-        Class of each image point, −1 for none; see :func:`by_point`, :func:`by_place`. A class with one
-        image point alone does not count.
+        Class of each image point, −1 for none; see :func:`by_point`, :func:`by_place`. Classes with a single
+        image point are ignored.
 
     Raises
     ------
@@ -191,10 +189,12 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     found, number, count = np.unique(key[rows], return_inverse=True, return_counts=True)
     good = (found >= 0) & (count > 1)
     if not good.any():
-        raise UsageError("no two image points are in a class", where="common_pattern")
+        raise UsageError("no class has two image points", where="common_pattern")
     shifts = int(good.sum())
     if 2 * shifts > _MOST:
-        raise UsageError(f"{shifts} classes are too many, {_MOST // 2} can be tested", where="common_pattern")
+        raise UsageError(
+            f"{shifts} classes are too many; at most {_MOST // 2} can be tested", where="common_pattern"
+        )
     at = np.where(good, np.cumsum(good) - 1, -1)[number]
     root = linear.system.seen.root
     own = np.flatnonzero(at >= 0)
@@ -208,7 +208,7 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
     inverse, k = np.linalg.inv(normal), np.arange(shifts)
     cov = inverse @ m.reshape(shifts, 2, shifts, 2)[k, :, k, :] @ inverse * variance
     shift = -(inverse @ g[:, :, None])[:, :, 0]
-    # A pattern s shows as N⁻¹ M s.
+    # A pattern s appears in the residuals as N⁻¹ M s.
     shown = (inverse @ m.reshape(shifts, 2, -1)).reshape(2 * shifts, -1)
     square = float((shift**2).sum() - np.trace(cov, axis1=1, axis2=2).sum()) / float((shown**2).sum())
     xy = np.zeros((shifts, 2))
@@ -229,10 +229,10 @@ def common_pattern(result: Result, key: Rows) -> CommonPattern:
 
 
 def _left(result: Result, at: Rows, normal: Array) -> Array:
-    """M (2k, 2k): what the unknowns leave of the normal equations of the shifts.
+    """M (2k, 2k): normal equations of the shifts, reduced by the unknowns of the adjustment.
 
-    Points are eliminated as from all others: with the derivatives H by the reduced unknowns and K by the
-    points, CᵀA Q AᵀC = K V⁻¹ Kᵀ + (H − K V⁻¹ Wᵀ) Z (H − K V⁻¹ Wᵀ)ᵀ, in whatever datum Z is.
+    Points are eliminated as in the adjustment: with the derivatives H by the reduced unknowns and K by the
+    points, CᵀA Q AᵀC = K V⁻¹ Kᵀ + (H − K V⁻¹ Wᵀ) Z (H − K V⁻¹ Wᵀ)ᵀ, with Z in any datum.
     """
     cofactors = result.fit.cofactors
     shifts, p = 2 * len(normal), len(cofactors.points)
@@ -250,7 +250,7 @@ def _left(result: Result, at: Rows, normal: Array) -> Array:
 
 
 def _slopes(result: Result, at: Rows, shifts: int) -> tuple[Array, Any]:
-    """Cᵀ of the weighted derivatives: by the reduced unknowns (u, 2k), by the points (3p, 2k), sparse."""
+    """Products of Cᵀ and the weighted derivatives by reduced unknowns (u, 2k) and points (3p, 2k), sparse."""
     linear, unknowns = result.fit.linear, result.fit.unknowns
     pattern, own, last = linear.system.pattern, np.flatnonzero(at >= 0), linear.rows.shape[2] - 3
     slope = np.swapaxes(linear.system.seen.root[own], 1, 2) @ linear.rows[own]
@@ -273,7 +273,7 @@ def _slopes(result: Result, at: Rows, shifts: int) -> tuple[Array, Any]:
 def _tested(
     m: Array, g: Array, normal: Array, cost: float, redundancy: int
 ) -> tuple[float, tuple[int, int], float]:
-    """F of all shifts, its degrees of freedom, and sigma0 without what they explain."""
+    """Return F of all shifts, its degrees of freedom, and sigma0 with the shifts estimated."""
     scale = 1.0 / np.sqrt(np.diagonal(normal, axis1=1, axis2=2)).ravel()
     values, vectors = np.linalg.eigh(m * np.outer(scale, scale))
     keep = values > _RANK

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Eliminated", "Result"]
 
 _STEP = 1e-6
-# Redundancy below which an image says nothing of its own scatter.
+# Minimum redundancy of an image for a variance factor.
 _UNCONTROLLED = 1e-6
 
 
@@ -39,11 +39,11 @@ class Eliminated:
     Parameters
     ----------
     camera : str
-        Name of its camera.
+        Name of the camera.
     test : CoefficientTest
-        Its test before it was dropped.
+        Test of the parameter before it was dropped.
     sigma0 : float
-        Standard deviation of unit weight without it.
+        Standard deviation of unit weight without the parameter.
 
     Examples
     --------
@@ -59,30 +59,31 @@ class Eliminated:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(Display):
-    """A bundle adjustment with its quality; truthy.
+    """Result of a bundle adjustment, with covariances and tests; truthy.
 
-    Standard deviations and covariances are a posteriori, multiplied by the estimated variance factor; without
-    redundancy they are a priori. What was not determined is NaN.
+    Standard deviations and covariances are a posteriori (multiplied by the estimated variance factor);
+    without redundancy they are a priori. Undetermined values are NaN.
 
     Parameters
     ----------
     network : Network
-        What was adjusted.
+        The adjusted network.
     fit : BundleFit
         The adjustment.
     rejected : ndarray of bool (n,)
         Image points left out by data snooping.
     steps : tuple of SnoopingStep
-        How that came about, by the numbers of :class:`~reseau.bundle.solver.problem.BundleProblem`.
+        Steps of data snooping, with the observation numbers of
+        :class:`~reseau.bundle.solver.problem.BundleProblem`.
     warnings : tuple of Remark
-        What deserves attention; each names what it is about.
+        Warnings about the adjustment.
     components : VarianceComponents, optional
-        Factors on the standard deviations given, where they were estimated.
+        Factors on the input standard deviations, where they were estimated.
     eliminated : tuple of Eliminated, optional
-        Parameters that were dropped, in this order; None where no parameter was tested for it.
+        Dropped parameters in order; None without elimination.
     validation : (float, float), optional
-        Root mean square of image coordinates predicted without them, in their standard deviations: with all
-        parameters, and with those that were kept.
+        Cross-validation: root mean square error of predicted image coordinates, in their standard deviations,
+        with all parameters and with the kept ones.
 
     Examples
     --------
@@ -109,7 +110,7 @@ class Result(Display):
         return True
 
     def required(self) -> Result:
-        """The result itself; see :meth:`~reseau.core.failure.Failure.required`."""
+        """Return the result itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
 
     @property
@@ -119,11 +120,11 @@ class Result(Display):
 
     @property
     def redundancy(self) -> int:
-        """Observations less unknowns, plus datum constraints."""
+        """Number of observations minus unknowns plus datum constraints."""
         return self.fit.redundancy
 
     def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
-        """Test of the variance factor against one; None without redundancy."""
+        """Test the variance factor against one; None without redundancy."""
         return self.fit.global_test(alpha) if self.redundancy > 0 else None
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -186,7 +187,7 @@ class Result(Display):
     # -- estimates in columns
 
     def camera(self, c: int) -> CameraEstimate:
-        """Estimated parameters of the c-th camera of the network."""
+        """Return the estimated parameters of the c-th camera of the network."""
         names, _, values = self.camera_columns(c)
         entry = self.network.cameras[c]
         units = tuple(unit_of(name, entry.model) for name in names)
@@ -227,10 +228,10 @@ class Result(Display):
     # -- cameras
 
     def camera_columns(self, c: int) -> tuple[tuple[str, ...], Rows, Array]:
-        """Names, columns among the reduced unknowns and values of what was estimated of a camera.
+        """Return names, columns among the reduced unknowns, and values of the estimated camera parameters.
 
-        Sets of additional parameters are named ``b1`` … ``b12``; where a camera has several, with the group
-        or image they belong to.
+        Additional parameters are named ``b1`` … ``b12``; where a camera has several sets, followed by the
+        group or image.
         """
         unknowns, values = self.fit.unknowns, self.fit.values
         camera, names, columns, found = self.network.cameras[c], [], [], []
@@ -248,13 +249,13 @@ class Result(Display):
         return tuple(names), np.array(columns, dtype=np.intp), np.array(found)
 
     def camera_covariance(self, c: int) -> Array:
-        """Covariance of what was estimated of a camera, in the order of :meth:`camera_columns`."""
+        """Return the covariance of the estimated camera parameters, ordered as :meth:`camera_columns`."""
         _, columns, _ = self.camera_columns(c)
         covariance: Array = self.fit.cofactors.reduced[np.ix_(columns, columns)] * self.fit.variance
         return covariance
 
     def camera_tests(self, c: int, alpha: float = 0.05) -> tuple[CoefficientTest, ...]:
-        """Whether each distortion and each additional parameter of a camera differs from zero."""
+        """Test each distortion and additional parameter of a camera against zero."""
         names, columns, values = self.camera_columns(c)
         tested = distortion_names(names, self.network.cameras[c].model)
         size = np.sqrt(np.diag(self.fit.cofactors.reduced)[columns])
@@ -285,7 +286,7 @@ class Result(Display):
 
     @cached_property
     def pose_covariance(self) -> Array:
-        """Covariances (m, 6, 6) of rotation vector and projection centre; NaN where an image has no pose."""
+        """Covariances (m, 6, 6) of rotation vector and projection centre; NaN for images without pose."""
         return self._pose_covariance(matrix_to_vector)
 
     @cached_property
@@ -294,7 +295,7 @@ class Result(Display):
         return np.sqrt(np.diagonal(self._pose_covariance(matrix_to_angles), axis1=1, axis2=2)[:, :3])
 
     def _pose_covariance(self, parameters: Callable[[Array], Array]) -> Array:
-        """Carried from rotations about the camera's axes to other parameters of the rotation."""
+        """Propagate from rotations about the camera axes to other rotation parameters."""
         unknowns, cofactor = self.fit.unknowns, self.fit.cofactors.reduced
         images = np.flatnonzero(unknowns.pose >= 0)
         at = unknowns.pose[images, None] + np.arange(6)
@@ -304,7 +305,7 @@ class Result(Display):
         for axis in range(3):
             small = rotation_matrix(_STEP * np.eye(3)[axis])
             change = parameters(small @ rotation) - parameters(small.T @ rotation)
-            # Where an angle passes ±π the change does not.
+            # Remove jumps of an angle at ±π.
             turn[:, :3, axis] = ((change + np.pi) % (2 * np.pi) - np.pi) / (2 * _STEP)
         full = np.full((len(unknowns.pose), 6, 6), np.nan)
         full[images] = turn @ block @ np.swapaxes(turn, 1, 2)
@@ -314,7 +315,7 @@ class Result(Display):
 
     @cached_property
     def point_covariance(self) -> Array:
-        """Covariances (p, 3, 3) of the points; zero for held coordinates, NaN where not determined."""
+        """Covariances (p, 3, 3) of the points; zero for held coordinates, NaN for undetermined points."""
         part = self.fit.usable.points[:, None, None]
         return np.where(part, self.fit.cofactors.points * self.fit.variance, np.nan)
 
@@ -325,21 +326,21 @@ class Result(Display):
 
     @cached_property
     def check_points(self) -> tuple[Rows, Array]:
-        """Rows of the check points, and their differences, computed less given (k, 3)."""
+        """Rows of the check points, and their differences, estimated minus given (k, 3)."""
         rows = np.flatnonzero([role == "check" for role in self.network.role])
         rows = rows[self.fit.usable.points[rows]]
         return rows, self.fit.values.xyz[rows] - self.network.xyz[rows]
 
-    # -- anything with anything
+    # -- joint covariances
 
     def covariance_of(self, *names: str) -> Array:
-        """Joint covariance of any unknowns.
+        """Return the joint covariance of any unknowns.
 
         Parameters
         ----------
         *names : str
-            ``c of camera C``, ``X0 of image I`` (or Y0, Z0), ``dx of image I`` (or dy, dz: rotations about
-            the axes of its camera, rad), ``X of point P`` (or Y, Z), ``b1 of group G``.
+            Names such as ``c of camera C``, ``X0 of image I`` (or Y0, Z0), ``dx of image I`` (or dy, dz:
+            rotations about the camera axes, rad), ``X of point P`` (or Y, Z), ``b1 of group G``.
 
         Returns
         -------
@@ -349,7 +350,7 @@ class Result(Display):
         Raises
         ------
         UsageError
-            For a name of nothing that was estimated.
+            When a name is not that of an estimated unknown.
         """
         unknowns, network = self.fit.unknowns, self.network
         column_of = {name: k for k, name in enumerate(unknowns.names)}
@@ -365,7 +366,7 @@ class Result(Display):
                 points += [j] if j not in points else []
                 places.append((True, points.index(j), "XYZ".index(axis)))
             else:
-                raise UsageError("is none of the unknowns that were estimated", where=name)
+                raise UsageError("is not an estimated unknown", where=name)
         joint = self.fit.cofactors.joint(np.array(columns, dtype=np.intp), np.array(points, dtype=np.intp))
         at = [len(columns) + 3 * k + axis if of_point else k for of_point, k, axis in places]
         covariance: Array = joint[np.ix_(at, at)] * self.fit.variance
@@ -375,7 +376,7 @@ class Result(Display):
 
     @property
     def residuals(self) -> Array:
-        """v (n, 2) of the image coordinates, px; NaN where not determined."""
+        """v (n, 2) of the image coordinates, px; NaN where undetermined."""
         return self._of_image_points(self.fit.residuals)
 
     @cached_property
@@ -385,24 +386,24 @@ class Result(Display):
 
     @cached_property
     def test_values(self) -> Array:
-        """``w = |v|/(sigma0·σ·√r)`` of the image coordinates (n, 2); NaN for those left out."""
+        """``w = |v|/(sigma0·σ·√r)`` of the image coordinates (n, 2); NaN for rejected ones."""
         sigma0 = self.sigma0 if self.redundancy > 0 and self.sigma0 > 0 else 1.0
         return self._of_image_points(np.abs(self.fit.w)) / sigma0
 
     def minimal_detectable_errors(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """Errors of single image coordinates (n, 2) that the test finds with this power, px."""
+        """Return the errors of single image coordinates (n, 2) detectable with this power, px."""
         return self._of_image_points(self.fit.minimal_detectable_errors(alpha, power))
 
     def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> Array:
-        """What errors that are just not found do at most to any result (n, 2), in its standard deviations."""
+        """Return the largest effect of undetected errors on any result (n, 2), in its standard deviations."""
         return self._of_image_points(self.fit.external_lengths(alpha, power))
 
     @cached_property
     def scatter(self) -> tuple[Array, Array]:
-        """Sums of v²/σ² of x and y in each image (m, 2), and what is expected of them with true sigmas.
+        """Sums of v²/σ² of x and y in each image (m, 2), and their expectations for correct sigmas (m, 2).
 
-        That is the sum of the variances of the residuals over σ²: of the redundancy numbers, where x and y
-        are not correlated.
+        The expectation is the sum of the variances of the residuals over σ²: the sum of the redundancy
+        numbers, if x and y are uncorrelated.
         """
         cov = self.network.cov
         variance = np.diagonal(cov, axis1=1, axis2=2)
@@ -417,21 +418,21 @@ class Result(Display):
 
     @cached_property
     def variance_factors(self) -> Array:
-        """By what the sigmas given are too small, of x and y in each image (m, 2); NaN without redundancy.
+        """Factors by which the input sigmas of x and y in each image are too small (m, 2); NaN if unknown.
 
-        To first order: :func:`~reseau.bundle.modelling.components.estimate_components` iterates.
+        To first order; :func:`~reseau.bundle.estimate_components` iterates.
         """
         return _factors(*self.scatter)
 
     def rejected_names(self) -> tuple[list[str], list[str]]:
-        """Images and points of the image points that data snooping left out."""
+        """Return images and points of the image points that data snooping rejected."""
         rows = np.flatnonzero(self.rejected)
         images = [self.network.images[i] for i in self.network.image_of[rows]]
         return images, [self.network.points[j] for j in self.network.point_of[rows]]
 
     @cached_property
     def rejected_tests(self) -> Array:
-        """Test values of the image points left out, when they were, and their bounds (n, 2), or NaN."""
+        """Test values at rejection and critical values (n, 2) of rejected image points, otherwise NaN."""
         tests = np.full((len(self.network.xy), 2), np.nan)
         for step in self.steps:
             row = step.index[0] // 2

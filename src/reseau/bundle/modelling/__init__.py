@@ -1,4 +1,4 @@
-"""From a network to its result and to the calibrations of its cameras; the search for a model."""
+"""Adjustment of a network, search for a model, calibrations of the cameras."""
 
 from .adjustment import Options, adjust_network, problem_of
 from .calibration import calibration_of

@@ -1,4 +1,4 @@
-"""From a network to its result: approximate values, adjustment, search for blunders, remarks."""
+"""From a network to its result: approximate values, adjustment, detection of gross errors, warnings."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ..solver.values import Values
 
 __all__ = ["Options", "adjust_network", "problem_of"]
 
-# Weight below which a robust adjustment takes an observation for a blunder, and how exactly it is settled.
-_BLUNDER, _SETTLED = 0.2, 0.05
-# Sigma0 above which the control is asked whether it agrees with itself.
+# Weight of a robust adjustment below which an observation is a gross error, and tolerance of its iteration.
+_GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
+# Sigma0 above which control points and single observations are checked.
 _DOUBT = 3.0
-# With more observations than this the search for what may be wrong takes too long to do unasked.
+# Maximum number of observations for the search for gross errors, because of its computing time.
 _MANY = 50_000
-# Image points further off than this many times the median wait, and how often they are looked at again.
-_FAR_OFF, _TRIMS = 5.0, 5
+# Image points with misfits above this multiple of the median are left out at first; number of rounds.
+_TRIM_LIMIT, _TRIM_ROUNDS = 5.0, 5
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,18 @@ class Options:
     Parameters
     ----------
     outliers : {"keep", "reject"}
-        Whether image points are left out by data snooping, after a robust start. What is kept is named in the
-        warnings where its test values are too large.
+        Whether to reject image points by data snooping, after a robust start. With ``keep``, image points
+        with large test values are named in the warnings.
     alpha : float
-        Level of the single test of data snooping.
+        Significance level of a single test of data snooping.
     max_fraction : float
-        Part of the observations that may be left out.
+        Largest fraction of the observations that may be rejected.
     max_iterations : int
-        Corrections tried at most in one adjustment.
+        Maximum number of iterations of one adjustment.
     tolerance : float
         Relative offset at which the iteration has converged.
     watch : callable, optional
-        Told the number of corrections and vᵀPv after each.
+        Called with the number of iterations and vᵀPv after each iteration.
 
     Examples
     --------
@@ -68,13 +68,13 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.outliers not in ("keep", "reject"):
-            raise UsageError(f"is neither keep nor reject: {self.outliers!r}", where="Options.outliers")
+            raise UsageError(f"is {self.outliers!r}, not `keep` or `reject`", where="Options.outliers")
         if not 0 < self.alpha < 1 or not 0 < self.max_fraction < 1:
             raise UsageError("must be between 0 and 1", where="alpha and max_fraction")
 
 
 def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[Remark, ...]]:
-    """The network with approximate values, as a problem of :mod:`reseau.adjust`; and notes about them.
+    """Return the network with approximate values as a problem of :mod:`reseau.adjust`, and remarks.
 
     Examples
     --------
@@ -104,12 +104,12 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     network : Network
         Cameras, images, points, observations.
     options : Options, optional
-        How.
+        Options of the adjustment.
 
     Returns
     -------
     Result or Failure
-        A failure is falsy and says what the network lacks.
+        A failure is falsy and says what is missing or wrong.
 
     Notes
     -----
@@ -129,7 +129,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     problem, notes = problem_of(network, options)
     steps: tuple[SnoopingStep, ...] = ()
     if options.outliers == "reject":
-        found = _without_blunders(problem, options)
+        found = _without_gross_errors(problem, options)
         if isinstance(found, Failure):
             return _explained(found, problem)
         fit, steps = found
@@ -146,7 +146,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
 
 
 def _doubts(problem: BundleProblem) -> list[Remark]:
-    """What may be wrong with the observations where they fit badly."""
+    """Return remarks on control points and gross errors of a network that fits badly."""
     doubts = []
     control = doubtful_control(problem.network) if problem.network.datum == "control" else ""
     if control:
@@ -159,7 +159,7 @@ def _doubts(problem: BundleProblem) -> list[Remark]:
 
 
 def _suspects(problem: BundleProblem) -> list[str]:
-    """Image points to which a robust adjustment gives next to no weight, the worst first."""
+    """Image points with very small weights in a robust adjustment, the smallest first."""
     off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
     if isinstance(off, Failure):
         return []
@@ -167,22 +167,22 @@ def _suspects(problem: BundleProblem) -> list[str]:
     n = len(network.xy)
     weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
     rows = np.argsort(weight, kind="stable")
-    rows = rows[weight[rows] < _BLUNDER]
+    rows = rows[weight[rows] < _GROSS_ERROR]
     return [
         f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
     ]
 
 
-def _without_blunders(
+def _without_gross_errors(
     problem: BundleProblem, options: Options
 ) -> tuple[BundleFit, tuple[SnoopingStep, ...]] | Failure:
-    """Robust start, then data snooping with what leaves and comes back."""
+    """Adjust robustly, then by data snooping, which may restore rejected observations."""
     problem = _trimmed(problem)
-    begun = robust(problem, "huber", max_iterations=50, tolerance=_SETTLED)
-    if not isinstance(begun, Failure):
-        start = problem.continued(begun.adjustment)
-        heavy = np.where(begun.factors < _BLUNDER, 0.0, 1.0)
-        first = start.with_weights(heavy).adjusted()
+    first_fit = robust(problem, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
+    if not isinstance(first_fit, Failure):
+        start = problem.continued(first_fit.adjustment)
+        weights = np.where(first_fit.factors < _GROSS_ERROR, 0.0, 1.0)
+        first = start.with_weights(weights).adjusted()
         problem = start if isinstance(first, Failure) else start.continued(first)
     found = data_snooping(problem, options.alpha, "tau", options.max_fraction, groups=problem.groups)
     if isinstance(found, Failure):
@@ -191,23 +191,24 @@ def _without_blunders(
 
 
 def _trimmed(problem: BundleProblem) -> BundleProblem:
-    """The problem begun at the estimates of those image points that most others agree with.
+    """Return the problem with approximate values from the image points that agree with most others.
 
-    Least squares of all observations may not converge at all where a fifth of them is wrong. The approximate
-    values come from the largest sets that agree: those far off them wait until the estimates are better.
+    Least squares may not converge with many gross errors (a fifth of the observations). The approximate
+    values come from the largest consistent sets: image points far from them are left out until the estimates
+    improve.
     """
     n = len(problem.network.xy)
     out = np.ones(n, dtype=bool)
-    for _ in range(_TRIMS):
+    for _ in range(_TRIM_ROUNDS):
         v = problem.misfits_at_start()
         size = np.sqrt((v**2).sum(axis=1))
         if not np.isfinite(size).any():
             break
-        limit = _FAR_OFF * float(np.nanmedian(size))
-        further = ~(size <= limit)
-        if (further == out).all():
+        limit = _TRIM_LIMIT * float(np.nanmedian(size))
+        far = ~(size <= limit)
+        if (far == out).all():
             break
-        out, weights = further, np.ones(len(problem.observations))
+        out, weights = far, np.ones(len(problem.observations))
         weights[: 2 * n] = np.repeat(~out, 2)
         fit = problem.with_weights(weights).adjusted()
         if isinstance(fit, Failure):
@@ -217,7 +218,7 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
 
 
 def _explained(failure: Failure, problem: BundleProblem) -> Failure:
-    """A failure to converge, with the observations that look like blunders."""
+    """Add wrong control points or likely gross errors to the reason of a failure."""
     if failure.code is Code.NO_DATUM:
         return failure
     doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""

@@ -24,23 +24,23 @@ def calibration_of(
     provenance: Mapping[str, Any] | None = None,
     times: Mapping[str, str] | None = None,
 ) -> Calibration:
-    """The calibration of one camera: ``reseau-calibration/1``.
+    """Create the calibration of one camera, ``reseau-calibration/1``.
 
     Parameters
     ----------
     result : Result
-        Of the adjustment.
+        Result of the adjustment.
     camera : str
-        Its id in the network.
+        Id of the camera in the network.
     name : str
-        What the calibration is called.
+        Name of the calibration.
     provenance, times : mapping, optional
-        How it came about, and when.
+        Provenance and times of the calibration.
 
     Raises
     ------
     UsageError
-        When there is no such camera, or nothing of it was estimated.
+        When there is no such camera, or none of its parameters was estimated.
 
     Examples
     --------
@@ -52,12 +52,14 @@ def calibration_of(
     """
     ids = [entry.id for entry in result.network.cameras]
     if camera not in ids:
-        raise UsageError(f"is none of the cameras {', '.join(ids[:8])}", where=camera)
+        raise UsageError(
+            "is not a camera of the network", where=camera, do=f"name one of {', '.join(ids[:8])}"
+        )
     c = ids.index(camera)
     entry = result.network.cameras[c]
     names, _, values = result.camera_columns(c)
     if not names:
-        raise UsageError("was not estimated", where=f"camera {camera}")
+        raise UsageError("no parameter was estimated", where=f"camera {camera}")
     covariance = result.camera_covariance(c)
     sigma = np.sqrt(np.diag(covariance))
     parameters = {
@@ -89,7 +91,7 @@ def calibration_of(
 
 
 def _model(camera: Camera) -> CameraModel:
-    """What the parameters are parameters of."""
+    """Return the model entry of the calibration."""
     model: CameraModel = {
         "model": camera.model,
         "width": camera.width,

@@ -1,4 +1,4 @@
-"""Search for the model that the observations need: variance components, elimination of parameters."""
+"""Search for a model: variance components and elimination of parameters that are not significant."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ def search_model(
     components: Kind | None = None,
     level: float | None = None,
 ) -> Result | Failure:
-    """Adjust a network, with variance components and without parameters that are not needed.
+    """Adjust a network with variance components and without parameters that are not significant.
 
     Parameters
     ----------
     network : Network
-        What was observed.
+        Network to adjust.
     options : Options, optional
-        How to adjust.
+        Options of the adjustment.
     components : {"axes", "images", "cameras"}, optional
-        What gets a factor of its own on its standard deviations.
+        Groups of image coordinates with separate factors on their standard deviations; by default none.
     level : float, optional
-        Level of the tests by which distortion parameters are dropped.
+        Significance level of the tests by which distortion parameters are dropped; by default none is tested.
 
     Returns
     -------
     Result or Failure
-        The result says how its model was found. A failure when an adjustment fails, or the components do not
-        converge.
+        The result includes components, dropped parameters and cross-validation. A failure when an adjustment
+        fails or the components do not converge.
 
     Examples
     --------
@@ -78,7 +78,7 @@ def search_model(
     selection = eliminate_parameters(network, level, options)
     if isinstance(selection, Failure):
         return selection
-    # Blunders would drown what the models differ by: both predict what the better one has kept.
+    # Gross errors would hide the difference of the models: both predict the observations that were kept.
     kept = ~selection.result.rejected
     both = [cross_validation(one.select(kept), options=options) for one in (network, selection.network)]
     for value in both:
@@ -101,18 +101,18 @@ def estimate_components(
     Parameters
     ----------
     network : Network
-        With the covariances as far as they are known; the correlations of x and y stay.
+        Network with approximate covariances; correlations of x and y are kept.
     kind : {"axes", "images", "cameras"}
-        What has a factor of its own: `x` (columns) and `y` (rows), each image, or the images of each camera.
+        Groups with separate factors: `x` (columns) and `y` (rows), each image, or the images of each camera.
     options : Options, optional
-        How to adjust.
+        Options of the adjustment.
     used : ndarray of bool (n,), optional
-        Image points that count; by default all.
+        Image points to use; by default all.
 
     Returns
     -------
     VarianceComponents or Failure
-        See :func:`reseau.adjust.variance_components`; what else was observed keeps its standard deviation.
+        See :func:`reseau.adjust.variance_components`; other observations keep their standard deviations.
 
     Examples
     --------
@@ -137,7 +137,7 @@ def estimate_components(
         mask[: 2 * n] = own.ravel() & part
         if mask.any():
             masks[name] = mask
-    # Factors to a thousandth of their own standard deviations are exact enough, and many need them so.
+    # A thousandth of the standard deviations of the factors suffices; with many groups more would be slow.
     return variance_components(problem.continued(first), masks, tolerance=1e-5)
 
 
@@ -156,7 +156,7 @@ def _kinds(network: Network) -> dict[Kind, Callable[[], dict[str, Mask]]]:
 
 
 def reweighted(network: Network, found: VarianceComponents[BundleFit], kind: Kind) -> Network:
-    """The network with standard deviations multiplied by the factors found; correlations stay.
+    """Return the network with the factors applied to its standard deviations; correlations are kept.
 
     Examples
     --------
@@ -175,16 +175,16 @@ def reweighted(network: Network, found: VarianceComponents[BundleFit], kind: Kin
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """A network with the parameters its observations ask for; truthy.
+    """A network without the parameters that are not significant; truthy.
 
     Parameters
     ----------
     network : Network
-        With the others held at zero.
+        Network with the dropped parameters held at zero.
     result : Result
-        Its adjustment.
+        Result of its adjustment.
     steps : tuple of Eliminated
-        In the order in which they were dropped.
+        Dropped parameters in order.
 
     Examples
     --------
@@ -205,18 +205,18 @@ class Selection:
 def eliminate_parameters(
     network: Network, alpha: float = 0.05, options: Options | None = None
 ) -> Selection | Failure:
-    """Drop the least significant distortion, adjust again, and so on until all that remain are significant.
+    """Drop the least significant distortion parameter and adjust again, until all are significant.
 
-    Additional parameters are dropped one by one too, of each set by itself.
+    Additional parameters are dropped in the same way, separately for each set.
 
     Parameters
     ----------
     network : Network
-        With all parameters that may be needed.
+        Network with all parameters that may be needed.
     alpha : float
-        Level of each test.
+        Significance level of each test.
     options : Options, optional
-        How to adjust.
+        Options of the adjustment.
 
     Returns
     -------
@@ -271,25 +271,31 @@ def _without(camera: Camera, name: str) -> Camera:
 def cross_validation(
     network: Network, folds: int = 5, seed: int = 0, options: Options | None = None
 ) -> float | Failure:
-    """Root mean square of image coordinates predicted without them, in their standard deviations.
+    """Compute the root mean square error of predicted image coordinates, in their standard deviations.
 
-    A model with parameters that are not needed predicts worse, although it fits better.
+    Each part of the image points is predicted by an adjustment without it. A model with unnecessary
+    parameters predicts worse, although it fits better.
 
     Parameters
     ----------
     network : Network
-        To be adjusted.
+        Network to adjust.
     folds : int
-        Parts of the image points, each left out once.
+        Number of parts of the image points, each left out once.
     seed : int
-        Of the division.
+        Seed of the random division.
     options : Options, optional
-        How to adjust.
+        Options of the adjustment.
+
+    Returns
+    -------
+    float or Failure
+        A failure when an adjustment fails or no image point can be predicted.
 
     Raises
     ------
     UsageError
-        For less than two folds.
+        For fewer than two folds.
 
     Examples
     --------
@@ -298,7 +304,7 @@ def cross_validation(
     1.3
     """
     if folds < 2:
-        raise UsageError(f"{folds} folds leave nothing to adjust", where="cross_validation")
+        raise UsageError(f"{folds} is too few: at least two are required", where="folds")
     problem, _ = problem_of(network, options)
     n = len(network.xy)
     part = np.random.default_rng(seed).permutation(n) % folds
@@ -317,5 +323,5 @@ def cross_validation(
     return (
         float(np.sqrt(squares / count))
         if count
-        else Failure("no point could be predicted without its image", Code.NO_REDUNDANCY)
+        else Failure("no image point could be predicted", Code.NO_REDUNDANCY)
     )

@@ -1,4 +1,4 @@
-"""What is adjusted: cameras, images, points and their observations, in columns."""
+"""The network: cameras, images, points and their observations, in columns."""
 
 from .calibrated import calibrated_camera, film_camera
 from .example import example_network

@@ -17,26 +17,26 @@ from .network import Camera
 __all__ = ["calibrated_camera", "film_camera"]
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional")
-"""Keys of the model in a calibration; the others are options of the camera model."""
+"""Keys of `Calibration.model` for every camera; all others are options of the camera model."""
 
 
 def calibrated_camera(name: str, calibration: Calibration, *, held: bool = False) -> Camera:
-    """Return the camera of a calibration for use in another network.
+    """Return the camera of a calibration for use in a network.
 
     Parameters
     ----------
     name : str
         Id of the camera in the network.
     calibration : Calibration
-        Of a camera.
+        Calibration of a camera.
     held : bool
-        Whether its parameters are held. Otherwise those that it estimated are observations with their joint
-        covariance, and are estimated again.
+        Whether all parameters are held. Otherwise those that the calibration estimated are observations with
+        their joint covariance and are estimated again.
 
     Raises
     ------
     UsageError
-        When it is no calibration of a camera.
+        When `calibration` is of another kind.
 
     Examples
     --------
@@ -55,11 +55,13 @@ def calibrated_camera(name: str, calibration: Calibration, *, held: bool = False
     model = cast(dict[str, Any], calibration.model)
     names, covariance = mapping.mapping.names, np.zeros((len(mapping.mapping.names),) * 2)
     covariance[np.ix_(mapping.rows, mapping.rows)] = mapping.covariance
-    # A camera with additional parameters has values of its own for them: a mapping of all parameters.
+    # With additional parameters, the mapping of the calibration contains all parameters.
     whole = model.get("additional") is not None
     own = () if whole else camera_model(model["model"]).names
     if own and tuple(names) != tuple(own):
-        raise UsageError("has other parameters than its model", where=f"calibration {calibration.name}")
+        raise UsageError(
+            "has parameters that do not match its model", where=f"calibration {calibration.name}"
+        )
     return Camera(
         id=name,
         width=mapping.width,
@@ -80,7 +82,7 @@ def film_camera(camera: Camera, frame: Calibration | FrameOrientation, *, held: 
     Parameters
     ----------
     camera : Camera
-        Gives all other parameters, the principal distance among them; its width and height are those of the
+        Camera with all other parameters, including the principal distance; width and height are those of the
         scan.
     frame : Calibration or FrameOrientation
         The inner orientation of the frame.
@@ -90,15 +92,15 @@ def film_camera(camera: Camera, frame: Calibration | FrameOrientation, *, held: 
     Raises
     ------
     UsageError
-        When the model of the camera has no size of a pixel, the scan is mirrored or has another size, or
-        `frame` is no calibration of a film frame.
+        When the camera model is not defined in millimetres, the scan is mirrored or has another size, or
+        `frame` is a calibration of another kind.
     FormatError
-        When the frame was declined.
+        When the orientation of the frame was declined.
 
     Notes
     -----
-    The origin of the photo-coordinates is the principal point. The size of a pixel is the length in the frame
-    of a step of one column and of one row, so that the frame may be turned in the scan.
+    The principal point is the origin of the photo-coordinates. The pixel size is the length in the frame of
+    one step along a row and along a column of the scan; the frame may be rotated in the scan.
 
     Examples
     --------
@@ -123,17 +125,18 @@ def film_camera(camera: Camera, frame: Calibration | FrameOrientation, *, held: 
     centre = () if model is None else model.of_role("centre")
     if model is None or not model.needs_pitch or len(centre) != 2:
         raise UsageError(
-            f"has the model `{camera.model}`, which takes no size of a pixel from a film frame", where=where
+            f"the model `{camera.model}` is not defined in millimetres and cannot use a film frame",
+            where=where,
         )
     mapping.check_size(camera.width, camera.height, where)
     xy = mapping.to_pixels(np.zeros((1, 2)))
     _, linear, by_parameters = (values[0] for values in mapping.derivatives(xy))
     if np.linalg.det(linear) > 0:
-        raise UsageError("has a film frame scanned from the wrong side", where=where, do="mirror the scan")
+        raise UsageError("the film frame was scanned from the wrong side", where=where, do="mirror the scan")
     inverse = np.linalg.inv(linear)
     cov: Array = inverse @ by_parameters @ mapping.parameter_covariance @ by_parameters.T @ inverse.T
     if isinstance(frame, FrameOrientation) and frame.transform is None and frame.principal_point is not None:
-        # The corners in the document are without the correlations that the principal point contains.
+        # The document has no correlations between corners; its principal point takes them into account.
         point = frame.principal_point
         xy, mixed = np.array([[point.x, point.y]]), point.rho * point.sx * point.sy
         cov = np.array([[point.sx**2, mixed], [mixed, point.sy**2]])

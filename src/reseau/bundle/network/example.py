@@ -1,4 +1,4 @@
-"""A small synthetic network, to try the package out and for the examples of its documentation."""
+"""A small synthetic network for examples and first trials."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def example_network(noise_px: float = 0.05, seed: int = 0) -> Network:
 
 
 def _towards(x0: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
-    """Rotation of a camera at x0 that is directed to a target, rolled about its axis."""
+    """Rotation of a camera at x0 that looks at a target, with a roll about its axis."""
     z = (target - x0) / np.linalg.norm(target - x0)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""The network: cameras, images, points and what was observed of them, in columns."""
+"""The network: cameras, images, points and their observations, in columns."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite
 
 Datum = Literal["control", "minimal", "free"]
 
-# An image has six unknowns: three points.
+# An image has six unknowns: at least three points are needed.
 _LEAST_POINTS = 3
 
 
@@ -37,9 +37,9 @@ class Additional:
     free : bool
         Whether they are estimated; otherwise they are zero.
     per : {"camera", "group", "image"}
-        What has a set of its own.
+        Whether the camera, each group or each image has its own set.
     dropped : frozenset of str
-        Those that stay zero, as a result names them: ``b3``, or ``b3 of group G`` of a set per group.
+        Parameters held at zero, as named in results: ``b3``, or ``b3 of group G`` for a set per group.
     model : str
         Name in the registry, :func:`reseau.optics.additional_models`.
 
@@ -65,7 +65,7 @@ class Additional:
         return self.names[k] if self.per == "camera" else f"{self.names[k]} of {label}"
 
     def mapping(self, values: ArrayLike | None = None) -> PlaneMapping:
-        """The correction of photo-coordinates (mm) by a set; with values of zero by default."""
+        """Return the correction of photo-coordinates (mm) by a set; all values are zero by default."""
         given = np.zeros(len(self.names)) if values is None else np.asarray(values, dtype=np.float64)
         return additional_model(self.model).build(given, self.base_mm)
 
@@ -81,24 +81,24 @@ class Camera:
     width, height : int
         Pixels of the image.
     pitch_mm : (float, float)
-        Size of a pixel; without meaning for models whose parameters are in pixels.
+        Pixel size; not used by models whose parameters are in pixels.
     model : str
         Name in the registry, :func:`reseau.optics.camera_models`; ``mapping`` for any other mapping.
     values : ndarray (u,)
         All parameters of the model, in its order; those of the mapping where there is one.
     free : tuple of str
-        Those to be estimated.
+        Parameters to estimate.
     options : mapping of str to str or float
-        Options of the model, as the side of Brown's distortion; others have their defaults.
+        Options of the model, such as the side of Brown's distortion; others have their defaults.
     sigma : mapping of str to float
-        Standard deviations of those whose values are observations.
+        Standard deviations of free parameters whose values are observations.
     additional : Additional, optional
         Additional parameters.
     mapping : PlaneMapping, optional
-        From ideal directions to pixels, for a camera of no registered model.
+        From ideal directions to pixels, for a camera without a registered model.
     covariance : ndarray (u, u), optional
-        Joint covariance of all parameters, where the values are those of an earlier calibration: free
-        parameters with a variance above zero are observed. In place of `sigma`.
+        Joint covariance of all parameters, for values from an earlier calibration: free parameters with a
+        positive variance are observations. Replaces `sigma`.
 
     Examples
     --------
@@ -125,13 +125,13 @@ class Camera:
     def __post_init__(self) -> None:
         if (self.model == "mapping") != (self.mapping is not None):
             raise UsageError(
-                "the model `mapping` needs a mapping, other models have none", where=f"camera {self.id}"
+                "`mapping` must be given for the model `mapping`, and only for it", where=f"camera {self.id}"
             )
         given = {} if self.registered is None else self.registered.checked_options(self.options)
         object.__setattr__(self, "options", given)
         if self.additional is not None and (self.registered is None or self.registered.combine is None):
             raise UsageError(
-                f"the model `{self.model}` takes no additional parameters", where=f"camera {self.id}"
+                f"the model `{self.model}` does not support additional parameters", where=f"camera {self.id}"
             )
         if len(self.values) != len(self.names):
             raise UsageError(
@@ -162,7 +162,7 @@ class Camera:
 
     @property
     def label(self) -> str:
-        """Name in a sentence."""
+        """Name for messages."""
         return self.id if self.id == "camera" else f"camera {self.id}"
 
     @property
@@ -172,12 +172,12 @@ class Camera:
 
     @property
     def distortions(self) -> tuple[str, ...]:
-        """Names of the parameters that are not principal distance, focal length or principal point."""
+        """Names of the distortion parameters."""
         return distortion_names(self.names, self.model)
 
     @property
     def compiled_kind(self) -> tuple[str, str | None] | None:
-        """Model and additional parameters of the compiled loops; None where the mapping is used."""
+        """Model and additional parameters for the compiled loops; None where the mapping is used."""
         model = self.registered
         if model is None or model.kernel is None:
             return None
@@ -185,19 +185,19 @@ class Camera:
 
     @property
     def constants(self) -> Array:
-        """What the kernel of the model needs of the options (q,)."""
+        """Option values for the kernel of the model (q,)."""
         model = self.registered
         return np.zeros(0) if model is None else np.asarray(model.constants(self.options), dtype=np.float64)
 
     def bare_mapping(self, values: ArrayLike | None = None, *, distorted: bool = True) -> PlaneMapping:
-        """The mapping from ideal directions to pixels, without additional parameters.
+        """Return the mapping from ideal directions to pixels, without additional parameters.
 
         Parameters
         ----------
         values : array_like (u,), optional
-            Instead of those of the camera.
+            Replace the values of the camera.
         distorted : bool
-            Whether with distortion; otherwise its parameters are zero. Any other mapping stays as it is.
+            Whether to include distortion; an unregistered mapping is never changed.
         """
         given = self.values if values is None else np.asarray(values, dtype=np.float64)
         model = self.registered
@@ -206,12 +206,12 @@ class Camera:
         return model.mapping(given if distorted else model.undistorted(given), self.grid, self.options)
 
     def plane_mapping(self) -> PlaneMapping:
-        """The mapping from ideal directions to pixels, with additional parameters of zero where it has them.
+        """Return the mapping from ideal directions to pixels; additional parameters are zero.
 
         Raises
         ------
         UsageError
-            When it has additional parameters and the mapping with them has no closed form.
+            When the mapping with additional parameters has no closed form.
         """
         if self.additional is None:
             return self.bare_mapping()
@@ -226,7 +226,7 @@ class Camera:
 
     @property
     def has_plane_mapping(self) -> bool:
-        """Whether :meth:`plane_mapping` has one; a camera with several sets of parameters has not."""
+        """Whether :meth:`plane_mapping` is defined; not for cameras with several sets of parameters."""
         extra, model = self.additional, self.registered
         if extra is None or model is None or model.combine is None:
             return True
@@ -234,7 +234,7 @@ class Camera:
 
     @classmethod
     def from_entry(cls, entry: CameraEntry) -> Self:
-        """The camera of an entry in ``reseau-network/1``; parameters not named there are zero."""
+        """Create the camera of an entry in ``reseau-network/1``; missing parameters are zero."""
         model, extra = camera_model(entry.model), entry.additional
         return cls(
             id=entry.id,
@@ -273,7 +273,7 @@ class Network(Display):
     sigma : ndarray (p, 3)
         0 holds a coordinate, NaN leaves it free, otherwise it is an observation.
     role : tuple of {"tie", "control", "check"} (p,)
-        What each point is for; check points are estimated and compared.
+        Use of each point; check points are estimated and compared with their coordinates.
     image_of, point_of : ndarray of int (n,)
         Image and point of each image observation.
     xy : ndarray (n, 2)
@@ -285,17 +285,18 @@ class Network(Display):
     distance : ndarray (d, 2)
         Distances and their standard deviations.
     datum : {"control", "minimal", "free"}
-        Where position, orientation and scale come from.
+        What defines position, orientation and scale.
     datum_points : ndarray of bool (p,)
-        For inner constraints.
+        Points of the inner constraints of a free network.
     groups : tuple of (str or None) (m,)
         Group of each image, for parameters per group.
     files : tuple of (str or None) (m,)
         File of each image.
     unit : str
-        Of object space; a label.
+        Unit of object space; a label.
     stage : Stage, optional
-        That moved the field between images which share their exterior orientation; needs control.
+        Stage that moved the field between images with the same exterior orientation; requires the datum
+        ``control``.
 
     Examples
     --------
@@ -344,7 +345,7 @@ class Network(Display):
         if not len(self.role) == p or not len(self.groups) == len(self.files) == m:
             raise UsageError("columns differ in length", where="Network")
         if self.stage is not None and (self.datum != "control" or len(self.stage.pose) != m):
-            raise UsageError("needs control, and a pose for each image", where="Network.stage")
+            raise UsageError("requires the datum `control` and a pose for each image", where="Network.stage")
 
     @classmethod
     def from_document(cls, document: Network1, calibrated: Mapping[str, Camera] | None = None) -> Self:
@@ -355,18 +356,18 @@ class Network(Display):
         document : Network1
             The document.
         calibrated : mapping of str to Camera, optional
-            Cameras by their id, in place of those of the document; needed for those that name a calibration,
-            see :func:`~reseau.bundle.calibrated_camera`.
+            Cameras by id that replace those of the document; required for entries that name a calibration,
+            see :func:`~reseau.bundle.calibrated_camera` and :func:`~reseau.bundle.film_camera`.
 
         Raises
         ------
         UsageError
-            When a camera that names a calibration is not given, or one is given that the document has not.
+            When a camera that names a calibration is missing, or a given camera is not in the document.
         """
         given = calibrated or {}
         for name in given:
             if name not in [entry.id for entry in document.cameras]:
-                raise UsageError("is no camera of the network", where=name)
+                raise UsageError("is not a camera of the network", where=name)
         cameras = tuple(_camera(entry, given) for entry in document.cameras)
         images, points, seen = document.images, document.points, document.observations
         camera_row = {camera.id: i for i, camera in enumerate(cameras)}
@@ -440,7 +441,7 @@ class Network(Display):
         return finite(self.x0) & finite(self.rotation)
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> Self:
-        """Return the network with other cameras in place of those with these ids.
+        """Return the network with some cameras replaced, by id.
 
         Raises
         ------
@@ -450,11 +451,11 @@ class Network(Display):
         known = [camera.id for camera in self.cameras]
         for name in cameras:
             if name not in known:
-                raise UsageError("is no camera of the network", where=name)
+                raise UsageError("is not a camera of the network", where=name)
         return replace(self, cameras=tuple(cameras.get(camera.id, camera) for camera in self.cameras))
 
     def select(self, observations: Mask) -> Self:
-        """The same network with some of the image observations (n,)."""
+        """Return the network with a selection of the image observations (n,)."""
         return replace(
             self,
             image_of=self.image_of[observations],
@@ -466,7 +467,7 @@ class Network(Display):
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Points whose coordinates are known.
+    """Points with known coordinates.
 
     Parameters
     ----------
@@ -492,16 +493,16 @@ class ControlPoints:
 
 @dataclass(frozen=True, eq=False)
 class Usable:
-    """What takes part in an adjustment.
+    """Observations, images and points that are used in an adjustment.
 
     Parameters
     ----------
     observations : ndarray of bool (n,)
         Image coordinates.
     images : ndarray of bool (m,)
-        Images with three points at least, whose pose is known approximately.
+        Images with at least three points and an approximate pose.
     points : ndarray of bool (p,)
-        Points with rays enough for their unknown coordinates, known approximately.
+        Points with enough rays for their unknown coordinates and with approximate coordinates.
     """
 
     observations: Mask
@@ -510,14 +511,14 @@ class Usable:
 
 
 def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
-    """What of a network can be adjusted.
+    """Select what can be adjusted.
 
     Parameters
     ----------
     network : Network
         The network.
     counted : ndarray of bool (n,)
-        Image coordinates that have a weight.
+        Image points with positive weights.
     x0 : ndarray (m, 3)
         Approximate projection centres, NaN where a pose is not known.
     xyz : ndarray (p, 3)
@@ -525,8 +526,8 @@ def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
 
     Notes
     -----
-    A ray gives two equations, but two rays are needed for three unknown coordinates. Whatever has too few is
-    left out with its rays, and so on until all that remains has enough.
+    Two rays are needed for three unknown coordinates, one ray for at most two. Points and images with too few
+    rays are removed together with their rays, repeatedly until all that remain have enough.
     """
     images, points = finite(x0), finite(xyz)
     unknown = (~network.held & ~network.observed).sum(axis=1)
@@ -543,7 +544,7 @@ def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
 
 
 def finite(rows: Array) -> Mask:
-    """Rows (k,) of an array (k, …) that hold finite numbers alone."""
+    """Return which rows (k,) of an array (k, …) contain only finite numbers."""
     return np.asarray(np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))), dtype=np.bool_)
 
 

@@ -1,7 +1,7 @@
-"""A stage that moves the field along a straight line: images of one pose share their exterior orientation.
+"""A stage that moves the field along a straight line between images with one exterior orientation.
 
-At a reading s the field is moved by s along the unit vector d of the stage's axis, the same in all
-poses; a camera at X0 sees it as one at X0 − s d sees the field at rest:
+At a reading s the field is shifted by s along the unit vector d of the stage axis, which is the same in all
+poses. A camera at X0 images the shifted field as a camera at X0 − s d images the field at rest:
 
     x_c = R (X + s d − X0).
 
@@ -39,7 +39,7 @@ class Stage:
     Parameters
     ----------
     pose : ndarray of int (m,)
-        Pose of each image; those of one pose share their exterior orientation.
+        Pose of each image; images with the same pose have the same exterior orientation.
     reading : ndarray (m,)
         Displacement of the field in each image, in the unit of object space.
     sigma : float
@@ -68,12 +68,14 @@ class Stage:
     def __post_init__(self) -> None:
         for name, sigma in (("reading", self.sigma), ("axis", self.axis_sigma)):
             if not 0 < sigma < np.inf:
-                raise UsageError("must be larger than 0", where=f"standard deviation of a stage's {name}")
+                raise UsageError(
+                    "must be larger than 0", where=f"standard deviation of the {name} of a stage"
+                )
         if self.pose.shape != self.reading.shape:
-            raise UsageError("needs a pose and a reading of every image", where="Stage")
+            raise UsageError("requires a pose and a reading for every image", where="Stage")
 
     def approximate(self, rotation: Array, x0: Array) -> tuple[StageValues, Array, Array]:
-        """Approximate values with one orientation per pose: that of its first image with a known pose."""
+        """Approximate values; each pose takes the orientation of its first image with a known pose."""
         rotation, x0 = rotation.copy(), x0.copy()
         moved = StageValues(self.reading, self.axis / np.linalg.norm(self.axis))
         for pose in np.unique(self.pose):
@@ -86,7 +88,7 @@ class Stage:
 
 
 def perpendicular(axis: Array) -> Array:
-    """Two unit vectors at right angles to a third and to each other, as columns (3, 2)."""
+    """Return two unit vectors perpendicular to an axis and to each other, as columns (3, 2)."""
     start = np.eye(3)[int(np.argmin(np.abs(axis)))]
     one = np.cross(axis, start)
     one /= np.linalg.norm(one)

@@ -1,4 +1,4 @@
-"""How a network is adjusted: normal equations with the points eliminated, iteration, cofactors, datum."""
+"""The solver: normal equations with the points eliminated, iteration, cofactors, datum."""
 
 from .approximation import Approximate, approximate
 from .problem import BundleFit, BundleProblem

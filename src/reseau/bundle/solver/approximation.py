@@ -1,4 +1,4 @@
-"""Approximate values by themselves: resection, relative orientation, and growing of the block."""
+"""Approximate values from the observations alone: resection, relative orientation, growing of the block."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from .values import Values
 
 __all__ = ["Approximate", "approximate"]
 
-# Misfit of an ideal direction that is no blunder while distortion and principal distance are hardly known.
+# Largest misfit of an ideal direction that is not a gross error while distortion and principal distance are
+# only roughly known.
 _LOOSE = 0.03
-# Angle (rad) at which rays must cut before their point helps to orient another image.
+# Minimum intersection angle (rad) of the rays of a point that is used to orient another image.
 _CUT = 0.03
+# Pairs of images tried as the first pair.
 _PAIRS = 12
-# A ray this many times further off than most is a blunder.
+# A ray with a misfit this many times the median is a gross error.
 _FAR = 20.0
 
 
@@ -40,7 +42,7 @@ class Approximate:
     xyz : ndarray (p, 3)
         Points, NaN likewise.
     notes : tuple of Remark
-        How they were found, where that matters.
+        Warnings about the approximate values.
 
     Examples
     --------
@@ -57,19 +59,19 @@ class Approximate:
 
 
 def approximate(network: Network) -> Approximate:
-    """Approximate values of all poses and points that can be had.
+    """Compute approximate values of poses and points.
 
     Parameters
     ----------
     network : Network
-        With what is known of poses and coordinates.
+        The network, with known poses and coordinates.
 
     Returns
     -------
     Approximate
-        Poses as given, or by resection from known points and points intersected before, or, where nothing is
-        known, grown from the pair of images with the most points at the best angles and carried onto the
-        control by a similarity.
+        Given poses are kept. Others are resected from known and intersected points. Where nothing is known,
+        the block grows from the pair of images with the most points and the best intersection angles, and is
+        transformed to the control points by a similarity.
 
     Examples
     --------
@@ -81,7 +83,7 @@ def approximate(network: Network) -> Approximate:
 
 
 class _Block:
-    """A block that grows image by image."""
+    """A block to which images are added one by one."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -101,7 +103,7 @@ class _Block:
         return finite(self.x0)
 
     def grown(self) -> Approximate:
-        """The block as far as it grows."""
+        """Return all poses and points that can be computed."""
         known, notes = self.known.copy(), list[Remark]()
         if not self.posed.any():
             self._resect_all()
@@ -109,9 +111,9 @@ class _Block:
             control = self.xyz.copy()
             self.rotation[:], self.x0[:], self.xyz[:] = np.nan, np.nan, np.nan
             self.known = np.zeros(len(self.xyz), dtype=bool)
-            if self._begin_with_a_pair():
+            if self._orient_first_pair():
                 self._grow()
-                notes += self._onto(control, known)
+                notes += self._transform_to(control, known)
             else:
                 self.known, self.xyz = known, control
         self._grow()
@@ -120,14 +122,14 @@ class _Block:
         return Approximate(self.rotation, self.x0, xyz, tuple(notes))
 
     def _grow(self) -> None:
-        """Intersect points and resect images in turn, until neither gives more."""
+        """Intersect points and resect images in turn until nothing is added."""
         while True:
             self._intersect_all()
             if self.posed.all() or not self._resect_all():
                 return
 
     def _intersect_all(self) -> None:
-        """Points of two oriented images or more, those with known coordinates apart."""
+        """Intersect the points of two or more oriented images, except points with known coordinates."""
         network = self.network
         rows = self.posed[network.image_of] & ~self.known[network.point_of] & finite(self.uv)
         image, point = network.image_of[rows], network.point_of[rows]
@@ -148,19 +150,19 @@ class _Block:
         self.angle = np.where(self.known, np.pi / 2, angle)
 
     def _misfit(self, image: Rows, point: Rows, uv: Array, xyz: Array) -> Array:
-        """Distance of the directions of points from those measured; infinite behind the camera."""
+        """Distances between computed and measured directions; infinite behind the camera."""
         x = np.einsum("nij,nj->ni", self.rotation[image], xyz[point] - self.x0[image])
         with np.errstate(divide="ignore", invalid="ignore"):
             off: Array = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
         return np.where(x[:, 2] > 0, off, np.inf)
 
     def _resect_all(self) -> bool:
-        """Orient every image that sees four known points; whether any was."""
+        """Orient every image with at least four known points; return whether any was oriented."""
         network, before = self.network, int(self.posed.sum())
         usable = finite(self.xyz)
         if before:
             usable &= self.angle > _CUT
-        # Those with the most points first, and only those near as good: the next round has better points.
+        # Only images with many points: in the next round the points are better determined.
         count = np.bincount(network.image_of[usable[network.point_of]], minlength=len(network.images))
         waiting = np.flatnonzero(~self.posed & (count >= 4))
         waiting = waiting[count[waiting] >= 0.5 * count[waiting].max(initial=0)]
@@ -178,7 +180,7 @@ class _Block:
         return int(self.posed.sum()) > before
 
     def _resect_one_by_one(self, usable: Mask, count: Rows) -> bool:
-        """When the best images fail: the others."""
+        """Orient one of the other images when those with the most points fail."""
         network = self.network
         for i in np.flatnonzero(~self.posed & (count >= 4)):
             rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
@@ -188,8 +190,8 @@ class _Block:
                 return True
         return False
 
-    def _begin_with_a_pair(self) -> bool:
-        """Orient two images relative to each other; those of many points that cut at the widest angles."""
+    def _orient_first_pair(self) -> bool:
+        """Orient the pair of images with many common points and the largest intersection angles."""
         network = self.network
         n = len(network.image_of)
         sees = scipy.sparse.csr_array(
@@ -198,7 +200,7 @@ class _Block:
         )
         common = scipy.sparse.triu(scipy.sparse.coo_array(sees @ sees.T), k=1)
         order = np.argsort(-common.data, kind="stable")
-        # Neighbours share the most points and have the shortest bases: look further down the list too.
+        # Neighbours have the most common points but the shortest bases: try pairs with fewer points as well.
         good = order[: max(1, int((common.data >= 0.3 * common.data.max(initial=0)).sum()))]
         picked = good[np.unique(np.linspace(0, len(good) - 1, _PAIRS).astype(int))] if len(good) else good
         best, score = None, 0.0
@@ -215,7 +217,7 @@ class _Block:
         return True
 
     def _pair(self, a: int, b: int) -> tuple[float, Array, Array] | None:
-        """How good a pair is, and its relative orientation."""
+        """Return the score of a pair and its relative orientation."""
         network = self.network
         in_a, in_b = np.flatnonzero(network.image_of == a), np.flatnonzero(network.image_of == b)
         _, left, right = np.intersect1d(
@@ -234,12 +236,12 @@ class _Block:
         score = float(agree.sum()) * min(float(np.median(angle[agree])), 0.5) if agree.any() else 0.0
         return score, found.rotation, found.x0
 
-    def _onto(self, control: Array, known: Mask) -> list[Remark]:
-        """Carry the block onto the known points; says so where it cannot be."""
+    def _transform_to(self, control: Array, known: Mask) -> list[Remark]:
+        """Transform the block to the known points; return a remark where they are too few."""
         common = known & finite(self.xyz)
         if common.sum() < 3:
             self.known = np.zeros(len(known), dtype=bool)
-            text = "too few known points in the block to place it in their system"
+            text = "too few known points in the block to transform it to their coordinate system"
             return [Remark(text, Code.TOO_FEW_POINTS)] if known.any() else []
         nothing = np.zeros((1, 12))
         values = Values(self.rotation, self.x0, self.xyz, nothing, nothing)

@@ -1,4 +1,4 @@
-"""Factorisation of an arrow: a band, and full rows below it (or full rows alone)."""
+"""Factorisation of an arrow matrix: a band with full rows below it, or only full rows."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["Arrow", "Singular", "full"]
 
 
 class Singular(Exception):
-    """The matrix is not positive definite to rounding."""
+    """The matrix is numerically not positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """Cholesky factors of a symmetric positive definite arrow.
+    """Cholesky factors of a symmetric positive definite arrow matrix.
 
     Parameters
     ----------
@@ -27,9 +27,9 @@ class Arrow:
     coupling : ndarray (b, r)
         L⁻¹ times the columns of the full rows.
     corner : ndarray (r, r)
-        Factor of what the full rows leave.
+        Factor of the Schur complement of the full rows.
     scale : ndarray (u,)
-        Factors that made the diagonal one.
+        Scale factors that give a unit diagonal.
     """
 
     band: Array
@@ -39,19 +39,19 @@ class Arrow:
 
     @classmethod
     def factorise(cls, band: Array, border: Array) -> Arrow:
-        """Factorise; the arrays are overwritten.
+        """Factorise an arrow matrix; the arrays are overwritten.
 
         Parameters
         ----------
         band : ndarray (b, w + 1)
             Lower triangle of the band, column by column.
         border : ndarray (r, b + r)
-            The full rows; of the corner only the lower triangle is read.
+            The full rows; only the lower triangle of the corner is read.
 
         Raises
         ------
         Singular
-            When it is not positive definite.
+            When the matrix is not positive definite.
         """
         b, r = len(band), len(border)
         diagonal = np.concatenate([band[:, 0], np.diagonal(border[:, b:])])
@@ -79,7 +79,7 @@ class Arrow:
         return cls(lower, coupling, corner, scale)
 
     def solve(self, sides: Array) -> Array:
-        """The matrix's inverse times right-hand sides (u,) or (u, s)."""
+        """Return the inverse of the matrix times right-hand sides (u,) or (u, s)."""
         b = len(self.band)
         x = (sides.T * self.scale).T
         head, tail = x[:b], x[b:]
@@ -93,11 +93,11 @@ class Arrow:
         return solved
 
     def inverse(self) -> Array:
-        """The inverse, (u, u)."""
+        """Return the inverse (u, u)."""
         if len(self.band):
             u = len(self.scale)
             whole = np.empty((u, u))
-            # In pieces: the right-hand sides of a large block need not all stand in memory at once.
+            # In pieces, so that not all right-hand sides of a large block are in memory at once.
             for begin in range(0, u, 512):
                 unit = np.zeros((u, min(512, u - begin)))
                 unit[np.arange(begin, begin + unit.shape[1]), np.arange(unit.shape[1])] = 1.0
@@ -112,13 +112,13 @@ class Arrow:
 
     @property
     def weakest(self) -> float:
-        """Square of the least pivot of the matrix scaled to ones; near rounding it is singular."""
+        """Square of the smallest pivot of the matrix with unit diagonal; tiny for a singular matrix."""
         pivots = np.concatenate([self.band[:, 0], np.diagonal(self.corner)])
         return float(pivots.min(initial=1.0) ** 2)
 
 
 def full(band: Array, border: Array) -> Array:
-    """An arrow as a full symmetric matrix."""
+    """Return an arrow matrix as a full symmetric matrix."""
     b, u = len(band), len(band) + len(border)
     full = np.zeros((u, u))
     for k in range(band.shape[1] if b else 0):

@@ -1,7 +1,7 @@
-"""Loops over observations, compiled, and spread over the processors.
+"""Compiled loops over observations, in parallel threads.
 
-Whole-array NumPy makes a new array for every product; over a hundred thousand image points that costs ten
-times the arithmetic (``docs/decisions/0002-numba.md``).
+Whole-array NumPy allocates an array for every product; for a hundred thousand image points that takes ten
+times as long as the arithmetic (``docs/decisions/0002-numba.md``).
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ __all__ = ["chunks_of", "compiled", "in_parallel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Sums are formed in this many parts whatever the number of processors, so that results do not depend on it.
+# Sums are formed in this many parts for any number of processors, so that results do not depend on it.
 _PARTS = 4
-# Below this many observations a part is not worth a thread.
-_LEAST = 2000
+# Minimum number of observations in a part.
+_PART_SIZE = 2000
 
 
 def compiled(function: F) -> F:
-    """A function compiled at its first call, kept on disk, that does not hold the interpreter's lock."""
+    """Compile a function at its first call, cached on disk, without the global interpreter lock."""
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def chunks_of(starts: Rows) -> list[tuple[int, int]]:
-    """Ranges of groups of about as many observations each.
+    """Divide groups into ranges with about the same number of observations.
 
     Parameters
     ----------
     starts : ndarray of int (g + 1,)
-        Where the observations of each group begin.
+        First observation of each group, and the total.
     """
     groups, total = len(starts) - 1, int(starts[-1])
-    parts = min(_PARTS, max(1, total // _LEAST))
+    parts = min(_PARTS, max(1, total // _PART_SIZE))
     bounds = np.searchsorted(starts, np.linspace(0, total, parts + 1)[1:-1])
     edges = [0, *bounds.tolist(), groups]
     return [(a, b) for a, b in pairwise(edges) if b > a]
@@ -54,14 +54,14 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def processors() -> int:
-    """Processors this process may use, eight at most."""
+    """Number of processors available to this process, at most eight."""
     return max(
         1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     )
 
 
 def in_parallel(function: Callable[[int, int, int], None], chunks: Sequence[tuple[int, int]]) -> None:
-    """Call `function(part, begin, end)` for every chunk, on several threads where there is more than one."""
+    """Call `function(part, begin, end)` for each chunk, in parallel threads."""
     if len(chunks) == 1 or processors() == 1:
         for part, (begin, end) in enumerate(chunks):
             function(part, begin, end)

@@ -1,4 +1,4 @@
-"""The datum: which similarities a network leaves free, and how estimates and cofactors are referred to it."""
+"""The datum: similarity transformations that a network leaves free, and how the datum fixes them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .values import Values
 
 __all__ = ["Freedom", "Similarity", "freedom_of", "held_for", "held_minimally", "similarity_onto"]
 
-# What the seven parameters are called.
+# Names of the seven parameters.
 _NAMES = ("position in X", "position in Y", "position in Z", "rotation about X", "rotation about Y",
           "rotation about Z", "scale")  # fmt: skip
 
@@ -28,7 +28,7 @@ class Similarity(NamedTuple):
     shift: Array
 
     def __call__(self, values: Values) -> Values:
-        """Poses and points carried along; images stay as they are."""
+        """Transform poses and points; image coordinates do not change."""
         return Values(
             values.rotation @ self.turn.T,
             self.scale * values.x0 @ self.turn.T + self.shift,
@@ -41,7 +41,7 @@ class Similarity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """Directions in which position, orientation and scale may change without any observation noticing.
+    """Changes of position, orientation and scale that no observation determines.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Freedom:
     points : ndarray (p, 3, d)
         Changes of the eliminated points.
     names : tuple of str
-        What may change.
+        Names of the free parameters.
     """
 
     reduced: Array
@@ -59,14 +59,14 @@ class Freedom:
 
     @property
     def defect(self) -> int:
-        """Number of directions."""
+        """Number of free parameters."""
         return int(self.reduced.shape[1])
 
 
 def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -> tuple[Array, Array]:
     """Changes of reduced unknowns (u, 7) and points (p, 3, 7) by a small similarity: shift, rotation, scale.
 
-    X' = X + t + ω × X + μX; a camera that turns with it turns by −R ω about its own axes.
+    X' = X + t + ω × X + μX; a camera rotates by −R ω about its own axes.
     """
 
     def moved(x: Array) -> Array:
@@ -92,7 +92,7 @@ def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -
 
 
 def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
-    """The similarities that held and observed coordinates, distances and a stage's readings leave free.
+    """Find the similarity transformations not determined by coordinates, distances and stage readings.
 
     Parameters
     ----------
@@ -130,32 +130,32 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
 
 
 def held_for(freedom: Freedom, unknowns: Unknowns, diagonal: Array) -> Rows:
-    """As many reduced unknowns as there is freedom, which held take it away; well-conditioned ones.
+    """Choose well-conditioned reduced unknowns that fix the datum when they are held.
 
     Parameters
     ----------
     diagonal : ndarray (u,)
-        Of the normal equations, to compare unknowns of different units.
+        Diagonal of the normal equations, to compare unknowns with different units.
     """
     if not freedom.defect:
         return np.zeros(0, dtype=np.intp)
     scaled = freedom.reduced * np.sqrt(diagonal)[:, None]
     scaled = scaled / np.linalg.norm(scaled, axis=0)
-    # Orthogonal directions first: of those at hand some may be nearly the same.
+    # Orthogonalise first: some columns may be nearly parallel.
     basis, _ = np.linalg.qr(scaled)
     _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
     return np.sort(order[: freedom.defect]).astype(np.intp)
 
 
 def similarity_onto(values: Values, reference: Array, chosen: Mask, *, scaled: bool) -> Similarity:
-    """The similarity of least squares from the points (p, 3) onto others (Horn 1987; Umeyama 1991).
+    """Compute the least-squares similarity from the points (p, 3) to others (Horn 1987; Umeyama 1991).
 
     Parameters
     ----------
     reference : ndarray (p, 3)
-        Where the points should be.
+        Target coordinates.
     chosen : ndarray of bool (p,)
-        Which points count.
+        Points to use.
     scaled : bool
         Whether the scale is free.
     """
@@ -170,9 +170,9 @@ def similarity_onto(values: Values, reference: Array, chosen: Mask, *, scaled: b
 
 
 def held_minimally(freedom: Freedom, unknowns: Unknowns, values: Values) -> Rows:
-    """Minimal constraints: the pose of the first image, and the largest part of a base from it.
+    """Choose minimal constraints: the pose of the first image and the largest component of a base from it.
 
-    Where less than that is free, as many unknowns as there is freedom.
+    Where fewer parameters are free, choose well-conditioned unknowns instead.
     """
     images = np.flatnonzero(unknowns.pose >= 0)
     first: Rows = np.asarray(unknowns.pose[images[0]] + np.arange(6), dtype=np.intp)

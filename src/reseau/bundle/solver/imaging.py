@@ -1,9 +1,9 @@
-"""Image points and their derivatives from pose, point and camera, in compiled loops over the observations.
+"""Image points and their derivatives by pose, point and camera, in compiled loops over the observations.
 
 For every observation: the misfit v (px) and its derivatives by the pose (rotation about the axes of the
 camera, projection centre), by the parameters of the camera and by the object point. The cameras are the
 registered models of :mod:`reseau.optics.cameras`. For each model with a kernel the loops are compiled with
-this kernel; all other cameras take part with their mappings, by :func:`mapped`.
+this kernel; all other cameras are evaluated by their mappings in :func:`mapped`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ..network.network import Network
 
 __all__ = ["Imaging", "Orientation", "Seen", "mapped"]
 
-# Of cameras whose mapping is used instead of a kernel.
+# Kind of cameras without a kernel, for which the mapping is used.
 _NO_KERNEL = -1
 
 
 class Seen(NamedTuple):
     """Image observations in columns (n, …): rows of image, point, camera and additional set (−1 for none).
 
-    `xy` in pixels; `root` (n, 2, 2) the lower triangle W with P = Wᵀ W.
+    `xy` is in pixels; `root` (n, 2, 2) is the lower triangular W with P = Wᵀ W.
     """
 
     image: Rows
@@ -54,7 +54,7 @@ def _image(
     k: int, seen: Seen, at: Orientation, cameras: CameraColumns, x: Array, by_uv: Array, d: Array,
     more: Array, off: Array,
 ) -> None:  # fmt: skip
-    """Point in the system of the camera into `x`; misfit and derivatives by the kernel of the camera."""
+    """Write the point in the camera system to `x`; compute misfit and derivatives with the camera kernel."""
     i, j, c = seen.image[k], seen.point[k], seen.camera[k]
     dx, dy, dz = at.xyz[j, 0] - at.x0[i, 0], at.xyz[j, 1] - at.x0[i, 1], at.xyz[j, 2] - at.x0[i, 2]
     for q in range(3):
@@ -74,7 +74,7 @@ def _misfit(
     cameras: CameraColumns,
     out: Array,
 ) -> None:
-    """Weighted misfits into `out` (n, 2), of the observations begin…end by cameras of the kind `own`."""
+    """Write weighted misfits to `out` (n, 2), for observations begin…end by cameras of kind `own`."""
     by_uv, off, x = np.empty((2, 2)), np.empty(2), np.empty(3)
     d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
     root = seen.root
@@ -91,11 +91,12 @@ def _derive(
     begin: int, end: int, own: int, kind: Rows, seen: Seen, at: Orientation, cameras: CameraColumns,
     free: Rows, count: Rows, width: Rows, movable: Array, r_out: Array, a_out: Array, b_out: Array,
 ) -> None:  # fmt: skip
-    """Weighted misfits (n, 2) and derivatives, of the observations begin…end by cameras of the kind `own`.
+    """Compute weighted misfits (n, 2) and derivatives of observations begin…end by cameras of kind `own`.
 
-    Those by the pose go into a_out[:, :, :6], those by the `count` (c,) parameters `free` (c, p) of the
-    camera behind it, those by the `width` (e,) additional parameters into the last columns, those by the
-    point into b_out (n, 2, 3); `movable` (p, 3) is 0 for coordinates that are held and 1 for others.
+    Derivatives by the pose are written to a_out[:, :, :6], those by the `count` (c,) parameters `free`
+    (c, p) of the camera to the columns after it, those by the `width` (e,) additional parameters to the last
+    columns, those by the point to b_out (n, 2, 3); `movable` (p, 3) is 0 for held coordinates and 1 for
+    others.
     """
     by_uv, off, x = np.empty((2, 2)), np.empty(2), np.empty(3)
     d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
@@ -150,12 +151,12 @@ def _loops(model: str, additional: str | None) -> _Loops:
 
 
 class Imaging:
-    """The cameras of a network, ready for the loops.
+    """The cameras of a network in columns, with their compiled loops.
 
     Parameters
     ----------
     network : Network
-        With the cameras.
+        Network with the cameras.
     sets : tuple of (int, str)
         Camera and label of each set of additional parameters.
     """
@@ -180,13 +181,13 @@ class Imaging:
         )
 
     def of_kernels(self, camera_of: Rows) -> Mask:
-        """Whether observations by these cameras (n,) are of the compiled loops."""
+        """Return which observations by these cameras (n,) use the compiled loops."""
         return np.asarray(self.kind[camera_of] != _NO_KERNEL)
 
     def misfit(
         self, begin: int, end: int, seen: Seen, at: Orientation, values: Array, extra: Array, out: Array
     ) -> None:
-        """Weighted misfits of the observations begin…end into `out` (n, 2); not those of mappings.
+        """Write weighted misfits of observations begin…end to `out` (n, 2), for cameras with a kernel.
 
         Parameters
         ----------
@@ -197,7 +198,7 @@ class Imaging:
         at : Orientation
             Poses and points.
         values, extra : ndarray (c, p), (e, a)
-            Parameters of the cameras, and additional ones, padded.
+            Parameters of the cameras and additional parameters, padded.
         out : ndarray (n, 2)
             Result.
         """
@@ -209,11 +210,12 @@ class Imaging:
         self, begin: int, end: int, seen: Seen, at: Orientation, values: Array, extra: Array, free: Rows,
         count: Rows, movable: Array, r_out: Array, a_out: Array, b_out: Array,
     ) -> None:  # fmt: skip
-        """Weighted misfits into r_out (n, 2), and their derivatives; not those of mappings.
+        """Write weighted misfits to r_out (n, 2) and compute derivatives, for cameras with a kernel.
 
-        By the pose into a_out[:, :, :6], by the `count` (c,) parameters `free` (c, p) of the camera behind
-        it, by the additional ones into the last columns, by the point into b_out (n, 2, 3); `movable` (p, 3)
-        is 0 for coordinates that are held and 1 for others. Other parameters as in :meth:`misfit`.
+        Derivatives by the pose are written to a_out[:, :, :6], those by the `count` (c,) parameters `free`
+        (c, p) of the camera to the columns after it, those by additional parameters to the last columns,
+        those by the point to b_out (n, 2, 3); `movable` (p, 3) is 0 for held coordinates and 1 for others.
+        Other parameters as in :meth:`misfit`.
         """
         cameras = self._columns._replace(values=values, extra=extra)
         for own, loops in enumerate(self._loops):
@@ -226,7 +228,7 @@ class Imaging:
 def mapped(
     camera: PlaneMapping, at: Orientation, image: Rows, point: Rows
 ) -> tuple[Array, Array, Array, Array]:
-    """Image points of any camera with their derivatives, in NumPy.
+    """Compute image points of any camera and their derivatives, in NumPy.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
-"""Levenberg–Marquardt over the sparse system: one factorisation an iteration.
+"""Levenberg–Marquardt iteration of the sparse system, with one factorisation per iteration.
 
-The damping falls where steps keep their promise and grows after Nielsen (1999) where they do not. What
-decides is the relative offset (Bates & Watts 1981), as in :mod:`reseau.adjust.engine`; it is taken from the
-decrease that the damped step promises, and therefore counts only once the damping is small.
+The damping decreases where a step reaches the predicted decrease, and otherwise increases after Nielsen
+(1999). Convergence is decided by the relative offset (Bates & Watts 1981), as in
+:mod:`reseau.adjust.engine`; it is computed from the decrease predicted for the damped step and is therefore
+valid only with small damping.
 """
 
 from __future__ import annotations
@@ -22,34 +23,35 @@ from .values import Values
 __all__ = ["Iterated", "iterate"]
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
-# A step that gains so much of what it promised lets the next one be so much bolder.
+# Ratio of actual to predicted decrease above which the damping is multiplied by the factor that follows.
 _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
-# Damping at which the step is as good as undamped, and below which a decrease is rounding.
+# Damping at which a step is practically undamped; relative decrease that is rounding; relative offset
+# accepted in the last iteration.
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
-# Points farther off than so many times the extent of the network are at infinity.
+# Points farther away than this many times the extent of the network are at infinity.
 _HORIZON, _NEARLY = 1e8, 0.99
-# A sum of squares that falls by no more than this part in so many corrections creeps.
-_PATIENCE, _CREEP = 25, 1e-6
+# The iteration stalls when the sum of squares decreases by at most this fraction in this many iterations.
+_STALL_ITERATIONS, _STALL_DECREASE = 25, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Iterated:
-    """Where the iteration arrived.
+    """Result of the iteration.
 
     Parameters
     ----------
     linear : Linear
         The linear problem at the estimates.
     costs : tuple of float
-        vᵀPv at the approximate values and after each correction taken.
+        vᵀPv at the approximate values and after each accepted step.
     iterations : int
-        Corrections tried.
+        Number of steps tried.
     offset : float
-        Relative offset: corrections still to come, in standard deviations.
+        Relative offset: size of the next correction, in standard deviations.
     away : ndarray of int
-        Points that ran off to infinity.
+        Points that diverged to infinity.
     converged : bool
-        Whether this is the minimum; otherwise the iteration was at the end of its patience.
+        Whether the minimum was reached; otherwise the maximum number of iterations or damping was.
     """
 
     linear: Linear
@@ -75,35 +77,35 @@ def iterate(
     damping: float,
     watch: Callable[[int, float], None] | None = None,
 ) -> Iterated | Failure:
-    """Bring the values to the minimum of vᵀPv.
+    """Minimise vᵀPv.
 
     Parameters
     ----------
     system : System
-        What is adjusted.
+        System to adjust.
     start : Values
         Approximate values.
     redundancy : int
-        For the relative offset.
+        Redundancy, for the relative offset.
     max_iterations : int
-        Corrections tried at most.
+        Maximum number of steps tried.
     tolerance : float
         Relative offset at which the iteration has converged.
     damping : float
         Initial damping, relative to the diagonal of the normal equations.
     watch : callable, optional
-        Told the number of corrections and vᵀPv after each one taken.
+        Called with the number of steps and vᵀPv after each accepted step.
 
     Returns
     -------
     Iterated or Failure
-        A failure when there is no way to go on.
+        A failure when the misfits are not finite or the normal equations are singular.
     """
     linear = system.linearise(start)
     cost, growth, tried = linear.cost, 2.0, 0
     if not np.isfinite(cost):
         return Failure(
-            "the image coordinates have no finite misfits at the approximate values", Code.NOT_FINITE
+            "misfits of image coordinates are not finite at the approximate values", Code.NOT_FINITE
         )
     radius = _HORIZON * _extent(system, start)
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.other_misfits) - redundancy)
@@ -120,10 +122,11 @@ def iterate(
             continue
         offset = np.sqrt(max(step.predicted, 0.0) / rank) / np.sqrt(max(cost, 1e-300) / max(1, redundancy))
         settled = damping <= _SMALL or step.predicted <= 1e-14 * cost
-        # At the end of its patience it takes what is near, and what creeps it leaves where it is.
-        creeps = len(costs) > _PATIENCE and costs[-_PATIENCE] - cost <= _CREEP * cost
+        # In the last iteration a larger offset is accepted; a stalled iteration ends where it is.
+        slow = len(costs) > _STALL_ITERATIONS
+        stalled = slow and costs[-_STALL_ITERATIONS] - cost <= _STALL_DECREASE * cost
         near = tried == max_iterations and offset < _NEAR
-        if (offset <= tolerance and settled) or cost <= system.floor or near or creeps:
+        if (offset <= tolerance and settled) or cost <= system.floor or near or stalled:
             away = linear.values.beyond(_NEARLY * radius)
             return Iterated(linear, tuple(costs), tried, float(offset), away)
         trial = linear.values.moved(system.unknowns, step, system.constraints)
@@ -150,7 +153,7 @@ def iterate(
 
 
 def _extent(system: System, values: Values) -> float:
-    """Distance from the centre within which most projection centres or points lie."""
+    """Median distance of projection centres or of points from the centroid, whichever is larger."""
     images = system.unknowns.pose >= 0
     sizes = [np.linalg.norm(part, axis=1) for part in (values.x0[images], values.xyz)]
     return max(float(np.median(size)) if len(size) else 0.0 for size in sizes) or 1.0

@@ -1,11 +1,11 @@
 """Normal equations with the points eliminated: compiled loops over points and their rays.
 
-Of every point j with rays k the blocks V = Σ BᵀB, W = Σ AᵀB and the right-hand side are formed and its part
-of the reduced normal equations S = Σ AᵀA − Σ W V⁻¹ Wᵀ is added at once (Brown 1958; Kraus, *Photogrammetry*;
-Förstner & Wrobel 2016, sect. 15.3.3). A ray touches at most four *segments* of the reduced unknowns: pose,
-interior orientation, additional parameters, and the point itself where it is kept among them.
+For each point j with rays k, the blocks V = Σ BᵀB, W = Σ AᵀB and the right-hand side are formed and its part
+of the reduced normal equations S = Σ AᵀA − Σ W V⁻¹ Wᵀ is added (Brown 1958; Kraus, *Photogrammetry*;
+Förstner & Wrobel 2016, sect. 15.3.3). A ray depends on at most four *segments* of the reduced unknowns: pose,
+interior orientation, additional parameters, and the point itself where it is not eliminated.
 
-S is an arrow: a band of `bands` unknowns, lower triangle, column by column, and full rows below it.
+S is an arrow matrix: a band of `bands` unknowns (lower triangle, column by column) and full rows below it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ SEGMENTS = 4
 
 
 class Pattern(NamedTuple):
-    """Who touches what, in columns over points (p), rays (n) and local segments.
+    """Sparsity pattern, in columns over points (p), rays (n) and local segments.
 
-    Rays `first[j]:first[j+1]` see point j. `start`, `width`, `column`, `place` (n, 4) say for each segment of
-    a ray where it begins among the reduced unknowns, how wide it is, where it begins in the ray's row of
-    derivatives, and where among the unknowns its point touches. These are the segments
-    `local[j]:local[j+1]` of `at`, `size`, `offset`, by ascending place; `eliminated` (p,) is 1 for points
-    that are.
+    Point j has the rays `first[j]:first[j+1]`. For each segment of a ray, `start` (n, 4) is its first reduced
+    unknown, `width` its number of unknowns, `column` its first column among the derivatives of the ray, and
+    `place` its first position among the unknowns that the point depends on. These unknowns are the segments
+    `local[j]:local[j+1]` of `at`, `size`, `offset`, in ascending order; `eliminated` (p,) is 1 for
+    eliminated points.
     """
 
     first: Rows
@@ -45,7 +45,7 @@ class Pattern(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Arrow of S, right-hand sides (u,) before and after elimination, diagonal (u,) before elimination."""
+    """Arrow matrix S, right-hand sides (u,) before and after elimination, diagonal (u,) before it."""
 
     band: Array
     border: Array
@@ -56,7 +56,7 @@ class Sums(NamedTuple):
 
 @compiled
 def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, count: Rows) -> int:
-    """Distinct segments of each point by ascending start, into `out` (n·4, 3) and `place`; their number."""
+    """Write the distinct segments of each point to `out` (n·4, 3) and `place`; return their number."""
     total = 0
     for j in range(len(first) - 1):
         base = total
@@ -91,7 +91,7 @@ def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, cou
 
 @compiled
 def _inverse(j: int, v: Array, out: Array) -> float:
-    """Inverse of a symmetric positive definite 3×3 matrix; the least pivot of the matrix scaled to ones."""
+    """Invert a symmetric positive definite 3×3 matrix; return the smallest pivot with unit diagonal."""
     s0, s1, s2 = 1.0 / np.sqrt(v[0, 0]), 1.0 / np.sqrt(v[1, 1]), 1.0 / np.sqrt(v[2, 2])
     a, b, c = v[1, 0] * s0 * s1, v[2, 0] * s0 * s2, v[2, 1] * s1 * s2
     d1 = 1.0 - a * a
@@ -111,7 +111,7 @@ def _inverse(j: int, v: Array, out: Array) -> float:
 
 @compiled
 def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -> None:
-    """AᵀA and Aᵀr of one ray, added to the arrow and the right-hand side."""
+    """Add AᵀA and Aᵀr of one ray to the matrix and the right-hand side."""
     start, width, column, border = pattern.start, pattern.width, pattern.column, sums.border
     bands, r0, r1 = len(sums.band), misfits[k, 0], misfits[k, 1]
     for a in range(SEGMENTS):
@@ -134,7 +134,7 @@ def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -
 
 @compiled
 def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None:
-    """− T Wᵀ of one point, added to the arrow."""
+    """Add −T Wᵀ of one point to the matrix."""
     bands, border, first = len(sums.band), sums.border, pattern.local[j]
     for a in range(first, pattern.local[j + 1]):
         sa, oa = pattern.at[a], pattern.offset[a]
@@ -156,7 +156,7 @@ def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None
 
 @compiled
 def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
-    """W of one point (3, m): its derivatives against those of the unknowns it touches."""
+    """Compute W of one point (3, m), for the unknowns that it depends on."""
     end = rows.shape[2]
     for q in range(3):
         for i in range(_touched(j, pattern)):
@@ -181,11 +181,11 @@ def assemble(
     begin: int, end: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float,
     sums: Sums, inverse: Array, side: Array, diagonal: Array,
 ) -> float:  # fmt: skip
-    """Normal equations of the points begin…end, reduced to the other unknowns.
+    """Form the normal equations of the points begin…end, reduced to the other unknowns.
 
-    `prior` (p, 3, 2) holds weights of observed coordinates (1 for held ones, so that they can be divided by)
-    and their weighted misfits. Into `inverse` (p, 3, 3) goes V⁻¹ of the damped V, into `side` (p, 3) the
-    right-hand side, into `diagonal` (p, 3) the undamped diagonal of V. Returns the least scaled pivot of V.
+    `prior` (p, 3, 2) has the weights of observed coordinates (1 for held ones, to avoid division by zero) and
+    their weighted misfits. Output: `inverse` (p, 3, 3) is V⁻¹ of the damped V, `side` (p, 3) the right-hand
+    side, `diagonal` (p, 3) the undamped diagonal of V. Returns the smallest scaled pivot of V.
     """
     most = 1
     for j in range(begin, end):
@@ -227,7 +227,7 @@ def assemble(
 def substitute(
     begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, side: Array, y: Array, out: Array
 ) -> None:
-    """Points (p, 3, s) of the right-hand sides `side` (p, 3, s) and the reduced unknowns y (u, s)."""
+    """Compute points (p, 3, s) from right-hand sides `side` (p, 3, s) and reduced unknowns y (u, s)."""
     last, sides = rows.shape[2] - 3, y.shape[1]
     h, step = np.empty(3), np.empty(2)
     for j in range(begin, end):
@@ -253,7 +253,7 @@ def substitute(
 def reduce_sides(
     begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, side: Array, out: Array
 ) -> None:
-    """− W V⁻¹ times right-hand sides (p, 3, s) of the points, added to `out` (u, s)."""
+    """Add −W V⁻¹ times right-hand sides (p, 3, s) of the points to `out` (u, s)."""
     last, sides = rows.shape[2] - 3, side.shape[2]
     h = np.empty(3)
     for j in range(begin, end):
@@ -279,10 +279,10 @@ def reduce_sides(
 def posterior(
     begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, z: Array, points: Array, seen: Array
 ) -> None:
-    """Cofactors after the adjustment, from the inverse z (u, u) of the reduced normal equations.
+    """Compute cofactors from the inverse z (u, u) of the reduced normal equations.
 
-    Of the points Q = V⁻¹ + Tᵀ Z T, T = W V⁻¹, into `points` (p, 3, 3); of the adjusted image coordinates,
-    whitened, A Z Aᵀ − A Z T Bᵀ − B Tᵀ Z Aᵀ + B Q Bᵀ into `seen` (n, 2, 2).
+    Written to `points` (p, 3, 3): Q = V⁻¹ + Tᵀ Z T with T = W V⁻¹, for the points; to `seen` (n, 2, 2):
+    A Z Aᵀ − A Z T Bᵀ − B Tᵀ Z Aᵀ + B Q Bᵀ, for the adjusted image coordinates, whitened.
     """
     most = 1
     for j in range(begin, end):
@@ -320,7 +320,7 @@ def posterior(
 
 @compiled
 def _hat(j: int, k: int, rows: Array, pattern: Pattern, z: Array, y: Array, q: Array, out: Array) -> None:
-    """Cofactor (2, 2) of the adjusted coordinates of one ray."""
+    """Compute the cofactor (2, 2) of the adjusted coordinates of one ray."""
     eliminated, last = pattern.eliminated[j], rows.shape[2] - 3
     h00, h01, h11 = 0.0, 0.0, 0.0
     cross = np.zeros((2, 3))

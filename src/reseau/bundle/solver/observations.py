@@ -24,20 +24,20 @@ class OtherObservations:
     Parameters
     ----------
     ends : ndarray of int (d, 2)
-        Points of the distances.
+        End points of the distances.
     coordinate : ndarray of int (q, 2)
         Point and axis of the observed coordinates.
     interior : ndarray of int (i, 2)
-        Camera and row of the observed parameter.
+        Camera and row of each parameter observed by itself.
     joint : ndarray of int (k,)
-        Cameras whose parameters were observed with a joint covariance C = L Lᵀ, once for each parameter.
+        Camera of each parameter observed with a joint covariance C = L Lᵀ.
     combination : ndarray (k, w)
-        Rows of L⁻¹: what is observed are the uncorrelated combinations L⁻¹ p of the parameters p.
+        Rows of L⁻¹: the observations are the uncorrelated combinations L⁻¹ p of the parameters p.
     reading : ndarray of int (r,)
-        Images of a stage's readings.
+        Images of the stage readings.
     across : ndarray (3, t)
-        Two directions at right angles to the nominal axis of a stage, along which the components of the axis
-        are observed to be zero; none without a stage.
+        Two directions perpendicular to the nominal axis of a stage; the components of the axis along them are
+        observed as zero. Empty without a stage.
     value, sigma : ndarray (d + q + i + k + r + t,)
         Observed values and their standard deviations, in this order.
     """
@@ -54,7 +54,7 @@ class OtherObservations:
 
     @classmethod
     def of(cls, network: Network, active: Mask, xyz: Array) -> OtherObservations:
-        """Collect those of a network; `xyz` (p, 3) are reduced coordinates, `active` the adjusted points."""
+        """Collect the observations of a network; `xyz` (p, 3) are reduced, `active` the adjusted points."""
         interior = [
             (c, camera.names.index(name), camera.sigma[name])
             for c, camera in enumerate(network.cameras)
@@ -113,13 +113,13 @@ class OtherObservations:
 
     @property
     def readings(self) -> slice:
-        """Positions of the readings of a stage in `value`."""
+        """Positions of the stage readings in `value`."""
         start = self.combinations.stop
         return slice(start, start + len(self.reading))
 
     @property
     def tilts(self) -> slice:
-        """Positions of the two components of its axis."""
+        """Positions of the two components of the stage axis in `value`."""
         return slice(self.readings.stop, len(self.value))
 
     def computed(self, values: Values) -> Array:
@@ -139,7 +139,7 @@ class OtherObservations:
 
 
 def _combinations(cameras: Sequence[Camera]) -> tuple[Rows, Array, Array]:
-    """Cameras, coefficients and values of uncorrelated combinations of jointly observed parameters."""
+    """Return cameras, coefficients and values of uncorrelated combinations of jointly observed parameters."""
     width = max(len(camera.names) for camera in cameras)
     joint, rows, observed = list[int](), [np.zeros((0, width))], [np.zeros(0)]
     for c, camera in enumerate(cameras):
@@ -154,7 +154,7 @@ def _combinations(cameras: Sequence[Camera]) -> tuple[Rows, Array, Array]:
             root = np.linalg.cholesky(camera.covariance[np.ix_(at, at)] / np.outer(scale, scale))
         except np.linalg.LinAlgError:
             raise UsageError(
-                "has a covariance of its parameters that is not positive definite",
+                "the covariance of its parameters is not positive definite",
                 where=f"camera {camera.id}",
             ) from None
         coefficients = np.zeros((len(at), width))

@@ -1,7 +1,7 @@
-"""Cofactors after the adjustment: of all unknowns, of all adjusted observations, in any datum.
+"""Cofactors of all unknowns and adjusted observations, in any datum.
 
-With Q⁻ of any datum, that of inner constraints over chosen unknowns is S Q⁻ Sᵀ,
-S = I − G (GᵀEG)⁻¹ Gᵀ E (Baarda 1973), of which every block needs only G, Q⁻EG and Q⁻ of the block.
+If Q⁻ is the cofactor matrix in some datum, that of inner constraints over chosen unknowns is S Q⁻ Sᵀ with
+S = I − G (GᵀEG)⁻¹ Gᵀ E (Baarda 1973); each block needs only G, Q⁻EG and its own block of Q⁻.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of", "inverse_from_rows"]
 
-# Least pivot of the normal equations scaled to ones that is no rounding.
+# Smallest pivot of the normal equations with unit diagonal that is not rounding.
 _RANK = 1e-14
-# How far the cofactors of the adjusted observations may be from summing to the number of unknowns.
+# Allowed deviation of the trace of the cofactors of the adjusted observations from the number of unknowns.
 _EXACT, _INEXACT = 1e-7, 1e-6
-# The same where a stage moves the field: frontal views leave the normal equations half of their digits.
+# The same with a stage: frontal images make the normal equations lose half of their digits.
 _STAGED = 1e-3
-# Entries of F that are still a matter of a second.
+# Largest number of entries of F; up to this, its decomposition takes about a second.
 _ENTRIES = 20_000_000
 # Singular values below this part of the largest count as zero, as in :mod:`reseau.adjust`.
 _ZERO = 1e-13
@@ -57,7 +57,7 @@ class BlockSolution(Whitened):
 
     @classmethod
     def of(cls, weightings: list[Weighting], whitened: Array, adjusted: list[Array]) -> BlockSolution:
-        """From the weights of image coordinates and of other observations, one after the other."""
+        """Create the solution from the weights of image coordinates and of other observations."""
         influence, cofactors, start = [], [], 0
         for weighting in weightings:
             for root, cofactor in zip(weighting.roots, weighting.cofactors, strict=True):
@@ -76,7 +76,7 @@ class BlockSolution(Whitened):
 
 @dataclass(frozen=True, eq=False)
 class Referral:
-    """What refers cofactors to inner constraints: Q = Q⁻ − G N Hᵀ − H N Gᵀ + G M Gᵀ.
+    """Terms of the transformation of cofactors to inner constraints: Q = Q⁻ − G N Hᵀ − H N Gᵀ + G M Gᵀ.
 
     N = (GᵀEG)⁻¹ (d, d) is `weight`; H = Q⁻EG of reduced unknowns (u, d) and points (p, 3, d); M = N GᵀE H N
     is `m`; `before` is Q⁻ of the reduced unknowns.
@@ -99,15 +99,15 @@ class Cofactors:
     reduced : ndarray (u, u)
         Of the reduced unknowns.
     points : ndarray (p, 3, 3)
-        Of the points; zero for those held or not adjusted.
+        Of the points; zero for points that are held or not adjusted.
     seen : ndarray (n, 2, 2)
-        Of the adjusted image coordinates, whitened, by points.
+        Of the adjusted image coordinates, whitened, in the order of points.
     others : ndarray
-        Of the others adjusted observations, over their variances.
+        Of the other adjusted observations, divided by their variances.
     normal : Normal
-        Undamped normal equations, which joint cofactors are made of.
+        Undamped normal equations, for joint cofactors.
     referral : Referral, optional
-        How cofactors come into the datum of inner constraints.
+        Transformation of the cofactors to inner constraints.
     """
 
     reduced: Array
@@ -118,7 +118,7 @@ class Cofactors:
     referral: Referral | None = None
 
     def joint(self, columns: Rows, points: Rows) -> Array:
-        """Joint cofactor matrix of some reduced unknowns and of all coordinates of some points.
+        """Compute the joint cofactor matrix of reduced unknowns and of all coordinates of points.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Cofactors:
         Returns
         -------
         ndarray (k + 3q, k + 3q)
-            In this order; zero for coordinates that are held.
+            In this order; zero for held coordinates.
         """
         linear, inverse = self.normal.linear, self.normal.inverse
         system, k, size = linear.system, len(columns), len(columns) + 3 * len(points)
@@ -155,23 +155,23 @@ class Cofactors:
 
 
 def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_part: Mask) -> Cofactors:
-    """Cofactors of everything, at the estimates.
+    """Compute the cofactors at the estimates.
 
     Parameters
     ----------
     linear : Linear
-        The linear problem there.
+        The linear problem at the estimates.
     freedom : Freedom
-        Similarities that no observation opposes.
+        Similarity transformations that the observations do not determine.
     datum : ndarray of bool (p,), optional
-        Points over which inner constraints hold; by default the held unknowns of the system are the datum.
+        Points of the inner constraints; by default the held unknowns of the system are the datum.
     taking_part : ndarray of bool (p,)
-        Points that are adjusted.
+        Adjusted points.
 
     Raises
     ------
     Singular
-        When the observations leave more undetermined than the datum.
+        When the observations do not determine the unknowns in this datum.
     """
     system = linear.system
     normal = linear.normal(0.0)
@@ -202,8 +202,8 @@ def _marginal(
 ) -> tuple[Array, Array, Array, Array]:
     """Cofactors of reduced unknowns, points, image coordinates and other observations in some datum.
 
-    Those of the adjusted observations sum to the number of unknowns. Where they do not, the normal equations
-    have lost digits, and the inverse is had from the rows of the observations instead.
+    The trace of the cofactors of the adjusted observations is the number of unknowns. Where it is not, the
+    normal equations have lost digits, and the inverse is computed from the rows of the observations instead.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def _marginal(
 def _with_stage(
     linear: Linear, normal: Normal, stage: StageConstraints, columns: Mask, taking_part: Mask
 ) -> tuple[Array, Array, Array, Array]:
-    """The same where a stage moves the field.
+    """Compute the same cofactors with a stage.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def _with_stage(
 
 
 def _total(found: tuple[Array, Array, Array, Array]) -> float:
-    """Sum of the cofactors of the adjusted observations, whitened."""
+    """Trace of the whitened cofactors of the adjusted observations."""
     _, _, seen, others = found
     return float(np.trace(seen, axis1=1, axis2=2).sum() + others.sum())
 
@@ -291,7 +291,7 @@ def _with_inverse(
 
 
 def _others(linear: Linear, z: Array, points: Array) -> Array:
-    """Cofactors of distances, observed coordinates and interior orientation, over their variances."""
+    """Cofactors of distances, observed coordinates and interior orientation, divided by their variances."""
     system = linear.system
     hats = np.zeros(len(system.sigma_root))
     j, axis = system.others.coordinate.T
@@ -306,7 +306,7 @@ def _others(linear: Linear, z: Array, points: Array) -> Array:
 
 
 def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Referral:
-    """What refers cofactors to inner constraints over the chosen points."""
+    """Terms of the transformation of cofactors to inner constraints over the chosen points."""
     system = normal.linear.system
     unknowns, d = system.unknowns, freedom.defect
     g = np.where(chosen[:, None, None], freedom.points, 0.0)
@@ -323,7 +323,7 @@ def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Refer
 
 
 def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:
-    """Cofactors of the reduced unknowns and of the points, referred."""
+    """Cofactors of the reduced unknowns and of the points with inner constraints."""
     freedom, weight, m = referral.freedom, referral.weight, referral.m
     one = freedom.reduced @ weight @ referral.h.T
     z = referral.before - one - one.T + freedom.reduced @ m @ freedom.reduced.T
@@ -334,7 +334,7 @@ def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:
 
 
 def _cross(linear: Linear, point: int) -> Array:
-    """W of one point (u, 3): derivatives by the reduced unknowns against those by the point."""
+    """W of one point (u, 3): products of derivatives by the reduced unknowns and by the point."""
     pattern, last = linear.system.pattern, linear.rows.shape[2] - 3
     w = np.zeros((linear.system.unknowns.size, 3))
     for k in range(pattern.first[point], pattern.first[point + 1]):
@@ -345,28 +345,28 @@ def _cross(linear: Linear, point: int) -> Array:
 
 
 def _is_small(linear: Linear) -> bool:
-    """Whether the rows of all observations can be held as a full matrix."""
+    """Whether the rows of all observations are small enough for a dense matrix."""
     return 2 * len(linear.misfits) * linear.system.unknowns.size <= _ENTRIES
 
 
 def inverse_from_rows(normal: Normal, held: Mask) -> Array:
-    """S⁻¹ (u, u) from the rows of the observations, without S; zero for what is held.
+    """Compute S⁻¹ (u, u) from the rows of the observations, without S; zero for held unknowns.
 
-    The rows F = A − B V⁻¹ Wᵀ of all observations, points eliminated, have FᵀF = S. Their QR factors know S to
-    the root of its condition: what S loses to rounding, F keeps (Golub & Van Loan, *Matrix Computations*,
-    ch. 5).
+    The rows F = A − B V⁻¹ Wᵀ of all observations, with points eliminated, satisfy FᵀF = S. The condition
+    number of F is the square root of that of S: its QR factors keep digits that S loses (Golub & Van Loan,
+    *Matrix Computations*, ch. 5).
 
     Parameters
     ----------
     normal : Normal
-        Undamped normal equations, whose V⁻¹ are used.
+        Undamped normal equations; their V⁻¹ are used.
     held : ndarray of bool (u,)
-        Reduced unknowns that are held.
+        Held reduced unknowns.
 
     Raises
     ------
     Singular
-        When the rows do not determine the others.
+        When the rows do not determine the other unknowns.
     """
     rows = _reduced_rows(normal)[:, ~held]
     length = np.sqrt((rows**2).sum(axis=0))
@@ -383,7 +383,7 @@ def inverse_from_rows(normal: Normal, held: Mask) -> Array:
 
 
 def _reduced_rows(normal: Normal) -> Array:
-    """F (N, u): all observations by the reduced unknowns, points eliminated."""
+    """F (N, u): derivatives of all observations by the reduced unknowns, points eliminated."""
     linear, system = normal.linear, normal.linear.system
     pattern, last, u = system.pattern, linear.rows.shape[2] - 3, system.unknowns.size
     point = system.seen.point
@@ -402,7 +402,7 @@ def _reduced_rows(normal: Normal) -> Array:
     j, axis = system.others.coordinate.T
     _, coordinates, _ = system.others.slices
     root = system.sigma_root
-    # An observed coordinate is a row with B alone, or a column of its own where its point is kept.
+    # An observed coordinate is a row of B only, or a separate column where its point is kept.
     observed = -root[coordinates][:, None] * through[j, axis]
     own = np.zeros((len(root), u))
     rows_kept, columns_kept, rows_interior, columns_interior = system.prior_column

@@ -1,4 +1,4 @@
-"""A network as a problem of :mod:`reseau.adjust`: the same statistics, another solver."""
+"""A network as a problem of :mod:`reseau.adjust`, with a sparse solver and the same statistics."""
 
 from __future__ import annotations
 
@@ -25,50 +25,50 @@ from .datum import Freedom, freedom_of, held_minimally, similarity_onto
 from .iteration import Iterated, iterate
 from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import creeping_points, steady_points, undetermined, weak_points
+from .rank import poorly_determined_points, steady_points, undetermined, weak_points
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .values import Values
 
 __all__ = ["BundleFit", "BundleProblem"]
 
-# Options of the dense engine that this solver does not have, and their defaults.
-_NOT_HERE, _USUAL = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()
+# Options of the dense engine that this solver does not support, and their defaults.
+_UNSUPPORTED, _DEFAULTS = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()
 # Initial damping, relative to the diagonal of the normal equations.
 _DAMPING = 1e-5
-# Points that run off to infinity are left out at most this many times.
+# Maximum number of rounds in which points that diverge to infinity are left out.
 _ROUNDS = 12
-# Corrections tried after which an adjustment that has not converged is asked for points that creep.
-_ENOUGH = 50
+# Iterations after which poorly determined points of an adjustment that has not converged are left out.
+_SLOW = 50
 
 
 @dataclass(frozen=True, eq=False)
 class BundleProblem:
     """All observations of a network in one column, with approximate values.
 
-    Image coordinates come first, x and y in turn, then distances, observed coordinates, observed interior
-    orientation, one by one or jointly, readings and axis of a stage. It is an
+    Image coordinates come first, x and y alternating, then distances, observed coordinates, observed interior
+    orientation (single parameters, then joint), readings and axis of a stage. It is an
     :class:`~reseau.adjust.fitted.Adjustable`: robust estimation, data snooping and variance components of
-    :mod:`reseau.adjust` take it as any other problem.
+    :mod:`reseau.adjust` apply to it as to any other problem.
 
     Parameters
     ----------
     network : Network
-        What was observed.
+        Network to adjust.
     start : Values
-        Approximate values, NaN where there are none; coordinates of known points as the network has them.
+        Approximate values, NaN where unknown; known points have the coordinates of the network.
     reference : ndarray (p, 3)
         Coordinates that inner constraints refer to.
     weights : ndarray (N,), optional
         Factors on the weights.
     max_iterations : int
-        Corrections tried at most.
+        Maximum number of iterations.
     tolerance : float
         See :func:`~reseau.bundle.solver.iteration.iterate`.
     watch : callable, optional
-        Told the number of corrections and vᵀPv after each.
+        Called with the number of iterations and vᵀPv after each iteration.
     rounds : int
-        How often points have been left out that ran off to infinity.
+        Number of rounds so far in which diverging points were left out.
 
     Examples
     --------
@@ -89,20 +89,20 @@ class BundleProblem:
 
     @cached_property
     def centre(self) -> Array:
-        """Middle of the points (3,): coordinates are reckoned from it, so that large ones lose nothing."""
+        """Centroid of the points (3,), the origin of reduced coordinates: large ones keep their precision."""
         known = self.start.xyz[finite(self.start.xyz)]
         centre: Array = known.mean(axis=0) if len(known) else np.zeros(3)
         return centre
 
     @cached_property
     def others(self) -> OtherObservations:
-        """Observations other than image coordinates, of all points; coordinates from the centre."""
+        """Observations other than image coordinates, of all points; with reduced coordinates."""
         every = np.ones(len(self.network.points), dtype=bool)
         return OtherObservations.of(self.network, every, self.network.xyz - self.centre)
 
     @cached_property
     def observations(self) -> NDArray[Any]:
-        """All observations (N,); coordinates are reckoned from the centre."""
+        """All observations (N,), with reduced coordinates."""
         return np.concatenate([self.network.xy.ravel(), self.others.value])
 
     @property
@@ -112,23 +112,23 @@ class BundleProblem:
 
     @cached_property
     def marks(self) -> NDArray[np.intp]:
-        """The two coordinates of an image point leave together."""
+        """Number of the mark of each observation: x and y of an image point are rejected together."""
         n, more = len(self.network.xy), len(self.others.value)
         return np.concatenate([np.repeat(np.arange(n), 2), n + np.arange(more)])
 
     @cached_property
     def groups(self) -> NDArray[np.intp]:
-        """The object point of each observation: errors of different points hardly know of each other."""
+        """Object point of each observation: errors of different points hardly affect each other."""
         points = len(self.network.points)
         more = points + np.arange(len(self.others.value))
         return np.concatenate([np.repeat(self.network.point_of, 2), more])
 
     def with_weights(self, weights: ArrayLike | None) -> Self:
-        """The same problem with other factors on the weights."""
+        """Return the problem with other factors on the weights."""
         return replace(self, weights=None if weights is None else np.asarray(weights, dtype=np.float64))
 
     def continued(self, fit: BundleFit) -> Self:
-        """The same problem, begun at the estimates; points without any keep their approximate values."""
+        """Return the problem with the estimates as approximate values, where there are estimates."""
         part, images = fit.usable.points[:, None], fit.usable.images
         start = replace(
             fit.values,
@@ -140,7 +140,7 @@ class BundleProblem:
         return replace(self, start=start)
 
     def misfits_at_start(self) -> Array:
-        """Weighted misfits (n, 2) of the image coordinates at the approximate values, NaN without any."""
+        """Weighted misfits (n, 2) of the image coordinates at the approximate values; NaN without these."""
         network, start = self.network, self.start
         known = finite(start.x0)[network.image_of] & finite(start.xyz)[network.point_of]
         rows, v = np.flatnonzero(known), np.full((len(known), 2), np.nan)
@@ -155,25 +155,25 @@ class BundleProblem:
         Parameters
         ----------
         options : reseau.adjust.Options, optional
-            All its fields count, in place of `max_iterations` and `tolerance` of the problem. By default
-            these, an initial damping of 1e-5, and covariances a posteriori.
+            Replaces `max_iterations` and `tolerance` of the problem. By default these are used, with an
+            initial damping of 1e-5 and covariances a posteriori.
 
         Raises
         ------
         UsageError
-            For an option that this solver does not have: another method than Levenberg–Marquardt, a bound of
-            the curvature, a rank tolerance, a check of derivatives.
+            For an option that this solver does not support: a method other than Levenberg–Marquardt, a bound
+            of the curvature, a rank tolerance, a check of derivatives.
         """
         if options is None:
             return self._adjusted(
                 AdjustOptions(max_iterations=self.max_iterations, tolerance=self.tolerance, damping=_DAMPING)
             )
-        for name in _NOT_HERE:
-            if getattr(options, name) != getattr(_USUAL, name):
+        for name in _UNSUPPORTED:
+            if getattr(options, name) != getattr(_DEFAULTS, name):
                 raise UsageError(
-                    f"is no option of a bundle adjustment: {getattr(options, name)!r}",
+                    f"is not supported by the bundle adjustment: {getattr(options, name)!r}",
                     where=f"Options.{name}",
-                    do="leave it at its default",
+                    do="use its default",
                 )
         return self._adjusted(options)
 
@@ -186,33 +186,32 @@ class BundleProblem:
 class BundleFit(Fitted):
     """A bundle adjustment that converged; truthy.
 
-    What stands in columns over the observations has the order of :class:`BundleProblem`; residuals of what
-    was not determined are NaN.
+    Columns over the observations have the order of :class:`BundleProblem`; undetermined residuals are NaN.
 
     Parameters
     ----------
     problem : BundleProblem
-        What was adjusted.
+        The adjusted problem.
     values : Values
-        Estimates, in the system of the network.
+        Estimates, in the coordinate system of the network.
     unknowns : Unknowns
-        Columns of the reduced cofactors, of the observations that took part.
+        Columns of the reduced cofactors, for the observations that were used.
     usable : Usable
-        What took part.
+        Observations, images and points that were used.
     freedom : Freedom
-        Similarities left free by the observations.
+        Similarity transformations that the observations do not determine.
     cofactors : Cofactors
-        Of unknowns and adjusted observations; rotations about the axes of their cameras.
+        Of unknowns and adjusted observations; rotations are about the camera axes.
     linear : Linear
         The linear problem at the estimates.
     sigma0, redundancy, cost, residuals, iterations, costs, solution, scale
         As in :class:`~reseau.adjust.Adjustment`.
     offset : float
-        Corrections still to come, in standard deviations.
+        Size of the next correction, in standard deviations.
     counts : tuple of int
         Observations, unknowns before datum constraints, datum constraints.
     datum : ndarray of bool (p,), optional
-        Points over which inner constraints hold: those chosen, or all but the weak ones.
+        Points of the inner constraints: the chosen ones, or all except weak points.
 
     Examples
     --------
@@ -244,12 +243,12 @@ class BundleFit(Fitted):
 
     @property
     def variance(self) -> float:
-        """Factor of the cofactors in covariances: sigma0² a posteriori, one a priori."""
+        """Variance factor of covariances: sigma0² a posteriori, one a priori."""
         return self.sigma0**2 if self.scale == "a-posteriori" else 1.0
 
 
 class _Run:
-    """One adjustment of a network on its way."""
+    """State of one adjustment."""
 
     def __init__(self, problem: BundleProblem, options: AdjustOptions) -> None:
         self.problem, self.options, whole = problem, options, problem.network
@@ -300,15 +299,15 @@ class _Run:
         problem, network = self.problem, self.network
         if not self.usable.images.any():
             return Failure(
-                "no image has three points whose position in space is known or can be computed",
+                "no image has three points with known or computable coordinates",
                 Code.TOO_FEW_POINTS,
             )
         start = self._start()
         freedom = freedom_of(self.system, start, self.usable.points)
         if network.datum == "control" and freedom.defect:
             return Failure(
-                f"rank defect {freedom.defect}: nothing determines {', '.join(freedom.names)}; "
-                "give control points or distances, or a datum that is minimal or free",
+                f"rank defect {freedom.defect}: {', '.join(freedom.names)} not determined; "
+                "give control points or distances, or use the datum `minimal` or `free`",
                 Code.NO_DATUM,
             )
         if network.datum == "minimal":
@@ -326,8 +325,8 @@ class _Run:
         )  # fmt: skip
         if isinstance(found, Failure):
             return found
-        # What hardly any angle determines creeps on for ever, and what it creeps on is noise.
-        away = found.away if found.converged else self._creeping(found)
+        # Points with nearly parallel rays converge very slowly, and only follow the noise.
+        away = found.away if found.converged else self._slowly_converging(found)
         if len(away) and problem.rounds < _ROUNDS:
             again = self._without(away, found.values)._adjusted(self.options)
             if found.converged or again:
@@ -341,9 +340,7 @@ class _Run:
         chosen = network.datum_points & self.usable.points
         if inner:
             if int(chosen.sum()) < 3:
-                return Failure(
-                    "inner constraints need three datum points that are determined", Code.TOO_FEW_POINTS
-                )
+                return Failure("inner constraints require three determined datum points", Code.TOO_FEW_POINTS)
             if network.datum_points.all():
                 chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)
@@ -358,13 +355,13 @@ class _Run:
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
 
-    def _creeping(self, found: Iterated) -> Rows:
-        """Points without which an iteration that was given time enough may come to its end."""
+    def _slowly_converging(self, found: Iterated) -> Rows:
+        """Poorly determined points that may prevent convergence; none after few iterations."""
         none = np.zeros(0, dtype=np.intp)
-        return creeping_points(found.linear) if found.iterations >= _ENOUGH else none
+        return poorly_determined_points(found.linear) if found.iterations >= _SLOW else none
 
     def _without(self, points: Rows, values: Values) -> BundleProblem:
-        """The problem begun at the estimates, without points whose rays turn out to be parallel."""
+        """Return the problem with the estimates as approximate values, without points with parallel rays."""
         start, images = self.problem.start, self.usable.images
         xyz = np.where(self.usable.points[:, None], values.xyz + self.problem.centre, start.xyz)
         xyz[points] = np.nan
@@ -374,7 +371,7 @@ class _Run:
         return replace(self.problem, start=start, rounds=self.problem.rounds + 1)
 
     def _start(self) -> Values:
-        """Approximate values from the centre, of all that takes part; the rest is out of the way."""
+        """Approximate values with reduced coordinates; finite for unused images and points as well."""
         start, centre = self.problem.start, self.problem.centre
         known = finite(start.x0)
         extra = start.extra
@@ -395,7 +392,7 @@ class _Run:
         return observations, unknowns, freedom.defect if network.datum != "control" else 0
 
     def _aligned(self, values: Values, freedom: Freedom, chosen: Mask) -> Values:
-        """The estimates carried to where the chosen points are nearest their approximate coordinates."""
+        """Transform the estimates so that the chosen points fit their approximate coordinates best."""
         if freedom.defect < 6:
             return values
         reference = self.problem.reference - self.problem.centre

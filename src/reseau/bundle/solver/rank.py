@@ -1,4 +1,4 @@
-"""What the observations do not determine, by name."""
+"""Names of the unknowns that the observations do not determine."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from .arrow import full
 from .datum import Freedom, held_for
 from .system import Linear
 
-__all__ = ["PARALLEL", "creeping_points", "steady_points", "undetermined", "weak_points"]
+__all__ = ["PARALLEL", "poorly_determined_points", "steady_points", "undetermined", "weak_points"]
 
-# Eigenvalues of the scaled normal equations that count as zero.
+# Eigenvalues of the scaled normal equations below this count as zero.
 _ZERO = 1e-11
-# Of the scaled normal equations of a point whose rays are parallel: they cut at less than 3e-5 rad.
+# Smallest eigenvalue of the scaled normal equations of a point with parallel rays: they intersect at less
+# than 3e-5 rad.
 PARALLEL = 1e-9
 _LISTED = 8
-# A point this many times as uncertain as the median is hardly determined.
-_CREEPING = 50.0
-# A point of a datum may be this many times as uncertain, by its own rays, as the median of all.
+# A point with this many times the median uncertainty is poorly determined.
+_POOR = 50.0
+# Largest uncertainty of a datum point from its own rays, relative to the median of all points.
 _UNSTEADY = 5.0
 
 
 def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> Failure:
-    """A failure that names points, or combinations of the other unknowns, that nothing determines.
+    """Return a failure that names the undetermined points, or combinations of the other unknowns.
 
     Parameters
     ----------
     linear : Linear
         The linear problem at the estimates.
     freedom : Freedom
-        Similarities that the datum takes care of.
+        Similarity transformations that the datum determines.
     costs : tuple of float
-        vᵀPv on the way.
+        vᵀPv after each iteration.
     """
     weak = [linear.system.unknowns.network.points[j] for j in weak_points(linear)]
     if weak:
@@ -44,17 +45,17 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
             Code.NOT_IDENTIFIED,
             costs=costs,
         )
-    # Without the constraints of a stage, more would look undetermined than is.
+    # Without the constraints of the stage, determined unknowns would appear undetermined.
     vectors = _null_vectors(linear, freedom) if linear.system.constraints is None else []
     if not vectors:
-        return AdjustmentFailure("the normal equations are singular to rounding", Code.SINGULAR, costs=costs)
+        return AdjustmentFailure("the normal equations are numerically singular", Code.SINGULAR, costs=costs)
     listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
     reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
     return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
 
 
 def weak_points(linear: Linear) -> Rows:
-    """Points whose own normal equations are singular: rays along one line."""
+    """Return the points with singular normal equations: all rays lie on one line."""
     v = _own_normals(linear)
     size = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
     known = (size > 0).all(axis=1) & (linear.system.pattern.eliminated == 1)
@@ -64,10 +65,10 @@ def weak_points(linear: Linear) -> Rows:
 
 
 def steady_points(linear: Linear, chosen: Mask) -> Mask:
-    """Those of the chosen points (p,) that are fit to carry a datum.
+    """Return which of the chosen points (p,) are determined well enough for the datum.
 
-    A point that its rays hardly determine is no place to refer others to: inner constraints over it make all
-    of them as uncertain as itself. What its rays say with the images held does not depend on any datum.
+    Inner constraints over a poorly determined point make all others as uncertain as this point. Its
+    uncertainty with all images held does not depend on the datum.
 
     Parameters
     ----------
@@ -79,16 +80,16 @@ def steady_points(linear: Linear, chosen: Mask) -> Mask:
     return chosen & ~_unsteady(linear, chosen, _UNSTEADY)
 
 
-def creeping_points(linear: Linear) -> Rows:
-    """Points that their rays, all but parallel, hardly determine: too little to come to an end with."""
+def poorly_determined_points(linear: Linear) -> Rows:
+    """Return the points with nearly parallel rays that can prevent convergence."""
     every = np.ones(len(linear.prior), dtype=bool)
-    return np.asarray(np.flatnonzero(_unsteady(linear, every, _CREEPING)), dtype=np.intp)
+    return np.asarray(np.flatnonzero(_unsteady(linear, every, _POOR)), dtype=np.intp)
 
 
 def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
-    """Which points (p,), images held, are so many times as uncertain as the median of the chosen ones."""
+    """Points (p,) above a multiple of the median uncertainty of the chosen ones, with images held."""
     v, movable = _own_normals(linear), linear.system.movable > 0
-    # Held coordinates are as certain as can be: they must not count as what no ray determines.
+    # Held coordinates have no uncertainty: they must not count as undetermined.
     largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
     j, axis = np.nonzero(~movable)
     v[j, axis, axis] = largest[j]
@@ -100,7 +101,7 @@ def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
 
 
 def _own_normals(linear: Linear) -> Array:
-    """Normal equations (p, 3, 3) of each point by itself, the images held."""
+    """Normal equations (p, 3, 3) of each point with all images held."""
     system = linear.system
     last = linear.rows.shape[2] - 3
     b = linear.rows[:, :, last:]
@@ -114,7 +115,7 @@ def _own_normals(linear: Linear) -> Array:
 
 
 def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
-    """A basis of what is left undetermined among the reduced unknowns, with as many zeros as may be."""
+    """Basis of the null space of the reduced normal equations, with as many zeros as possible."""
     system = linear.system
     normal = linear.normal(0.0)
     held = system.held.copy()

@@ -1,8 +1,7 @@
 """Orientation of single images and pairs, and intersection of rays, as approximate values.
 
-The minimal solvers (three-point resection, five-point essential matrix) and the search for the largest set of
-consistent points are those of OpenCV; they receive directions that are corrected for the distortion of the
-camera.
+The minimal solvers (resection, five-point essential matrix) and the search for the largest set of consistent
+points are those of OpenCV, applied to directions corrected for distortion.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Pair(NamedTuple):
 
 
 def directions(network: Network) -> Array:
-    """Ideal directions u = xc/zc, v = yc/zc (n, 2) of all image coordinates, for the cameras as given."""
+    """Compute ideal directions u = xc/zc, v = yc/zc (n, 2) of all image coordinates."""
     found = np.full((len(network.xy), 2), np.nan)
     camera = network.camera_of[network.image_of]
     for c, entry in enumerate(network.cameras):
@@ -49,7 +48,7 @@ def directions(network: Network) -> Array:
 def _inverse(camera: Camera, xy: Array) -> Array:
     found = camera.bare_mapping().inverse(xy)
     if camera.registered is not None:
-        # Beyond the fold of a distortion that is not known yet, the ray without distortion is near enough.
+        # Where a roughly known distortion has no inverse, the direction without distortion is close enough.
         beyond = ~np.isfinite(found).all(axis=1)
         found[beyond] = camera.bare_mapping(distorted=False).inverse(xy[beyond])
     return found
@@ -58,7 +57,7 @@ def _inverse(camera: Camera, xy: Array) -> Array:
 def intersect(
     image: Rows, point: Rows, uv: Array, rotation: Array, x0: Array, points: int
 ) -> tuple[Array, Array]:
-    """Points nearest to all their rays, and the angles at which the rays intersect.
+    """Compute the points nearest to all their rays, and the intersection angles of the rays.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ def intersect(
     Returns
     -------
     ndarray (p, 3), ndarray (p,)
-        Points, NaN with less than two rays; the angle (rad) at which the rays intersect, 0 for parallel ones.
+        Points, NaN with fewer than two rays; intersection angles (rad), 0 for parallel rays.
     """
     ray = np.einsum("nji,nj->ni", rotation[image], np.column_stack([uv, np.ones(len(uv))]))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -85,7 +84,7 @@ def intersect(
     np.add.at(normal, point, across)
     np.add.at(side, point, np.einsum("nij,nj->ni", across, begin - centre))
     count = np.bincount(point, minlength=points)
-    # For two rays that intersect at an angle θ the least eigenvalue is 1 − cos θ.
+    # For two rays that intersect at an angle θ the smallest eigenvalue is 1 − cos θ.
     least = np.linalg.eigvalsh(normal)[:, 0]
     angle = np.where(count > 1, np.arccos(np.clip(1.0 - 2.0 * least / np.maximum(count, 2), -1.0, 1.0)), 0.0)
     good = (count > 1) & (least > 1e-12)
@@ -95,7 +94,7 @@ def intersect(
 
 
 def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
-    """Pose of an image from four points or more: that of the largest consistent set.
+    """Compute the pose of an image from the largest consistent set of at least four points.
 
     Parameters
     ----------
@@ -104,7 +103,7 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     uv : ndarray (k, 2)
         Ideal directions.
     tolerance : float
-        Greatest misfit of the ideal direction of a consistent point.
+        Largest misfit of the ideal direction of a consistent point.
 
     Returns
     -------
@@ -165,14 +164,14 @@ def _best_pose(xyz: Array, uv: Array, tolerance: float) -> tuple[Array, Array, M
 
 
 def relative_orientation(first: Array, second: Array, tolerance: float) -> Pair | None:
-    """Relative orientation of two images by the essential matrix of five points (Nistér 2004).
+    """Compute the relative orientation of two images by the five-point algorithm (Nistér 2004).
 
     Parameters
     ----------
     first, second : ndarray (k, 2)
         Ideal directions of the same points.
     tolerance : float
-        Greatest distance of a consistent point from its epipolar line.
+        Largest distance of a consistent point from its epipolar line.
     """
     if len(first) < 6:
         return None

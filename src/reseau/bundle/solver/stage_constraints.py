@@ -1,9 +1,9 @@
-"""The normal equations of images on a stage: those of one pose share their exterior orientation.
+"""Normal equations with a stage: all images of a pose have the same exterior orientation.
 
-Unknown are R and X0 of each pose, the reading of each image, which was observed, and the direction d of the
-axis by two small angles. The normal equations are formed as if every image had an orientation of its own.
-Changes y of these are y = T q of the unknowns q proper, and Tᵀ S T q = −Tᵀ s is what is solved (constraints
-by elimination: Förstner & Wrobel 2016, sect. 4.8.2); cofactors go back by T Q Tᵀ.
+The unknowns are R and X0 of each pose, the observed reading of each image, and the direction d of the axis
+(two small angles). The normal equations are first formed with a separate orientation for every image. Its
+corrections are y = T q with the independent unknowns q, and Tᵀ S T q = −Tᵀ s is solved (constraints by
+elimination: Förstner & Wrobel 2016, sect. 4.8.2); the cofactors of y are T Q Tᵀ.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ __all__ = ["Constrained", "StageConstraints"]
 class Constrained(NamedTuple):
     """Normal equations of the independent unknowns.
 
-    T (u, size) is `back`; then come the matrix (size, size), and gradients (size,): the readings', and all.
+    `back` is T (u, size), `matrix` is (size, size); `own` is the gradient (size,) of readings and axis only,
+    `gradient` that of all observations.
     """
 
     back: Array
@@ -36,17 +37,17 @@ class Constrained(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StageConstraints:
-    """The reduced unknowns of images as functions of the unknowns of poses and stage.
+    """Reduced unknowns of images as functions of the independent unknowns of poses and stage.
 
-    The independent unknowns are those that belong to no pose, six for each pose, the readings, and two for
-    the axis.
+    The independent unknowns are, in this order: all that belong to no image, six for each pose, the readings,
+    and two for the axis.
 
     Parameters
     ----------
     unknowns : Unknowns
-        Columns of the reduced normal equations, an orientation for each image.
+        Columns of the reduced normal equations, with an orientation for each image.
     stage : Stage
-        What moves the field.
+        The stage.
     """
 
     unknowns: Unknowns
@@ -54,18 +55,18 @@ class StageConstraints:
 
     @cached_property
     def images(self) -> Rows:
-        """Images that take part (a,)."""
+        """Adjusted images (a,)."""
         return np.flatnonzero(self.unknowns.pose >= 0).astype(np.intp)
 
     @cached_property
     def pose(self) -> Rows:
-        """First column of the pose of each image that takes part (a,)."""
+        """First column of the pose of each adjusted image (a,)."""
         _, number = np.unique(self.stage.pose[self.images], return_inverse=True)
         return np.asarray(len(self.others) + 6 * number, dtype=np.intp)
 
     @cached_property
     def others(self) -> Rows:
-        """Reduced unknowns that belong to no pose."""
+        """Reduced unknowns that belong to no image."""
         own = np.ones(self.unknowns.size, dtype=bool)
         own[self.unknowns.pose[self.images, None] + np.arange(6)] = False
         return np.flatnonzero(own).astype(np.intp)
@@ -81,7 +82,7 @@ class StageConstraints:
         return int(self.pose.max()) + 6 + len(self.images) + 2
 
     def matrix(self, moved: StageValues) -> Array:
-        """T (u, size) at some values."""
+        """Compute T (u, size) at given values."""
         t = np.zeros((self.unknowns.size, self.size))
         t[self.others, np.arange(len(self.others))] = 1.0
         row = self.unknowns.pose[self.images, None] + np.arange(6)
@@ -100,20 +101,20 @@ class StageConstraints:
         misfits: Array,
         held: Mask | None,
     ) -> Constrained:
-        """Normal equations of the independent unknowns.
+        """Compute the normal equations of the independent unknowns.
 
         Parameters
         ----------
         moved : StageValues
             Values of the stage.
         s, gradient : ndarray (u, u), (u,)
-            Reduced normal equations of the images as if the images were independent.
+            Reduced normal equations with a separate orientation for each image.
         slopes : ndarray (a + 2, size)
-            Weighted derivatives of readings and angles of the axis, see :meth:`slopes`.
+            Weighted derivatives of readings and axis angles, see :meth:`slopes`.
         misfits : ndarray (a + 2,)
             Their weighted misfits.
         held : ndarray of bool (size,), optional
-            Unknowns that are held.
+            Held unknowns.
         """
         assert moved is not None
         t, own = self.matrix(moved), slopes.T @ misfits
@@ -124,7 +125,7 @@ class StageConstraints:
         return Constrained(t, matrix, own, t.T @ gradient + own)
 
     def slopes(self, moved: StageValues | None, nominal: Array, root: Array) -> Array:
-        """Derivatives (a + 2, size) of readings and angles of the axis, times roots (a + 2,) of weights."""
+        """Derivatives (a + 2, size) of readings and axis angles, times roots (a + 2,) of weights."""
         assert moved is not None
         slopes, a = np.zeros((len(root), self.size)), len(self.images)
         slopes[np.arange(a), self.readings] = 1.0
@@ -132,13 +133,13 @@ class StageConstraints:
         return slopes * root[:, None]
 
     def stepped(self, moved: StageValues, x0: Array, y: Array, q: Array) -> tuple[StageValues, Array]:
-        """Readings, axis and projection centres (m, 3) after a correction y = T q."""
+        """Return readings and axis, and projection centres (m, 3), after a correction y = T q."""
         images, by_axis = self.images, perpendicular(moved.axis) @ q[-2:]
         reading = moved.reading.copy()
         reading[images] += q[self.readings]
         axis = moved.axis + by_axis
         axis /= np.linalg.norm(axis)
-        # What the pose itself is moved by is the part of y that is not the stage's.
+        # The correction of the pose is the part of y that does not come from the stage.
         rest = x0[images] + y[self.unknowns.pose[images, None] + np.arange(3, 6)]
         rest += reading[images, None] * moved.axis + moved.reading[images, None] * by_axis
         x0 = x0.copy()
@@ -146,7 +147,7 @@ class StageConstraints:
         return StageValues(reading, axis), x0
 
     def held(self, columns: Mask) -> Mask:
-        """Return which independent unknowns (size,) are held, from the held reduced unknowns (u,)."""
+        """Return the held independent unknowns (size,) from the held reduced unknowns (u,)."""
         held = np.zeros(self.size, dtype=bool)
         held[: len(self.others)] = columns[self.others]
         return held

@@ -1,4 +1,4 @@
-"""The adjustment's observations made ready: misfits, normal equations and corrections at any values."""
+"""The sparse system of an adjustment: misfits, normal equations and corrections at given values."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .values import Correction, Values
 
 __all__ = ["Linear", "Normal", "System", "residuals"]
 
-# The sums of one part need as much memory as the matrix: a large one is formed in one part.
+# The sums of each part need as much memory as the matrix: large matrices are formed in one part.
 _LARGE = 2000
-# Of an image coordinate computed from its unknowns, relative.
+# Relative rounding error of a computed image coordinate.
 _ROUNDING = 1e-14
 
 
@@ -37,11 +37,11 @@ class System:
     others : OtherObservations
         Observations other than image coordinates.
     weighting : Weighting
-        Of the image coordinates, in the order of the network.
+        Weights of the image coordinates, in the order of the network.
     factors : ndarray
-        On the weights of the other observations.
+        Factors on the weights of the other observations.
     held : ndarray of bool (u,)
-        Reduced unknowns that are held.
+        Held reduced unknowns.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class System:
 
     @cached_property
     def floor(self) -> float:
-        """A sum of squares that is no more than the rounding of the image coordinates."""
+        """Sum of squares that is only rounding of the image coordinates."""
         seen = np.einsum("nij,nj->ni", self.seen.root, self.seen.xy)
         return float(_ROUNDING**2 * (seen**2).sum())
 
     def misfits(self, values: Values) -> tuple[Array, Array]:
-        """Weighted misfits of the image coordinates (n, 2), by points, and of the other observations."""
+        """Return weighted misfits of image coordinates (n, 2), in point order, and of other observations."""
         out = np.empty((len(self.seen.image), 2))
         at, first = values.orientation, self.unknowns.first
 
@@ -85,7 +85,7 @@ class System:
         return out, (self.others.computed(values) - self.others.value) * self.sigma_root
 
     def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
-        """Cameras without a kernel, their numbers, and the rows of their observations."""
+        """Return mapping, number and rows of the observations of each camera without a kernel."""
         return _mappings(self.unknowns.network, self.seen.camera, values)
 
     def _weighted(self, rows: Rows, matrix: Array) -> Array:
@@ -93,7 +93,7 @@ class System:
         return weighted
 
     def linearise(self, values: Values) -> Linear:
-        """Misfits and derivatives at some values."""
+        """Compute misfits and derivatives at given values."""
         unknowns, n = self.unknowns, len(self.seen.image)
         rows, out = np.zeros((n, 2, unknowns.width)), np.empty((n, 2))
         at, first = values.orientation, unknowns.first
@@ -119,10 +119,10 @@ class System:
 
     @cached_property
     def prior_column(self) -> tuple[Rows, Rows, Rows, Rows]:
-        """Where other observations act on reduced unknowns.
+        """Columns of other observations of single reduced unknowns.
 
-        Rows of observed coordinates of kept points, their columns; rows of observed interior orientation,
-        their columns.
+        Rows and columns of observed coordinates of kept points, then rows and columns of observed interior
+        orientation.
         """
         unknowns, (_, coordinates, interior) = self.unknowns, self.others.slices
         kept = unknowns.kept[self.others.coordinate[:, 0]]
@@ -139,12 +139,12 @@ class System:
 
 
 class Linear:
-    """The linear problem at some values.
+    """The linear problem at given values.
 
     Parameters
     ----------
     rows : ndarray (n, 2, w)
-        Weighted derivatives of the image coordinates, by points; those by the point in the last three.
+        Weighted derivatives of the image coordinates, in point order; the last three are by the point.
     misfits : ndarray (n, 2)
         Weighted misfits.
     other_misfits : ndarray
@@ -173,7 +173,7 @@ class Linear:
         j, axis = others.coordinate.T
         root = self.system.sigma_root[at]
         prior[j, axis, 0] += root**2
-        # An observed coordinate that was left out of a point that nothing else holds.
+        # A rejected coordinate observation of a point that no other observation determines.
         prior[j, axis, 0] = np.where(
             (prior[j, axis, 0] == 0) & (network.rays[j] == 0), 1.0, prior[j, axis, 0]
         )
@@ -181,7 +181,7 @@ class Linear:
         return prior
 
     def _add_others(self, sums: Sums) -> None:
-        """Distances, and coordinates and parameters observed among the reduced unknowns."""
+        """Add distances, and observed coordinates and parameters among the reduced unknowns."""
         system = self.system
         bands, kept = len(sums.band), system.unknowns.kept
         rows, columns, rows_interior, columns_interior = system.prior_column
@@ -194,7 +194,7 @@ class Linear:
             if column[0] >= bands:
                 sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
             else:
-                # A camera of a single image: all its columns are in the band.
+                # All columns of a camera with a single image are in the band.
                 for i, c in enumerate(column):
                     sums.band[c, column[i:] - c] += slope[i] * slope[i:]
         held = np.flatnonzero(kept >= 0)
@@ -205,7 +205,7 @@ class Linear:
     def slopes(self) -> list[tuple[int, Rows, Array]]:
         """Return number, columns and weighted derivatives of observations of several reduced unknowns.
 
-        These are distances, of six columns each, and combinations of the parameters of a camera.
+        These are distances (six columns each) and combinations of the parameters of a camera.
         """
         system, slopes = self.system, []
         for k, (a, b) in enumerate(system.others.ends):
@@ -224,7 +224,7 @@ class Linear:
         return slopes
 
     def normal(self, damping: float) -> Normal:
-        """The normal equations reduced to the unknowns other than points, damped."""
+        """Form the damped normal equations, reduced to the unknowns other than points."""
         system, unknowns = self.system, self.system.unknowns
         p, u, bands = len(self.prior), unknowns.size, unknowns.bands
         inverse, side, diagonal = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
@@ -262,7 +262,7 @@ class Linear:
 
 
 class Normal:
-    """Reduced normal equations, ready to be solved."""
+    """Reduced normal equations."""
 
     def __init__(
         self, linear: Linear, sums: Sums, inverse: Array, side: Array, diagonal: Array, damping: float,
@@ -277,29 +277,35 @@ class Normal:
             _hold(self.sums, int(column))
 
     def factorise(self) -> Arrow:
-        """Cholesky factors; the sums are overwritten.
+        """Compute the Cholesky factors; the sums are overwritten.
 
         Raises
         ------
         Singular
-            When they have no positive definite solution.
+            When the matrix is not positive definite.
         """
         return Arrow.factorise(self.sums.band, self.sums.border)
 
     def constrained(self, stage: StageConstraints, held: Mask | None = None) -> Constrained:
-        """The same in the independent unknowns, of which some (size,) may be held."""
+        """Return the normal equations of the independent unknowns, of which some (size,) may be held."""
         linear, slopes = self.linear, self.stage_slopes(stage)
         matrix, last = full(self.sums.band, self.sums.border), linear.other_misfits[-len(slopes) :]
         return stage.constrained(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
 
     def stage_slopes(self, stage: StageConstraints) -> Array:
-        """Weighted derivatives of a stage's readings and axis, the last of the other observations."""
+        """Weighted derivatives of stage readings and axis, the last of the other observations."""
         system, others = self.linear.system, self.linear.system.others
         root = system.sigma_root[others.readings.start :]
         return stage.slopes(self.linear.values.stage, others.across, root)
 
     def correction(self) -> Correction:
-        """The correction the normal equations give; raises Singular."""
+        """Solve for the correction.
+
+        Raises
+        ------
+        Singular
+            When the matrix is not positive definite.
+        """
         constraints, q, by_stage = self.linear.system.constraints, None, 0.0
         if constraints is None:
             y = self.factorise().solve(-self.sums.reduced)
@@ -313,7 +319,7 @@ class Normal:
         return Correction(y, points, float(-gradient + self.damping * bent), q)
 
     def points(self, side: Array, y: Array) -> Array:
-        """Points (p, 3, s) for right-hand sides (p, 3, s) and reduced unknowns (u, s)."""
+        """Compute points (p, 3, s) from right-hand sides (p, 3, s) and reduced unknowns (u, s)."""
         linear, out = self.linear, np.zeros(side.shape)
 
         def work(_: int, a: int, b: int) -> None:
@@ -323,7 +329,7 @@ class Normal:
         return out
 
     def reduced_sides(self, side: Array) -> Array:
-        """− W V⁻¹ of right-hand sides (p, 3, s) of the points, (u, s)."""
+        """Compute −W V⁻¹ times right-hand sides (p, 3, s) of the points, (u, s)."""
         linear = self.linear
         out = np.zeros((linear.system.unknowns.size, side.shape[2]))
         reduce_sides(0, len(side), linear.rows, linear.system.pattern, self.inverse, side, out)
@@ -340,7 +346,7 @@ def _add(sums: Sums, column: int, root: float, misfit_: float, bands: int) -> No
 
 
 def _hold(sums: Sums, column: int) -> None:
-    """Leave an unknown as it is."""
+    """Hold an unknown."""
     bands = len(sums.band)
     if column < bands:
         sums.band[column] = 0.0
@@ -357,7 +363,7 @@ def _hold(sums: Sums, column: int) -> None:
 
 
 def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) -> Array:
-    """v (px) of some image observations of a network, adjusted or not, (len(rows), 2)."""
+    """Compute v (px) of selected image observations of a network, (len(rows), 2)."""
     image = network.image_of[rows]
     unit = np.tile(np.eye(2), (len(rows), 1, 1))
     seen = Seen(
@@ -377,7 +383,7 @@ def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) 
 
 
 def _mappings(network: Network, camera_of: Rows, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
-    """Cameras without a kernel, their numbers, and the rows of their observations."""
+    """Return mapping, number and rows of the observations of each camera without a kernel."""
     return [
         (
             camera.bare_mapping(values.cameras[c, : len(camera.names)]),

@@ -1,4 +1,4 @@
-"""Where each unknown of a network stands in the normal equations, and which rays touch it."""
+"""Columns of the unknowns of a network in the normal equations, and the rays that depend on them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .normal import SEGMENTS, Pattern, locals_of
 
 __all__ = ["Unknowns"]
 
-# Fewer unknowns than this are factorised as a full matrix, whatever their pattern.
+# Fewer unknowns than this are factorised as a full matrix.
 _DENSE = 1500
 _POINT = ("X", "Y", "Z")
 _POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
@@ -23,18 +23,18 @@ _POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Columns of the reduced normal equations: images with what is theirs alone, then what they share.
+    """Columns of the reduced normal equations: unknowns of single images first, then shared unknowns.
 
     Parameters
     ----------
     network : Network
-        Whose unknowns.
+        The network.
     active : ndarray of bool (m,)
-        Images that take part.
+        Adjusted images.
     pose : ndarray of int (m,)
-        First of the six columns of each image: rotation about the axes of the camera, projection centre.
+        First of the six columns of each image: rotation about the camera axes, projection centre.
     camera : ndarray of int (c,)
-        First column of each camera's free parameters.
+        First column of the free parameters of each camera.
     extra : ndarray of int (e,)
         First column of each set of additional parameters; −1 for a set that is held.
     extra_of : ndarray of int (m,)
@@ -44,7 +44,7 @@ class Unknowns:
     kept : ndarray of int (p,)
         First of three columns of points that are not eliminated, −1 for the others.
     size, bands, bandwidth : int
-        Number of columns, those of the band, and how many places below the diagonal it reaches.
+        Number of columns, number of columns in the band, and number of subdiagonals of the band.
     """
 
     network: Network
@@ -61,7 +61,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, network: Network, active: Mask) -> Unknowns:
-        """The unknowns of a network of which some images take part."""
+        """Create the columns for a network with the active images."""
         extra_of, extra_names = _extra_sets(network, active)
         users = np.bincount(network.camera_of[active], minlength=len(network.cameras))
         extra_users = np.bincount(extra_of[active & (extra_of >= 0)], minlength=len(extra_names))
@@ -104,12 +104,12 @@ class Unknowns:
 
     @cached_property
     def order(self) -> Rows:
-        """Observations in the order of their points (n,)."""
+        """Observations sorted by points (n,)."""
         return np.argsort(self.network.point_of, kind="stable")
 
     @cached_property
     def first(self) -> Rows:
-        """Where the rays of each point begin (p + 1,)."""
+        """First ray of each point (p + 1,)."""
         return np.concatenate([[0], np.cumsum(self.network.rays)])
 
     @cached_property
@@ -139,7 +139,7 @@ class Unknowns:
 
     @cached_property
     def dropped(self) -> Mask:
-        """Columns (u,) of additional parameters that stay zero."""
+        """Mask of the columns (u,) of additional parameters held at zero."""
         held = np.zeros(self.size, dtype=bool)
         for (c, label), at in zip(self.extra_names, self.extra, strict=True):
             extra = self.network.cameras[c].additional
@@ -150,12 +150,12 @@ class Unknowns:
 
     @property
     def width(self) -> int:
-        """Entries in a ray's row of derivatives."""
+        """Number of derivatives of a ray."""
         return 6 + int(self.count.max()) + self.extra_width + 3
 
     @cached_property
     def pattern(self) -> Pattern:
-        """Which unknowns each ray touches, in the order of points."""
+        """Unknowns of each ray, in the order of points."""
         image, point = self.network.image_of[self.order], self.network.point_of[self.order]
         camera, extra = self.network.camera_of[image], self.extra_of[image]
         n = len(image)
@@ -180,7 +180,7 @@ class Unknowns:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What each column is, as it is named in messages."""
+        """Name of each column for messages."""
         names = [""] * self.size
         for i, at in enumerate(self.pose):
             if at >= 0:
@@ -200,7 +200,7 @@ class Unknowns:
 
 
 def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, str], ...]]:
-    """The set of additional parameters of each image, and what each set is called."""
+    """Return the set of additional parameters of each image, and camera and label of each set."""
     sets: dict[tuple[int, str], int] = {}
     rows = np.full(len(network.images), -1)
     for i in np.flatnonzero(active):
@@ -217,7 +217,7 @@ def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, 
 
 
 def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
-    """Active images in an order that keeps neighbours together, and how far down each reaches in it."""
+    """Order the active images for a small bandwidth; return also the last neighbour of each in this order."""
     images = np.flatnonzero(active)
     if 6 * len(images) <= _DENSE:
         return images, np.full(len(images), len(images) - 1)

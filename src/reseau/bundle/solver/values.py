@@ -1,4 +1,4 @@
-"""Values of all unknowns of a network, and how a correction changes them."""
+"""Values of all unknowns of a network, and their correction."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Correction:
     Parameters
     ----------
     reduced : ndarray (u,)
-        Of the reduced unknowns.
+        Correction of the reduced unknowns.
     points : ndarray (p, 3)
-        Of the eliminated points.
+        Correction of the eliminated points.
     predicted : float
         Decrease of the weighted sum of squares, to first order.
     independent : ndarray, optional
-        Of the independent unknowns, where a stage moves the field.
+        Correction of the independent unknowns, with a stage.
     """
 
     reduced: Array
@@ -53,9 +53,9 @@ class Values:
     cameras : ndarray (c, p)
         Parameters of the cameras, padded to the longest.
     extra : ndarray (e, a)
-        Sets of additional parameters; one row at least.
+        Sets of additional parameters; at least one row.
     stage : StageValues, optional
-        Readings of a stage, and its axis.
+        Readings and axis of a stage.
     """
 
     rotation: Array
@@ -67,7 +67,7 @@ class Values:
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
-        """Values with the cameras as the network gives them."""
+        """Create values with the camera parameters of the network."""
         network = unknowns.network
         cameras = np.zeros(unknowns.free.shape)
         for row, camera in zip(cameras, network.cameras, strict=True):
@@ -76,15 +76,15 @@ class Values:
 
     @property
     def orientation(self) -> Orientation:
-        """What the compiled loops take."""
+        """Poses and points for the compiled loops."""
         return Orientation(self.rotation, self.x0, self.xyz)
 
     def beyond(self, radius: float) -> Rows:
-        """Points further than this from the origin."""
+        """Return the points farther than `radius` from the origin."""
         return np.flatnonzero(~(np.linalg.norm(self.xyz, axis=1) <= radius)).astype(np.intp)
 
     def confined(self, points: Rows, radius: float) -> Values:
-        """The same with these points brought back to a distance from the origin."""
+        """Return the values with these points moved to the distance `radius` from the origin."""
         xyz = self.xyz.copy()
         xyz[points] *= radius / np.linalg.norm(xyz[points], axis=1, keepdims=True)
         return replace(self, xyz=xyz)
@@ -92,7 +92,7 @@ class Values:
     def moved(
         self, unknowns: Unknowns, step: Correction, constraints: StageConstraints | None = None
     ) -> Values:
-        """The values after a correction; rotations turn about the axes of their camera."""
+        """Return the values after a correction; rotations are about the camera axes."""
         y = step.reduced
         images = unknowns.pose >= 0
         pose = np.zeros((len(images), 6))
