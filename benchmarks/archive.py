@@ -1,10 +1,10 @@
-"""What an archive of many frames costs: keeping one beside merely writing it, opening, listing, finding one.
+"""Cost of an archive with many frames: storing compared with writing a file, opening, listing, finding.
 
     python benchmarks/archive.py [--frames 10000] [--pixels 1024] [--objects 400] [--folder FOLDER]
 
-Frames are 8-bit, of noise: nothing of them can be left out. Plain writing is the same TIFF brought to the
-disk with fsync and a rename, as anyone must who does not want to lose it. To spare the disk, only so many
-frames are stored as files of their own (`--objects`); all others have rows in the index, and share a file.
+Frames contain 8-bit noise, which cannot be compressed. For comparison, the same TIFF is written with fsync
+and a rename, which is the minimum for a write that survives a power failure. To save disk space, only
+`--objects` frames are stored as separate files; all others have rows in the index and share one file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def milliseconds(work: Callable[[], object], times: int = 15) -> tuple[float, fl
 
 
 def plain(path: Path, data: bytes) -> None:
-    """Write a file that outlasts a power cut."""
+    """Write a file that survives a power failure."""
     draft = path.with_suffix(".draft")
     with draft.open("wb") as stream:
         stream.write(data)
@@ -53,8 +53,8 @@ def main() -> None:
     )
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--pixels", type=int, default=1024, help="width and height")
-    parser.add_argument("--objects", type=int, default=400, help="frames with a file of their own")
-    parser.add_argument("--folder", type=Path, help="where; by default a temporary folder")
+    parser.add_argument("--objects", type=int, default=400, help="number of frames with separate files")
+    parser.add_argument("--folder", type=Path, help="folder to use; default: a temporary folder")
     given = parser.parse_args()
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory(dir=given.folder) as name:
@@ -85,9 +85,9 @@ def main() -> None:
         print(f"{given.frames} frames, index {size:.1f} MB; median and worst, ms")
         written = statistics.median(written_ms), max(written_ms)
         print(f"  writing one of {given.pixels}² px    {written[0]:7.1f} {written[1]:7.1f}")
-        print(f"  keeping one              {statistics.median(kept_ms):7.1f} {max(kept_ms):7.1f}")
+        print(f"  storing one              {statistics.median(kept_ms):7.1f} {max(kept_ms):7.1f}")
         print(
-            f"  overhead                 {statistics.median(overhead):7.1f} {max(overhead):7.1f}   asked < 15"
+            f"  overhead                 {statistics.median(overhead):7.1f} {max(overhead):7.1f}   limit 15"
         )
         row = "  {:<24} {:7.1f} {:7.1f}   asked < 50"
         print(row.format("opening", *milliseconds(lambda: Archive.open(folder / "archive").close())))

@@ -1,10 +1,10 @@
-"""The bundle adjustment beside Ceres and COLMAP, its statistics, its growth, and how its covariances cover.
+"""Bundle adjustment compared with Ceres and COLMAP: time, statistics, growth, coverage of covariances.
 
 Run from the checkout: ``python benchmarks/bundle.py [--part peers|statistics|growth|cover]``. Networks are
-looked for in $RESEAU_DATA/networks. The Ceres runs need g++ and libceres-dev (Debian), those of COLMAP need
-pycolmap (PyPI); without them our times stand alone. All have two threads, and end where the relative change
-of the sum is below 1e-6 (ours: corrections below 1e-6 standard deviations); import, compilation and reading
-of files are not counted.
+read from $RESEAU_DATA/networks. Ceres needs g++ and libceres-dev (Debian), COLMAP needs pycolmap (PyPI);
+without them only our times are printed. All use two threads and stop when the relative change of the sum of
+squares is below 1e-6 (ours: corrections below 1e-6 standard deviations). Import, compilation and reading of
+files are not included.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ DATA = (
     Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "networks"
 )
 SOURCE, COLMAP = (Path(__file__).parent / "ceres" / name for name in ("bundle.cc", "colmap.py"))
-# ½Σr² to be reached: that of Ceres for ladybug, the published 185.94²/2 for roma.
+# Target of ½Σr²: that of Ceres for ladybug, the published 185.94²/2 for roma.
 LADYBUG, ROMA = 1.334433e4, 0.5 * 185.940**2
 REPEATS = 5
 
 
 def compiled_peer(folder: Path) -> Path | None:
     if shutil.which("g++") is None or not Path("/usr/include/ceres/ceres.h").exists():
-        print("no g++ or no libceres-dev: no peer")
+        print("no g++ or no libceres-dev: no comparison with Ceres")
         return None
     program = folder / "bundle"
     command = [
@@ -66,7 +66,7 @@ def peer(program: Path, kind: str, network: Path, target: float) -> tuple[float,
 
 
 def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
-    """Nothing is known of the way: seconds in all are those to its end."""
+    """Only the total time is known."""
     if importlib.util.find_spec("pycolmap") is None:
         return None
     words = subprocess.run(
@@ -76,7 +76,7 @@ def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
 
 
 def ours(problem: BundleProblem, target: float) -> tuple[float, float, float, int]:
-    """Seconds to the target, seconds of the adjustment in all without its statistics, ½Σr², iterations."""
+    """Seconds to the target, total seconds of the adjustment without statistics, ½Σr², iterations."""
     seen: list[tuple[float, float]] = []
     begun = time.perf_counter()
     watched = replace(problem, watch=lambda _, cost: seen.append((time.perf_counter() - begun, 0.5 * cost)))
@@ -138,7 +138,9 @@ def said(who: str, runs: list[tuple[float, float, float, int]], ratios: list[flo
     reached, whole, cost, steps = np.median(np.array(runs), axis=0)
     to_it = "        –" if np.isnan(reached) else f"{reached:7.3f} s"
     ratio = "" if ratios is None else f"; reseau takes {np.median(ratios):.2f} of it"
-    print(f"  {who:6s} {to_it} to it, {whole:.3f} s in all, ½Σr² {cost:.6f}, {steps:.0f} steps{ratio}")
+    print(
+        f"  {who:6s} {to_it} to the target, {whole:.3f} s in total, ½Σr² {cost:.6f}, {steps:.0f} steps{ratio}"
+    )
 
 
 def statistics() -> None:
@@ -156,7 +158,7 @@ def statistics() -> None:
         numbers.append(time.perf_counter() - begun)
     print(f"roma: covariances of all {len(found.points)} points and image points {np.median(spent):.3f} s")
     print(f"      redundancy numbers and tests of {len(r)} coordinates from them {np.median(numbers):.3f} s")
-    print(f"      their sum less the redundancy {r.sum() - fit.redundancy:.1e}")
+    print(f"      their sum minus the redundancy {r.sum() - fit.redundancy:.1e}")
 
 
 def strip(images: int, seed: int = 0) -> Network:

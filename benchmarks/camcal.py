@@ -1,9 +1,9 @@
-"""Photographs of a sheet of disks, some coded: what is measured in them, beside another program.
+"""Photographs of a sheet of disks with coded rings: measured coordinates compared with another program.
 
-Run from the checkout: ``python benchmarks/camcal.py [DATA] [--channel luma]``. The photographs are looked for
-in DATA/testfield_camcal, by default $RESEAU_DATA or ../shared/data. The other program measures centres of
-ellipses; the image of a disk's centre, which is what we measure, lies beside that in perspective. The table
-shows the difference to both.
+Run from the checkout: ``python benchmarks/camcal.py [DATA] [--channel luma]``. The photographs are read from
+DATA/testfield_camcal, by default in $RESEAU_DATA or ../shared/data. The other program measures centres of
+ellipses; we measure the image of a disk's centre, which differs in perspective. The table shows the
+difference to both.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from reseau.optics.formation import Outline
 _LIMIT_PX = 0.03
 _MISNUMBERED_PX = 5.0
 EXTRA = (("P8250026.JPG", "95"), ("P8250030.JPG", "80"))
-"""Marks that we measure and the other program does not, in the green channel."""
+"""Marks measured by us but not by the other program, in the green channel."""
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph, what we measure in it, and what others do (n, 2), NaN where they do not."""
+    """One photograph, our measurement, and that of others (n, 2), NaN where missing."""
 
     name: str
     result: ReseauResult
@@ -51,7 +51,7 @@ class Photograph:
     wall: float
 
     def off(self, ours: Array) -> Array:
-        """Differences (n, 2) to the other program; no wrong numbers among them."""
+        """Differences (n, 2) to the other program, without misnumbered marks."""
         difference = ours - self.theirs
         return np.where(np.hypot(*difference.T)[:, None] < _MISNUMBERED_PX, difference, np.nan)
 
@@ -72,7 +72,7 @@ def measure(path: Path, design: ReseauDesign, theirs: dict[str, Array], channel:
 
 
 def ellipses(result: ReseauResult, design: ReseauDesign) -> tuple[Array, Array]:
-    """Where the centre of each image lies beside the image of the centre (n, 2), and its radius in pixels."""
+    """Centre of each image relative to the image of the centre (n, 2), and its radius in pixels."""
     assert design.mark.size is not None
     pitch = of_the_tests("measure/camcal.py").PITCH
     circle = Outline.circle(design.mark.size / 2, design.mark.size / 20)
@@ -82,7 +82,7 @@ def ellipses(result: ReseauResult, design: ReseauDesign) -> tuple[Array, Array]:
         near = np.flatnonzero((gap < 2.5 * pitch) & result.ok)
         if len(near) < 6:
             continue
-        # A projectivity to the neighbours: the lens has no say over so short a way.
+        # A projectivity of the neighbours: over so short a distance, lens distortion has no effect.
         h, _ = cv2.findHomography(design.xy[near] - design.xy[k], result.xy[near])
         if h is None:
             continue
@@ -153,7 +153,7 @@ def table(done: list[Photograph]) -> None:
 
 
 def summary(name: str, kind: list[Array], shift: Array, done: list[Photograph]) -> None:
-    """All photographs together: one common shift, then a common scale about the middle as well."""
+    """All photographs together: one common shift, then also a common scale about the middle."""
     off = np.concatenate(kind)
     medians = np.array([np.nanmedian(each, axis=0) - shift for each in kind])
     away = np.concatenate([p.theirs for p in done]) - np.array([1135.5, 851.5])
@@ -171,7 +171,7 @@ def summary(name: str, kind: list[Array], shift: Array, done: list[Photograph]) 
 
 
 def bundles(done: list[Photograph], network: Path) -> None:
-    """The same bundle adjustment from their image coordinates and from ours."""
+    """The same bundle adjustment with their image coordinates and with ours."""
     for name in ("theirs", "centre", "ellipse"):
         content = json.loads(network.read_text())
         at = content["observations"]

@@ -1,4 +1,4 @@
-"""The whole oscilloscope procedure in one world, held against the truth and against the noise-free chain."""
+"""The complete oscilloscope procedure in one world, compared with the truth and the noise-free chain."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from reseau_sims import Truth, World
 __all__ = ["FALSE_PX", "FAR_SIGMA", "Errors", "Found", "Trial", "trial"]
 
 FALSE_PX, FAR_SIGMA = 3.0, 5.0
-"""A point further than this from any true one is none; one this many sigmas off has a false sigma."""
+"""Points farther than this from all true ones are false; larger errors in sigmas indicate a wrong sigma."""
 
 Mapping = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Points of a photograph beside the truth.
+    """Points of a photograph compared with the truth.
 
     Parameters
     ----------
@@ -106,13 +106,13 @@ class Trial:
 
 
 def trial(seed: int, physics: Physics, folder: Path | None = None) -> Trial | str:
-    """The procedure in one world; a text says what failed."""
+    """The procedure in one world; a text if it failed."""
     seen = measured(seed, physics, folder)
     return seen if isinstance(seen, str) else compared(seen)
 
 
 def compared(seen: Measured) -> Trial | str:
-    """What was measured in a world, taken through the procedure and held against the truth."""
+    """Process the measurements of a world, and compare the results with the truth."""
     world = World.standard(seen.seed, display=seen.physics)
     first = photo_i(seen.marks, world.design)
     if isinstance(first, Failure):
@@ -140,7 +140,7 @@ def compared(seen: Measured) -> Trial | str:
 
 
 def nearest(xy: Array, known: Array) -> Rows:
-    """For each point the row of the known one that it is, −1 where it is none, (n,)."""
+    """For each point the row of the corresponding known point, or −1, (n,)."""
     off = np.hypot(*(xy[:, None] - known[None]).transpose(2, 0, 1))
     row = off.argmin(axis=1)
     mine = (off.argmin(axis=0)[row] == np.arange(len(xy))) & (off.min(axis=1) <= FALSE_PX)
@@ -148,7 +148,7 @@ def nearest(xy: Array, known: Array) -> Rows:
 
 
 def found_of(points: ImagePoints, row: Rows, known: Array) -> Found:
-    """Count, and compare positions; what lies far from the point that it should be is none."""
+    """Count and compare positions; points far from all known points are false."""
     off = points.xy - known[row]
     row = np.where(np.hypot(*off.T) <= FALSE_PX, row, -1)
     right = row >= 0
@@ -158,7 +158,7 @@ def found_of(points: ImagePoints, row: Rows, known: Array) -> Found:
 def chain_without_noise(
     second: PhotoII, design: ReseauDesign, rods: Truth, refined: Mapping
 ) -> tuple[Array, Mapping]:
-    """Group B adjusted to noise-free positions of the rods and to where they really are.
+    """Group B adjusted to noise-free images and true positions of the rods.
 
     Parameters
     ----------

@@ -1,11 +1,12 @@
-"""How many poses the closed loop needs for what the paper's 36 recordings give.
+"""Number of poses that the closed loop needs for the precision of the paper's 36 recordings.
 
     python benchmarks/closed_loop.py [--seeds 2] [--parameter c]
 
-For every seed the paper's recordings are taken first, all 36; their standard deviation of the parameter is
-the goal. Then poses are chosen until it is reached: the next one always lowers it most, predicted from the
-design matrix; among the paper's tilts with eight turns of the board, and among tilts up to 60°. The testfield
-is flat here, so that sigma0 is one and counts for nothing; noise, jitter and camera are the paper's.
+For every seed the 36 recordings of the paper are simulated first; their standard deviation of the parameter
+is the goal. Then poses are chosen until the goal is reached: the next pose is the one that reduces the
+predicted standard deviation most, among the tilts of the paper with eight rotations of the board, and among
+tilts up to 60°. The testfield is plane, so that sigma0 is one; noise, jitter and camera are those of the
+paper.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ DESIGN = coded_testfield()
 
 
 def grid(tilts: Sequence[float], rolls: int) -> list[Step]:
-    """All poses of a raster; the board that is not tilted is not turned either."""
+    """All poses of a raster; an untilted board is not rotated."""
     steps = []
     for tilt in tilts:
         for roll in range(0, 360, 360 // rolls) if tilt else (0,):
@@ -39,7 +40,7 @@ def grid(tilts: Sequence[float], rolls: int) -> list[Step]:
 
 
 class Session:
-    """A testfield procedure on the simulated bench, without instruments between."""
+    """A testfield procedure on the simulated bench, without instruments."""
 
     def __init__(self, seed: int) -> None:
         self.bench = FieldBench(seed=seed, bend_mm=0.0)
@@ -55,7 +56,7 @@ class Session:
         self.poses += 1
 
     def sigma(self, parameter: str) -> float:
-        """Reached so far; infinite before there is a calibration."""
+        """Standard deviation reached so far; infinite before the first calibration."""
         return self.procedure.progress().get(f"sigma_{parameter}", float("inf"))
 
 

@@ -1,9 +1,8 @@
-"""The method of Cruz, Cardenal and Delgado as their paper says it (sect. 2.2): the baseline of `frames.py`.
+"""The method of Cruz, Cardenal and Delgado, section 2.2 of their paper: baseline of `frames.py`.
 
-Search areas are given, as their user extracts them; each is turned so that its edge is an upper one. The
-template of Prewitt, the threshold of 80, the line with the most white pixels within a tilt of 1°, a window of
-30 pixels around it, profiles, the three largest gradients of each, a regression line without what is
-beyond 3σ.
+Search areas are given, as selected by a user; each is rotated so that its edge is an upper one. Steps:
+Prewitt template, threshold 80, line with the most white pixels within a tilt of 1°, window of 30 pixels
+around it, profiles, the three largest gradients of each, regression line without points beyond 3σ.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ def cruz_corners(grey: NDArray[np.uint8], areas: Array, bright_film: bool = Fals
     for k, (x0, y0, x1, y1) in enumerate(np.rint(areas).astype(int)):
         x0, y0 = max(x0, 0), max(y0, 0)
         part = image[y0:y1, x0:x1]
-        # Upper, and the others turned into upper ones: two rotations and a flip.
+        # The upper edge, and the others rotated or flipped to upper ones.
         upper = [part, np.rot90(part), part[::-1], np.rot90(part, -1)][k]
         fit = _edge(np.ascontiguousarray(upper).astype(np.float32))
         if fit is None:

@@ -1,8 +1,8 @@
-"""Modulation transfer of slanted edges: the free curve, the Gaussian, and ISO 12233 in its plain form.
+"""Modulation transfer function of slanted edges: the free curve, the Gaussian, and plain ISO 12233.
 
 Run from the checkout: ``python benchmarks/edge.py [--edges N]``. Edges are formed by brute force (clouds of
-rays), 48 × 48 pixels, 3° to 20°, of both orientations and polarities; errors are over 32 frequencies up to
-one cycle per pixel, against the transform of the same rays.
+rays), 48 × 48 pixels, at 3° to 20°, of both orientations and polarities. Errors are computed at 32
+frequencies up to one cycle per pixel, against the transform of the same rays.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def row(kind: str, decibels: float, count: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--edges", type=int, default=60, help="Of each kind and noise.")
+    parser.add_argument("--edges", type=int, default=60, help="Number of edges of each kind and noise level.")
     count = parser.parse_args().edges
     began = time.process_time()
     print("rms error of the modulation: free curve, plain ISO 12233, Gaussian; free: rms error/σ, largest")
-    print("bias/σ of a frequency; edges of which the test says that they are no Gaussian's, at 1 %")
+    print("bias/σ of a frequency; share of edges rejected as Gaussian at 1 %")
     print(f"{'':16} {'free':>9} {'ISO':>9} {'Gaussian':>9} {'error/σ':>10} {'bias/σ':>10} rejected")
     for kind in edges.KINDS:
         for decibels in (30.0, 40.0, 50.0):

@@ -1,10 +1,11 @@
-"""What no method can tell: the bound of an edge with a bright line behind it (Cruz et al., fig. 7B).
+"""Cramér–Rao bound of an edge with a bright line behind it (Cruz et al., fig. 7B).
 
     python benchmarks/frame_bound.py [--frames 200]
 
-Of the frames that are declined alone: the standard deviation of the edge's ends that the pixels allow (Cramér
-and Rao), when edge and line, their contrasts in twenty sections and the line's own end are unknown, and the
-width of the spread is known. The geometry is that of the frame without noise; the noise is that of the scan.
+For frames that are declined when processed alone: the smallest standard deviation of the ends of the edge
+that the pixels allow, with edge and line, their contrasts in twenty sections and the end of the line unknown,
+and the width of the point-spread function known. The geometry is that of the frame without noise; the noise
+is that of the scan.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from reseau.measure.film.border import read_band
 from reseau_sims.filmframe import Beside, FilmFrame
 
 LIMIT_PX = 0.33
-"""Standard deviation of a corner from which on a frame is not called oriented."""
+"""Standard deviation of a corner above which a frame is not oriented."""
 _DARK = 14.0
 _REACH_PX = 20.0
 
@@ -37,7 +38,7 @@ def scanned(frame: FilmFrame) -> Scan:
 
 
 def bound(frame: FilmFrame) -> Array:
-    """Standard deviations (2,) of the ends of the edge beside which the line is, pixels."""
+    """Standard deviations (2,) of the ends of the edge beside the line, pixels."""
     seen, bare = scanned(frame), scanned(dataclasses.replace(frame, beside=Beside()))
     corners = frame.truth.corners
     bands = [
@@ -68,7 +69,7 @@ def main() -> None:
         ends = bound(frame)
         declined, beyond = declined + 1, beyond + int(ends.max() > LIMIT_PX)
         print(f"  {seed}  {ends[0]:.2f} {ends[1]:.2f}  {result.why}", flush=True)
-    print(f"{declined} of {count} declined; of {beyond} no method could tell an end to {LIMIT_PX} px")
+    print(f"{declined} of {count} declined; for {beyond} the bound of an end exceeds {LIMIT_PX} px")
 
 
 if __name__ == "__main__":

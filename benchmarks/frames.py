@@ -1,10 +1,10 @@
-"""Inner orientation of scanned frames: the evidence, printed by one command.
+"""Inner orientation of scanned frames: accuracy, time and memory.
 
     python benchmarks/frames.py [--frames 200] [--jobs 2] [--only NAME …] [--real DIR] [--pictures DIR]
 
-Simulated frames of every difficulty against their truth, beside the method of Cruz, Cardenal and Delgado as
-their paper says it (`cruz.py`, with its search areas given); table 1 of the paper on a roll of each camera; a
-roll of 36 and a frame of 40 megapixels by the clock; the real scans of the reference data.
+Simulated frames of every difficulty compared with their truth, and with the method of Cruz, Cardenal and
+Delgado (`cruz.py`, with given search areas); table 1 of the paper on a roll of each camera; time of a roll of
+36 frames and of a frame of 40 megapixels; the real scans of the reference data.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ PAPER = {"Ricoh, 600 dpi": (0.008, 0.014, 0.015, 0.010), "Hasselblad, 1200 dpi":
 """Table 1, examples 1 and 2: affine σX, σY, conformal σX, σY in mm."""
 
 SEEDS = 700_000
-"""Of the first frame of every difficulty. Nothing was tuned to these: that was done on seeds below."""
+"""Seed of the first frame of every difficulty; seeds below were used for development."""
 
 Row = tuple[FrameResult, Array, Array, Array]
 
 
 def _areas(corners: Array) -> Array:
-    """Search areas as a user draws them: a millimetre to both sides at 600 dpi, between the corners."""
+    """Search areas as selected by a user: one millimetre to both sides at 600 dpi, between the corners."""
     boxes = []
     for k in range(4):
         a, b = corners[k], corners[(k + 1) % 4]
@@ -79,7 +79,7 @@ def _areas(corners: Array) -> Array:
 
 
 def one(frame: FilmFrame) -> Row:
-    """Our result, its errors and sigmas, errors of the paper's method: of one simulated frame."""
+    """Our result, its errors and sigmas, and errors of the paper's method, for one simulated frame."""
     pixels = frame.scan()
     options = FrameOptions(formats=(frame.format[:2],))
     result = orient_frames(scan_of(pixels, dpi=frame.dpi), options)[0]
@@ -97,7 +97,7 @@ def _errors(result: FrameResult, frame: FilmFrame) -> tuple[Array, Array]:
 
 
 def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float]:
-    """Status of a frame that was not oriented alone, by the shape of its roll, and its largest error."""
+    """Status and largest error of a frame with the shape of its roll, if it was not oriented without."""
     before, frame, roll = doubtful
     options = FrameOptions(formats=(frame.format[:2],))
     result = reorient_scan(scan_of(frame.scan(), dpi=frame.dpi), roll, [before], options)[0]
@@ -129,7 +129,7 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str]) -> None:
 
 
 def _of_roll(pool: ProcessPoolExecutor, frame: FilmFrame, results: list[FrameResult]) -> str:
-    """What the frames that are oriented, of the same camera as all, do for those that are not."""
+    """Orient the remaining frames with the shape of the oriented frames of the same camera."""
     roll = roll_of(results, frame.dpi)
     doubtful = [
         (result, frame.with_seed(SEEDS + seed), roll)
@@ -144,7 +144,7 @@ def _of_roll(pool: ProcessPoolExecutor, frame: FilmFrame, results: list[FrameRes
 
 
 def print_table_1(pool: ProcessPoolExecutor, count: int) -> None:
-    """Table 1 of the paper: transformations to calibrated corners, which a roll of frames gave."""
+    """Table 1 of the paper: transformations to corners calibrated with a roll of frames."""
     print(f"\nTable 1: transformation to calibrated corners (from another {count} frames), σX σY in mm")
     print("                              affine           conformal")
     for name, form, dpi in (("Ricoh, 600 dpi", RICOH, 600.0), ("Hasselblad, 1200 dpi", HASSELBLAD, 1200.0)):
@@ -180,7 +180,7 @@ def _results(frame: FilmFrame) -> FrameResult:
 
 
 def _commanded(*arguments: object) -> tuple[str, float, float, float]:
-    """What `reseau orient` said of scans, its wall time and processor time in s, its peak memory in MB."""
+    """Output of `reseau orient`, wall and processor time in s, peak memory in MB."""
     start = time.perf_counter()
     command = [str(Path(sys.executable).with_name("reseau")), "orient", *map(str, arguments)]
     command += ["--frame", "36x24"]
@@ -195,7 +195,7 @@ def _commanded(*arguments: object) -> tuple[str, float, float, float]:
 
 def print_times() -> None:
     """A roll of 36, a frame of 40 megapixels, and a scan of 600 MB by the command, for its memory."""
-    print("\nTimes and memory of `reseau orient` (with its start), by the clock and of the processor")
+    print("\nWall time, processor time and memory of `reseau orient`, including its start")
     with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(2) as pool:
         # Other processes make the scans: a child begins with the memory of its parent.
         folder = Path(name)
@@ -249,7 +249,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument(
-        "--only", nargs="*", default=[], help="parts of names of difficulties, or: table times real"
+        "--only", nargs="*", default=[], help="parts of names of difficulties, or: table, times, real"
     )
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     data = Path(os.environ.get("RESEAU_DATA", beside))

@@ -1,10 +1,10 @@
-"""Frames of 2048 × 2048 pixels over GigE Vision: our driver beside Aravis's own client, on the same loopback.
+"""Frames of 2048 × 2048 pixels over GigE Vision: our driver compared with Aravis's own client.
 
     python benchmarks/gige.py [--frames 300] [--rounds 3]
 
-In each round both receive from the same simulated camera, which sends as fast as it can; the rates of whole
-frames are compared, and CPU seconds of a frame. Afterwards a long series by our driver, in blocks: CPU and
-memory must not grow, every frame must be to the bit what was sent or be counted as lost.
+In each round both receive from the same simulated camera, which sends as fast as it can; rates of complete
+frames and CPU seconds per frame are compared. Then our driver receives a long series in blocks: CPU time and
+memory must not grow, and every frame must be identical to the one sent or be counted as lost.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ BLOCKS = 10
 
 
 class Numbered:
-    """A noisy picture whose first pixels are its number."""
+    """A noisy picture whose first pixels contain its number."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -53,7 +53,7 @@ class Numbered:
 
 
 def serve(ready: Connection) -> None:
-    """The simulated camera, in a process of its own: it is not to take our client's time."""
+    """The simulated camera in a separate process, so that it does not use the client's time."""
     with GigeCamera(SimulatedCamera(Numbered(), SIZE, SIZE), wait_s=120.0) as simulated:
         ready.send(simulated.address)
         ready.recv()
@@ -74,7 +74,7 @@ def simulated_camera() -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Received:
-    """What a client received."""
+    """Frames received by a client."""
 
     rate: float
     cpu_ms: float
@@ -137,7 +137,7 @@ def long_series(camera: CameraDriver, sight: Numbered, frames: int) -> tuple[lis
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare, and look whether anything grows."""
+    """Compare the clients, and check for growth of time and memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=int(os.environ.get("RESEAU_FRAMES", "300")))
     parser.add_argument("--rounds", type=int, default=5)

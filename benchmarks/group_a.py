@@ -1,16 +1,16 @@
-r"""Group A on the simulated bench: are the sigmas true, do the tests keep their level, what is left?
+r"""Group A on the simulated bench: correctness of the sigmas, level of the tests, remaining errors.
 
 Run from the checkout: ``python benchmarks/group_a.py [--frames 200] [--draws 2000] [--jobs 1]``. It prints
 
 1. the chain from points: exact positions in simulated worlds, with normal noise of known covariance;
 2. level and power of the :math:`\chi^2` test of each coefficient, the first in the elimination;
-3. the whole chain, one world to a seed: frame → measured marks → corrected camera.
+3. the complete chain, one world per seed: frame → measured marks → corrected camera.
 
-What a coefficient is compared with: the adjustment of the *noise-free* positions with the same reduced
-model, the same weights, and the same common system, frozen at the measured images of O and S. Elimination
-selects: a coefficient that was dropped is zero in the one as in the other, and what that does to those that
-remain is no error of theirs. What the reduced model leaves of the noise-free positions is its approximation
-error; it stands apart, and no sigma covers it.
+Coefficients are compared with those of an adjustment of the *noise-free* positions with the same reduced
+model, the same weights, and the same common system, fixed at the measured images of O and S. A coefficient
+that was dropped is zero in both, and the effect on the remaining ones is not counted as an error. The
+residuals of the reduced model for noise-free positions are its approximation error; it is listed separately,
+and no sigma covers it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from reseau_sims import World
 
 COEFFICIENTS = RationalPolynomial.camera().names
 INVARIANT = ("a0", "b0", "d1", "d2", "k", "h1", "h2")
-"""Coefficients that errors of O and S, which turn, shift and scale the common system, do not make up."""
+"""Coefficients that do not depend on errors of O and S (rotation, shift and scale of the common system)."""
 NOISE_PX = 0.007
 EVERYTHING = 1 - 1e-12
 """A level at which every coefficient is significant: nothing is eliminated."""
@@ -47,7 +47,7 @@ EVERYTHING = 1 - 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One correction against the truth; mm in the common system unless the name says otherwise."""
+    """One correction compared with the truth; mm in the common system unless the name has another unit."""
 
     seed: int
     marks: int
@@ -56,23 +56,23 @@ class Trial:
     coefficients: Array
     """Errors of the coefficients over their sigmas; NaN where dropped."""
     check: Array
-    """Errors of corrected check marks over their sigmas, against the noise-free model, (c, 2)."""
+    """Errors of corrected check marks over their sigmas, relative to the noise-free model, (c, 2)."""
     check_design: Array
-    """The same against the design: with the approximation error."""
+    """The same relative to the design, including the approximation error."""
     check_mm: dict[str, Array]
     passed: bool
     expected: float
     """Probability of passing, from the noise-free sum of squares."""
     sigma0: float
     left: Array
-    """What the model leaves of noise-free positions, (n, 2)."""
+    """Residuals of the model for noise-free positions, (n, 2)."""
     px_per_mm: float
 
 
 def without_noise(
     points: ImagePoints, exact: dict[str, Array], mapping: Callable[[Array], Array]
 ) -> ImagePoints:
-    """The same points where they really are, carried by a mapping, with the covariances they have."""
+    """The true positions of the points, mapped, with the covariances of the points."""
     return ImagePoints(points.names, mapping(np.array([exact[name] for name in points.names])), points.cov)
 
 
@@ -124,7 +124,7 @@ def trial(world: World, points: ImagePoints, seed: int) -> Trial | str:
 
 
 def simpler(model: RationalPolynomial, system: Similarity, points: ImagePoints, fit: CorrectionFit) -> Array:
-    """What a simpler transformation, fitted to the same marks, leaves at the check marks."""
+    """Residuals of a simpler transformation, fitted to the same marks, at the check marks."""
     found = fit_mapping(model, fit.points, fit.target).required()
     return model.with_values(found.values)(system(points.select(fit.check.names).xy)) - fit.check_target
 
@@ -218,7 +218,7 @@ def print_trials(title: str, found: list[Trial | str]) -> None:
 
 
 def first_tests(pool: Executor, draws: int) -> None:
-    """Level and power of the first test of each coefficient: drawn, and printed."""
+    """Simulate and print level and power of the first test of each coefficient."""
     seeds = [draws] + [max(1, draws // 4)] * (len(SIZES) - 1)
     rates = [
         np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=50)), axis=0)

@@ -1,15 +1,15 @@
-r"""Level and power of the F-tests of group B: of every monomial at first, and of what the elimination keeps.
+r"""Level and power of the F-tests of group B: of every monomial first, then of those that are kept.
 
-The test of one coefficient is that of the model without it against that with it, :math:`F = (\Omega_0 -
-\Omega)/(\Omega/r)`, with the variance factor of the adjustment itself: of the standard deviations of rods and
-pins only the ratios matter. Equations (7a, b) are linear in their coefficients and the pins' errors small
-beside the rods', so that F has one and r degrees of freedom, and the non-centrality of a coefficient of s
-standard deviations is s².
+The test of one coefficient compares the model without it with the model with it, :math:`F = (\Omega_0 -
+\Omega)/(\Omega/r)`, with the variance factor of the adjustment itself: only the ratios of the standard
+deviations of rods and pins matter. Equations (7a, b) are linear in their coefficients and the errors of the
+pins are small compared with those of the rods, so that F has one and r degrees of freedom, and a coefficient
+of s standard deviations has the non-centrality s².
 
-At the end of an elimination this no longer holds of what is kept: the smallest of several statistics was
-dropped at each step, and where monomials go together (x², y² and r⁴ over the rods: ρ up to 0.94) the one that
-remains inherits what the others explained by chance. What to expect then is drawn from a linear model of the
-same design.
+At the end of an elimination this no longer holds for the remaining coefficients: the smallest of several
+statistics was dropped at each step, and of correlated monomials (x², y² and r⁴ over the rods: ρ up to 0.94)
+the one that remains includes what the others explained by chance. The expected rates are therefore simulated
+with a linear model of the same design.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ __all__ = ["COEFFICIENTS", "f_tests"]
 
 COEFFICIENTS = RationalPolynomial.ultrasonic().names
 DATUM = ("A0", "A1", "A2", "B0", "B1", "B2")
-"""What the elimination keeps in any case."""
+"""Coefficients that the elimination always keeps."""
 TESTED = tuple(name for name in COEFFICIENTS if name not in DATUM)
 PAPER = ("A6", "A7", "B6", "B7")
-"""What the paper's reduced model has of those tested."""
+"""Tested coefficients in the reduced model of the paper."""
 LARGE = 8.0
-"""Size, in standard deviations, of a coefficient that no test overlooks."""
+"""Size, in standard deviations, of a coefficient that every test detects."""
 PIN_PX = 0.05
 LINEAR_DRAWS = 20000
 
 
 @cache
 def camera() -> CameraCorrection:
-    """A camera that distorts nothing."""
+    """A camera without distortion."""
     design = standard_reseau()
     points = ImagePoints.with_sigma(design.ids, in_pixels(design.xy), 0.007)
     return correct_camera(points, design, trials=0).required()
@@ -58,7 +58,7 @@ def on_screen(xy: Array) -> Array:
 
 
 def elimination(made: Array, sizes: dict[str, float], noise: Array, alpha: float = ALPHA) -> Elimination:
-    """Group B of rods made somewhere, seen with some noise in a world with coefficients of some sizes."""
+    """Group B from rods with tolerance and pins with noise, in a world with given coefficients."""
     rods = test_object()
     sigma = unit_sigmas() if sizes else {}
     values = {name: size * sigma[name] for name, size in sizes.items()}
@@ -79,7 +79,7 @@ def unit_sigmas() -> dict[str, float]:
 
 
 def drawn(seed: int, sizes: dict[str, float], alpha: float = ALPHA) -> Elimination:
-    """The same with rods as a workshop makes them, and pins as they are measured."""
+    """The same with the tolerance of a workshop and the noise of measured pins."""
     design = test_object()
     rng = np.random.default_rng([seed, *(round(10 * size) for size in sizes.values()), 3])
     tolerance = np.array([point.sigma for point in design.points], dtype=np.float64)
@@ -100,7 +100,7 @@ def kept(seed: int, present: Collection[str]) -> Array:
 
 
 def kept_of_a_linear_model(present: Collection[str], draws: int = LINEAR_DRAWS) -> Array:
-    """Shares of the coefficients that remain when a linear model of this design is reduced alike, (k,)."""
+    """Rates at which coefficients remain when a linear model of this design is reduced, (k,)."""
     matrix = RationalPolynomial.ultrasonic().derivatives(on_screen(test_object().xy)).d_parameters
     matrix = matrix.reshape(-1, len(COEFFICIENTS))
     matrix = matrix / np.linalg.norm(matrix, axis=0)
@@ -127,7 +127,7 @@ def kept_of_a_linear_model(present: Collection[str], draws: int = LINEAR_DRAWS) 
 
 
 def f_tests(pool: Executor, draws: int) -> None:
-    """Level and power of the first tests, and what the elimination keeps: drawn, and printed."""
+    """Simulate and print level and power of the first tests, and the result of the elimination."""
     seeds = [draws] + [max(1, draws // 4)] * (len(SIZES) - 1)
     rates = [
         np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=25)), axis=0)

@@ -20,7 +20,7 @@ ENOUGH = 8.0
 
 
 def row(nist: ModuleType, problem: Any, start: int, number: Any) -> tuple[float, float]:
-    """Solve, print one line, and give the digits."""
+    """Solve, print one line, and return the digits."""
     begun = time.perf_counter()
     fit = adjust(problem.problem(start, number))
     elapsed = 1e3 * (time.perf_counter() - begun)

@@ -1,23 +1,23 @@
-"""The oscilloscope procedure on the simulated bench: are the sigmas true, what does each factor take off?
+"""The oscilloscope procedure on the simulated bench: correctness of the sigmas, effect of each factor.
 
 Run from the checkout: ``python benchmarks/oscilloscope.py [--frames 200] [--polynomial 100] [--draws 1000]
-[--jobs 1] [--keep FOLDER]``. PHOTO I, II and III of one world to a seed go through the whole procedure. For
-displays of Wong's physics, and for such as equations (7a, b) correct exactly, it prints
+[--jobs 1] [--keep FOLDER]``. PHOTO I, II and III of one world per seed go through the complete procedure. For
+displays with Wong's physics, and for displays that equations (7a, b) correct exactly, it prints
 
-1. what was found, and the errors of its positions over their standard deviations;
-2. the same of the coefficients of groups A and B, and of the true coordinates of PHOTO III's points;
-3. factor by factor, what is left of the errors of those points;
+1. the number of measured points, and errors of positions over their standard deviations;
+2. the same for the coefficients of groups A and B, and for the true coordinates of the points of PHOTO III;
+3. the remaining errors of those points, factor by factor;
 4. which of the two models of a display is preferred;
 5. the time;
 
-and, apart from the frames, level and power of the tests of both groups (`group_a`, `group_b`).
+and, without frames, level and power of the tests of both groups (`group_a`, `group_b`).
 
-What is compared with: the same adjustments of *noise-free* positions, and for group B of the rods where they
-really are, with the same models, weights and common systems, frozen at the measured ones. What this chain
-leaves of the true coordinates is the approximation error of equations (5) and (7); it stands apart, and no
-sigma covers it. The rods' tolerance hides all other errors of group B; what those are shows where the rods'
-coordinates are taken free of error. Errors of one world go together: behind ± stands the standard error over
-worlds.
+Results are compared with the same adjustments of *noise-free* positions, and for group B of the true
+positions of the rods, with the same models, weights and common systems, fixed at the measured ones. The
+remaining errors of true coordinates in this chain are the approximation error of equations (5) and (7); it is
+listed separately, and no sigma covers it. The tolerance of the rods dominates all other errors of group B;
+rows with error-free rods show those. Errors within one world are correlated: the number after ± is the
+standard error over worlds.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def print_physics(physics: Physics, found: Sequence[Trial | str], jobs: int) -> 
 def through_the_procedure(
     pool: Executor, physics: Physics, seeds: range, folder: Path | None
 ) -> list[Trial | str]:
-    """Worlds one after the other, each with a word on standard error when it is done."""
+    """Process worlds one after the other, and report each on standard error."""
     found = []
     for seed, one in zip(seeds, pool.map(partial(trial, physics=physics, folder=folder), seeds), strict=True):
         found.append(one)

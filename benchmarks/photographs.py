@@ -1,7 +1,7 @@
 """PHOTO I, II and III of simulated worlds, measured by the procedure from the frames, and timed.
 
-What is measured can be kept in a folder and taken from there: an interrupted run goes on where it stopped,
-and tables can be made anew without the frames.
+Measurements can be stored in a folder and read from there: an interrupted run continues where it stopped, and
+tables can be made again without the frames.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What the procedure measured in the three photographs of a world.
+    """Measurements in the three photographs of a world.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Measured:
 
 
 def measured(seed: int, physics: Physics, folder: Path | None = None) -> Measured | str:
-    """Measure the photographs of a world, or take what was kept of them; a text says what failed."""
+    """Measure the photographs of a world, or read the stored measurements; a text if it failed."""
     file = None if folder is None else folder / f"{physics}-{seed}.pickle"
     if file is not None and file.exists():
         kept: Measured = pickle.loads(file.read_bytes())

@@ -1,8 +1,8 @@
-"""Pins in real B-mode frames beside PLUS: which wires are found, how far apart the two are, and in mm.
+"""Pins in real B-mode frames compared with PLUS: wires found, differences in pixels, and deviations in mm.
 
-Run from the checkout: ``python benchmarks/pins.py [DATA] [--overlay DIR]``. DATA holds the folder
-ultrasound_nwire; by default $RESEAU_DATA, else ../shared/data. PLUS takes a centroid, we the middle of the
-line: where an echo has a tail (a reverberation below it), the two differ by what the tail weighs.
+Run from the checkout: ``python benchmarks/pins.py [DATA] [--overlay DIR]``. DATA contains the folder
+ultrasound_nwire; the default is $RESEAU_DATA or ../shared/data. PLUS computes a centroid, we the middle of
+the line: for an echo with a tail (a reverberation below it), the two differ by the weight of the tail.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from reseau.measure.fitting import fit_mapping
 from reseau.optics import RationalPolynomial
 
 SAME_PX = 10.0
-"""A reflector this near to PLUS's wire is that wire; wires lie 50 px and more apart."""
+"""Largest distance between a reflector and the same wire of PLUS; wires are at least 50 px apart."""
 LIMITS_PX = np.array([1.5, 0.7])
 MOST_FURTHER = 2
 TOLERANCE_MM = 0.25
@@ -34,7 +34,7 @@ PLUS_MM = "0.48 ± 0.23"
 
 @dataclass
 class Tally:
-    """What the frames of a sequence add up to."""
+    """Totals over the frames of a sequence."""
 
     wires: int = 0
     missed: list[str] = field(default_factory=list)
@@ -73,7 +73,7 @@ def compare(name: str, seen: PinDetections, wires: Array, candidates: Array, tal
 
 
 def number(seen: PinDetections, reference: dict[str, Any], phantom: dict[str, Any], tally: Tally) -> None:
-    """Tell the phantom's wires apart, and carry the parallel ones into its millimetres by an affinity."""
+    """Identify the wires of the phantom, and map the parallel ones to its millimetres by an affinity."""
     ids = tuple(phantom)
     ends = np.array([phantom[name] for name in ids], dtype=float)
     wires = Wires(ids, ends[:, 0][:, [0, 2]], ends[:, 1][:, [0, 2]])  # the plane across the wires
@@ -108,7 +108,7 @@ def number(seen: PinDetections, reference: dict[str, Any], phantom: dict[str, An
 
 
 def linear(model: RationalPolynomial, matrix: Array, shift: Array) -> RationalPolynomial:
-    """The model nearest to a linear map, as approximate values."""
+    """The model closest to a linear map, as approximate values."""
     grid = np.array([[0.0, 0.0], [500.0, 0.0], [0.0, 500.0], [500.0, 500.0]])
     design = model.derivatives(grid).d_parameters.reshape(8, -1)
     values = np.linalg.lstsq(design, (grid @ matrix.T + shift).ravel(), rcond=None)[0]
@@ -165,7 +165,7 @@ def sequence(folder: Path, name: str, overlay: Path | None, others: int) -> Tall
 
 
 def report(name: str, tally: Tally) -> None:
-    """Print what a sequence came to."""
+    """Print the totals of a sequence."""
     away, centre, sigma = rms(tally.deviation), rms(tally.centroid), np.median(tally.sigma, axis=0)
     print(
         f"{name:20} {len(tally.seconds):6} {len(tally.deviation):4}/{tally.wires:<4}"
@@ -190,7 +190,7 @@ def report(name: str, tally: Tally) -> None:
 
 
 def main() -> None:
-    """Print the table; exit status 1 when a figure misses its limit."""
+    """Print the table; exit status 1 if a value exceeds its limit."""
     parser = argparse.ArgumentParser(description=__doc__)
     default = Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     parser.add_argument("data", nargs="?", type=Path, default=default)

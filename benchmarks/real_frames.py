@@ -1,4 +1,4 @@
-"""The real scans of film: what is found of their frames, and pictures of the edges to be looked at."""
+"""Real scans of film: orientation of their frames, and pictures of the edges for inspection."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ _SCANS: dict[str, tuple[tuple[float, float], tuple[float, ...] | None]] = {
     "kino_1264.jpg": ((22.0, 16.0), (893, 1676, 2874, 3145)),
     "kino_1265.jpg": ((22.0, 16.0), (885, 1615, 2870, 3085)),
 }
-"""Formats, and where a frame is to be looked for among others: left, top, right, bottom."""
+"""Formats, and approximate position of a frame among others: left, top, right, bottom."""
 
 _PERFORATIONS = {
     "kino_1264.jpg": ((357, 1245, 621, 1421, 431), (2904, 1246, 3157, 1425, 431)),
     "kino_1265.jpg": ((351, 1184, 613, 1360, 431), (2896, 1187, 3150, 1365, 431)),
 }
-"""Of the first perforation of both rows left, top, right, bottom, and the approximate pitch."""
+"""Edges of the first perforation of both rows (left, top, right, bottom), and the approximate pitch."""
 _EDGES = {"kino_1264.jpg": (1421, 1673, 3142, 3393), "kino_1265.jpg": (1362, 1614, 3082, 3335)}
-"""Rows at which the lower edge of the frame before, the frame's two and the upper one of the next are."""
+"""Rows of the lower edge of the previous frame, both edges of the frame, and the upper edge of the next."""
 _SEVEN, _FRAME_MM, _GATE_MM = 7, 4 * PITCH_MM, 16.0
-"""Perforations of a row that are whole; from one frame to the next; the nominal height of the gate."""
+"""Number of complete perforations in a row, and per frame; nominal height of the gate."""
 
 
 def print_real(folder: Path, pictures: Path | None) -> None:
-    """Orient every real scan; they were copied by tilted cameras: shapes are known to 2 % and 1° only."""
+    """Orient every real scan; cameras were tilted when copying, so shapes are known only to 2 % and 1°."""
     if not folder.is_dir():
         print(f"\nReal scans: no reference data in {folder}")
         return
@@ -93,7 +93,7 @@ def print_film(scan: Scan, pictures: Path | None) -> None:
 
 
 def _film_picture(scan: Scan, plane: FilmPlane, edges: list[Array]) -> NDArray[np.uint8]:
-    """Every edge of a perforation and of a frame on the pixels where it was found, enlarged."""
+    """Enlarged pictures of every edge of a perforation and of a frame."""
     places = [*plane.at, *(edge[k] for edge in edges for k in (5, 25, 45))]
     size, zoom = 24, 5
     tiles = []

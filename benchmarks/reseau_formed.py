@@ -1,8 +1,8 @@
-"""Formed frames of known truth: errors of measured marks beside the Cramér–Rao bound, and the time it takes.
+"""Formed frames with known truth: errors of measured marks compared with the Cramér–Rao bound, and time.
 
 Run from the checkout: ``python benchmarks/reseau_formed.py [--least N] [--only TEXT]``. Frames of 210 marks
-go through `measure_reseau`. The bound counts position, width of the point-spread function, contrast, level
-and slopes of the background and size as unknown, and all noise that was simulated.
+are measured with `measure_reseau`. In the bound, position, width of the point-spread function, contrast,
+level and slopes of the background, and size are unknown; all simulated noise is included.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BATCH, MOST_FRAMES = 4, 120
 
 
 def scenes(formed: ModuleType) -> Iterator[tuple[str, Any]]:
-    """What is formed: every shape, one thing changed at a time."""
+    """Cases: every shape, with one parameter changed at a time."""
     for shape, mark in formed.MARKS.items():
         base = formed.Scene(mark=mark)
         for polarity in ("dark", "bright"):
@@ -51,7 +51,7 @@ def scenes(formed: ModuleType) -> Iterator[tuple[str, Any]]:
 
 
 def enough(formed: ModuleType, scene: Any, least: int) -> Any:
-    """Frames until there are marks enough, and the bias is known well enough."""
+    """Form frames until there are enough marks and the bias is sufficiently precise."""
     parts: list[Any] = []
     while len(parts) * BATCH < MOST_FRAMES:
         parts.append(formed.measure_many(scene, BATCH, seed=len(parts)))
@@ -66,7 +66,7 @@ def pair(values: Any, digits: int) -> str:
 
 
 def row(label: str, s: Any) -> bool:
-    """Print one case; whether it keeps what is required."""
+    """Print one case; return whether it satisfies the limits."""
     bias, sigma = np.abs(s.bias).max(), s.bias_sigma.max()
     missed = s.expected - len(s.error)
     remarks = [
@@ -91,7 +91,7 @@ def row(label: str, s: Any) -> bool:
 
 def speed(formed: ModuleType) -> None:
     """The time for the marks of an 800×800 frame, the best of five and the median."""
-    print("\nSeconds for 202 marks (the design of 15×14 less 8) in 800×800 pixels, best and median of five:")
+    print("\nSeconds for 202 marks (design of 15×14 without 8) in 800×800 pixels, best and median of five:")
     for shape, mark in formed.MARKS.items():
         scene = formed.Scene(mark=mark, missing=frozenset(range(0, 208, 26)))
         frame = formed.form(scene, np.random.default_rng(0))
@@ -113,7 +113,7 @@ def speed(formed: ModuleType) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--least", type=int, default=2000, help="marks per case")
-    parser.add_argument("--only", default="", help="cases whose name holds this text")
+    parser.add_argument("--only", default="", help="only cases whose name contains this text")
     arguments = parser.parse_args()
     formed = of_the_tests("measure/formed.py")
     print(
@@ -125,7 +125,9 @@ def main() -> int:
         for label, scene in scenes(formed)
         if arguments.only in label
     ]
-    print(f"\n{sum(kept)} of {len(kept)} cases keep rms/bound <= {MOST_RATIO}, |bias| < {MOST_BIAS_PX} px,")
+    print(
+        f"\n{sum(kept)} of {len(kept)} cases satisfy rms/bound <= {MOST_RATIO}, |bias| < {MOST_BIAS_PX} px,"
+    )
     print(
         f"normalised errors {NORMALISED[0]}–{NORMALISED[1]}, and miss no mark. 'By phase': the largest mean"
     )

@@ -1,7 +1,7 @@
-"""The real frames of vidicon cameras: what is found, how well it agrees with itself and with NASA's programs.
+"""Real frames of vidicon cameras: marks found, internal consistency, and agreement with NASA's programs.
 
-Run from the checkout: ``python benchmarks/reseau_frames.py [DATA] [--overlay DIR]``. The frames are looked
-for in DATA/reseau, by default $RESEAU_DATA or ../shared/data.
+Run from the checkout: ``python benchmarks/reseau_frames.py [DATA] [--overlay DIR]``. The frames are read from
+DATA/reseau, by default in $RESEAU_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VECTORS = 50
 
 @dataclass(frozen=True)
 class Measured:
-    """A frame with its result, and the seconds that took: of the processor, and of the clock on the wall."""
+    """A frame with its result, processor time and wall time in s."""
 
     case: Any
     result: ReseauResult
@@ -82,7 +82,7 @@ def found_table(frames: ModuleType, all_measured: list[Measured]) -> None:
 
 
 def deviation_table(frames: ModuleType, all_measured: list[Measured]) -> None:
-    print("Leave-one-out rms x/y in px over the marks that both found, the same predictor for both.")
+    print("Leave-one-out rms x/y in px over the marks found by both, with the same predictor.")
     print(f"{'frame':<28} {'predictor':<34} {'marks':>5} {'RESLOC':>12} {'ours':>12}")
     for m in all_measured:
         reference, xy, source = m.case.others.get("vicar"), m.result.xy, m.case.design.xy
@@ -124,7 +124,7 @@ def agreement_table(frames: ModuleType, all_measured: list[Measured]) -> None:
 
 
 def disguised(design: ReseauDesign, rng: np.random.Generator, mirrored: bool) -> tuple[ReseauDesign, str]:
-    """The design without nominal positions, its coordinates turned, scaled and shifted."""
+    """The design without nominal positions, its coordinates rotated, scaled and shifted."""
     angle, scale = np.deg2rad(rng.uniform(-10, 10)), float(np.exp(rng.uniform(-0.5, 0.5)))
     turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     xy = (design.xy * [1, -1 if mirrored else 1]) @ turn.T + rng.uniform(-5, 5, 2)
@@ -139,9 +139,13 @@ def disguised(design: ReseauDesign, rng: np.random.Generator, mirrored: bool) ->
 
 
 def blind_table(all_measured: list[Measured], seed: int) -> None:
-    print("Without nominal positions, the design turned, scaled, shifted, mirrored at random. Symmetric ones")
-    print("(Viking; Voyager but for one mark) explain a frame from either side: their marks are then at")
-    print("the same places under other names, and the same ones once the handedness of the design is told.")
+    print(
+        "Without nominal positions; designs rotated, scaled, shifted and mirrored at random. Symmetric ones"
+    )
+    print("(Viking; Voyager except for one mark) match a frame from either side: their marks then have")
+    print(
+        "the same positions under other names, and the same names if the handedness of the design is given."
+    )
     print(
         f"{'frame':<28} {'design':<34} {'found':>5} {'same':>5} {'places':>6} {'largest px':>10} {'cpu s':>6}"
     )
@@ -155,7 +159,7 @@ def blind_table(all_measured: list[Measured], seed: int) -> None:
 
 
 def blind_row(m: Measured, design: ReseauDesign, told: str, options: ReseauOptions) -> bool:
-    """Print one case; whether it was seen from the other side."""
+    """Print one case; return whether it was matched from the other side."""
     begun = time.process_time()
     result = measure_reseau(m.case.frame, design, options)
     elapsed = time.process_time() - begun
@@ -173,7 +177,7 @@ def blind_row(m: Measured, design: ReseauDesign, told: str, options: ReseauOptio
 
 
 def overlay(m: Measured, folder: Path) -> None:
-    """The frame, levelled so that dim marks show, with what was found in it; three times enlarged."""
+    """The frame, levelled to show faint marks, with the measured marks; enlarged three times."""
     zoom = 3
     grey = m.case.frame.pixels.astype(np.float32)
     mean = cv2.GaussianBlur(grey, (0, 0), 25)
@@ -206,8 +210,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     default = os.environ.get("RESEAU_DATA", "../shared/data")
     parser.add_argument("data", nargs="?", type=Path, default=Path(default))
-    parser.add_argument("--overlay", type=Path, help="folder for pictures of the frames with what was found")
-    parser.add_argument("--seed", type=int, default=1, help="of the random systems of the design")
+    parser.add_argument(
+        "--overlay", type=Path, help="folder for pictures of the frames with the measured marks"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the random design systems")
     arguments = parser.parse_args()
     frames = of_the_tests("measure/frames.py")
     directory = arguments.data / "reseau"

@@ -1,10 +1,10 @@
-"""The coded testfield: lines, recognition and precision in the paper's recordings, against known truth.
+"""The coded testfield: lines, recognition and precision in the paper's recordings, compared with known truth.
 
 Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--workers N]``. The 36 recordings of
-Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured. The bound
-is that of Cramér and Rao with position, sharpness, contrast, ground (level and slopes) and size unknown,
-under all noise that was simulated, row jitter included. The figures are of the 256 targets of the central
-4 × 4 squares.
+Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured. In the
+Cramér–Rao bound, position, sharpness, contrast, background (level and slopes) and size are unknown, and all
+simulated noise is included, also row jitter. The figures refer to the 256 targets of the central 4 × 4
+squares.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PAPER = {
 
 @dataclass
 class Recording:
-    """A recording as it was measured, with its truth."""
+    """A measured recording with its truth."""
 
     station: Station
     frame: Frame
@@ -72,7 +72,7 @@ def recordings(fields: ModuleType, seed: int, tilts: tuple[float, ...]) -> Itera
 
 
 def lines(recording: Recording) -> Array:
-    """How far lines are off the truth, across, at points 15 mm apart between the outermost ones found."""
+    """Distances of lines from the truth at points 15 mm apart, between the outermost lines found."""
     lattice = recording.result.lattice
     found = []
     for axis, (numbers, others) in enumerate(
@@ -103,7 +103,7 @@ def true_distance(recording: Recording, xy: Array) -> Array:
 
 
 def misread(recording: Recording, contours: bool = False) -> Array:
-    """Targets of the central squares taken for something else: alone, in their cluster, by contours (3,)."""
+    """Misclassified targets of the central squares: individually, by cluster, by contours (3,)."""
     reading = recording.result.reading
     places = reading.xy.reshape(-1, 2)
     distance = np.hypot(*(places[:, None] - recording.truth.xy[CENTRAL]).transpose(2, 0, 1))
@@ -164,7 +164,7 @@ def binary_centroids(recording: Recording) -> Array:
 
 
 def table(done: list[Recording]) -> bool:
-    """Print rms against the bound for each kind of target; whether all keep to what is required."""
+    """Print rms and bound for each kind of target; return whether all satisfy the limits."""
     error = np.stack([r.error[CENTRAL] for r in done])
     bound = np.stack([np.diagonal(r.bound[CENTRAL], axis1=1, axis2=2) for r in done])
     cov = np.stack([np.diagonal(r.result.cov[CENTRAL], axis1=1, axis2=2) for r in done])
@@ -198,7 +198,7 @@ def table(done: list[Recording]) -> bool:
 
 
 def counts(label: str, done: list[Recording]) -> bool:
-    """Print what was found and what was taken for something else."""
+    """Print numbers of targets found and misclassified."""
     wrong = sum(misread(r, contours=True) for r in done)
     expected = [r.truth for r in done]
     inside = sum(int((CENTRAL & ((t.xy > 8) & (t.xy < 231)).all(axis=1)).sum()) for t in expected)
@@ -208,8 +208,8 @@ def counts(label: str, done: list[Recording]) -> bool:
     off = np.concatenate([lines(r) for r in done])
     worst = max(float(np.sqrt((lines(r) ** 2).mean())) for r in done)
     print(f"\n{label}: {len(done)} recordings")
-    print(f"  lines: rms {np.sqrt((off**2).mean()):.4f} px off the truth, worst recording {worst:.4f} px")
-    print(f"  central targets in the frames {inside}, measured {measured}; targets measured in all {every}")
+    print(f"  lines: rms {np.sqrt((off**2).mean()):.4f} px from the truth, worst recording {worst:.4f} px")
+    print(f"  central targets in the frames {inside}, measured {measured}; targets measured in total {every}")
     print(
         f"  misclassified: alone {wrong[0]}, in their cluster {wrong[1]} (by contours {wrong[2]}); "
         f"misnumbered {misnumbered}"
@@ -218,14 +218,14 @@ def counts(label: str, done: list[Recording]) -> bool:
 
 
 def timed(frame: Frame) -> tuple[float, float]:
-    """Seconds of processor and of wall for one image."""
+    """Processor and wall time for one image (s)."""
     cpu, clock = time.process_time(), time.perf_counter()
     measure(frame)
     return time.process_time() - cpu, time.perf_counter() - clock
 
 
 def speed(done: list[Recording], workers: int) -> None:
-    """Print the time for an image and for all, on one core and on several."""
+    """Print the time for one image and for all, on one core and on several."""
     frames = [r.frame for r in done]
     for frame in frames[:3]:
         measure(frame)

@@ -1,9 +1,10 @@
-"""Targets measured by us and by other programs on the same formed photographs, of which the truth is known.
+"""Targets measured by us and by other programs in the same formed photographs with known truth.
 
-Run from the checkout: ``python benchmarks/testfield_peers.py``. The others come with
-``pip install .[peers]``; what is missing is said. A sheet of 8 × 7 disks, and a ChArUco board with its
-corners in the same places, are seen by the same camera. Programs that only locate are told to a pixel where
-to look. The truth is the image of a disk's centre, which in perspective is not the centre of its ellipse.
+Run from the checkout: ``python benchmarks/testfield_peers.py``. The other programs are installed by
+``pip install .[peers]``; missing ones are listed. A sheet of 8 × 7 disks, and a ChArUco board with corners at
+the same positions, are seen by the same camera. Programs that only refine positions get the true position
+rounded to a pixel. The truth is the image of a disk's centre, which in perspective is not the centre of its
+ellipse.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ sheets = of_the_tests("measure/sheets.py")
 ROLLS, TILTS = (0.0, 100.0, 200.0, 300.0), (0.0, 30.0, 45.0)
 NEAR_PX = 3.0
 CELLS = 8
-"""Of a square of the board; a marker of 4 × 4 bits with its border takes six."""
+"""Cells per square of the board; a marker of 4 × 4 bits with its border has six."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Photographs of the sheet and of the board by one camera, the truth (n, 2) and where to look (n, 2).
+    """Photographs of sheet and board by one camera, the truth (n, 2) and approximate positions (n, 2).
 
     Programs for stars and particles get the sheet as bright disks without the ground: `dark`.
     """
@@ -77,7 +78,7 @@ def viewed(roll: float, tilt: float, seed: int) -> View:
 
 
 def charuco() -> Any:
-    """The board: 9 × 8 squares of 10 mm, so that its inner corners are where the sheet has its disks."""
+    """The board: 9 × 8 squares of 10 mm, with inner corners at the positions of the disks."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     return cv2.aruco.CharucoBoard((9, 8), 10.0, 7.5, dictionary)
 
@@ -96,7 +97,7 @@ def cells() -> Array:
 
 
 def nearest(found: Array, view: View) -> Array:
-    """Of places found the one next to each target (n, 2), NaN where there is none."""
+    """The position found nearest to each target (n, 2), or NaN."""
     if not len(found):
         return np.full(view.truth.shape, np.nan)
     gap, row = KDTree(found).query(view.truth)
@@ -151,7 +152,7 @@ def charuco_corners(view: View) -> Array:
 
 
 def darkness(sheet: Array) -> Array:
-    """Grey values the other way round, less the ground, a plane: bright disks on nought."""
+    """Inverted grey values minus a plane background: bright disks on zero."""
     grey = sheet.astype(np.float64)
     v, u = np.mgrid[: grey.shape[0], : grey.shape[1]]
     plane = np.stack([np.ones(grey.size), u.ravel(), v.ravel()], axis=1)
@@ -181,7 +182,7 @@ def photutils_by(name: str) -> Callable[[ModuleType], Locate]:
 
 
 def nearest_of_own(found: Array, view: View) -> Array:
-    """Places found for each target, NaN where they lie too far off."""
+    """Positions found for each target, NaN if too far away."""
     return np.where(np.hypot(*(found - view.truth).T)[:, None] < NEAR_PX, found, np.nan)
 
 
@@ -228,11 +229,11 @@ PROGRAMS: tuple[tuple[str, str, Any], ...] = (
     ("trackpy (found)", "trackpy", trackpy_locate),
     ("scikit-image, ellipse", "skimage", skimage_ellipse),
 )
-"""What it is called, the package it needs, and what locates; where that must be imported, what makes it."""
+"""Name of a program, the package it needs, and the function that locates, or one that creates it."""
 
 
 def located(name: str, needs: str, make: Any, views: list[View]) -> Tally | None:
-    """Errors of one program in all views; None, and a word, where its package is not installed."""
+    """Errors of one program in all views; None with a message if its package is not installed."""
     locate: Locate = make
     if needs and not needs.startswith("cv2"):
         try:
