@@ -16,7 +16,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from .data import Array
+from .arrays import Array
 
 __all__ = [
     "ACCENT",
