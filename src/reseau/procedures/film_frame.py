@@ -51,6 +51,20 @@ def orient_scan(scan: Scan, options: FrameOptions | None = None) -> list[FrameRe
         The scan.
     options : FrameOptions, optional
         Prior knowledge of its frames.
+
+    Returns
+    -------
+    list of FrameResult
+        One for each frame; falsy ones are declined, with the reason in `why`.
+
+    Examples
+    --------
+    :func:`reseau.measure.film.orient_frames` has an example with a frame; a scan without one is declined:
+
+    >>> from reseau.io.scans import scan_of
+    >>> (found,) = orient_scan(scan_of(np.full((60, 90), 128, np.uint8), "07.tif"))
+    >>> bool(found), found.why
+    (False, 'is of one tone; scan it with more exposure')
     """
     return orient_frames(scan, options)
 
@@ -70,6 +84,23 @@ def reorient_scan(
         Results without it.
     options : FrameOptions
         Prior knowledge of its frames.
+
+    Returns
+    -------
+    list of FrameResult
+        The repeated results if more frames are oriented, otherwise `before`.
+
+    Examples
+    --------
+    A scan without a frame is declined with the shape of its roll as well:
+
+    >>> from reseau.io.scans import scan_of
+    >>> from reseau.measure.film.lines import FrameShape
+    >>> corners = FrameCorners.from_xy([[-18, 12], [18, 12], [18, -12], [-18, -12]])
+    >>> roll = Roll(corners, FrameShape(36.0, 24.0), px_per_mm=4.0, frames=12, scatter_mm=(0.01, 0.01))
+    >>> scan, options = scan_of(np.full((136, 184), 128, np.uint8), "07.tif"), FrameOptions()
+    >>> reorient_scan(scan, roll, orient_scan(scan, options), options)
+    [<FrameResult: image 07.tif, status declined, reason is of one tone; scan it with more exposure>]
     """
     again = orient_frames(scan, roll.options(options))
     order = {"oriented": 2, "three-edges": 1, "declined": 0}
@@ -97,6 +128,18 @@ def orientation_of(
         Calibrated corners of the camera.
     kind : str
         Kind of the transformation.
+
+    Returns
+    -------
+    FrameOrientation or Failure
+        The document of the frame; a failure if the transformation is not determined.
+
+    Examples
+    --------
+    >>> found = FrameResult("07.tif", "declined", "of one tone", None, None, None, {})
+    >>> document = orientation_of(found)
+    >>> document.status, document.why, document.principal_point
+    ('declined', 'of one tone', None)
     """
     document = result.document()
     if calibrated is None or not result:

@@ -127,6 +127,18 @@ def photo_i(
     -------
     PhotoI or Failure
         A failure if the reseau is not found, or too few of its marks.
+
+    Examples
+    --------
+    Marks of a reseau, imaged without distortion at 8 px/mm: only the two scales are significant.
+
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(5, 4, 20.0, Mark(shape="disk", size=4.0))
+    >>> def imaged(design):  # 8 px/mm, y down
+    ...     return ImagePoints.with_sigma(design.ids, [700, 500] + design.xy * [8, -8], 0.02)
+    >>> photo_i(imaged(reseau), reseau).camera.model.names
+    ('a1', 'b2')
     """
     # (i) object and photo-coordinates of the reseau
     measured = None
@@ -234,6 +246,21 @@ def photo_ii(
     -------
     PhotoII or Failure
         A failure if reseau or test object are not found, or too few of their points.
+
+    Examples
+    --------
+    An instrument without distortion: both scales of the display are 1.
+
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(5, 4, 20.0, Mark(shape="disk", size=4.0))
+    >>> rods = regular_reseau(4, 3, 18.0, Mark(shape="rod", size=1.0))
+    >>> def imaged(design):  # 8 px/mm, y down
+    ...     return ImagePoints.with_sigma(design.ids, [700, 500] + design.xy * [8, -8], 0.02)
+    >>> first = photo_i(imaged(reseau), reseau)
+    >>> second = photo_ii(imaged(rods), reseau, rods, first.camera, marks=imaged(reseau))
+    >>> second.instrument.plane.scale.round(6).tolist()
+    [1.0, 1.0]
     """
     # (iv) photo-coordinates of the test object, (v) in the common system by PHOTO I
     seen = _pins_in(photo, reseau, test_object, camera, marks, options, pins)
@@ -283,6 +310,22 @@ def photo_iii(
     -------
     PhotoIII or Failure
         A failure if the reseau is not found, or no echo.
+
+    Examples
+    --------
+    Two points of a body, which are two of the rods here:
+
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(5, 4, 20.0, Mark(shape="disk", size=4.0))
+    >>> rods = regular_reseau(4, 3, 18.0, Mark(shape="rod", size=1.0))
+    >>> def imaged(design):  # 8 px/mm, y down
+    ...     return ImagePoints.with_sigma(design.ids, [700, 500] + design.xy * [8, -8], 0.02)
+    >>> first = photo_i(imaged(reseau), reseau)
+    >>> instrument = photo_ii(imaged(rods), reseau, rods, first.camera).instrument
+    >>> body = imaged(rods).select(np.arange(12) < 2)
+    >>> photo_iii(body, instrument, reseau).true.xy.round(6).tolist()
+    [[-27.0, 18.0], [-9.0, 18.0]]
     """
     measured = None
     if isinstance(photo, Frame):
@@ -366,6 +409,21 @@ def still_standard_in(
     -------
     StillStandard or Failure
         A failure if reseau or test object are not found, or too few of their points.
+
+    Examples
+    --------
+    A new photograph of an unchanged instrument:
+
+    >>> from reseau.designs import regular_reseau
+    >>> from reseau.io import Mark
+    >>> reseau = regular_reseau(5, 4, 20.0, Mark(shape="disk", size=4.0))
+    >>> rods = regular_reseau(4, 3, 18.0, Mark(shape="rod", size=1.0))
+    >>> def imaged(design):  # 8 px/mm, y down
+    ...     return ImagePoints.with_sigma(design.ids, [700, 500] + design.xy * [8, -8], 0.02)
+    >>> first = photo_i(imaged(reseau), reseau)
+    >>> instrument = photo_ii(imaged(rods), reseau, rods, first.camera).instrument
+    >>> still_standard_in(imaged(rods), instrument, reseau, rods).test.holds
+    True
     """
     seen = _pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
     if isinstance(seen, Failure):
