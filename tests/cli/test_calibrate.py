@@ -83,7 +83,7 @@ def test_two_calibrations_are_compared_as_a_field(
     files = ("-o", tmp_path / "D.json", "--figure", tmp_path / "D.svg")
     status, out, err = reseau("compare", tmp_path / "A.json", tmp_path / "B.json", *files)
     assert (status, err) == (0, "")
-    assert out.startswith("beside B.json: ")
+    assert out.startswith("difference to B.json: ")
     found = json.loads((tmp_path / "D.json").read_text())
     assert found["schema"] == "reseau-difference/1"
     assert found["p"] > 1e-3
@@ -168,7 +168,7 @@ def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]
 def test_components_and_elimination_search_the_model(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
-    """Without K2, P1 and P2, that the lens has not; x and y are as good as given; fields at distances."""
+    """K2, P1 and P2, which the lens does not have, are dropped; the sigmas of x and y are confirmed."""
     files = (
         "-o",
         tmp_path / "K.json",
@@ -184,7 +184,7 @@ def test_components_and_elimination_search_the_model(
     assert (status, err) == (0, "")
     assert "sigmas of x times " in out
     assert "cross-validation" in out
-    assert "of points at 1500 mm to " in out
+    assert "at 1500 mm: median " in out
     content = json.loads((tmp_path / "K.json").read_text())["validity"]
     assert {step["name"] for step in content["eliminated"]} == {"K2", "P1", "P2"}
     assert content["cross_validation"]["kept"] < content["cross_validation"]["all"]

@@ -23,6 +23,7 @@ import scipy.sparse
 import scipy.special
 
 from ...core.data import Array, Rows
+from ...core.display import Display
 from ...core.errors import UsageError
 from ..solver.normal import SEGMENTS
 from .result import Result
@@ -35,8 +36,8 @@ _RANK = 1e-6
 _MOST, _AT_ONCE = 6000, 128
 
 
-@dataclass(frozen=True, eq=False)
-class CommonPattern:
+@dataclass(frozen=True, eq=False, repr=False)
+class CommonPattern(Display):
     """Common shifts of classes of observations.
 
     Parameters
@@ -66,8 +67,10 @@ class CommonPattern:
     >>> from reseau.bundle import adjust_network, example_network
     >>> result = adjust_network(example_network())
     >>> pattern = common_pattern(result, by_place(result, 0, 2, 2))
-    >>> pattern.count, pattern.degrees, pattern.p > 0.05
-    (array([41, 40, 39, 40]), (6, 209), True)
+    >>> pattern
+    <CommonPattern: 4 classes, F 0.8, p 0.57, 0 px rms>
+    >>> pattern.count, pattern.degrees
+    (array([41, 40, 39, 40]), (6, 209))
     """
 
     key: Rows
@@ -79,6 +82,24 @@ class CommonPattern:
     degrees: tuple[int, int]
     sigma0: float
     rms: float
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{len(self.count)} classes", ""),
+            ("F", f"{self.statistic:.1f}"),
+            ("p", f"{self.p:.2g}"),
+            (f"{self.rms:.2g} px rms", ""),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        found: dict[str, list[object]] = {}
+        for k, axis in enumerate("xy"):
+            found |= {
+                f"{axis}_px": self.xy[:, k].tolist(),
+                f"shift_{axis}_px": self.shift[:, k].tolist(),
+                f"sigma_{axis}_px": np.sqrt(self.cov[:, k, k]).tolist(),
+            }
+        return found | {"count": self.count.tolist(), "p": self.p_at.tolist()}
 
     @property
     def p(self) -> float:

@@ -80,8 +80,8 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     --------
     >>> from reseau.bundle import example_network
     >>> problem, notes = problem_of(example_network())
-    >>> len(problem.observations), notes
-    (320, ())
+    >>> problem, notes
+    (<BundleProblem: 8 images, 20 points, 320 observations>, ())
     """
     options = options or Options()
     found = approximate(network)

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse
 
 from ...core.data import Array, Mask, Rows
+from ...core.display import Display
 from ...core.failure import Code, Remark
 from ...optics.poses import rotation_matrix
 from ..network import Network
@@ -29,8 +30,8 @@ _PAIRS = 12
 _FAR = 20.0
 
 
-@dataclass(frozen=True, eq=False)
-class Approximate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Approximate(Display):
     """Approximate poses and points.
 
     Parameters
@@ -47,15 +48,20 @@ class Approximate:
     Examples
     --------
     >>> from reseau.bundle import example_network
-    >>> found = approximate(example_network())
-    >>> found.rotation.shape, found.x0.shape, found.notes
-    ((8, 3, 3), (8, 3), ())
+    >>> approximate(example_network())
+    <Approximate: 8 of 8 images, 20 of 20 points>
     """
 
     rotation: Array
     x0: Array
     xyz: Array
     notes: tuple[Remark, ...] = ()
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{int(finite(self.x0).sum())} of {len(self.x0)} images", ""),
+            (f"{int(finite(self.xyz).sum())} of {len(self.xyz)} points", ""),
+        ]
 
 
 def approximate(network: Network) -> Approximate:

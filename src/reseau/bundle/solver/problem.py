@@ -15,6 +15,7 @@ from ...adjust import Options as AdjustOptions
 from ...adjust.fitted import Fitted
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
+from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
@@ -42,8 +43,8 @@ _ROUNDS = 12
 _SLOW = 50
 
 
-@dataclass(frozen=True, eq=False)
-class BundleProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class BundleProblem(Display):
     """All observations of a network in one column, with approximate values.
 
     Image coordinates come first, x and y alternating, then distances, observed coordinates, observed interior
@@ -74,8 +75,8 @@ class BundleProblem:
     --------
     >>> from reseau.bundle import example_network, problem_of
     >>> problem, _ = problem_of(example_network())
-    >>> len(problem.observations), bool(problem.adjusted())
-    (320, True)
+    >>> problem
+    <BundleProblem: 8 images, 20 points, 320 observations>
     """
 
     network: Network
@@ -86,6 +87,14 @@ class BundleProblem:
     tolerance: float = 1e-6
     watch: Callable[[int, float], None] | None = None
     rounds: int = 0
+
+    def _facts(self) -> list[tuple[str, str]]:
+        images, points = len(self.network.images), len(self.network.points)
+        return [
+            (f"{images} images", ""),
+            (f"{points} points", ""),
+            (f"{len(self.observations)} observations", ""),
+        ]
 
     @cached_property
     def centre(self) -> Array:
@@ -182,8 +191,8 @@ class BundleProblem:
             return _Run(self, options).adjust()
 
 
-@dataclass(frozen=True, eq=False)
-class BundleFit(Fitted):
+@dataclass(frozen=True, eq=False, repr=False)
+class BundleFit(Fitted, Display):
     """A bundle adjustment that converged; truthy.
 
     Columns over the observations have the order of :class:`BundleProblem`; undetermined residuals are NaN.
@@ -218,8 +227,10 @@ class BundleFit(Fitted):
     >>> from reseau.bundle import example_network, problem_of
     >>> problem, _ = problem_of(example_network())
     >>> fit = problem.adjusted()
-    >>> fit.counts, fit.redundancy, round(fit.sigma0, 3)
-    ((320, 112, 7), 215, 1.005)
+    >>> fit
+    <BundleFit: sigma0 1.005, redundancy 215, ... iterations>
+    >>> fit.counts
+    (320, 112, 7)
     """
 
     problem: BundleProblem
@@ -240,6 +251,13 @@ class BundleFit(Fitted):
     offset: float
     counts: tuple[int, int, int]
     datum: Mask | None = None
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            ("sigma0", f"{self.sigma0:.3f}"),
+            ("redundancy", f"{self.redundancy}"),
+            (f"{self.iterations} iterations", ""),
+        ]
 
     @property
     def variance(self) -> float:
