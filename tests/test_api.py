@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code
 from reseau.designs import regular_reseau
 from reseau.io import Mark
+from reseau.io.images import write_image
 from reseau_sims import FieldBench, paper_stations
 from reseau_sims.filmframe import FilmFrame
 
@@ -134,6 +136,21 @@ def test_photographs_become_a_calibration_its_file_and_its_plot(
     assert calibration.values()["c"] == dict(zip(estimate.parameters, estimate.values, strict=True))["c"]
     assert len(repr(calibration)) < 200
     assert calibration.plot().get_title(loc="left").startswith("σ of the projection")
+
+
+def test_the_lines_of_the_readme_make_a_calibration_of_photographs(
+    photographs: list[reseau.Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    (lines,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert sum(bool(line) for line in lines.splitlines()) == 5
+    (tmp_path / "photos").mkdir()
+    for frame in photographs:
+        write_image(tmp_path / "photos" / f"{frame.name}.jpg", frame.pixels)
+    FieldBench().design.write(tmp_path / "sheet.json")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(lines, "README.md", "exec"), {})
+    assert reseau.read_calibration("camera.json").kind == "camera"
 
 
 def test_measured_marks_are_shown_written_and_read_back(
