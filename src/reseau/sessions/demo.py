@@ -323,8 +323,8 @@ def _gige_available() -> bool:
 def _way(simulated: Any) -> str:
     """The protocol of the camera."""
     if simulated.video is None:
-        return "Video4Linux, simulated in process (Aravis or PyGObject is not installed)"
-    return "GigE Vision"
+        return "GigE Vision"
+    return "Video4Linux, simulated in process (Aravis or PyGObject is not installed)"
 
 
 def _compared(done: OscilloscopeSession) -> Comparison:
