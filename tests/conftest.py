@@ -1,4 +1,4 @@
-"""What tests share: the reference data, which is not part of the project."""
+"""Shared by the tests: the reference data, which is not part of the project."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def reference_data() -> Callable[[str], Path]:
-    """A file or folder of the reference data by name; the test is skipped, and says so, without it."""
+    """A file or folder of the reference data by name; without it the test is skipped with a message."""
     root = Path(os.environ.get("RESEAU_DATA", _BESIDE))
 
     def find(name: str) -> Path:

@@ -54,7 +54,7 @@ class NistProblem:
         ]
 
     def problem(self, start: int, number: Callable[[str], Any] = float, analytic: bool = True) -> GaussMarkov:
-        """The problem from start 0 or 1, with its observations in some arithmetic."""
+        """The problem from start 0 or 1, with its observations in a given arithmetic."""
         model, slopes = MODELS[self.name]
         y, *x = self.columns(number)
         plain = self.columns()[1:]
@@ -71,13 +71,13 @@ class NistProblem:
 
 
 def data_directory() -> Path:
-    """Where the files are: $RESEAU_DATA/nist_strd, or ../shared/data beside the checkout."""
+    """Folder of the files: $RESEAU_DATA/nist_strd, or ../shared/data next to the checkout."""
     beside = Path(__file__).resolve().parents[2].parent / "shared" / "data"
     return Path(os.environ.get("RESEAU_DATA", beside)) / "nist_strd"
 
 
 def names() -> list[str]:
-    """Problems whose files are there."""
+    """Problems whose files exist."""
     return sorted(path.stem for path in data_directory().glob("*.dat"))
 
 

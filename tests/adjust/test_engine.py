@@ -492,7 +492,7 @@ def test_wrong_derivatives_by_the_observations_are_found():
 @given(st.sampled_from([1e-9, 1e-4, 1.0, 1e6]), st.sampled_from([0.0, 1.0, -3.0]))
 @settings(max_examples=12, deadline=None)
 def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
-    """Of a parameter in any unit, in a function whose value may itself be zero where it is asked for."""
+    """A parameter in any unit, also if the function is zero at its value."""
     at = np.linspace(1.0, 2.0, 5)
     problem = GaussMarkov(
         lambda x: offset + np.expm1(x[0] / unit * at),

@@ -53,7 +53,7 @@ def test_the_derivatives_are_those_of_the_model(problems, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_certified_parameters_give_the_certified_residual_sum(problems, name):
-    """Which holds the models to the files, and the files to themselves."""
+    """Checks the models against the files, and the files for consistency."""
     problem = problems[name]
     y, *x = problem.columns(np.longdouble)
     y = np.log(y) if name == "Nelson" else y

@@ -1,4 +1,4 @@
-"""The archive keeps what it is given, on a folder, with an object store, and with PostgreSQL as its index."""
+"""The archive stores its content in a folder, in an object store, and with PostgreSQL as index."""
 
 import json
 import os
@@ -236,7 +236,7 @@ def test_bytes_that_are_not_a_frame_are_refused(data: bytes) -> None:
 
 
 def test_a_file_too_large_for_the_disk_leaves_nothing_behind(tmp_path: Path) -> None:
-    """A limit of the process stands for a disk that is full: the system refuses in the middle of a file."""
+    """A limit of the process simulates a full disk: a write fails in the middle of a file."""
     script = """
         import resource, sys
         from pathlib import Path

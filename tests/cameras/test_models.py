@@ -132,7 +132,7 @@ WITH_KERNEL = pytest.mark.parametrize("case", [c for c in cases() if c.values[0]
 
 @WITH_KERNEL
 def test_the_kernel_agrees_with_the_mapping(case: Case) -> None:
-    """To 1e-12 of the size; where the misfit is that of a corrected image point, with the slope of this."""
+    """To 1e-12 of the size; for misfits of corrected image points, including the slope of the correction."""
     mapping, uv, values = case.mapping(), directions(), case.values()
     seen = mapping.derivatives(uv)
     off, by_uv, d = kernel_at(case, True, uv, seen.value, values)

@@ -37,7 +37,7 @@ class CameraSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """A frame with what is known of it."""
+    """A frame with its metadata."""
 
     frame: Frame
     sequence: int
@@ -51,7 +51,7 @@ class Taken:
 
 
 class _Simple(Device[Any]):
-    """An instrument that is always there."""
+    """An instrument that is always connected."""
 
     def _open(self, deadline: Deadline) -> None: ...
     def _disconnect(self) -> None: ...
@@ -143,7 +143,7 @@ class FieldCamera(_Simple):
 
 
 class Sweeper(_Simple):
-    """A scanner that does not tell its frequency."""
+    """A scanner that does not report its frequency."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, Settings())
@@ -170,7 +170,7 @@ class FieldRig:
     def procedure(
         self, design: TestfieldDesign = DESIGN, sigmas: tuple[float, float, float] | None = None
     ) -> TestfieldProcedure:
-        """The testfield procedure with Brown's model, as the paper's camera wants it."""
+        """The testfield procedure with Brown's model, for the camera of the paper."""
         model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))
         measure = measurer_of(design, TestfieldOptions(row_jitter_px=0.0086, fill=0.8))
         return TestfieldProcedure(design, measure, model, name="field", sigmas=sigmas)

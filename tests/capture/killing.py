@@ -1,4 +1,4 @@
-"""A session in a process of its own, killed while it goes on."""
+"""A session in a separate process that is killed."""
 
 from __future__ import annotations
 

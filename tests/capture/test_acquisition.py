@@ -1,4 +1,4 @@
-"""Acquisitions: nothing is taken twice, nothing is lost, and the bench comes to rest whatever happens."""
+"""Acquisitions: nothing is taken twice or lost, and the bench always stops safely."""
 
 import json
 import os
@@ -348,7 +348,7 @@ def test_failed_checks_stop_the_acquisition(rig: FieldRig, session: Session) -> 
 
 
 def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, session: Session) -> None:
-    """What was predicted of a pose from the design matrix comes about."""
+    """The precision predicted from the design matrix is reached."""
     run = rig.acquisition(session, rig.procedure())
     goal = Goal("c", 0.007, "mm")
     first = (EVERY[0], EVERY[4], EVERY[9])

@@ -39,11 +39,11 @@ HEAVY = (
     "reseau.measure.testfield.measure",
     "reseau.bundle.modelling.adjustment",
 )
-"""What takes long to import."""
+"""Modules that take long to import."""
 
 
 def work(place: Path, kind: str, seed: int) -> None:
-    """What `reseau capture` does, on a bench that is there anew: begin or resume, and carry on to the end."""
+    """As `reseau capture` on a new bench: begin or resume, and continue to the end."""
     with Archive.open(place, create=True) as archive, ExitStack() as stack:
         names = [each.name for each in archive.sessions()]
         kept = archive.session("s") if "s" in names else archive.begin("s", kind, {})

@@ -15,7 +15,7 @@ from reseau.core.errors import FormatError, UsageError
 
 def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: float = 0.5, seed: int = 0,
           level: float = 1.0) -> Frame:  # fmt: skip
-    """Some bright disks with Gaussian edges, moved by a shift."""
+    """Bright disks with Gaussian edges, moved by a shift."""
     import scipy.special
 
     y, x = np.mgrid[:120, :160].astype(float)

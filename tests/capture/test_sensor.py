@@ -1,4 +1,4 @@
-"""The series of a sensor: streamed, tried again, killed and resumed; and what its procedure holds of it."""
+"""The series of a sensor: streamed, retried, killed and resumed; memory use of its procedure."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PLAN = SensorSeriesPlan(levels=10, frames=3, longest_us=40_000.0)
 
 
 class Rig:
-    """A camera before a lamp, which whoever is asked covers."""
+    """A camera in front of a lamp; the operator covers it on request."""
 
     def __init__(self, light: float = 1.0) -> None:
         drawn = PixelSensor.drawn(np.random.default_rng(2), 48, 32, full_well=12_000.0)
@@ -185,7 +185,7 @@ def test_frames_that_are_not_part_of_the_series_are_rejected() -> None:
 
 
 def work(place: Path) -> None:
-    """What `reseau capture sensor` does: begin or resume, and carry on to the end."""
+    """As `reseau capture sensor`: begin or resume, and continue to the end."""
     with Archive.open(place, create=True) as archive, (rig := Rig()).bench:
         names = [each.name for each in archive.sessions()]
         kept = archive.session("s") if "s" in names else archive.begin("s", "sensor", {})

@@ -22,7 +22,7 @@ SHAPE = (300, 360)
 
 @dataclass(frozen=True)
 class Photo:
-    """Files of a photograph, and what is true about it."""
+    """Files of a photograph, and its true values."""
 
     image: Path
     design: Path
@@ -65,7 +65,7 @@ def reseau(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, 
 
 @pytest.fixture(scope="session")
 def calibration(photo: Photo, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `reseau refine` makes of the photograph."""
+    """The calibration that `reseau refine` computes from the photograph."""
     path = tmp_path_factory.mktemp("calibration") / "camera.json"
     assert run(["refine", "--photo-i", str(photo.image), "--reseau", str(photo.design), "-o", str(path)]) == 0
     return path

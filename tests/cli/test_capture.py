@@ -33,7 +33,7 @@ TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
-    """A folder with a bench, a design and poses; and what stands behind the bench."""
+    """A folder with a bench file, a design and poses; and the simulated instruments."""
     rig = FieldRig()
     made = {"table": rig.table, "camera": rig.camera, "near": Sweeper("near"), "far": Sweeper("far")}
     monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])

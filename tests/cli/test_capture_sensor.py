@@ -51,7 +51,7 @@ def camera(lamp: LampScene) -> VideoCamera:
 
 @pytest.fixture
 def asked(lamp: LampScene, camera: VideoCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A folder with a bench; and what the operator was asked to do, who does it at once."""
+    """A folder with a bench file; and the requests to the operator, who carries them out at once."""
     asked: list[str] = []
 
     def message(text: str = "", err: bool = False, **_: Any) -> None:

@@ -1,4 +1,4 @@
-"""Commands: what they write is what was asked for, and it is right."""
+"""Commands write the requested files with correct content."""
 
 from __future__ import annotations
 

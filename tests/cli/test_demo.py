@@ -43,7 +43,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Its folder, and what it said."""
+    """Its folder, and its output."""
     folder, message = tmp_path_factory.mktemp("demo") / "out", StringIO()
     with redirect_stdout(message):
         assert run(["demo", "--out", str(folder), "--seed", "2"]) == 0

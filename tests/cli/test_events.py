@@ -1,4 +1,4 @@
-"""What is seen of an acquisition at a terminal, a narrow one too: pose, frames, precision, time left."""
+"""Display of an acquisition on a terminal, also a narrow one: pose, frames, precision, remaining time."""
 
 import io
 import re
@@ -9,7 +9,7 @@ from reseau.cli.events import Display
 
 
 class Terminal(io.StringIO):
-    """What a terminal was sent."""
+    """Text sent to the terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -26,7 +26,7 @@ def at_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 
 def shown(terminal: Terminal) -> list[str]:
-    """Its lines, without what moves the cursor."""
+    """Its lines, without control sequences."""
     return re.sub(r"\x1b\[[0-9?;]*[A-Za-z]", "", terminal.getvalue()).replace("\r", "\n").splitlines()
 
 

@@ -1,4 +1,4 @@
-"""`reseau orient` on files: what it writes, goes on after a break, and says of what it cannot orient."""
+"""`reseau orient` on files: output, resumption, and messages for frames that cannot be oriented."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`reseau measure pins`: what it writes, and what it says where it cannot."""
+"""`reseau measure pins`: output and error messages."""
 
 from __future__ import annotations
 

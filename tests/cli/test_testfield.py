@@ -1,4 +1,4 @@
-"""`reseau design testfield`: what it writes, and what it refuses."""
+"""`reseau design testfield`: output and refused input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames and image points: what they refuse, and that they select in the order asked for."""
+"""Frames and image points: refused input, and selection in the requested order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Provenance: hashes of what was read, and JSON that is the same to the byte."""
+"""Provenance: hashes of inputs, and JSON that is reproducible to the byte."""
 
 from __future__ import annotations
 

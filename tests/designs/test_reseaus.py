@@ -1,4 +1,4 @@
-"""Regular reseaus: names, coordinates, and what does not fit."""
+"""Regular reseaus: names, coordinates, and refused designs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The coded testfield: the paper's dimensions, a strict document, and what does not fit."""
+"""The coded testfield: the dimensions of the paper, a strict document, and refused designs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The code of the testfield: its distance proved over all words, and what it puts right."""
+"""The code of the testfield: its distance over all words, and the errors it corrects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CODE = TopologicalCode.of(coded_testfield())
 
 
 def every_appearance(count: int) -> tuple[Symbols, list[tuple[int, int, bool]]]:
-    """All words turned by numpy's own rotation of pictures: (8·count, 16), and what each is."""
+    """All words rotated as pictures with numpy: (8·count, 16), and the identity of each."""
     seen, what = [], []
     for square, word in enumerate(words(count)):
         for mirrored in (False, True):

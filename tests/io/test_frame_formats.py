@@ -1,4 +1,4 @@
-"""The documents of scanned frames: what is written reads back, and what breaks a rule is named."""
+"""The documents of scanned frames are read back unchanged, and invalid ones are refused."""
 
 from __future__ import annotations
 

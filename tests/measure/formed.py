@@ -76,7 +76,7 @@ class Scene:
         return regular_reseau(self.columns, self.rows, PITCH_MM, self.mark, polarity=self.polarity)
 
     def options(self, **changes: Any) -> ReseauOptions:
-        """What one who measures knows of the camera."""
+        """Camera parameters that are known to the measurement."""
         return ReseauOptions(row_jitter_px=self.jitter_px, fill=self.fill, **changes)
 
     def background(self) -> Array:

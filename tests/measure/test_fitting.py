@@ -1,4 +1,4 @@
-"""Mappings fitted to points: recovery, covariance, elimination, and what cannot be had."""
+"""Mappings fitted to points: recovery, covariance, elimination, and failures."""
 
 from __future__ import annotations
 

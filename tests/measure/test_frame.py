@@ -1,4 +1,4 @@
-"""Frames oriented: corners where they truly are, sigmas that cover, and refusal rather than a guess."""
+"""Oriented frames: correct corners and sigmas, and refusal instead of a guess."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
 
 
 def test_certain_frames_of_a_roll_locate_an_edge_hidden_by_a_line() -> None:
-    """The line is at one distance from the edge all along: alone, nothing tells them apart."""
+    """The line is parallel to the edge: in a single frame they cannot be distinguished."""
     frame = FilmFrame(320035, beside=Beside(lines=1))
     alone = oriented(frame)
     assert alone.status == "declined"
@@ -180,7 +180,7 @@ def test_another_channel_is_used_if_that_with_the_highest_contrast_hides_an_edge
 
 
 def moved_at_its_corners(frame: FilmFrame, by: Array) -> tuple[FrameResult, Array]:
-    """A scan warped so that its corners (4, 2) move by this much; and where the frame's corners are then."""
+    """A scan warped so that its corners (4, 2) move by given amounts; and the true corners of the frame."""
     pixels = frame.scan()
     h, w = pixels.shape
     square = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]], dtype=np.float32)

@@ -22,7 +22,7 @@ def design() -> np.ndarray:
 
 
 def seen(xy, scale=10.0, turn=0.0, mirrored=True, bend=0.0, shift=(0.0, 0.0)):
-    """Where the marks are in the image; `bend` is the radial distortion at its corner in pixels."""
+    """Positions of the marks in the image; `bend` is the radial distortion at its corner in pixels."""
     c, s = np.cos(turn), np.sin(turn)
     matrix = scale * np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
     q = xy @ matrix.T

@@ -1,4 +1,4 @@
-"""Patches matched with formed images: derivatives, known positions, and what disturbs a patch."""
+"""Patches matched with formed images: derivatives, known positions, and disturbances."""
 
 from __future__ import annotations
 

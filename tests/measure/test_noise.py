@@ -1,4 +1,4 @@
-"""How the noise of grey values goes with their size."""
+"""Noise of grey values as a function of their size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STARTS = np.stack(np.meshgrid(np.arange(20, 380, 30), np.arange(20, 280, 30)), a
 
 
 def windows(a: float, b: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A frame with a dark mark in each window, and what an adjustment would leave."""
+    """A frame with a dark mark in each window, and residuals of an adjustment."""
     y, x = np.mgrid[:300, :400]
     at = np.rint(STARTS)
     distance = np.min([np.hypot(x - cx, y - cy) for cx, cy in at], axis=0)

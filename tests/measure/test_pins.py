@@ -1,4 +1,4 @@
-"""Pins: formed arcs with known truth, what is declined and why, real B-mode frames beside PLUS."""
+"""Pins: formed arcs with known truth, declined echoes with reasons, real B-mode frames compared with PLUS."""
 
 from __future__ import annotations
 

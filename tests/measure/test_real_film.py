@@ -1,4 +1,4 @@
-"""Real film: still frames are oriented, cine frames beside a soundtrack are never wrong silently."""
+"""Real film: still frames are oriented, cine frames beside a soundtrack give no unflagged errors."""
 
 from __future__ import annotations
 

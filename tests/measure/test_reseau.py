@@ -1,4 +1,4 @@
-"""From a frame to the marks of its reseau: accuracy, honesty, and what is refused."""
+"""Marks of a reseau measured in a frame: accuracy, correct sigmas, and refused input."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def _reseau(rows: Array, half: int = 4) -> Mask:
 
 
 def _glowing(lines: float = 0.0, fall: float = 0.0, seed: int = 0) -> tuple[Array, Array]:
-    """Echoes on a raster of a glow of 45; where they are, and the picture."""
+    """Echoes on a raster with a glow of 45: their positions, and the picture."""
     rng = np.random.default_rng(seed)
     truth = _AT + rng.uniform(-4, 4, _AT.shape)
     light = picture(truth, arcs(len(truth), 18.0, 3.6, 0.004), _SIZE, 120.0, noise=0.0) + 37.0

@@ -1,4 +1,4 @@
-"""What of a frame can be measured in."""
+"""Which pixels of a frame can be used for measurement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The testfield measured: right numbers and places from every side; a clear answer where there is none."""
+"""The testfield: correct numbers and positions from every side; a failure with a reason if it is absent."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
 
 
 def measured(bench: FieldBench, station: Station) -> tuple[TestfieldResult, Array]:
-    """What is measured, and its errors (n, 2), NaN where nothing was."""
+    """The result, and its errors (n, 2), NaN for missing targets."""
     result = measure_testfield(bench.record(station), bench.design, OPTIONS)
     assert isinstance(result, TestfieldResult), result.reason
     return result, result.xy - bench.truth(station).xy

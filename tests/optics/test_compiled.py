@@ -1,4 +1,4 @@
-"""Images formed in single precision, beside those in double."""
+"""Images formed in single precision, compared with double precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is compiled anew gives the same bytes as what was compiled before: results can be computed again."""
+"""Newly compiled code and cached code give the same bytes: results can be reproduced."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""The field through measured points: its own predictions, its test, and what the local model is good for."""
+"""The field through measured points: its predictions, its test, and the effect of the local model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def grid(side: int, pitch: float = 1.0) -> np.ndarray:
 
 
 def bent(xy: np.ndarray) -> np.ndarray:
-    """What no polynomial of low degree follows: points beside a small disc pushed outwards."""
+    """A deformation that no low-degree polynomial follows: points around a small disc pushed outwards."""
     from_centre = xy - 4.3
     return 50 * xy + 1.5 * from_centre * np.exp(-0.5 * (from_centre**2).sum(axis=1, keepdims=True) / 1.2**2)
 

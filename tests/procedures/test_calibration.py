@@ -1,4 +1,4 @@
-"""A camera calibrated by whatever measures a frame."""
+"""A camera calibrated with any function that measures a frame."""
 
 from __future__ import annotations
 

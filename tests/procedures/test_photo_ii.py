@@ -44,7 +44,7 @@ def bench(world) -> tuple[PhotoI, PhotoII]:
 
 
 def at_fault(**faults: float | str) -> World:
-    """The same world with something amiss."""
+    """The same world with faults."""
     return World.standard(1, faults=Faults(**faults))
 
 

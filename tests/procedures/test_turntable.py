@@ -1,4 +1,4 @@
-"""A camera calibrated on an exact turntable: where it is only turned about its axis, points have no depth."""
+"""A camera calibrated on an exact turntable: points seen only with camera rotation have no depth."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ def board() -> Board:
 
 
 def recordings(seed: int) -> list[tuple[str, ImagePoints]]:
-    """What twelve poses of the paper show of it, with noise."""
+    """Its images in twelve poses of the paper, with noise."""
     rng, target, seen = np.random.default_rng(seed), board(), []
     for step in spread(paper_steps(), 12):
         xy = project(CAMERA, MOUNT.pose(step.position), np.pad(target.xy, ((0, 0), (0, 1)))).xy

@@ -42,13 +42,13 @@ RODS = ReseauDesign(
 
 
 def pixels(common: Array) -> Array:
-    """Where the camera shows points of the common system."""
+    """Images of points of the common system, in pixels."""
     photo = CAMERA.inverse(common)
     return np.stack([800 + 9 * photo[:, 0], 600 - 9 * photo[:, 1]], axis=1)
 
 
 def displayed(object_xy: Array) -> Array:
-    """Where the instrument shows points of the object (y down, as depth), in pixels."""
+    """Images of object points (y down, as depth), in pixels."""
     return pixels(INSTRUMENT.inverse(object_xy * SCALE * [1, -1] + [-50.0, 38.0]))
 
 

@@ -1,4 +1,4 @@
-"""The camera corrected by a reseau: the common system, sigmas, tests, files, and what cannot be had."""
+"""The camera corrected with a reseau: the common system, sigmas, tests, files, and failures."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def redesigned(design: ReseauDesign = GRID, *, down: bool = False, **changes) ->
 
 
 def pixels(photo, *, angle=0.03, flip=(1.0, -1.0)):
-    """A scan of photo-coordinates: 8 px to the millimetre, turned, shifted, y down unless told otherwise."""
+    """A scan of photo-coordinates: 8 px to the millimetre, rotated, shifted, y down by default."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return (photo * flip) @ turn.T * 8.0 + [611.3, 480.7]
 

@@ -1,4 +1,4 @@
-"""Stored coefficients held against a new photograph of the test object."""
+"""Stored coefficients tested with a new photograph of the test object."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TOLERANCE = 0.05
 
 @pytest.fixture(scope="module")
 def stored() -> tuple[InstrumentCorrection, np.ndarray]:
-    """A correction, and where its rods really are."""
+    """A correction, and the true positions of its rods."""
     rng = np.random.default_rng(1)
     real = RODS.xy + rng.normal(0, TOLERANCE, RODS.xy.shape)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()

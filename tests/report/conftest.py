@@ -18,7 +18,7 @@ NOISE_PX = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A bench, what was found in its photographs, and what is true."""
+    """A bench, the results from its photographs, and the true values."""
 
     world: World
     first: PhotoI

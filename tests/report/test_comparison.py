@@ -1,4 +1,4 @@
-"""The comparison with the truth: what it says is so, and points are told apart by their places."""
+"""The comparison with the truth: correct numbers, and points identified by their positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a sensor: what was found, with its figures; the same to the byte."""
+"""The report of a sensor: results and figures, reproducible to the byte."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def rays(kind: str, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class Edge:
-    """An edge, and what is true of it."""
+    """An edge with its true values."""
 
     frame: Frame
     truth: Callable[[Array], Array]

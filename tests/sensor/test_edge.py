@@ -1,4 +1,4 @@
-"""Edges measured: the free curve within its sigmas of the truth, its tests at their levels, a peer beside."""
+"""Measured edges: agreement of the free curve with the truth, levels of the tests, and plain ISO 12233."""
 
 from __future__ import annotations
 

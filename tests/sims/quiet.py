@@ -1,4 +1,4 @@
-"""Worlds without noise, to be held against their truth."""
+"""Worlds without noise, for comparison with their truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated scans of film frames: the edge lies where the truth says, whatever else is on the film."""
+"""Simulated scans of film frames: edges are at their true positions despite disturbances."""
 
 from __future__ import annotations
 

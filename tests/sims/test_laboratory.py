@@ -1,4 +1,4 @@
-"""One world: what the turntable does over its real protocol is what the camera sees of the testfield."""
+"""One world: the camera images the testfield as the turntable moves it over its real protocol."""
 
 from __future__ import annotations
 

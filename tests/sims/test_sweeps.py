@@ -1,4 +1,4 @@
-"""PHOTO II and III of the simulated bench: arcs where the truth has them, and the faults asked for."""
+"""PHOTO II and III of the simulated bench: arcs at their true positions, and the requested faults."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from reseau_sims import Display, Faults, Reflectors, Scanner, Truth, World, swap
 from .quiet import echoes, middle_of, quiet
 
 ROWS = "ABCDE"
-"""Rods of these rows stand alone: no other echo is near."""
+"""Rods of these rows are isolated: no other echo is near."""
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +236,7 @@ def test_bright_areas_deflect_the_beam_and_the_truth_includes_it() -> None:
 
 
 class Inverse:
-    """Where a world displays points of an ideal screen."""
+    """Displayed positions of points of an ideal screen."""
 
     def __init__(self, world: World) -> None:
         self.path = replace(world.display, bending_mm=0.0).path(

@@ -1,4 +1,4 @@
-"""The testfield on its turntable: recordings show what the truth says, and only that."""
+"""The testfield on its turntable: recordings agree with the truth."""
 
 from __future__ import annotations
 
