@@ -138,7 +138,7 @@ def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, session: Se
     takes = session.frames(FEW[1].name)
     assert [(f.take, f.verdict.ok) for f in takes if f.verdict] == [(0, False), (1, True)]
     assert takes[0].verdict is not None
-    assert "saturated: reduce the exposure" in takes[0].verdict.why
+    assert "saturated: expose less" in takes[0].verdict.why
     assert rig.camera.exposures == 6
 
 
