@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Power", "aligned", "grouped", "measured", "power"]
+__all__ = ["Power", "aligned", "grouped", "measured", "plain", "power"]
 
 _MINUS = "\u2212"
 
@@ -34,6 +34,17 @@ def grouped(value: float) -> str:
     ('62.2', True)
     """
     return f"{value:.1f}" if value < 1000 else f"{value:,.0f}".replace(",", "\u202f")
+
+
+def plain(value: float, digits: int) -> str:
+    """Return a number rounded to some digits, without a power of ten up to a million.
+
+    Examples
+    --------
+    >>> plain(5012.3, 3), plain(0.0004567, 2), plain(3600.0, 2)
+    ('5010', '0.00046', '3600')
+    """
+    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 class Power(NamedTuple):

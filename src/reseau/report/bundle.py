@@ -11,6 +11,7 @@ from markupsafe import Markup
 from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Rows
+from ..core.numbers import plain, power
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
 from .bundle_figures import distortion_figure, network_figure, residual_figure
@@ -117,9 +118,9 @@ def _reliability(result: Result) -> list[tuple[str, str, str]]:
     if not len(error) or not len(length):
         return []
     return [
-        (f"{np.median(error):.2g}", "px", "smallest detectable error of an image coordinate, median"),
-        (f"{np.median(length):.2g}", "σ", "largest effect of an undetected error on any result, median"),
-        (f"{length.max():.2g}", "σ", "the same, maximum"),
+        (plain(np.median(error), 2), "px", "smallest detectable error of an image coordinate, median"),
+        (plain(np.median(length), 2), "σ", "largest effect of an undetected error on any result, median"),
+        (plain(length.max(), 2), "σ", "the same, maximum"),
     ]
 
 
@@ -136,8 +137,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
         rows.append(
             {
                 "name": name,
-                "value": f"{value:.7g}",
-                "sigma": f"{s:.2g}",
+                "estimate": power(value, s),
                 "between": f"{other:.2g}" if np.isfinite(other) else "–",
                 "unit": unit_text(unit_of(name, camera.model)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
@@ -171,7 +171,10 @@ def _fields(
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     fields = [("directions", projection_field(lens, _PLACES))]
     fields += [
-        (f"points at {distance:.3g} {network.unit}", projection_field_at(result, c, distance, across=_PLACES))
+        (
+            f"points at {plain(distance, 3)} {network.unit}",
+            projection_field_at(result, c, distance, across=_PLACES),
+        )
         for distance in distances or [usual]
     ]
     return [
