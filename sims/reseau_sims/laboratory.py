@@ -157,7 +157,7 @@ class Laboratory:
     def attach(self, axis: str, where: Callable[[], float]) -> None:
         """Connect an axis of :data:`AXES` to a function that returns its position (degrees or mm)."""
         if axis not in AXES:
-            raise UsageError(f"is none of {', '.join(AXES)}", where=axis)
+            raise UsageError(f"is not one of {', '.join(AXES)}", where=axis)
         self._axes[axis] = where
 
     @property

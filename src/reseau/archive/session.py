@@ -203,7 +203,7 @@ class Session:
         Raises
         ------
         ArchiveError
-            If there is none of this name, or it is lost or damaged.
+            If no input has this name, or it is lost or damaged.
         """
         found = self.find(name, INPUT)
         if found is None:

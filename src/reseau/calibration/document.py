@@ -204,7 +204,7 @@ class Calibration(Document):
             raise ValueError(f"`covariance` has {n} names but no {n}×{n} matrix")
         unknown = [name for name in self.covariance.names if name not in self.parameters]
         if unknown:
-            raise ValueError(f"`covariance` names {unknown[0]!r}, which is none of the parameters")
+            raise ValueError(f"`covariance` names {unknown[0]!r}, which is not a parameter")
         return self
 
     def values(self) -> dict[str, float]:

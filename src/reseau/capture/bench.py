@@ -56,7 +56,7 @@ def plugin(group: str, name: str) -> Any:
     Raises
     ------
     UsageError
-        If there is none of this name, or it cannot be loaded.
+        If no entry point has this name, or it cannot be loaded.
 
     Examples
     --------
