@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -174,7 +175,9 @@ def test_an_aborted_plan_stops_the_table(make_table: Callable[[], Pair], engine:
         threading.Timer(0.5, engine.request_pause).start()
         with pytest.raises(bluesky.utils.RunEngineInterrupted):
             engine(moving())
-        engine.abort("enough")
+        # The engine may see the failure of the stopped move before the abort has ended; this depends on timing.
+        with contextlib.suppress(bluesky.utils.FailedStatus):
+            engine.abort("enough")
         state = table.state("tilt")
         assert not state.moving
         assert state.position < 40.0
