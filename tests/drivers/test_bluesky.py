@@ -175,7 +175,7 @@ def test_an_aborted_plan_stops_the_table(make_table: Callable[[], Pair], engine:
         threading.Timer(0.5, engine.request_pause).start()
         with pytest.raises(bluesky.utils.RunEngineInterrupted):
             engine(moving())
-        # The engine may see the failure of the stopped move before the abort has ended; this depends on timing.
+        # The engine may see the failure of the stopped move before the abort ends, depending on timing.
         with contextlib.suppress(bluesky.utils.FailedStatus):
             engine.abort("enough")
         state = table.state("tilt")
