@@ -58,7 +58,7 @@ def test_results_have_units_and_as_many_digits_as_the_sigma_supports(film: Path,
 
 def test_wrong_use_is_reported_in_one_line(film: Path, reseau: Run) -> None:
     for more, text in (
-        (("--channel", "blue"), "--channel: the scan has no channel blue; use grey"),
+        (("--channel", "blue"), "--channel: the scan has no channel 'blue'; use grey"),
         (("--left", 600, 160, 712, 239), "film.png: "),
     ):
         status, _, err = reseau("measure", "perforations", film, *OPTIONS, *more)

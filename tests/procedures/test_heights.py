@@ -110,5 +110,5 @@ def test_sigmas_of_zero_are_refused() -> None:
 
 def test_a_stage_needs_control() -> None:
     _, _, result = camera_of(calibrated(*recorded(2)))
-    with pytest.raises(UsageError, match="needs control"):
+    with pytest.raises(UsageError, match="requires the datum `control`"):
         replace(result.network, datum="free")

@@ -152,7 +152,7 @@ class FrameOrientation(Document):
     ...     channel=None, corners=None, principal_point=None, angle_deg=None, angle_sigma_deg=None,
     ...     px_per_mm=None, edges={},
     ... ).image_points()
-    ImagePoints(...)
+    <ImagePoints: points 0>
     """
 
     SCHEMA: ClassVar[str] = "reseau-orientation/1"

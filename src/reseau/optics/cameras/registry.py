@@ -368,7 +368,7 @@ def camera_model(name: str) -> CameraModel:
     --------
     >>> camera_model("pinhole")
     Traceback (most recent call last):
-    reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, opencv
+    reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, opencv...
     """
     return _found(_CAMERAS, name, "camera model")
 
