@@ -159,7 +159,7 @@ def test_the_self_test_passes(grey: str) -> None:
 
 def test_unsupported_settings_are_refused(grey: str) -> None:
     with v4l2("camera", grey) as camera:
-        with pytest.raises(RefusedError, match="no control of the exposure time"):
+        with pytest.raises(RefusedError, match="no control for the exposure time"):
             camera.configure(exposure_us=1000.0)
         with pytest.raises(RefusedError, match="brightness 999 is outside 0…255"):
             camera.configure(brightness=999)
