@@ -1,0 +1,96 @@
+"""Pixels of a scene that is given as a function of position: sampled finely, then blurred and averaged.
+
+The scene is sampled `oversampling` times per pixel in both directions. In the domain of frequencies it is
+multiplied by the transfer functions of a Gaussian point-spread function and of a square aperture; the values
+at the centres of the pixels form the image. Scenes soften their edges over one sample (`edge`), which adds the
+variance of a box one sample wide; the point-spread function is narrowed by as much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+__all__ = ["Array", "Scene", "edge", "form", "form_at"]
+
+Array = NDArray[np.float64]
+Scene = Callable[[Array, Array, float], Array]
+"""Brightness at positions x, y (pixels, origin at the centre of the first) sampled at a spacing."""
+
+_TILE = 96
+_REACH = 6.0
+
+
+def edge(inside: Array, spacing: float) -> Array:
+    """Share of a sample inside, from the signed distance to an edge (positive inside)."""
+    return np.clip(0.5 + inside / spacing, 0.0, 1.0)
+
+
+def form(
+    scene: Scene, width: int, height: int, sigma: float, aperture: float = 1.0, oversampling: int = 8
+) -> Array:
+    """An image (height, width) of a scene.
+
+    Parameters
+    ----------
+    scene : callable
+        Brightness of positions.
+    width, height : int
+        Of the image, in pixels.
+    sigma : float
+        Standard deviation of the point-spread function, in pixels.
+    aperture : float
+        Side of the square light-sensitive part of a pixel, in pixels.
+    oversampling : int
+        Samples per pixel and axis.
+    """
+    image = np.empty((height, width))
+    for top in range(0, height, _TILE):
+        for left in range(0, width, _TILE):
+            down, across = min(_TILE, height - top), min(_TILE, width - left)
+            tile = form_at(scene, (left, top), (across, down), sigma, aperture, oversampling)
+            image[top : top + down, left : left + across] = tile[0]
+    return image
+
+
+def form_at(
+    scene: Scene,
+    first: tuple[int, int],
+    size: tuple[int, int],
+    sigma: float,
+    aperture: float = 1.0,
+    oversampling: int = 8,
+    derivatives: bool = False,
+) -> Array:
+    """A part of an image, (1, height, width), see `form`; with derivatives (4, height, width).
+
+    Parameters
+    ----------
+    scene : callable
+        Brightness of positions.
+    first : (int, int)
+        x and y of its first pixel.
+    size : (int, int)
+        Its width and height.
+    sigma, aperture, oversampling
+        As for `form`.
+    derivatives : bool
+        Whether to return those by a shift of the scene in x, in y and by `sigma` too.
+    """
+    n = oversampling
+    margin = int(np.ceil(_REACH * sigma + 1))
+    x, y = (a - margin + np.arange((s + 2 * margin) * n) / n for a, s in zip(first, size, strict=True))
+    bright = scene(*np.meshgrid(x, y), 1.0 / n)
+    fx, fy = np.fft.rfftfreq(len(x), 1 / n), np.fft.fftfreq(len(y), 1 / n)[:, None]
+    narrow = sigma**2 - 1 / (12 * n**2)
+    across, down = (np.exp(-2 * np.pi**2 * narrow * f**2) * np.sinc(aperture * f) for f in (fx, fy))
+    light = scipy.fft.rfft2(bright) * down * across
+    parts = [light]
+    if derivatives:
+        parts += [-2j * np.pi * fx * light, -2j * np.pi * fy * light]
+        parts += [-4 * np.pi**2 * sigma * (fx**2 + fy**2) * light]
+    inner = slice(margin * n, -margin * n, n)
+    return np.stack([scipy.fft.irfft2(part, bright.shape)[inner, inner] for part in parts])
