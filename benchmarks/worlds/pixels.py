@@ -2,8 +2,8 @@
 
 The scene is sampled `oversampling` times per pixel in both directions. In the domain of frequencies it is
 multiplied by the transfer functions of a Gaussian point-spread function and of a square aperture; the values
-at the centres of the pixels form the image. Scenes soften their edges over one sample (`edge`), which adds the
-variance of a box one sample wide; the point-spread function is narrowed by as much.
+at the centres of the pixels form the image. Scenes soften their edges over one sample (`edge`), which adds
+the variance of a box one sample wide; the point-spread function is narrowed by as much.
 """
 
 from __future__ import annotations
