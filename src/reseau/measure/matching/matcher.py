@@ -465,7 +465,7 @@ def match(
         Options of the matching.
     noise : float
         Approximate standard deviation of the grey values; used for the weights of prior knowledge only.
-    form : ndarray (m, 2, 2), optional
+    form : ndarray (m, 2, 2) or (k, m, 2, 2), optional
         Generators F_i of the form of an outline, which is multiplied by 1 + Σ p_i F_i.
     form_sigma : ndarray (m,), optional
         Prior standard deviations of the p_i around 0.

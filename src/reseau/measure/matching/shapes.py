@@ -80,8 +80,8 @@ class GrownOutline:
     nodes : Outline
         Outlines (k, j, 2) in pixels around the point to be measured, padded with zeros where an outline has
         fewer nodes. Outlines in single precision are formed in single precision, about eight times faster.
-    generators : ndarray (p, 2, 2)
-        The generators F_i.
+    generators : ndarray (p, 2, 2) or (k, p, 2, 2)
+        The generators F_i, of all shapes or of each.
 
     Examples
     --------
@@ -101,7 +101,7 @@ class GrownOutline:
     @property
     def parameters(self) -> int:
         """Number of parameters of the form."""
-        return len(self.generators)
+        return int(self.generators.shape[-3])
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`Shape`."""
@@ -119,16 +119,22 @@ class GrownOutline:
             return parts[:, 0], parts[:, 1:]
         motions = None
         if self.parameters:
-            motions = np.einsum("pij,knj->kpni", self.generators, self.nodes.xy[at])
+            motions = np.einsum("kpij,knj->kpni", self._generators(at), self.nodes.xy[at])
         outline = self._placed(xy, form, at)
         return coverage_derivatives(outline, window.columns, window.rows, width, window.response, motions)
 
     def _placed(self, xy: Array, form: Array, at: Rows) -> Outline:
         nodes, tangents = self.nodes.xy[at], self.nodes.dxy[at]
         if self.parameters:
-            grown = np.swapaxes(np.eye(2) + np.einsum("kp,pij->kij", form, self.generators), 1, 2)
+            grown = np.swapaxes(np.eye(2) + np.einsum("kp,kpij->kij", form, self._generators(at)), 1, 2)
             nodes, tangents = nodes @ grown, tangents @ grown
         return Outline(nodes + xy[:, None, :], tangents)
+
+    def _generators(self, at: Rows) -> Array:
+        """Generators (m, p, 2, 2) of the shapes `at`."""
+        if self.generators.ndim == 4:
+            return self.generators[at]
+        return np.broadcast_to(self.generators, (len(at), *self.generators.shape))
 
     def _compiled(self, xy: Array, width: Array, form: Array, at: Rows, window: Window, parts: int) -> Array:
         """Share and as many of its derivatives as `parts` asks for, (m, parts, r, c)."""

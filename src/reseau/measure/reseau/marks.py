@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
@@ -14,6 +15,7 @@ from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
 from ..points import Reason
 from .placement import Placement
+from .wires import grid_wires
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
 
@@ -24,9 +26,18 @@ _LEARN_FROM = 50
 _SEEN = 0.1
 """Minimum share of a mark on pixels that carry an image."""
 _BLURRED = 1.55
-"""A mark counts as blurred from this multiple of the others' point-spread function: it is another object."""
+"""A mark counts as blurred from this multiple of the width of the others' images: it is another object."""
 _LIKE_OTHERS = 4.0
 """Spreads by which the contrast of a mark may differ from that of the others."""
+_CONTRAST_SPREAD = 0.25
+"""Smallest spread of contrasts within a frame, relative to the median: the light and the marks are uneven. It
+leaves the contrast of a distinct mark to its own image and supports only that of a faint one."""
+_ARMS = ("cross", "line-grid")
+"""Shapes with arms, whose directions are estimated."""
+_MOVED = 0.5
+"""Shift against the start, in widths of the mark's image, from which a mark is matched again."""
+_TURN, _TURNED = 0.12, 0.02
+"""Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +115,26 @@ class MarkMeasurement:
         self.free_size = size is None
         self.size = placed.mark_px / self.px_per_unit if size is None else size
         self.extent_px = self.px_per_unit * (3.0 * self.size if mark.shape == "line-grid" else self.size)
+        # Directions (n, 2, 2) of the two arms in the plane of the design, as columns.
+        self.arms = (
+            grid_wires(source).directions
+            if mark.shape == "line-grid"
+            else np.broadcast_to(np.eye(2), (len(source), 2, 2))
+        )
 
     def result(self) -> tuple[Rows, Matches, Verdict]:
         """Match, learn the appearance of marks, match again, test."""
         placed = self.assignment
         has = placed.candidate >= 0
-        # The strongest marks show what a mark looks like here, and where exactly to look for the others.
-        strongest = np.flatnonzero(has)[np.argsort(placed.candidate[has], kind="stable")[:_LEARN_FROM]]
+        # The strongest marks show what a mark looks like here, and where exactly to look for the others; some
+        # of all strengths show how much contrasts differ.
+        ranked = np.flatnonzero(has)[np.argsort(placed.candidate[has], kind="stable")]
+        rest = ranked[_LEARN_FROM:]
+        shown = np.concatenate([ranked[:_LEARN_FROM], rest[:: max(1, -(-len(rest) // _LEARN_FROM))]])
         first = self._match(
-            strongest, placed.at[strongest], self._first_options(), 0.3 if self.free_size else 0.1
+            shown, placed.at[shown], self._first_options(), 0.3 if self.free_size else 0.1, _TURN
         )
-        self._learn(first, placed.at[strongest])
+        self._learn(first, placed.at[shown])
         at = np.flatnonzero(self._near_frame(self.predicted))
         found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
         self._refit(at, found)
@@ -145,28 +165,55 @@ class MarkMeasurement:
     def _outline(self, at: Rows, options: MatchOptions) -> Outline:
         """Outlines of the marks `at` in pixels, mapped by the field."""
         psf_px = float(np.max(options.psf_px))
-        jacobian = self.field.jacobian(self.source[at])
+        axes = self._axes(at)
         mark = self.design.mark
         width = self.size if mark.shape == "line-grid" else mark.line_width
+        if width is not None:
+            # An arm becomes narrower where the other is not perpendicular to it.
+            width = width / float(np.median(np.abs(np.linalg.det(self.arms[at]))))
         # Wires of a crossing are cut off outside the window, whatever its rotation.
         reach = (1.5 * max(options.half) + 8 * psf_px) / self.px_per_unit
         outline = mark_outline(mark.shape, self.size, width, 0.8 * psf_px / self.px_per_unit, reach).affine(
-            jacobian
+            axes
         )
         # A mirroring mapping reverses the direction of the outline.
-        return Outline(outline.xy, outline.dxy * np.sign(np.linalg.det(jacobian))[:, None, None])
+        return Outline(outline.xy, outline.dxy * np.sign(np.linalg.det(axes))[:, None, None])
 
-    def _match(self, at: Rows, start: Array, options: MatchOptions, size_sigma: float) -> Matches:
-        return match(
-            self.screened.grey,
-            self.screened.valid,
-            self._outline(at, options),
-            start,
-            options,
-            noise=self.screened.noise,
-            form=SIZE,
-            form_sigma=np.array([size_sigma]),
-        )
+    def _axes(self, at: Rows) -> Array:
+        """Linear mappings (m, 2, 2) from an upright mark to the images of the marks `at`."""
+        axes: Array = self.field.jacobian(self.source[at]) @ self.arms[at]
+        return axes
+
+    def _match(
+        self, at: Rows, start: Array, options: MatchOptions, size_sigma: float, turn_sigma: float
+    ) -> Matches:
+        form, sigma = SIZE, np.array([size_sigma])
+        if self.design.mark.shape in _ARMS:
+            # Each arm turns by itself: its tip moves in the direction of the other.
+            axes = self._axes(at)
+            turns = axes[:, None] @ np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]])
+            turns = turns @ np.linalg.inv(axes)[:, None]
+            form = np.concatenate([np.broadcast_to(SIZE, (len(at), 1, 2, 2)), turns], axis=1)
+            sigma = np.array([size_sigma, turn_sigma, turn_sigma])
+        outline = self._outline(at, options)
+
+        def matched(rows: Rows, start: Array) -> Matches:
+            return match(
+                self.screened.grey,
+                self.screened.valid,
+                Outline(outline.xy[rows], outline.dxy[rows]),
+                start,
+                options,
+                noise=self.screened.noise,
+                form=form[rows] if form.ndim == 4 else form,
+                form_sigma=sigma,
+            )
+
+        found = matched(np.arange(len(at)), start)
+        # From a poor start, pixels of the mark are taken for objects in its background and rejected.
+        moved = found.converged & (np.hypot(*(found.xy - start).T) > _MOVED * self._image_width(0.0))
+        again = np.flatnonzero(moved & (found.t > self.options.least_t))
+        return found.replaced(again, matched(again, found.xy[again])) if len(again) else found
 
     def _refit(self, at: Rows, found: Matches) -> None:
         """Fit the field through the reliable marks; the field of the candidates was coarse."""
@@ -188,10 +235,21 @@ class MarkMeasurement:
         log_psf, self.psf_spread = _robust(np.log(first.psf_px[sure]), 0.08)
         self.psf_px = float(np.exp(log_psf))
         self.contrast, spread = _robust(first.contrast[sure], 0.03)
+        # Contrasts may be of several kinds, of which the smallest has a share of one tenth.
+        low, high = np.quantile(first.contrast[sure], [0.05, 0.95])
+        spread = max(spread, float(high - low) / 2, _CONTRAST_SPREAD * abs(self.contrast))
         self.contrast_spread = 1.5 * spread
         growth, self.size_spread = _robust(first.form[sure, 0], 0.02)
         self.size *= 1 + growth
         self.extent_px *= 1 + growth
+        if self.design.mark.shape in _ARMS:
+            self.arms = self._turned(first.form[sure, 1:])
+
+    def _turned(self, turns: Array) -> Array:
+        """The arms, turned by what the marks of the frame have in common."""
+        first, second = np.median(turns, axis=0)
+        arms = self.arms @ np.array([[1.0, second], [first, 1.0]])
+        return np.asarray(arms / np.linalg.norm(arms, axis=1, keepdims=True))
 
     def _match_all(self, at: Rows, start: Array) -> Matches:
         """Match with the learnt appearance; with a curved background where that is better."""
@@ -205,12 +263,14 @@ class MarkMeasurement:
             start_px=1.0,
             variance=self.variance,
         )
-        found = self._match(at, start, options, self.size_spread)
+        found = self._match(at, start, options, self.size_spread, _TURNED)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
         uneasy = np.flatnonzero(~found.converged | (found.noise > 1.5 * ordinary) | (found.rejected > 0.1))
         if not len(uneasy):
             return found
-        curved = self._match(at[uneasy], start[uneasy], replace(options, background=2), self.size_spread)
+        curved = self._match(
+            at[uneasy], start[uneasy], replace(options, background=2), self.size_spread, _TURNED
+        )
         better = ~found.converged[uneasy] | (_size(curved.cov) < 0.8 * _size(found.cov[uneasy]))
         better &= curved.converged
         return found.replaced(uneasy[better], curved.select(better))
@@ -244,13 +304,22 @@ class MarkMeasurement:
             (found.seen <= _SEEN, Reason("on lost lines or beyond the edge of the frame", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
             (~(found.t >= o.least_t), Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST)),
-            (found.psf_px > _BLURRED * ordinary, Reason("less sharp than the other marks", Code.BLURRED)),
+            (
+                self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary),
+                Reason("less sharp than the other marks", Code.BLURRED),
+            ),
             (unlike, Reason("contrast differs from the other marks", Code.UNLIKE)),
             (strong & (found.correlation < 0.5), Reason("the image is not that of a mark", Code.UNLIKE)),
             (found.rejected > 0.4, Reason("disturbed by bit errors or the scene", Code.DISTURBED)),
             (moved, Reason("no mark at the position predicted by its neighbours", Code.DEVIATES)),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
+
+    def _image_width(self, psf_px: ArrayLike) -> Array:
+        """Width (one sigma) of the images of marks: point-spread function, pixel, and the mark itself."""
+        narrow = self.design.mark.line_width or self.size
+        mark_px = min(narrow, self.size) * self.px_per_unit
+        return np.sqrt(np.square(np.asarray(psf_px)) + (1 + mark_px**2) / 12)
 
     def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
         """Reject marks that deviate from the prediction of their neighbours, the worst first."""

@@ -27,6 +27,7 @@ from ..points import Measured, Reason
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .placement import GridOptions, PlacingOptions, place, spacing
 from .sheet import measure_sheet
+from .wires import grid_wires
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
@@ -95,14 +96,20 @@ class ReseauResult(Measured):
             for centre in self.field(xy):
                 cv2.circle(hidden, tuple(int(c) for c in np.rint(centre)), (width + 1) // 2, 1, -1)
             return hidden > 0
-        low, high = xy.min(axis=0), xy.max(axis=0)
-        along = np.linspace(-0.06, 1.06, 120)[:, None] * (high - low) + low  # wires extend to their frame
-        for axis in (0, 1):
-            for at in np.unique(np.round(xy[:, axis], 9)):
-                line = along.copy()
-                line[:, axis] = at
+        wires = grid_wires(xy)
+        for family, chains in enumerate(wires.marks):
+            for chain in chains:
+                ends = xy[chain[[0, -1]]]
+                inner = ends[0] + np.linspace(0, 1, 120)[:, None] * (ends[1] - ends[0])
+                # Wires extend to their frame; there the field is continued along its tangent.
+                beyond = (
+                    np.hypot(*(ends[1] - ends[0])) / (len(chain) - 1) * wires.directions[chain[0], :, family]
+                )
+                outer = (self.field.jacobian(ends) @ beyond) * [[-1.0], [1.0]]
+                line = self.field(inner)
+                line = np.concatenate([line[:1] + outer[:1], line, line[-1:] + outer[1:]])
                 # Coordinates with four binary digits after the point make a smooth line.
-                bent = np.rint(self.field(line) * 16).astype(np.int32)
+                bent = np.rint(line * 16).astype(np.int32)
                 cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
         return hidden > 0
 

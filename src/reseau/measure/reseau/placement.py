@@ -453,10 +453,11 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     """
     mark = design.mark
     size = mark.line_width if mark.shape == "line-grid" else mark.size
+    axes = np.eye(2) if options.nominal is None else _nominal_axes(source, options.nominal)
     best: tuple[float, Placement] | None = None
     for mark_px in _sizes(source, size, options):
         screened = screen(frame, run=max(15, round(4 * mark_px)))
-        template = _template(design, mark_px, options.psf_px)
+        template = _template(design, mark_px, options.psf_px, axes)
         if len(template) > min(frame.pixels.shape):
             continue
         candidates = find_candidates(screened.grey, screened.valid, template)
@@ -489,15 +490,23 @@ def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[
     return _TRIAL_PX
 
 
-def _template(design: ReseauDesign, mark_px: float, psf_px: float) -> Array:
-    """Formed image of an upright mark of this size."""
+def _nominal_axes(source: Array, nominal: Array) -> Array:
+    """Linear mapping (2, 2) of unit determinant from the design to the image, by the nominal positions."""
+    from_mean = source - source.mean(axis=0)
+    linear = np.linalg.lstsq(from_mean, nominal - nominal.mean(axis=0), rcond=None)[0].T
+    size = abs(float(np.linalg.det(linear)))
+    return np.asarray(linear / np.sqrt(size)) if size > 1e-12 else np.eye(2)
+
+
+def _template(design: ReseauDesign, mark_px: float, psf_px: float, axes: Array) -> Array:
+    """Formed image of a mark of this size, turned and sheared by `axes`."""
     mark, width = design.mark, mark_px
     if mark.shape == "cross" and mark.size and mark.line_width:
         width = mark_px * mark.line_width / mark.size
     half = int(np.ceil((1.5 * mark_px + 2 if mark.shape == "line-grid" else mark_px / 2) + 4))
     pixels = np.arange(-half, half + 1.0)
     outline = mark_outline(mark.shape, mark_px, width, 0.5 * psf_px, 2.0 * half)
-    share = coverage(outline, pixels, pixels, psf_px)
+    share = coverage(outline.affine(axes).oriented(), pixels, pixels, psf_px)
     return -share if design.polarity == "dark" else share
 
 
