@@ -319,7 +319,8 @@ class MarkMeasurement:
         """Width (one sigma) of the images of marks: point-spread function, pixel, and the mark itself."""
         narrow = self.design.mark.line_width or self.size
         mark_px = min(narrow, self.size) * self.px_per_unit
-        return np.sqrt(np.square(np.asarray(psf_px)) + (1 + mark_px**2) / 12)
+        width: Array = np.sqrt(np.square(np.asarray(psf_px)) + (1 + mark_px**2) / 12)
+        return width
 
     def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
         """Reject marks that deviate from the prediction of their neighbours, the worst first."""
