@@ -493,7 +493,8 @@ def main() -> int:
         check(Path(os.environ.get("RESEAU_DATA", "../shared/data")) / "independent" / "marks")
     if given.folder is not None:
         given.folder.mkdir(parents=True, exist_ok=True)
-        for kind in [given.kind] if given.kind else ["cross", "disk", "line-grid", "wires"]:
+        kinds: tuple[Kind, ...] = (given.kind,) if given.kind else ("cross", "disk", "line-grid", "wires")
+        for kind in kinds:
             for seed in range(given.first, given.first + given.count):
                 sheet = Sheet.drawn_from(kind, np.random.default_rng((seed, 0)))
                 write(given.folder, f"{kind}_{seed:03d}", sheet, seed)
