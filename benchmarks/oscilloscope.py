@@ -1,7 +1,13 @@
 """The oscilloscope procedure on the simulated bench: correctness of the sigmas, effect of each factor.
 
 Run from the checkout: ``python benchmarks/oscilloscope.py [--frames 200] [--polynomial 100] [--draws 1000]
-[--jobs 1] [--keep FOLDER]``. PHOTO I, II and III of one world per seed go through the complete procedure. For
+[--jobs 1] [--keep FOLDER]``, or with ``--part``:
+
+- ``independent``: the sets of another program in ``$RESEAU_DATA``, through ``reseau refine`` (see `refined`);
+- ``worlds``: the same with ``--count 200`` worlds of `worlds.oscilloscope`;
+- ``points``: such worlds as coordinates with noise of known covariance, without images.
+
+Without it, PHOTO I, II and III of one world per seed go through the complete procedure. For
 displays with Wong's physics, and for displays that equations (7a, b) correct exactly, it prints
 
 1. the number of measured points, and errors of positions over their standard deviations;
@@ -24,6 +30,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import sys
 import time
 from collections import Counter
@@ -31,13 +38,16 @@ from collections.abc import Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import group_a
 import group_b
 import numpy as np
 from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
 from photographs import Physics
+from refined import of_points, print_refined, refined
 from tables import judged, mean_square, rms, rms_over_worlds
+from worlds.oscilloscope import World, write
 
 from reseau.core.data import Array
 from reseau.report.factors import FACTORS
@@ -171,6 +181,33 @@ def through_the_procedure(
     return found
 
 
+def _of_others(part: str, seeds: range, keep: Path | None) -> None:
+    """The parts in worlds that share nothing with the project's formation of images."""
+    if part == "points":
+        done = [of_points(seed) for seed in seeds]
+        print_refined("Worlds as coordinates with noise", done, 0.95, 1.05, 0.95, 1.05)
+        return
+    with TemporaryDirectory() as scratch:
+        place = Path(scratch) if keep is None else keep
+        if part == "independent":
+            folder = Path(os.environ.get("RESEAU_DATA", "../shared/data")) / "independent" / "oscilloscope"
+            names = sorted(file.name.split(".")[0] for file in folder.glob("*.truth.json"))
+            found = [refined(folder, name, place) for name in names]
+            print_refined("Sets of another program", found, 0.85, 1.15, 0.8, 1.2)
+            return
+        found = []
+        for seed in seeds:
+            name = f"world{seed:03d}"
+            if not (place / f"{name}.truth.json").exists():
+                write(place, name, World.drawn_from(seed))
+            found.append(refined(place, name, place))
+            if keep is None:
+                for file in place.glob(f"{name}.*"):
+                    file.unlink()
+            print(f"{name}: {found[-1].message or found[-1].worst}", file=sys.stderr, flush=True)
+        print_refined("Worlds without the project's formation", found, 0.95, 1.05, 0.95, 1.05)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=200, help="worlds of Wong's physics")
@@ -179,10 +216,16 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=1000, help="tests of level, from points")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep there what is measured in frames")
+    parser.add_argument("--part", choices=["bench", "independent", "worlds", "points"], default="bench")
+    parser.add_argument("--count", type=int, default=200, help="worlds of --part worlds and points")
     given = parser.parse_args()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)
     begun = time.perf_counter()
+    if given.part != "bench":
+        _of_others(given.part, range(given.first, given.first + given.count), given.keep)
+        print(f"\n{time.perf_counter() - begun:.0f} s")
+        return 0
     worlds: tuple[tuple[Physics, int], ...] = (("wong", given.frames), ("polynomial", given.polynomial))
     with ProcessPoolExecutor(given.jobs) as pool:
         for physics, count in worlds:
