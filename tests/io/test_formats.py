@@ -67,6 +67,20 @@ def broken(change: str) -> str:
             content["mark"]["shape"] = "star"
         case "string":
             content["points"][0]["x"] = "0"
+        case "place":
+            content["points"][1]["x"] = 1e-9
+            content["points"].append({"id": "e", "x": 30.0, "y": 5.0})
+        case "nominal place":
+            content["points"][2] |= {"nominal_px": [7.5, 8.0]}
+            content["points"].append({"id": "e", "x": None, "y": None, "nominal_px": [7.5, 8.0]})
+        case "tiny":
+            content["points"][1]["x"] = 1e-9
+        case "far":
+            content["points"][1]["x"] = 1e300
+        case "segment of a cross":
+            content["points"][1]["end"] = [20.0, 0.0]
+        case "no segment":
+            content["points"][1]["end"] = [10.0, 0.0]
         case "schema":
             content["schema"] = "reseau-design/9"
     return json.dumps(content)
@@ -85,6 +99,12 @@ def broken(change: str) -> str:
         ("empty", "no points"),
         ("shape", "mark.shape"),
         ("string", "valid number"),
+        ("place", r"points 'a' and 'b' lie at one place, \(0, 0\); correct or remove one of them"),
+        ("nominal place", r"points 'c' and 'e' have one nominal position, \(7.5, 8\) px"),
+        ("tiny", "all points lie within 1e-06 mm; check the unit"),
+        ("far", r"points\[1\]\.x`: .* less than or equal to 1000000000"),
+        ("segment of a cross", "requires marks of shape 'rod'"),
+        ("no segment", "`end` of 'b' must lie at another place"),
         ("schema", "'reseau-design/1' was expected"),
     ],
 )
@@ -105,6 +125,17 @@ def test_nan_is_refused_as_a_coordinate() -> None:
     text = json.dumps(design()).replace("10.0", "NaN", 1)
     with pytest.raises(FormatError, match="finite"):
         ReseauDesign.parse(text, where="x.json")
+
+
+def test_a_slanted_wire_has_a_segment_and_no_place() -> None:
+    content = design() | {"mark": {"shape": "rod", "size": 0.5}}
+    # The diagonal of an N runs from one wire to the other: their ends are at one place.
+    content["points"].append({"id": "n", "x": 0.0, "y": 0.0, "end": [10.0, 0.0]})
+    wires = ReseauDesign.parse(json.dumps(content), where="d.json")
+    np.testing.assert_array_equal(wires.xy[3], [np.nan, np.nan])
+    np.testing.assert_array_equal(wires.segments[[1, 3]], [[[10, 0], [10, 0]], [[0, 0], [10, 0]]])
+    assert ReseauDesign.parse(wires.to_json(), where="d.json") == wires
+    assert wires.to_json().count("end") == 1
 
 
 def test_missing_and_binary_files_are_named_in_the_message(tmp_path: Path) -> None:

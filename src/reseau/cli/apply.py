@@ -11,10 +11,8 @@ from ..core.errors import UsageError
 from .common import (
     AsJson,
     Out,
-    is_points,
     points_document,
     progress,
-    read_measurement,
     say,
     suffix_of,
     writable,
@@ -82,6 +80,7 @@ def apply(
     the frame (film frame). With the calibration of a sensor, the grey values are corrected.
     """
     from ..calibration import SensorCorrection, read_calibration
+    from ..io import is_points
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
@@ -178,7 +177,7 @@ def _points(
     """Correct points; for a camera, to pixels of the undistorted image, or without view to directions."""
     from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
-    from ..io import write_whole
+    from ..io import read_measurement, write_whole
 
     if "points" not in mapping.applies_to:
         raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")

@@ -28,9 +28,7 @@ from .common import (
     Out,
     SensorFile,
     corrected,
-    is_points,
     progress,
-    read_measurement,
     required,
     say,
 )
@@ -175,6 +173,7 @@ def _options(
 def _processes(images: list[Path], jobs: int | None) -> int:
     """Number of processes for the photographs; start them early so that they import in the background."""
     from ..core.processes import cores, start_early
+    from ..io import is_points
 
     count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
     if count > 1:
@@ -208,6 +207,7 @@ def _frames(
     paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs, or measured image coordinates, in order."""
+    from ..io import is_points, read_measurement
     from ..io.images import read_image
 
     for path in paths:

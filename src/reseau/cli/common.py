@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
-    from ..io import ReseauMeasurement
 
 T = TypeVar("T")
 
@@ -40,6 +39,32 @@ SensorFile = Annotated[
     Path | None,
     typer.Option("--sensor", help="Calibration of the sensor; correct images with it before measuring."),
 ]
+
+
+Mirrored = Annotated[
+    bool | None,
+    typer.Option(
+        "--mirrored/--not-mirrored",
+        help="The image shows the design from behind, or from the front (x right, y up). Default: determined "
+        "by the design if it is not symmetric. Not used with nominal positions.",
+    ),
+]
+MaxRotation = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        max=180,
+        help="Maximum rotation of the design in the image (degrees). Not used with nominal positions.",
+    ),
+]
+
+
+def handedness(mirrored: bool | None) -> bool | None:
+    """Whether image and design have opposite handedness, as the options of the measurements state it.
+
+    The design has y up and the image y down: they are opposite if the design is seen from the front.
+    """
+    return None if mirrored is None else not mirrored
 
 
 def corrected(frame: Frame, sensor: Path | None) -> Frame:
@@ -76,22 +101,9 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
     return Archive.open(place, objects, create=create)
 
 
-def is_points(path: Path) -> bool:
-    """Whether a file contains image coordinates; :func:`reseau.io.is_points`, imported on use."""
-    from .. import io
-
-    return io.is_points(path)
-
-
-def read_measurement(path: Path) -> ReseauMeasurement:
-    """Read image coordinates from a file; :func:`reseau.io.read_measurement`, imported on use."""
-    from .. import io
-
-    return io.read_measurement(path)
-
-
 def read_photo(path: Path) -> Frame | ImagePoints:
     """Read an image, or image coordinates."""
+    from ..io import is_points, read_measurement
     from ..io.images import read_image
 
     return read_measurement(path).image_points() if is_points(path) else read_image(path)
@@ -143,6 +155,47 @@ def suffix_of(path: Path, allowed: tuple[str, ...]) -> str:
             do=f"use {', '.join(allowed)}",
         )
     return suffix
+
+
+def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
+    """Return the overlay of each image: the PNG that is named, or one for each image in a folder.
+
+    A path without a suffix is a folder, which is created; the file of an image is called after it. Where
+    a PNG is named for several images, the name of the image is appended to its own. Files of image
+    coordinates have no overlay.
+
+    Raises
+    ------
+    UsageError
+        If the suffix is not .png, there is no image, or the overlay would replace the image.
+    InputError
+        If the folder does not exist or cannot be created.
+    """
+    from ..io import is_points
+
+    where = "--overlay"
+    shown = list(dict.fromkeys(image for image in images if not is_points(image)))
+    if not shown:
+        raise UsageError("needs an image, not image coordinates", where=where)
+    stems = [image.stem for image in shown]
+    names = [
+        stem if stems.count(stem) == 1 else f"{stem}-{stems[: i + 1].count(stem)}"
+        for i, stem in enumerate(stems)
+    ]
+    if path.is_dir() or not path.suffix:
+        try:
+            path.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot be created ({error.strerror})", where=path) from None
+        files = [path / f"{name}-overlay.png" for name in names]
+    else:
+        suffix_of(writable(path), (".png",))
+        one = len(shown) == 1
+        files = [path if one else path.with_name(f"{path.stem}-{name}.png") for name in names]
+    for file in files:
+        if file.resolve() in {image.resolve() for image in images}:
+            raise UsageError("would replace the image", where=file, do="choose another name")
+    return dict(zip(shown, files, strict=True))
 
 
 def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, Any]:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .common import (
     AsJson,
+    MaxRotation,
+    Mirrored,
     Out,
     SensorFile,
     corrected,
-    is_points,
+    handedness,
+    overlay_files,
     progress,
-    read_measurement,
     required,
     say,
     suffix_of,
@@ -23,9 +26,10 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..core.data import Array
-    from ..core.failure import Remark
+    from ..core.data import Frame
+    from ..core.failure import Failure
     from ..io import ReseauMeasurement
+    from ..measure.points import Measured
 
 __all__ = ["app", "measurement_csv"]
 
@@ -38,6 +42,11 @@ class Channel(StrEnum):
     GREEN = "green"
     BLUE = "blue"
 
+
+Overlay = Annotated[
+    Path | None,
+    typer.Option(help="PNG to write: the frame with what was measured, what was declined, and why."),
+]
 
 app = typer.Typer(help="Measure image coordinates of a target.", no_args_is_help=True)
 
@@ -52,9 +61,12 @@ def reseau(
     image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the reseau.")],
     out: Out = None,
+    overlay: Overlay = None,
     mark_px: Annotated[
         float | None, typer.Option(help="Size of a mark (px); for a grid, the width of its lines.")
     ] = None,
+    mirrored: Mirrored = None,
+    max_rotation: MaxRotation = 12.0,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
     channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
     sensor: SensorFile = None,
@@ -65,18 +77,18 @@ def reseau(
     from ..io.images import read_image
     from ..measure import ReseauOptions, measure_reseau
 
-    suffix = _suffix(out)
+    task = _Task(image, out, overlay, as_json, "marks")
     target = ReseauDesign.read(design)
-    rms = None
-    if is_points(image):
-        found = read_measurement(image)
-    else:
-        frame = corrected(read_image(image, channel.value), sensor)
-        options = ReseauOptions(mark_px=mark_px, row_jitter_px=row_jitter)
-        with progress(f"measuring {image.name}", 1):
-            result = required(measure_reseau(frame, target, options), image)
-        found, rms = result.measurement(), result.rms()
-    _deliver(image, found, out, suffix, as_json, rms, "marks")
+    options = ReseauOptions(
+        mark_px=mark_px,
+        row_jitter_px=row_jitter,
+        mirrored=handedness(mirrored),
+        max_rotation_deg=max_rotation,
+    )
+    task.run(
+        lambda: corrected(read_image(image, channel.value), sensor),
+        lambda frame: measure_reseau(frame, target, options),
+    )
 
 
 @app.command()
@@ -84,6 +96,7 @@ def pins(
     image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the test object's rods.")],
     out: Out = None,
+    overlay: Overlay = None,
     also: Annotated[
         list[Path] | None,
         typer.Option(help="Other image of the sequence, to reject static spots; repeatable."),
@@ -92,31 +105,27 @@ def pins(
         float | None,
         typer.Option(min=1, help="Maximum length of an echo (px). Default: 6 % of the frame diagonal."),
     ] = None,
-    max_rotation: Annotated[
-        float, typer.Option(help="Maximum rotation of the test object (degrees).")
-    ] = 12.0,
+    mirrored: Mirrored = None,
+    max_rotation: MaxRotation = 12.0,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the rods of an ultrasonic test object."""
+    """Measure the rods of an ultrasonic test object, or the wires of an N-wire phantom."""
     from ..io import ReseauDesign
     from ..io.images import read_image
     from ..measure import PinOptions, measure_pins
 
-    suffix = _suffix(out)
+    task = _Task(image, out, overlay, as_json, "rods")
     target = ReseauDesign.read(design)
-    rms = None
-    notes: tuple[Remark, ...] = ()
-    if is_points(image):
-        found = read_measurement(image)
-    else:
-        frame = corrected(read_image(image), sensor)
-        others = [corrected(read_image(path), sensor) for path in also or []]
-        options = PinOptions(most_length_px=max_length_px, max_rotation_deg=max_rotation)
-        with progress(f"measuring {image.name}", 1):
-            result = required(measure_pins(frame, target, options, others), image)
-        found, rms, notes = result.measurement(), result.rms(), result.notes
-    _deliver(image, found, out, suffix, as_json, rms, "rods", notes)
+    options = PinOptions(
+        most_length_px=max_length_px, max_rotation_deg=max_rotation, mirrored=handedness(mirrored)
+    )
+    task.run(
+        lambda: corrected(read_image(image), sensor),
+        lambda frame: measure_pins(
+            frame, target, options, [corrected(read_image(path), sensor) for path in also or []]
+        ),
+    )
 
 
 @app.command("testfield")
@@ -124,6 +133,7 @@ def coded_field(
     image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield.")],
     out: Out = None,
+    overlay: Overlay = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
     fill: Annotated[
         float, typer.Option(min=0, max=1, help="Light-sensitive fraction of the pixel pitch.")
@@ -136,54 +146,68 @@ def coded_field(
     from ..io.images import read_image
     from ..measure import TestfieldOptions, measure_testfield
 
-    suffix = _suffix(out)
+    task = _Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
-    rms = None
-    if is_points(image):
-        found = read_measurement(image)
-    else:
-        frame = corrected(read_image(image), sensor)
-        with progress(f"measuring {image.name}", 1):
-            options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
-            result = required(measure_testfield(frame, target, options), image)
-        found, rms = result.measurement(), result.rms()
-    _deliver(
-        image, found, out, suffix, as_json, rms, "targets", spread="deviations from the mapping of the field"
+    options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
+    task.run(
+        lambda: corrected(read_image(image), sensor),
+        lambda frame: measure_testfield(frame, target, options),
     )
 
 
-def _suffix(out: Path | None) -> str:
-    """Format of the output file, determined before measuring."""
-    return ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+class _Task:
+    """Measure one image, or read its coordinates; write and report what was found.
 
+    The names of the outputs are checked first, before anything is computed.
+    """
 
-def _deliver(
-    image: Path,
-    found: ReseauMeasurement,
-    out: Path | None,
-    suffix: str,
-    as_json: bool,
-    rms: Array | None,
-    marks: str,
-    notes: tuple[Remark, ...] = (),
-    spread: str = "leave-one-out deviations",
-) -> None:
-    """Write the measurement to its file, and report what was measured."""
-    from ..io import write_whole
+    def __init__(
+        self,
+        image: Path,
+        out: Path | None,
+        overlay: Path | None,
+        as_json: bool,
+        marks: str,
+        spread: str = "leave-one-out deviations",
+    ) -> None:
+        self.image, self.out, self.as_json, self.marks, self.spread = image, out, as_json, marks, spread
+        self.suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+        self.overlay = overlay_files(overlay, [image])[image] if overlay is not None else None
 
-    if out is not None:
-        write_whole(out, measurement_csv(found) if suffix == ".csv" else found.to_json())
-    if as_json:
-        say(found.to_json())
-        return
-    say(f"{image.name}: {found.found} of {found.expected} {marks} measured\n")
-    if rms is not None and rms[0] == rms[0]:  # NaN if too few points were measured
-        say(f"{spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)\n")
-    for point in found.points:
-        if not point.ok:
-            say(f"  {point.id}: {point.why}\n")
-    for note in notes:
-        say(f"note: {note}\n")
+    def run(self, read: Callable[[], Frame], measure: Callable[[Frame], Any]) -> None:
+        """Measure the image and deliver the result."""
+        from ..io import is_points, read_measurement
+
+        if is_points(self.image):
+            self._deliver(read_measurement(self.image), None)
+            return
+        frame = read()
+        with progress(f"measuring {self.image.name}", 1):
+            result: Measured | Failure = measure(frame)
+        if self.overlay is not None:
+            result.overlay(frame, self.overlay)
+        found = required(result, self.image)
+        self._deliver(found.measurement(), found)
+
+    def _deliver(self, document: ReseauMeasurement, result: Measured | None) -> None:
+        """Write the measurement to its file, and report what was measured."""
+        from ..io import write_whole
+
+        if self.out is not None:
+            write_whole(self.out, measurement_csv(document) if self.suffix == ".csv" else document.to_json())
+        if self.as_json:
+            say(document.to_json())
+            return
+        say(f"{self.image.name}: {document.found} of {document.expected} {self.marks} measured\n")
+        if result is not None:
+            rms = result.rms()
+            if rms[0] == rms[0]:  # NaN if too few points were measured
+                say(f"{self.spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)\n")
+        for point in document.points:
+            if not point.ok:
+                say(f"  {point.id}: {point.why}\n")
+        for note in document.notes:
+            say(f"note: {note}\n")
 
 
 def measurement_csv(found: ReseauMeasurement) -> str:

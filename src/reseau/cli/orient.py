@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core.errors import InputError, ReseauError, UsageError
-from .common import AsJson, progress, required, say
+from .common import AsJson, overlay_files, progress, required, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,6 +46,7 @@ class _Job:
     transform: str
     out: Path | None
     marked: bool
+    overlay: Path | None = None
     roll: Any = None
 
 
@@ -79,6 +80,13 @@ def orient(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to.")] = None,
     marked: Annotated[bool, typer.Option(help="Write copies of the scans with marked corners.")] = True,
     roll: Annotated[bool, typer.Option(help="Use the common shape of the frames of a roll.")] = True,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a PNG of each scan: edges and corners, and what was not found. "
+            "FILE.png for a single scan."
+        ),
+    ] = None,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")
     ] = None,
@@ -96,8 +104,20 @@ def orient(
     _format(frame)
     if out is not None:
         _prepare(out)
+    drawn = {} if overlay is None else overlay_files(overlay, images)
     work = [
-        _Job(path, name, frame, dpi, box, corners, transform.value, out, marked and out is not None)
+        _Job(
+            path,
+            name,
+            frame,
+            dpi,
+            box,
+            corners,
+            transform.value,
+            out,
+            marked and out is not None,
+            drawn.get(path),
+        )
         for path, name in zip(images, _names(images), strict=True)
     ]
     done = dict(zip((job.name for job in work), _all(work, jobs), strict=True))
@@ -174,6 +194,7 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
     from ..io import FrameCorners
     from ..io.images import open_scan
     from ..procedures.film_frame import orient_scan, orientation_of, reorient_scan
+    from ..report.frames import scan_overlay
 
     try:
         scan = open_scan(job.image)
@@ -188,6 +209,8 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
         ]
         if job.out is not None:
             _write(job, scan, documents)
+        if job.overlay is not None:
+            scan_overlay(job.overlay, scan, results)
     except ReseauError as error:
         return _Done([], [], str(error))
     return _Done(documents, results)
@@ -238,7 +261,7 @@ def _earlier(job: _Job) -> _Done | None:
 
     from ..io import FrameOrientation
 
-    if job.out is None:
+    if job.out is None or job.overlay is not None:
         return None
     path = job.out / "provenance" / f"{job.name}.json"
     try:

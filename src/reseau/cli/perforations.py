@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from .common import AsJson, required, say
+from .common import AsJson, overlay_files, required, say
+from .measure import Overlay
 
 __all__ = ["perforations"]
 
@@ -31,6 +32,7 @@ def perforations(
         str, typer.Option(help="Channel with the darkest rims: red, green, blue. Default: the last.")
     ] = "",
     reach: Annotated[float, typer.Option(min=1.0, help="Search distance from the given edges (px).")] = 12.0,
+    overlay: Overlay = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the perforations of 35 mm film: scale, rotation and perspective of the scan.
@@ -46,6 +48,7 @@ def perforations(
     from ..measure.film import film_plane
     from ..procedures.film_frame import film_scale
 
+    drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
     opened = open_scan(scan)
     name = channel or opened.channels[-1]
     if name not in opened.channels:
@@ -53,6 +56,9 @@ def perforations(
         raise UsageError(f"the scan has no channel {name!r}", where="--channel", do=do)
     rows = [np.array([*box, pitch]) for box in (left, right)]
     plane = required(film_plane(opened, rows, count, channel=opened.channels.index(name), reach=reach), scan)
+    if drawn is not None:
+        pixels = opened.window(0, opened.height, 0, opened.width)
+        plane.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
     found = film_scale(plane)
     if as_json:
         document: dict[str, Any] = {

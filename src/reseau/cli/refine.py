@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,12 +12,14 @@ import typer
 
 from .common import (
     AsJson,
+    MaxRotation,
+    Mirrored,
     Out,
-    is_points,
+    handedness,
+    overlay_files,
     points_document,
     probability,
     progress,
-    read_measurement,
     read_photo,
     required,
     say,
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
     from ..io import ReseauDesign
+    from ..measure import PinOptions, ReseauOptions
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard
 
 __all__ = ["refine"]
@@ -47,6 +51,38 @@ class _Files:
     points: Path | None
     check: tuple[str, ...]
     alpha: float
+    mirrored: bool | None = None
+    max_rotation: float = 12.0
+    overlays: Mapping[Path, Path] = field(default_factory=dict)
+
+    def marks(self) -> ReseauOptions:
+        """Options of the measurement of the reseau."""
+        from ..measure import ReseauOptions
+
+        return ReseauOptions(mirrored=handedness(self.mirrored), max_rotation_deg=self.max_rotation)
+
+    def pins(self) -> PinOptions:
+        """Options of the measurement of the rods."""
+        from ..measure import PinOptions
+
+        return PinOptions(max_rotation_deg=self.max_rotation)
+
+    def draw(self, path: Path, photo: Frame | ImagePoints, found: Any) -> None:
+        """Write the overlay of a photograph, if one is wanted: its marks and rods, or why there are none."""
+        from ..core.data import Frame
+        from ..core.failure import Failure
+        from ..core.overlay import draw_overlay
+
+        if path not in self.overlays or not isinstance(photo, Frame):
+            return
+        if isinstance(found, Failure):
+            found.overlay(photo, self.overlays[path])
+            return
+        marks = getattr(found, "marks", None)
+        layers = [] if found.measured is None else found.measured.layers()
+        if marks is not None:  # beside the rods, the marks have no names
+            layers += [replace(layer, names=()) for layer in marks.layers()]
+        draw_overlay(photo.pixels, layers, photo.name, [str(n) for n in found.notes], self.overlays[path])
 
     def provenance(self) -> Provenance:
         """Hashes of the inputs, and the options."""
@@ -55,7 +91,12 @@ class _Files:
         named = (self.photo_i, self.photo_ii, self.reseau, self.test_object, self.calibration, self.points)
         paths = [path for path in named if path is not None] + list(self.photo_iii)
         inputs = {path.name: sha256_of(path) for path in paths}
-        return Provenance(inputs, {"alpha": self.alpha, "check": list(self.check)})
+        options: dict[str, Any] = {"alpha": self.alpha, "check": list(self.check)}
+        if self.mirrored is not None:
+            options["mirrored"] = self.mirrored
+        if self.max_rotation != 12.0:
+            options["max_rotation"] = self.max_rotation
+        return Provenance(inputs, options)
 
     def photographs(self) -> list[Path]:
         """The photographs in their order."""
@@ -63,6 +104,7 @@ class _Files:
 
     def frames(self) -> list[Frame | None]:
         """The photographs in their order; None for coordinates."""
+        from ..io import is_points
         from ..io.images import read_image
 
         paths = (self.photo_i, self.photo_ii, *self.photo_iii)
@@ -91,6 +133,15 @@ def refine(
     report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
     alpha: Annotated[float, typer.Option(help="Significance level of the tests of the coefficients.")] = 0.05,
     check: Annotated[str, typer.Option(help="Marks and rods used only as check points, as A1,B2.")] = "",
+    mirrored: Mirrored = None,
+    max_rotation: MaxRotation = 12.0,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a PNG of each photograph: what was measured, what was declined, and why. "
+            "FILE.png for a single photograph."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Correct oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
@@ -103,12 +154,15 @@ def refine(
 
     held = tuple(name for name in check.split(",") if name)
     files = _Files(
-        photo_i, photo_ii, tuple(photo_iii or ()), reseau, test_object, calibration, points, held, alpha
-    )
+        photo_i, photo_ii, tuple(photo_iii or ()), reseau, test_object, calibration, points, held, alpha,
+        mirrored, max_rotation,
+    )  # fmt: skip
     _checked(files)
     for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
         if path is not None:
             suffix_of(writable(path), suffixes)
+    if overlay is not None:
+        files = replace(files, overlays=overlay_files(overlay, files.photographs()))
     with one_thread():  # results do not depend on the number of processors
         if calibration is not None:
             _by_calibration(files, calibration, out, true, report, as_json)
@@ -166,7 +220,9 @@ def _by_photographs(
     steps = 1 + (files.photo_ii is not None) + len(files.photo_iii)
     photo = read_photo(files.photo_i)
     with progress("correcting", steps) as step:
-        first = required(photo_i(photo, design, alpha=files.alpha, check=files.check), files.photo_i)
+        found = photo_i(photo, design, options=files.marks(), alpha=files.alpha, check=files.check)
+        files.draw(files.photo_i, photo, found)
+        first = required(found, files.photo_i)
         if isinstance(photo, Frame):
             first = replace(first, camera=replace(first.camera, size=(photo.width, photo.height)))
         step("PHOTO I")
@@ -219,7 +275,11 @@ def _second(files: _Files, design: ReseauDesign, rods: ReseauDesign, first: Phot
     photo, marks = read_photo(files.photo_ii), None
     if isinstance(photo, ImagePoints):
         marks, photo = _split(photo, design)
-    found = photo_ii(photo, design, rods, first.camera, marks=marks, alpha=files.alpha, check=files.check)
+    found = photo_ii(
+        photo, design, rods, first.camera, marks=marks, options=files.marks(), pins=files.pins(),
+        alpha=files.alpha, check=files.check,
+    )  # fmt: skip
+    files.draw(files.photo_ii, photo, found)
     return required(found, files.photo_ii)
 
 
@@ -227,6 +287,7 @@ def _third(
     files: _Files, instrument: InstrumentCorrection, design: ReseauDesign, step: Any
 ) -> list[tuple[Path, PhotoIII]]:
     from ..core.data import ImagePoints
+    from ..io import read_measurement
     from ..procedures.oscilloscope import photo_iii
 
     body = None if files.points is None else read_measurement(files.points).image_points()
@@ -235,7 +296,8 @@ def _third(
         photo, marks = read_photo(path), None
         if isinstance(photo, ImagePoints):
             marks, photo = _split(photo, design)
-        found = photo_iii(photo, instrument, design, points=body, marks=marks)
+        found = photo_iii(photo, instrument, design, points=body, marks=marks, options=files.marks())
+        files.draw(path, photo, found)
         results.append((path, required(found, path)))
         step(path.name)
     return results
@@ -313,8 +375,10 @@ def _again(
     if isinstance(photo, ImagePoints):
         marks, photo = _split(photo, design)
     found = still_standard_in(
-        photo, instrument, design, rods, marks=marks, same_object=same, alpha=files.alpha
-    )
+        photo, instrument, design, rods, marks=marks, options=files.marks(), pins=files.pins(),
+        same_object=same, alpha=files.alpha,
+    )  # fmt: skip
+    files.draw(path, photo, found)
     return required(found, path)
 
 
@@ -383,6 +447,8 @@ def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
     if fit is not None:
         x, y = (fit.residuals**2).mean(axis=0) ** 0.5
         say(f"  residuals {x:.2g} {design.unit} in x, {y:.2g} {design.unit} in y (rms)\n")
+    for note in first.notes:
+        say(f"  note: {note}\n")
 
 
 def _say_second(path: Path, second: PhotoII) -> None:

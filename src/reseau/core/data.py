@@ -78,11 +78,10 @@ class Frame(Display):
         axes : matplotlib Axes, optional
             Axes to draw into; by default those of a new figure.
         """
-        from .figures import draw_picture, image_axes, new_axes
+        from .figures import over_picture
 
-        axes = new_axes(axes)
-        draw_picture(axes, self.pixels)
-        image_axes(axes, self.width, self.height, self.name)
+        axes = over_picture(axes, self.pixels)
+        axes.set_title(self.name, loc="left")
         return axes
 
     @property
@@ -178,14 +177,11 @@ class ImagePoints(Display):
         y_down : bool
             Direction of the y-axis: down in images, up in object space.
         """
-        from .figures import BLUE, draw_ellipses, new_axes
+        from .figures import BLUE, draw_ellipses, over_picture
 
-        axes = new_axes(axes)
+        axes = over_picture(axes, y_down=y_down)
         axes.plot(*self.xy.T, ".", color=BLUE, markersize=3)
-        axes.set_aspect("equal")
         axes.margins(0.08)
-        if y_down and not axes.yaxis_inverted():
-            axes.invert_yaxis()
         enlarged = draw_ellipses(axes, self.xy, self.cov)
         axes.set_title(f"{len(self)} points, ellipses × {enlarged:g}", loc="left")
         return axes

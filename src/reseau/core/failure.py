@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
+from .arrays import Array
 from .errors import EstimationError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from .data import Frame
 
 __all__ = ["Code", "Failure", "Remark"]
 
@@ -85,6 +93,8 @@ class Failure:
         The same for programs.
     where : str
         The frame, file or mark it is about; empty where only the caller knows it.
+    places : ndarray (m, 2), optional
+        Places that were found in the frame (px) before the estimate failed.
 
     Examples
     --------
@@ -96,12 +106,42 @@ class Failure:
     reason: str
     code: Code
     where: str = ""
+    places: Array | None = field(default=None, compare=False, repr=False)
 
     def __bool__(self) -> bool:
         return False
 
     def __str__(self) -> str:
         return f"{self.where}: {self.reason}" if self.where else self.reason
+
+    def overlay(self, frame: Frame, path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw the places that were found over the frame, with the reason of the failure.
+
+        Parameters
+        ----------
+        frame : Frame
+            The frame.
+        path : str or Path, optional
+            PNG file to write.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            See :meth:`reseau.measure.points.Measured.overlay`.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from .overlay import OTHER, Layer, draw_overlay
+
+        layers = []
+        if self.places is not None:
+            label = f"places found, {len(self.places)}"
+            layers = [Layer(label, self.places, colour=OTHER)]
+        title = str(self) if self.where else f"{frame.name}: {self.reason}"
+        return draw_overlay(frame.pixels, layers, title, path=path)
 
     def required(self) -> NoReturn:
         """Raise, for callers that need the estimate.

@@ -35,6 +35,7 @@ __all__ = [
     "length",
     "new_axes",
     "nice",
+    "over_picture",
     "plane_axes",
     "to_svg",
     "typical_pitch",
@@ -299,6 +300,29 @@ def image_axes(axes: Axes, width: float, height: float, title: str = "") -> None
     axes.set_xlabel("x / px")
     axes.set_ylabel("y / px")
     axes.set_title(title, loc="left")
+
+
+def over_picture(axes: Axes | None, pixels: NDArray[Any] | None = None, *, y_down: bool = True) -> Axes:
+    """Return axes for points of an image, with equal scales and y down; the image is drawn if it is given.
+
+    Parameters
+    ----------
+    axes : Axes or None
+        Axes of a caller, also ones that are drawn into already; by default those of a new figure.
+    pixels : ndarray (h, w), optional
+        Grey values. Without them, the limits follow from what is drawn.
+    y_down : bool
+        False for points that are not in an image.
+    """
+    axes = new_axes(axes)
+    if pixels is not None:
+        draw_picture(axes, pixels)
+        image_axes(axes, pixels.shape[1], pixels.shape[0])
+    else:
+        axes.set_aspect("equal")
+        if y_down and not axes.yaxis_inverted():
+            axes.invert_yaxis()
+    return axes
 
 
 def draw_picture(axes: Axes, pixels: NDArray[Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -11,6 +11,13 @@ from ..core.data import Array
 from .document import Document, Strict
 
 __all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
+
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+"""Beyond this, squares of coordinates lose the digits of the design."""
+_ONE_PLACE = 1e-6
+"""Points closer than this share of the extent of the design are at one place."""
+_LEAST_EXTENT = 1e-6
+"""Extent of the smallest design, in its unit."""
 
 
 class Mark(Strict):
@@ -30,17 +37,31 @@ class Mark(Strict):
 class DesignPoint(Strict):
     """One mark of a design: coordinates in its plane, and its approximate position in the image.
 
+    A slanted wire of a phantom, as the diagonal of an N, has an `end`: the plane of an image cuts it anywhere
+    between (`x`, `y`) and `end`, both projected into the plane of the design.
+
     Examples
     --------
     >>> DesignPoint(id="A1", x=10.0, y=-5.0, sigma=0.002).nominal_px is None
     True
+    >>> DesignPoint(id="N1", x=10.0, y=-5.0, end=(30.0, -5.0)).end
+    (30.0, -5.0)
     """
 
     id: str = Field(min_length=1)
-    x: float | None
-    y: float | None
+    x: Coordinate | None
+    y: Coordinate | None
+    end: tuple[Coordinate, Coordinate] | None = None
     sigma: float | None = Field(default=None, ge=0)
-    nominal_px: tuple[float, float] | None = None
+    nominal_px: tuple[Coordinate, Coordinate] | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.x is None) != (self.y is None):
+            raise ValueError(f"point {self.id!r} has only one of its two coordinates")
+        if self.end is not None and (self.x is None or self.end == (self.x, self.y)):
+            raise ValueError(f"`end` of {self.id!r} must lie at another place than its `x` and `y`")
+        return self
 
 
 class Rings(Strict):
@@ -107,8 +128,7 @@ class ReseauDesign(Document):
             if point.id in names:
                 raise ValueError(f"duplicate id {point.id!r} in `points`")
             names.add(point.id)
-            if (point.x is None) != (point.y is None):
-                raise ValueError(f"point {point.id!r} has only one of its two coordinates")
+        self._check_places()
         for role in ("origin", "axis"):
             named = getattr(self, role)
             if named is not None and named not in names:
@@ -119,6 +139,27 @@ class ReseauDesign(Document):
             self._check_rings(self.rings, names)
         return self
 
+    def _check_places(self) -> None:
+        if self.mark.shape != "rod" and any(point.end is not None for point in self.points):
+            raise ValueError("`end` of a point requires marks of shape 'rod'")
+        places = self.segments.reshape(-1, 4)
+        known = np.asarray(np.isfinite(places).all(axis=1))
+        if known.sum() > 1 and 0 < np.ptp(places[known], axis=0).max() < _LEAST_EXTENT:
+            raise ValueError(f"all points lie within {_LEAST_EXTENT:g} {self.unit}; check the unit")
+        pair = at_one_place(places)
+        what, at = "lie at one place", "({:g}, {:g})"
+        if pair is None:  # where coordinates are missing, the nominal positions stand for them
+            pair = at_one_place(np.where(known[:, None], np.nan, self.nominal_px))
+            what, at = "have one nominal position", "({:g}, {:g}) px"
+        if pair is None:
+            return
+        one, other = (self.points[i] for i in pair)
+        place = one.nominal_px if one.x is None else (one.x, one.y)
+        assert place is not None
+        raise ValueError(
+            f"points {one.id!r} and {other.id!r} {what}, {at.format(*place)}; correct or remove one of them"
+        )
+
     def _check_rings(self, rings: Rings, names: set[str]) -> None:
         for name in rings.sectors:
             if name not in names:
@@ -127,10 +168,13 @@ class ReseauDesign(Document):
             raise ValueError("`rings` require marks of shape 'disk' and a size less than `inner`")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; without coded rings the key is left out."""
+        """Return the content of the file; keys of coded rings and slanted wires are left out without them."""
         content = super().to_dict()
         if self.rings is None:
             del content["rings"]
+        for point in content["points"]:
+            if point["end"] is None:
+                del point["end"]
         return content
 
     @property
@@ -140,8 +184,18 @@ class ReseauDesign(Document):
 
     @property
     def xy(self) -> Array:
-        """Coordinates in the plane of the design, (n, 2); NaN where unknown."""
-        return np.array([(p.x, p.y) for p in self.points], dtype=np.float64).reshape(-1, 2)
+        """Coordinates in the plane of the design, (n, 2); NaN where unknown, and for slanted wires."""
+        fixed = [(None, None) if p.end else (p.x, p.y) for p in self.points]
+        return np.array(fixed, dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def segments(self) -> Array:
+        """Both ends (n, 2, 2) of the place at which an image may show each point; NaN where unknown.
+
+        They differ for slanted wires only.
+        """
+        ends = [((p.x, p.y), p.end or (p.x, p.y)) for p in self.points]
+        return np.array(ends, dtype=np.float64).reshape(-1, 2, 2)
 
     @property
     def nominal_px(self) -> Array:
@@ -156,3 +210,20 @@ class ReseauDesign(Document):
             for point, place in zip(self.points, places, strict=True)
         ]
         return self.model_copy(update={"points": tuple(points)})
+
+
+def at_one_place(places: Array) -> tuple[int, int] | None:
+    """The first two rows of `places` (n, k) that are equal to a millionth of their extent, if any."""
+    from scipy.spatial import KDTree
+
+    known = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if len(known) < 2:
+        return None
+    # A single point far away, by a slip of the pen, does not make others one place.
+    low, high = np.quantile(places[known], [0.1, 0.9], axis=0)
+    within = _ONE_PLACE * float((high - low).max())
+    pairs = KDTree(places[known]).query_pairs(within, p=np.inf, output_type="ndarray")
+    if not len(pairs):
+        return None
+    first, second = known[pairs[np.lexsort(pairs.T[::-1])[0]]]
+    return int(first), int(second)

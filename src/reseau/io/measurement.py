@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import FormatError
+from ..core.failure import Remark
 from .document import Document, Strict, read_text
 
 __all__ = ["MeasuredPoint", "ReseauMeasurement"]
@@ -55,6 +56,16 @@ class ReseauMeasurement(Document):
     points: tuple[MeasuredPoint, ...]
     found: int
     expected: int
+    notes: tuple[str, ...] = ()
+    note_codes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of the file; optional keys are left out where there is nothing to say."""
+        content = super().to_dict()
+        for key in ("notes", "note_codes"):
+            if not content[key]:
+                del content[key]
+        return content
 
     def image_points(self) -> ImagePoints:
         """Return the marks that were measured.
@@ -79,6 +90,7 @@ class ReseauMeasurement(Document):
         cov: Array,
         ok: Mask,
         why: Sequence[str],
+        notes: Sequence[Remark] = (),
     ) -> Self:
         """Create the document from columns; marks that are not `ok` have a reason and no coordinates."""
         points = []
@@ -99,7 +111,13 @@ class ReseauMeasurement(Document):
                 )
             )
         return cls(
-            image=image, sha256=sha256, points=tuple(points), found=int(ok.sum()), expected=len(points)
+            image=image,
+            sha256=sha256,
+            points=tuple(points),
+            found=int(ok.sum()),
+            expected=len(points),
+            notes=tuple(note.text for note in notes),
+            note_codes=tuple(note.code.value for note in notes),
         )
 
     @classmethod

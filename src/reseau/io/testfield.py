@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ..core.data import Array
-from .design import ReseauDesign
+from .design import ReseauDesign, at_one_place
 from .document import Document, Strict
 
 __all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign", "parse_design"]
@@ -120,6 +120,13 @@ class TestfieldDesign(Document):
             raise ValueError("the design has no targets")
         if max(self.targets.square) > columns * rows:
             raise ValueError(f"square {max(self.targets.square)} does not exist in {columns} × {rows}")
+        pair = at_one_place(self.xy)
+        if pair is not None:
+            one, other = (self.ids[i] for i in pair)
+            x, y = self.xy[pair[0]]
+            raise ValueError(
+                f"targets {one!r} and {other!r} lie at one place, ({x:g}, {y:g}); correct one of them"
+            )
         return self
 
     @property

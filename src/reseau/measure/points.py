@@ -7,15 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.display import Display
 from ..core.errors import UsageError
-from ..core.failure import Code
+from ..core.failure import Code, Remark
 from ..io import ReseauMeasurement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ..core.overlay import Layer
 
 __all__ = ["Measured", "Reason"]
 
@@ -119,23 +122,53 @@ class Measured(Display):
         frame : Frame, optional
             The image, drawn beneath.
         """
-        from ..core.figures import ACCENT, BLUE, draw_picture, image_axes, new_axes
+        from ..core.figures import ACCENT, BLUE, over_picture
 
-        axes = new_axes(axes)
-        if frame is not None:
-            draw_picture(axes, frame.pixels)
+        axes = over_picture(axes, None if frame is None else frame.pixels)
         axes.plot(
             *self.xy[self.ok].T, "o", markerfacecolor="none", color=BLUE, markersize=4, markeredgewidth=0.8
         )
         axes.plot(*self.predicted[~self.ok].T, "x", color=ACCENT, markersize=4, markeredgewidth=0.8)
-        if frame is not None:
-            image_axes(axes, frame.width, frame.height)
-        else:
-            axes.set_aspect("equal")
-            if not axes.yaxis_inverted():
-                axes.invert_yaxis()
         axes.set_title(f"{self.image}: {self.found} of {len(self.ids)} measured", loc="left")
         return axes
+
+    def overlay(self, frame: Frame, path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw what was measured and what was declined, and why, over every pixel of the frame.
+
+        Parameters
+        ----------
+        frame : Frame
+            The frame that was measured.
+        path : str or Path, optional
+            PNG file to write.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            The frame, enlarged by a whole number if it is small, with a legend below it.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from ..core.overlay import draw_overlay
+
+        title = f"{self.image}: {self.found} of {len(self.ids)} measured"
+        return draw_overlay(frame.pixels, self.layers(), title, [str(note) for note in self.remarks], path)
+
+    def layers(self) -> list[Layer]:
+        """What is drawn over the frame: first what was measured, then each reason for declining."""
+        from ..core.overlay import Layer, declined_layers
+
+        found, rest = np.flatnonzero(self.ok), np.flatnonzero(~self.ok)
+        measured = Layer(
+            f"measured, {self.found}", self.xy[found], tuple(self.ids[i] for i in found), self.cov[found]
+        )
+        codes = [(self.codes[i] or Code.DECLINED).value for i in rest]
+        at = np.where(np.isfinite(self.xy[rest]), self.xy[rest], self.predicted[rest])
+        names, why = [self.ids[i] for i in rest], [str(self.why[i]) for i in rest]
+        return [measured, *declined_layers(names, at, why, codes)]
 
     def write(self, path: Path | str) -> None:
         """Write the result: ``reseau-measurement/1``, or CSV ``id,x,y,sx,sy`` of the measured points.
@@ -183,6 +216,12 @@ class Measured(Display):
 
     def measurement(self) -> ReseauMeasurement:
         """The result as a document."""
+        why = tuple(map(str, self.why))
         return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, tuple(map(str, self.why))
+            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, why, self.remarks
         )
+
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
+        """Notes for the user; results that have none have no `notes`."""
+        return tuple(getattr(self, "notes", ()))

@@ -99,6 +99,11 @@ class PhotoI(_Corrected):
     camera: FittedCamera
     measured: ReseauResult | None
 
+    @property
+    def notes(self) -> tuple[Remark, ...]:
+        """Warnings for the user."""
+        return () if self.measured is None else self.measured.notes
+
 
 def photo_i(
     photo: Frame | ImagePoints,
@@ -152,7 +157,7 @@ def photo_i(
     # (ii) both into the common system of O and S, (iii) equations (5a, b)
     camera = correct_camera(points, reseau, model=model, alpha=alpha, criterion=criterion, check=check)
     if isinstance(camera, Failure):
-        return camera
+        return camera if measured is None else replace(camera, places=points.xy)
     return PhotoI(points, camera, measured)
 
 
@@ -175,6 +180,8 @@ class PhotoII(_Corrected):
         Warnings for the user.
     measured : PinResult, optional
         Measurement of the pins; None if they were measured elsewhere.
+    marks : ReseauResult, optional
+        Measurement of the reseau; None if it was measured elsewhere.
     """
 
     pins: ImagePoints
@@ -183,6 +190,7 @@ class PhotoII(_Corrected):
     causes: Causes | None
     notes: tuple[Remark, ...]
     measured: PinResult | None
+    marks: ReseauResult | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +209,8 @@ class PhotoIII(_Corrected):
         Warnings for the user.
     measured : PinDetections, optional
         Measurement of the points; None if they were measured elsewhere.
+    marks : ReseauResult, optional
+        Measurement of the reseau; None if it was measured elsewhere.
     """
 
     points: ImagePoints
@@ -208,6 +218,7 @@ class PhotoIII(_Corrected):
     registration: Registration | None
     notes: tuple[Remark, ...]
     measured: PinDetections | None = None
+    marks: ReseauResult | None = None
 
 
 def photo_ii(
@@ -266,16 +277,17 @@ def photo_ii(
     seen = _pins_in(photo, reseau, test_object, camera, marks, options, pins)
     if isinstance(seen, Failure):
         return seen
-    images, registration, measured = seen
+    images, registration, measured, shown = seen
     # (iv) to (vii)
     instrument = correct_instrument(
         images, test_object, camera, model=model, alpha=alpha, criterion=criterion, check=check
     )
     if isinstance(instrument, Failure):
-        return instrument
+        return instrument if measured is None else replace(instrument, places=measured.points.xy)
     notes = of_the_camera(camera, registration) + of_the_object(instrument, images, test_object)
+    notes += _of_the_measurements(shown, measured)
     causes = None if instrument.fit is None else causes_of(instrument.fit.adjustment)
-    return PhotoII(images, instrument, registration, causes, notes, measured)
+    return PhotoII(images, instrument, registration, causes, notes, measured, shown)
 
 
 def photo_iii(
@@ -327,12 +339,12 @@ def photo_iii(
     >>> photo_iii(body, instrument, reseau).true.xy.round(6).tolist()
     [[-27.0, 18.0], [-9.0, 18.0]]
     """
-    measured = None
+    measured, shown = None, None
     if isinstance(photo, Frame):
         seen = _reseau_in(photo, reseau, instrument.camera, options)
         if isinstance(seen, Failure):
             return seen
-        marks = seen.points
+        marks, shown = seen.points, seen
         hidden = seen.shadow(reseau, photo.pixels.shape)
         if points is None:
             measured = find_pins(photo, pins, hidden=hidden)
@@ -348,8 +360,8 @@ def photo_iii(
         if isinstance(registered, Failure):
             return registered
         registration, body = registered, registered.apply(body)
-    notes = of_the_camera(instrument.camera, registration)
-    return PhotoIII(body, instrument.apply(body), registration, notes, measured)
+    notes = of_the_camera(instrument.camera, registration) + _of_the_measurements(shown)
+    return PhotoIII(body, instrument.apply(body), registration, notes, measured, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,12 +378,15 @@ class StillStandard(_Corrected):
         What has changed, and the probable cause.
     measured : PinResult, optional
         Measurement of the pins; None if they were measured elsewhere.
+    marks : ReseauResult, optional
+        Measurement of the reseau; None if it was measured elsewhere.
     """
 
     test: StandardTest
     registration: Registration | None
     notes: tuple[Remark, ...]
     measured: PinResult | None
+    marks: ReseauResult | None = None
 
 
 def still_standard_in(
@@ -428,13 +443,14 @@ def still_standard_in(
     seen = _pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
     if isinstance(seen, Failure):
         return seen
-    images, registration, measured = seen
+    images, registration, measured, shown = seen
     test = still_standard(instrument, images, test_object, same_object=same_object, alpha=alpha)
     if isinstance(test, Failure):
-        return test
+        return test if measured is None else replace(test, places=measured.points.xy)
     notes = of_the_camera(instrument.camera, registration)
     notes += of_the_change(test, registration, instrument.unit)
-    return StillStandard(test, registration, notes, measured)
+    notes += _of_the_measurements(shown, measured)
+    return StillStandard(test, registration, notes, measured, shown)
 
 
 def _pins_in(
@@ -445,9 +461,9 @@ def _pins_in(
     marks: ImagePoints | None,
     options: ReseauOptions | None,
     pins: PinOptions | None,
-) -> tuple[ImagePoints, Registration | None, PinResult | None] | Failure:
-    """Images of the rods (px of PHOTO I), their registration, and their measurement."""
-    measured = None
+) -> tuple[ImagePoints, Registration | None, PinResult | None, ReseauResult | None] | Failure:
+    """Images of the rods (px of PHOTO I), their registration, and the measurements of rods and reseau."""
+    measured, shown = None, None
     if isinstance(photo, Frame):
         seen = _reseau_in(photo, reseau, camera, options)
         if isinstance(seen, Failure):
@@ -456,15 +472,21 @@ def _pins_in(
         found = measure_pins(photo, test_object, pins, hidden=hidden)
         if isinstance(found, Failure):
             return found
-        marks, measured, images = seen.points, found, found.points
+        marks, shown, measured, images = seen.points, seen, found, found.points
     else:
         images = photo
     if marks is None:
-        return images, None, measured
+        return images, None, measured, shown
     registration = register(marks, reseau, camera)
     if isinstance(registration, Failure):
         return registration
-    return registration.apply(images), registration, measured
+    return registration.apply(images), registration, measured, shown
+
+
+def _of_the_measurements(*results: ReseauResult | PinResult | None) -> tuple[Remark, ...]:
+    """Notes on the measurements of a photograph, each once."""
+    notes = [note for result in results if result is not None for note in result.notes]
+    return tuple(dict.fromkeys(notes))
 
 
 def _reseau_in(

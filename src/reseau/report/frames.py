@@ -15,8 +15,9 @@ from ..core.errors import InputError
 from ..io import FrameOrientation
 from ..io.images import write_image
 from ..io.scans import Scan
+from ..measure.film import FrameResult
 
-__all__ = ["contact_sheet", "frame_tile", "write_marked"]
+__all__ = ["contact_sheet", "frame_tile", "scan_overlay", "write_marked"]
 
 _STRIPE = 512
 """Rows copied at a time."""
@@ -103,6 +104,25 @@ def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
     text = text.encode("ascii", "replace").decode()
     cv2.putText(tile, text, (2, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (34, 39, 43), 1, cv2.LINE_AA)
     return tile
+
+
+def scan_overlay(path: Path, scan: Scan, results: Sequence[FrameResult]) -> None:
+    """Write a scan with the edges and corners of all its frames, and what was not found, as PNG.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    from ..core.overlay import draw_overlay
+
+    pixels = scan.window(0, scan.height, 0, scan.width)
+    title = f"{scan.name}: {', '.join(result.status for result in results)}"
+    reasons = [
+        f"frame {k + 1}: {r.why}" if len(results) > 1 else r.why for k, r in enumerate(results) if r.why
+    ]
+    layers = [layer for result in results for layer in result.layers()]
+    draw_overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, layers, title, reasons, path)
 
 
 def _shown(grey: NDArray[Any], step: Array) -> NDArray[np.uint8]:

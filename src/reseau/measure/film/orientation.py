@@ -6,9 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.data import Array, Frame
 from ...core.display import Display
@@ -22,6 +23,8 @@ from .search import FrameGuess, search_frames
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ...core.overlay import Layer
 
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
 
@@ -147,22 +150,63 @@ class FrameResult(Display):
         frame : Frame, optional
             The scan, drawn beneath.
         """
-        from ...core.figures import ACCENT, draw_picture, image_axes, new_axes
+        from ...core.figures import ACCENT, over_picture
 
-        axes = new_axes(axes)
-        if frame is not None:
-            draw_picture(axes, frame.pixels)
-            image_axes(axes, frame.width, frame.height)
+        axes = over_picture(axes, None if frame is None else frame.pixels)
         if self.lines is not None:
             corners = self.lines.corners
             axes.plot(
                 *np.concatenate([corners, corners[:1]]).T, "o-", color=ACCENT, markersize=4, linewidth=0.9
             )
-        if frame is None:
-            axes.set_aspect("equal")
-            axes.invert_yaxis()
         axes.set_title(f"{self.image}: {self.status}", loc="left")
         return axes
+
+    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw edges and corners, and why edges are missing, over every pixel of the scan.
+
+        Parameters
+        ----------
+        pixels : ndarray (h, w) or (h, w, 3)
+            Grey or RGB values of the scan.
+        path : str or Path, optional
+            PNG file to write.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            See :meth:`reseau.measure.points.Measured.overlay`.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from ...core.overlay import draw_overlay
+
+        title = f"{self.image}: {self.status}" + (f" ({self.why})" if self.why else "")
+        return draw_overlay(pixels, self.layers(), title, path=path)
+
+    def layers(self) -> list[Layer]:
+        """What is drawn over the scan: corners, measured edges, and the edges that were not found."""
+        from ...core.overlay import MISSING, Layer
+
+        none = np.empty((0, 2))
+        if self.lines is None:
+            missing = [f"{name}: {edge.why}" for name, edge in self.edges.items() if edge.why]
+            return [Layer(text, none, symbol="x", colour=MISSING) for text in missing]
+        corners = self.lines.corners
+        cov = np.stack([self.lines.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
+        layers = [Layer("corners", corners, CORNERS, cov)]
+        for k, name in enumerate(EDGES):
+            edge, ends = self.edges[name], corners[[k, (k + 1) % 4]]
+            if edge.found:
+                rms = "" if edge.rms_px is None else f", rms {edge.rms_px:.2g} px"
+                text = f"{name} edge: {edge.points} profiles, {edge.rejected} rejected{rms}"
+                layers.append(Layer(text, none, symbol="_", paths=(ends,)))
+            else:
+                text = f"{name} edge not found: {edge.why}" if edge.why else f"{name} edge not found"
+                layers.append(Layer(text, none, symbol="x", colour=MISSING, paths=(ends,)))
+        return layers
 
     def write(self, path: Path | str) -> None:
         """Write ``reseau-orientation/1``.

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...adjust import BatchOptions, GaussMarkov, Parameters, adjust_batch, robust
 from ...core.data import Array
@@ -76,6 +79,31 @@ class FilmPlane:
     def edges(self) -> int:
         """Number of edges found."""
         return len(self.at)
+
+    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw the edges of the perforations over every pixel of the scan.
+
+        Parameters
+        ----------
+        pixels : ndarray (h, w) or (h, w, 3)
+            Grey or RGB values of the scan.
+        path : str or Path, optional
+            PNG file to write.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            See :meth:`reseau.measure.points.Measured.overlay`.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from ...core.overlay import Layer, draw_overlay
+
+        edges = Layer(f"edges, {self.edges}", self.at, symbol="|")
+        return draw_overlay(pixels, [edges], f"edges of perforations, rms {self.rms_px:.2g} px", path=path)
 
     def to_mm(self, xy: Array) -> Array:
         """Film coordinates (n, 2) in mm of pixels (n, 2)."""

@@ -16,8 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
 from ...core.failure import Code
@@ -27,6 +30,9 @@ from ..screening import Screened, screen
 from .arcs import ArcMatches, match_arcs
 from .echoes import Echoes, Grey, find_echoes, ground_of
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
+
+if TYPE_CHECKING:
+    from ...core.overlay import Layer
 
 __all__ = ["PinDetections", "PinOptions", "falloff", "find_pins"]
 
@@ -220,6 +226,41 @@ class PinDetections:
     def codes(self) -> tuple[Code | None, ...]:
         """Codes (m,) of the reasons; None where a spot is a pin."""
         return tuple(why.code if isinstance(why, Reason) else None for why in self.why)
+
+    def overlay(self, frame: Frame, path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw the pins with their arcs, and rejected spots with the reasons, over every pixel of the frame.
+
+        Parameters
+        ----------
+        frame : Frame
+            The frame.
+        path : str or Path, optional
+            PNG file to write.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            See :meth:`reseau.measure.points.Measured.overlay`.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from ...core.overlay import draw_overlay
+
+        count = int(self.ok.sum())
+        return draw_overlay(frame.pixels, self.layers(), f"{self.image}: {count} echoes found", path=path)
+
+    def layers(self) -> list[Layer]:
+        """What is drawn over the frame: pins, then rejected spots, one layer for each reason."""
+        from ...core.overlay import Layer, declined_layers
+
+        points, rest = self.points, np.flatnonzero(~self.ok)
+        found = Layer(f"echoes, {len(points)}", points.xy, points.names, points.cov)
+        codes = [(self.codes[i] or Code.DECLINED).value for i in rest]
+        nameless = [""] * len(rest)
+        return [found, *declined_layers(nameless, self.xy[rest], [self.why[i] for i in rest], codes)]
 
     @property
     def points(self) -> ImagePoints:

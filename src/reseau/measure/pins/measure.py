@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from ...optics.field import SmoothField, trend_degree
 from ..points import Measured, Reason
 from .detection import PinDetections, PinOptions, find_pins
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
+
+if TYPE_CHECKING:
+    from ...core.overlay import Layer
 
 __all__ = ["PinResult", "measure_pins"]
 
@@ -73,6 +77,24 @@ class PinResult(Measured):
     tilt: Array
     detections: PinDetections
     notes: tuple[Remark, ...] = ()
+
+    def layers(self) -> list[Layer]:
+        """Rods, then echoes and rejected spots that belong to none."""
+        from ...core.overlay import OTHER, Layer
+
+        seen, known = self.detections, self.xy[self.ok]
+        apart = np.hypot(*np.moveaxis(seen.xy[:, None] - known, -1, 0)).min(axis=1, initial=np.inf)
+        other = seen.ok & (apart > 0)
+        layers = super().layers()
+        if other.any():
+            layers.append(Layer(f"echoes of no rod, {int(other.sum())}", seen.xy[other], colour=OTHER))
+        rest = np.flatnonzero(~seen.ok)
+        kinds, count = np.unique([str(seen.codes[i] or Code.DECLINED) for i in rest], return_counts=True)
+        reasons = ", ".join(f"{kind} {number}" for kind, number in zip(kinds, count, strict=True))
+        rejected = Layer(
+            f"spots that are no echoes, {len(rest)}: {reasons}", seen.xy[rest], symbol="1", colour=OTHER
+        )
+        return [*layers, rejected] if len(rest) else layers
 
 
 def measure_pins(
@@ -142,6 +164,7 @@ def measure_pins(
             f"the rods of design {design.name!r} were not found: {layout.reason}",
             layout.code,
             where=frame.name,
+            places=seen.xy[echoes],
         )
     names = tuple(design.ids[i] for i in known)
     work = _Rods(frame, source[known], names, seen, echoes, layout)

@@ -189,7 +189,10 @@ def measure_reseau(
     why_not = _disagreement(source[known], judged, options)
     if why_not:
         return Failure(
-            f"design {design.name!r} was not found in the frame: {why_not}", Code.NOT_FOUND, where=frame.name
+            f"design {design.name!r} was not found in the frame: {why_not}",
+            Code.NOT_FOUND,
+            where=frame.name,
+            places=judged.xy[judged.why == ""],
         )
     return _columns(frame, design, known, at, found, judged, measurement.field)
 

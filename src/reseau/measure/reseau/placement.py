@@ -455,12 +455,15 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     size = mark.line_width if mark.shape == "line-grid" else mark.size
     axes = np.eye(2) if options.nominal is None else _nominal_axes(source, options.nominal)
     best: tuple[float, Placement] | None = None
+    likeliest = np.empty((0, 2))
     for mark_px in _sizes(source, size, options):
         screened = screen(frame, run=max(15, round(4 * mark_px)))
         template = _template(design, mark_px, options.psf_px, axes)
         if len(template) > min(frame.pixels.shape):
             continue
         candidates = find_candidates(screened.grey, screened.valid, template)
+        if not len(likeliest):
+            likeliest = candidates.xy[: 3 * len(source)]
         found = _lay(source, size, candidates, screened, mark_px, options)
         if found is None:
             continue
@@ -478,6 +481,7 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
             f"{frame.width}×{frame.height} px ({marks} of {len(source)} marks agree with it)",
             Code.NOT_FOUND,
             where=frame.name,
+            places=likeliest,
         )
     return best[1]
 

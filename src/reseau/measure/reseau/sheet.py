@@ -395,6 +395,7 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
             f"design {design.name!r} was not found in the frame: {placed.reason}",
             placed.code,
             where=frame.name,
+            places=disks.strongest(_STRONGEST * len(design.ids)).xy,
         )
     valid = screened.valid & (frame.pixels < frame.full_scale)
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
