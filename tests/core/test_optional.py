@@ -71,6 +71,15 @@ def test_a_compressed_tiff_names_the_package_that_decodes_it(tmp_path: Path) -> 
     assert "imagecodecs" not in lines["b.tif"]
 
 
+def test_a_dicom_photograph_names_the_package_that_reads_it(tmp_path: Path) -> None:
+    (tmp_path / "a.dcm").write_bytes(bytes(128) + b"DICM" + bytes(40))
+    design = tmp_path / "field.json"
+    assert without((), "design", "testfield", "--out", design).returncode == 0
+    done = without(("pydicom",), "measure", "testfield", tmp_path / "a.dcm", "--design", design)
+    assert done.returncode == 2
+    assert done.stderr == "reseau: needs pydicom, which is not installed; pip install 'reseau[dicom]'\n"
+
+
 def test_errors_of_other_modules_are_not_about_optional_packages() -> None:
     assert missing(ModuleNotFoundError("No module named 'reseau.nothing'", name="reseau.nothing")) is None
     assert missing(ImportError("cannot import name 'x'", name="matplotlib")) is None

@@ -77,6 +77,8 @@ def broken(change: str) -> str:
             content["points"][1]["x"] = 1e-9
         case "far":
             content["points"][1]["x"] = 1e300
+        case "huge":
+            content["mark"]["size"] = 4000.0
         case "segment of a cross":
             content["points"][1]["end"] = [20.0, 0.0]
         case "no segment":
@@ -103,6 +105,7 @@ def broken(change: str) -> str:
         ("nominal place", r"points 'c' and 'e' have one nominal position, \(7.5, 8\) px"),
         ("tiny", "all points lie within 1e-06 mm; check the unit"),
         ("far", r"points\[1\]\.x`: .* less than or equal to 1000000000"),
+        ("huge", "marks of 4000 mm are larger than the whole design"),
         ("segment of a cross", "requires marks of shape 'rod'"),
         ("no segment", "`end` of 'b' must lie at another place"),
         ("schema", "'reseau-design/1' was expected"),

@@ -29,6 +29,7 @@ from .common import (
     SensorFile,
     corrected,
     progress,
+    read_frame,
     required,
     say,
 )
@@ -208,14 +209,13 @@ def _frames(
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs, or measured image coordinates, in order."""
     from ..io import is_points, read_measurement
-    from ..io.images import read_image
 
     for path in paths:
         step(f"measuring {path.name}")
         if is_points(path):
             yield path.name, read_measurement(path).image_points()
         else:
-            yield corrected(read_image(path, channel.value), sensor)
+            yield corrected(read_frame(path, channel.value), sensor)
 
 
 def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:

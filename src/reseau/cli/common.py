@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
+    from ..io.images import Channel
 
 T = TypeVar("T")
 
@@ -50,7 +51,7 @@ Mirrored = Annotated[
     ),
 ]
 MaxRotation = Annotated[
-    float,
+    float | None,
     typer.Option(
         min=0,
         max=180,
@@ -59,12 +60,14 @@ MaxRotation = Annotated[
 ]
 
 
-def handedness(mirrored: bool | None) -> bool | None:
-    """Whether image and design have opposite handedness, as the options of the measurements state it.
+def orientation(mirrored: bool | None, max_rotation: float | None) -> dict[str, Any]:
+    """Options of a measurement from those of a command; what is not given keeps its default.
 
-    The design has y up and the image y down: they are opposite if the design is seen from the front.
+    The design has y up and the image y down: they have opposite handedness if the design is seen from the
+    front.
     """
-    return None if mirrored is None else not mirrored
+    given: dict[str, Any] = {"mirrored": None if mirrored is None else not mirrored}
+    return given if max_rotation is None else given | {"max_rotation_deg": max_rotation}
 
 
 def corrected(frame: Frame, sensor: Path | None) -> Frame:
@@ -101,12 +104,21 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
     return Archive.open(place, objects, create=create)
 
 
+def read_frame(path: Path, channel: Channel = "luma") -> Frame:
+    """Read an image; notes on how it was read are written to standard error."""
+    from ..io.images import read_image
+
+    frame = read_image(path, channel)
+    for note in frame.notes:
+        typer.echo(f"note: {note}", err=True)
+    return frame
+
+
 def read_photo(path: Path) -> Frame | ImagePoints:
     """Read an image, or image coordinates."""
     from ..io import is_points, read_measurement
-    from ..io.images import read_image
 
-    return read_measurement(path).image_points() if is_points(path) else read_image(path)
+    return read_measurement(path).image_points() if is_points(path) else read_frame(path)
 
 
 def required(found: T | Failure, where: object) -> T:

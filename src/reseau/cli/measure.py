@@ -16,9 +16,10 @@ from .common import (
     Out,
     SensorFile,
     corrected,
-    handedness,
+    orientation,
     overlay_files,
     progress,
+    read_frame,
     required,
     say,
     suffix_of,
@@ -66,7 +67,7 @@ def reseau(
         float | None, typer.Option(help="Size of a mark (px); for a grid, the width of its lines.")
     ] = None,
     mirrored: Mirrored = None,
-    max_rotation: MaxRotation = 12.0,
+    max_rotation: MaxRotation = None,
     row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
     channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
     sensor: SensorFile = None,
@@ -74,7 +75,6 @@ def reseau(
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
     from ..io import ReseauDesign
-    from ..io.images import read_image
     from ..measure import ReseauOptions, measure_reseau
 
     task = _Task(image, out, overlay, as_json, "marks")
@@ -82,11 +82,10 @@ def reseau(
     options = ReseauOptions(
         mark_px=mark_px,
         row_jitter_px=row_jitter,
-        mirrored=handedness(mirrored),
-        max_rotation_deg=max_rotation,
+        **orientation(mirrored, max_rotation),
     )
     task.run(
-        lambda: corrected(read_image(image, channel.value), sensor),
+        lambda: corrected(read_frame(image, channel.value), sensor),
         lambda frame: measure_reseau(frame, target, options),
     )
 
@@ -106,24 +105,21 @@ def pins(
         typer.Option(min=1, help="Maximum length of an echo (px). Default: 6 % of the frame diagonal."),
     ] = None,
     mirrored: Mirrored = None,
-    max_rotation: MaxRotation = 12.0,
+    max_rotation: MaxRotation = None,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the rods of an ultrasonic test object, or the wires of an N-wire phantom."""
     from ..io import ReseauDesign
-    from ..io.images import read_image
     from ..measure import PinOptions, measure_pins
 
     task = _Task(image, out, overlay, as_json, "rods")
     target = ReseauDesign.read(design)
-    options = PinOptions(
-        most_length_px=max_length_px, max_rotation_deg=max_rotation, mirrored=handedness(mirrored)
-    )
+    options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
     task.run(
-        lambda: corrected(read_image(image), sensor),
+        lambda: corrected(read_frame(image), sensor),
         lambda frame: measure_pins(
-            frame, target, options, [corrected(read_image(path), sensor) for path in also or []]
+            frame, target, options, [corrected(read_frame(path), sensor) for path in also or []]
         ),
     )
 
@@ -143,14 +139,13 @@ def coded_field(
 ) -> None:
     """Measure the targets of a coded testfield."""
     from ..io import TestfieldDesign
-    from ..io.images import read_image
     from ..measure import TestfieldOptions, measure_testfield
 
     task = _Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
     options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
     task.run(
-        lambda: corrected(read_image(image), sensor),
+        lambda: corrected(read_frame(image), sensor),
         lambda frame: measure_testfield(frame, target, options),
     )
 

@@ -15,7 +15,7 @@ from .common import (
     MaxRotation,
     Mirrored,
     Out,
-    handedness,
+    orientation,
     overlay_files,
     points_document,
     probability,
@@ -52,20 +52,20 @@ class _Files:
     check: tuple[str, ...]
     alpha: float
     mirrored: bool | None = None
-    max_rotation: float = 12.0
+    max_rotation: float | None = None
     overlays: Mapping[Path, Path] = field(default_factory=dict)
 
     def marks(self) -> ReseauOptions:
         """Options of the measurement of the reseau."""
         from ..measure import ReseauOptions
 
-        return ReseauOptions(mirrored=handedness(self.mirrored), max_rotation_deg=self.max_rotation)
+        return ReseauOptions(**orientation(self.mirrored, self.max_rotation))
 
     def pins(self) -> PinOptions:
         """Options of the measurement of the rods."""
         from ..measure import PinOptions
 
-        return PinOptions(max_rotation_deg=self.max_rotation)
+        return PinOptions(**orientation(None, self.max_rotation))
 
     def draw(self, path: Path, photo: Frame | ImagePoints, found: Any) -> None:
         """Write the overlay of a photograph, if one is wanted: its marks and rods, or why there are none."""
@@ -94,7 +94,7 @@ class _Files:
         options: dict[str, Any] = {"alpha": self.alpha, "check": list(self.check)}
         if self.mirrored is not None:
             options["mirrored"] = self.mirrored
-        if self.max_rotation != 12.0:
+        if self.max_rotation is not None:
             options["max_rotation"] = self.max_rotation
         return Provenance(inputs, options)
 
@@ -134,7 +134,7 @@ def refine(
     alpha: Annotated[float, typer.Option(help="Significance level of the tests of the coefficients.")] = 0.05,
     check: Annotated[str, typer.Option(help="Marks and rods used only as check points, as A1,B2.")] = "",
     mirrored: Mirrored = None,
-    max_rotation: MaxRotation = 12.0,
+    max_rotation: MaxRotation = None,
     overlay: Annotated[
         Path | None,
         typer.Option(

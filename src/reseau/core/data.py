@@ -36,6 +36,8 @@ class Frame(Display):
         Name in messages and results, usually a file name.
     sha256 : str
         Hash of the file, or of the pixels where there is no file.
+    notes : tuple of str
+        What a user should know about how it was read.
 
     Raises
     ------
@@ -53,6 +55,7 @@ class Frame(Display):
     full_scale: float
     name: str = "frame"
     sha256: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or min(self.pixels.shape) < 2:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .files import split_frame
 from .version import __version__
 
 __all__ = ["Provenance", "canonical_json", "sha256_of"]
 
 
 def sha256_of(source: bytes | Path) -> str:
-    """SHA-256 of bytes, or of a file read in pieces.
+    """SHA-256 of bytes, or of a file read in pieces; of ``loop.dcm#3``, a frame of a file, that of the file.
 
     Raises
     ------
@@ -30,7 +31,7 @@ def sha256_of(source: bytes | Path) -> str:
     if isinstance(source, bytes):
         return hashlib.sha256(source).hexdigest()
     try:
-        with source.open("rb") as stream:
+        with split_frame(source)[0].open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=source) from None

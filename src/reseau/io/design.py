@@ -146,6 +146,11 @@ class ReseauDesign(Document):
         known = np.asarray(np.isfinite(places).all(axis=1))
         if known.sum() > 1 and 0 < np.ptp(places[known], axis=0).max() < _LEAST_EXTENT:
             raise ValueError(f"all points lie within {_LEAST_EXTENT:g} {self.unit}; check the unit")
+        size = max(self.mark.size or 0.0, self.mark.line_width or 0.0)
+        if known.sum() > 1 and size > np.ptp(places[known], axis=0).max():
+            raise ValueError(
+                f"marks of {size:g} {self.unit} are larger than the whole design; check the unit"
+            )
         pair = at_one_place(places)
         what, at = "lie at one place", "({:g}, {:g})"
         if pair is None:  # where coordinates are missing, the nominal positions stand for them

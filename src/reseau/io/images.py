@@ -2,8 +2,8 @@
 
 Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and the first page of a TIFF with grey or RGB
 samples of 1, 8 or 16 bit, signed 16 bit, or floating point, uncompressed or in a compression that tifffile
-decodes. Grey values are never rescaled; an alpha channel is ignored, and so is an orientation tag: pixel
-coordinates are those of the sensor.
+decodes; and a frame of a DICOM file, see :mod:`reseau.io.dicom`. Other grey values are never rescaled; an
+alpha channel is ignored, and so is an orientation tag: pixel coordinates are those of the sensor.
 
 An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
 are decoded.
@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from ..core.data import Frame
 from ..core.errors import ImageError, InputError, UsageError
+from ..core.files import split_frame
 from ..core.provenance import sha256_of
 from . import write_whole
+from .dicom import is_dicom, open_dicom
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
 __all__ = ["MAX_PIXELS", "Channel", "open_scan", "read_image", "write_image"]
@@ -46,7 +48,8 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     Parameters
     ----------
     path : path
-        PNG, JPEG, BMP or TIFF; see :mod:`reseau.io.images` for the kinds of TIFF.
+        PNG, JPEG, BMP, TIFF or DICOM; see :mod:`reseau.io.images` for the kinds of TIFF. ``loop.dcm#3`` is
+        the third frame of a DICOM file; without a number the first is read, with a note.
     channel : {"luma", "red", "green", "blue"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
         channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
@@ -77,8 +80,8 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     path = Path(path)
     if channel != "luma" and channel not in _LUMA:
         raise UsageError("is not a channel", where=channel, do="use luma, red, green or blue")
-    digest = sha256_of(path)
     scan = open_scan(path)
+    digest = sha256_of(path)
     _check_size(path, scan.width, scan.height)
     pixels = scan.window(0, scan.height, 0, scan.width)
     if len(scan.channels) == 1:
@@ -87,7 +90,7 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
         grey = np.array(pixels[:, :, scan.channels.index(channel)])
     else:
         grey = _luma(pixels, scan.channels)
-    return Frame(grey, scan.full_scale, path.name, digest)
+    return Frame(grey, scan.full_scale, scan.name, digest, scan.notes)
 
 
 def _luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
@@ -121,12 +124,17 @@ def open_scan(path: Path | str) -> Scan:
     ...     scan.channels, scan.window(100, 102, 200, 203).shape
     (('grey',), (2, 3, 1))
     """
-    path = Path(path)
+    whole, number = split_frame(Path(path))
     try:
-        with path.open("rb") as stream:
-            magic = stream.read(64)
+        with whole.open("rb") as stream:
+            magic = stream.read(132)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if is_dicom(whole, magic):
+        return open_dicom(whole, number, MAX_PIXELS)
+    path = Path(path)
+    if number is not None:
+        raise ImageError("is no DICOM file, which could have frames", where=path, do=f"give {whole.name}")
     if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _open_tiff(path)
     pixels = _decoded(path, magic)

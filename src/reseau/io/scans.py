@@ -45,6 +45,8 @@ class Scan:
     window : callable
         ``window(top, bottom, left, right)`` returns rows [top, bottom) and columns [left, right) as an array
         (rows, columns, channels) of type `dtype`. The window must lie within the image.
+    notes : tuple of str
+        What a user should know about how it was read.
 
     Examples
     --------
@@ -62,6 +64,7 @@ class Scan:
     dpi: float | None
     dtype: np.dtype[Any]
     window: Window
+    notes: tuple[str, ...] = ()
 
     def overview(self, longest: int) -> tuple[NDArray[np.float32], float]:
         """Reduce the image so that its longer side has at most `longest` pixels.
