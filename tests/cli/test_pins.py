@@ -48,6 +48,33 @@ def test_rods_are_measured_and_the_missing_one_is_named(
     assert np.abs(points.xy - TRUTH[:6]).max() < 0.2
 
 
+def test_slanted_wires_are_measured_with_the_share_at_which_they_are_cut(reseau: Run, tmp_path: Path) -> None:
+    status, out, err = reseau("design", "n-wires", "--layers", 3, "--json", tmp_path / "phantom.json")
+    assert (status, err) == (0, "")
+    design = ReseauDesign.read(tmp_path / "phantom.json")
+    share = np.array([0.3, 0.55, 0.8])
+    ends = design.segments
+    slanted = np.isnan(design.xy).any(axis=1)
+    plane = ends[:, 0].copy()
+    plane[slanted] += share[:, None] * (ends[slanted, 1] - ends[slanted, 0])
+    truth = plane * [9.0, -9.0] + [310.25, 110.4]
+    arcs = Arcs(*(np.full(len(truth), v) for v in (7.0, 1.6, 0.012, 0.0)))
+    columns, rows = (np.broadcast_to(np.arange(n, dtype=float), (len(truth), n)) for n in (620, 480))
+    canvas = 5 + 150 * arcs.image(truth, columns, rows).sum(axis=0)
+    canvas += 1.5 * np.random.default_rng(0).standard_normal(canvas.shape)
+    write_image(tmp_path / "photo.png", np.clip(np.rint(canvas), 0, 255).astype(np.uint8))
+    arguments = ("measure", "pins", tmp_path / "photo.png", "-d", tmp_path / "phantom.json")
+    status, out, err = reseau(*arguments, "-o", tmp_path / "m.json")
+    assert (status, err) == (0, "")
+    assert "9 of 9 rods measured" in out
+    assert "N2: cut at 0.55" in out
+    found = {point.id: point for point in ReseauMeasurement.read(tmp_path / "m.json").points}
+    for name, true in zip(("N1", "N2", "N3"), share, strict=True):
+        assert found[name].share == pytest.approx(true, abs=0.002)
+        assert 1e-5 < found[name].s_share < 0.002
+    assert found["R1"].share is None
+
+
 def test_json_and_csv_contain_the_same_values(reseau: Run, bench: tuple[Path, Path], tmp_path: Path) -> None:
     image, design = bench
     status, out, _ = reseau("measure", "pins", image, "-d", design, "-o", tmp_path / "m.csv", "--json")

@@ -108,6 +108,21 @@ def sheet(
     _write(design, svg, pdf, out, f"{columns} × {rows} disks, pitch {pitch:g} mm")
 
 
+@app.command("n-wires")
+def n_wires(
+    layers: Annotated[int, typer.Option(help="Number of layers, each with one N.")] = 3,
+    width: Annotated[float, typer.Option(help="Distance of the parallel wires of a layer (mm).")] = 40.0,
+    spacing: Annotated[float, typer.Option(help="Distance of the layers (mm).")] = 15.0,
+    name: Annotated[str, typer.Option(help="Name of the design.")] = "n-wires",
+    out: Design = None,
+) -> None:
+    """Design an N-wire phantom: coordinates of parallel and slanted wires, to be edited to one's own."""
+    from ..designs import n_wire_phantom
+
+    design = n_wire_phantom(layers, width, spacing, name=name)
+    _write(design, None, None, out, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
+
+
 @app.command("testfield")
 def coded_field(
     columns: Annotated[int, typer.Option(help="Number of squares in a row.")] = 8,

@@ -186,6 +186,7 @@ class _Task:
 
     def _deliver(self, document: ReseauMeasurement, result: Measured | None) -> None:
         """Write the measurement to its file, and report what was measured."""
+        from ..core.numbers import measured
         from ..io import write_whole
 
         if self.out is not None:
@@ -201,6 +202,8 @@ class _Task:
         for point in document.points:
             if not point.ok:
                 say(f"  {point.id}: {point.why}\n")
+            elif point.share is not None and point.s_share is not None:
+                say(f"  {point.id}: cut at {measured(point.share, point.s_share)} of its segment\n")
         for note in document.notes:
             say(f"note: {note}\n")
 

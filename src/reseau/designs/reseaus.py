@@ -9,7 +9,7 @@ import numpy as np
 from ..core.errors import UsageError
 from ..io import DesignPoint, Mark, ReseauDesign, Rings
 
-__all__ = ["coded_sheet", "regular_reseau", "standard_reseau", "test_object"]
+__all__ = ["coded_sheet", "n_wire_phantom", "regular_reseau", "standard_reseau", "test_object"]
 
 
 def regular_reseau(
@@ -239,6 +239,61 @@ def test_object() -> ReseauDesign:
         origin="C1",
         axis="C5",
         points=tuple(DesignPoint(id=name, x=x, y=y, sigma=0.25) for name, x, y in rods),
+    )
+
+
+def n_wire_phantom(
+    layers: int = 3, width: float = 40.0, spacing: float = 15.0, *, name: str = "n-wires"
+) -> ReseauDesign:
+    """Design an N-wire phantom: in each layer two parallel wires and one that slants from one to the other.
+
+    In the k-th layer ``Rk`` and ``Lk`` are normal to the plane of the design, and ``Nk`` runs from the place
+    of ``Rk`` at the front to that of ``Lk`` at the back; in every other layer the other way. The last ``R``
+    is displaced to the inside, so that the phantom is not symmetric.
+
+    Parameters
+    ----------
+    layers : int
+        Number of layers, at least 2.
+    width, spacing : float
+        Distance of the parallel wires of a layer, and of the layers, millimetres.
+
+    Raises
+    ------
+    UsageError
+        When a number is not possible.
+
+    Examples
+    --------
+    >>> phantom = n_wire_phantom(2)
+    >>> phantom.ids
+    ('R1', 'N1', 'L1', 'R2', 'N2', 'L2')
+    >>> phantom.segments[1].tolist()
+    [[20.0, 0.0], [-20.0, 0.0]]
+    """
+    if not 2 <= layers <= 100 or not min(width, spacing) > 0:
+        raise UsageError(
+            f"cannot have {layers} layers of {width:g} mm, {spacing:g} mm apart", where=f"design {name}"
+        )
+    points = []
+    for k in range(layers):
+        y = float(np.round(-k * spacing, 6))
+        right = float(np.round(width / 2 - (width / 5 if k == layers - 1 else 0.0), 6))
+        left = float(np.round(-width / 2, 6))
+        front, back = (right, left) if k % 2 == 0 else (left, right)
+        points += [
+            DesignPoint(id=f"R{k + 1}", x=right, y=y),
+            DesignPoint(id=f"N{k + 1}", x=front, y=y, end=(back, y)),
+            DesignPoint(id=f"L{k + 1}", x=left, y=y),
+        ]
+    return ReseauDesign(
+        name=name,
+        unit="mm",
+        mark=Mark(shape="rod", size=0.3),
+        polarity="bright",
+        origin="L1",
+        axis="R1",
+        points=tuple(points),
     )
 
 

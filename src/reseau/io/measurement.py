@@ -20,6 +20,9 @@ __all__ = ["MeasuredPoint", "ReseauMeasurement"]
 class MeasuredPoint(Strict):
     """One mark, measured or not; sigmas in pixels.
 
+    Of a slanted wire, `share` is the place of the cut on its segment, 0 at its start and 1 at its end, and
+    `s_share` its standard deviation.
+
     Examples
     --------
     >>> MeasuredPoint(id="A1", x=100.25, y=80.5, sx=0.02, sy=0.02, rho=0.0, ok=True).x
@@ -36,6 +39,8 @@ class MeasuredPoint(Strict):
     rho: float | None = None
     ok: bool
     why: str = ""
+    share: float | None = None
+    s_share: float | None = None
 
 
 class ReseauMeasurement(Document):
@@ -65,6 +70,9 @@ class ReseauMeasurement(Document):
         for key in ("notes", "note_codes"):
             if not content[key]:
                 del content[key]
+        for point in content["points"]:
+            if point["share"] is None:
+                del point["share"], point["s_share"]
         return content
 
     def image_points(self) -> ImagePoints:

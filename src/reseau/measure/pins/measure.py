@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
-from ...io import ReseauDesign
+from ...io import ReseauDesign, ReseauMeasurement
 from ...optics.field import SmoothField, trend_degree
 from ..points import Measured, Reason
 from .detection import PinDetections, PinOptions, find_pins
+from .segments import cut_segments
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ _AMBIGUOUS = Remark(
 )
 _BESIDE_PX = 3.0
 """Minimum distance from the centre line of an echo within which another rod counts as covered by it."""
+_FLAT = 1e-3
+"""Least extent of a design across, relative to that along."""
 _ROUNDS = 3
 """Rounds of fitting the field and assigning echoes with it; usually two suffice."""
 _COLUMNS = (
@@ -57,6 +60,11 @@ class PinResult(Measured):
         All spots of the frame.
     notes : tuple of Remark
         Notes for the user.
+    share, share_sigma : ndarray (n,), optional
+        Where the image plane cuts slanted wires, 0 at the start of a segment and 1 at its end, and its
+        standard deviation; NaN for others. None for a design without slanted wires.
+    segments_px : ndarray (n, 2, 2), optional
+        Ends of the slanted wires in the image.
 
     Examples
     --------
@@ -77,6 +85,26 @@ class PinResult(Measured):
     tilt: Array
     detections: PinDetections
     notes: tuple[Remark, ...] = ()
+    share: Array | None = None
+    share_sigma: Array | None = None
+    segments_px: Array | None = None
+
+    def _columns(self) -> dict[str, list[Any]]:
+        columns = super()._columns()
+        if self.share is None or self.share_sigma is None:
+            return columns
+        return columns | {"share": self.share.tolist(), "share_sigma": self.share_sigma.tolist()}
+
+    def measurement(self) -> ReseauMeasurement:
+        """The result as a document."""
+        found = super().measurement()
+        if self.share is None or self.share_sigma is None:
+            return found
+        shared = zip(found.points, self.share.tolist(), self.share_sigma.tolist(), strict=True)
+        points = tuple(
+            point.model_copy(update={"share": t, "s_share": s}) if t == t else point for point, t, s in shared
+        )
+        return found.model_copy(update={"points": points})
 
     def layers(self) -> list[Layer]:
         """Rods, then echoes and rejected spots that belong to none."""
@@ -86,6 +114,11 @@ class PinResult(Measured):
         apart = np.hypot(*np.moveaxis(seen.xy[:, None] - known, -1, 0)).min(axis=1, initial=np.inf)
         other = seen.ok & (apart > 0)
         layers = super().layers()
+        if self.segments_px is not None:
+            lines = self.segments_px[np.isfinite(self.segments_px).all(axis=(1, 2))]
+            layers.insert(
+                0, Layer("slanted wires", np.empty((0, 2)), symbol="_", colour=OTHER, paths=tuple(lines))
+            )
         if other.any():
             layers.append(Layer(f"echoes of no rod, {int(other.sum())}", seen.xy[other], colour=OTHER))
         rest = np.flatnonzero(~seen.ok)
@@ -111,7 +144,8 @@ def measure_pins(
     frame : Frame
         A frame that shows the echoes of the rods, bright on a dark background.
     design : ReseauDesign
-        The rods, with or without nominal positions in the image.
+        The rods, with or without nominal positions in the image. Slanted wires, which have segments, are
+        found by means of the others.
     options : PinOptions, optional
         Options of the measurement.
     others : sequence of Frame
@@ -156,6 +190,11 @@ def measure_pins(
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
     if len(known) < 4:
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
+    across = np.linalg.svd(source[known] - source[known].mean(axis=0), compute_uv=False)
+    if across[1] < _FLAT * across[0]:
+        raise UsageError(
+            "has its points on one line, which does not show where they are", where=f"design {design.name}"
+        )
     seen = find_pins(frame, o, others, hidden)
     echoes = np.flatnonzero(seen.ok)
     layout = _placed_pattern(design, known, seen.xy[echoes], o)
@@ -168,17 +207,53 @@ def measure_pins(
         )
     names = tuple(design.ids[i] for i in known)
     work = _Rods(frame, source[known], names, seen, echoes, layout)
-    return work.result(design.ids, known)
+    return _with_slanted(work.result(design.ids, known), design, echoes, layout.gate_px)
 
 
 def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
-    """The pattern fitted to the echoes, from nominal positions if the design has them."""
-    ids = tuple(design.ids[i] for i in known)
-    wires = Wires.of_points(ids, design.xy[known])
+    """The rods fitted to the echoes, from nominal positions if the design has them.
+
+    Echoes on the segments of slanted wires support a position; only the rods are in the result.
+    """
+    slanted = np.setdiff1d(np.flatnonzero(np.isfinite(design.segments).all(axis=(1, 2))), known)
+    rows = np.concatenate([known, slanted])
+    ends = design.segments[rows]
+    wires = Wires(tuple(design.ids[i] for i in rows), ends[:, 0], ends[:, 1])
     nominal = design.nominal_px[known]
     options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), o.mirrored)
     start = nominal if np.isfinite(nominal).all() else None
-    return lay_wires(wires, seen, options, start)
+    if start is not None:
+        start = np.concatenate([start, np.full((len(slanted), 2), np.nan)])
+    layout = lay_wires(wires, seen, options, start)
+    return layout if isinstance(layout, Failure) else replace(layout, row=layout.row[: len(known)])
+
+
+def _with_slanted(result: PinResult, design: ReseauDesign, echoes: Rows, gate_px: float) -> PinResult:
+    """The result with the slanted wires of the design, found among the echoes that belong to no rod."""
+    segments = design.segments
+    slanted = np.flatnonzero(np.isfinite(segments).all(axis=(1, 2)) & np.isnan(design.xy).any(axis=1))
+    if not len(slanted):
+        return result
+    seen, known = result.detections, np.flatnonzero(result.ok)
+    apart = np.hypot(*np.moveaxis(seen.xy[echoes][:, None] - result.xy[known], -1, 0))
+    free = echoes[apart.min(axis=1, initial=np.inf) > 0]
+    cuts = cut_segments(
+        segments[slanted], seen.xy[free], seen.cov[free], design.xy[known], result.xy[known], gate_px
+    )
+    found = cuts.row >= 0
+    rows, at = slanted[found], free[cuts.row[found]]
+    columns = {name: np.array(getattr(result, name)) for name in ("xy", "cov", *_COLUMNS)}
+    for name, values in columns.items():
+        values[rows] = getattr(seen, name)[at]
+    ok, why, predicted = result.ok.copy(), list(result.why), result.predicted.copy()
+    ok[rows] = True
+    predicted[slanted] = cuts.ends.mean(axis=1)
+    for i, reason in zip(slanted, cuts.why, strict=True):
+        why[i] = reason
+    full = [np.full(len(ok), np.nan), np.full(len(ok), np.nan), np.full((len(ok), 2, 2), np.nan)]
+    full[0][slanted], full[1][slanted], full[2][slanted] = cuts.share, cuts.sigma, cuts.ends
+    changed: dict[str, Any] = {"ok": ok, "why": tuple(why), "predicted": predicted} | columns
+    return replace(result, **changed, share=full[0], share_sigma=full[1], segments_px=full[2])
 
 
 class _Rods:
