@@ -69,7 +69,7 @@ def bound(xy: Array, shown: Arcs, light: float) -> Array:
     image, d = shown.derivatives(xy, np.rint(xy[:, :1]) + offset, np.rint(xy[:, 1:]) + offset)
     k, plane = len(xy), np.broadcast_to(offset, (len(offset), len(offset)))
     ground = np.stack([np.ones_like(plane), plane, plane.T]).reshape(1, 3, -1).repeat(k, axis=0)
-    design = np.concatenate([light * d.reshape(k, 6, -1), image.reshape(k, 1, -1), ground], axis=1)
+    design = np.concatenate([light * d[:, :6].reshape(k, 6, -1), image.reshape(k, 1, -1), ground], axis=1)
     fisher = design @ np.swapaxes(design, 1, 2) / NOISE**2
     return np.sqrt(np.diagonal(np.linalg.inv(fisher), axis1=1, axis2=2)[:, :2])
 

@@ -7,7 +7,7 @@ import pytest
 
 from reseau.core.data import Array, Mask
 from reseau.measure import find_pins
-from reseau.measure.pins.detection import falloff
+from reseau.measure.pins.screenlight import falloff
 
 from .test_pins import NOISE, arcs, frame, nearest, picture
 

@@ -1,27 +1,52 @@
-r"""The image of a point reflector in an ultrasonic section: an arc that is brightest at its centre.
+r"""The image of a point reflector in an ultrasonic section: an arc, in one of several forms.
 
 A point at range d reflects every beam that grazes it; the echo is later and weaker for more oblique beams. If
-the echo is late by :math:`v` at the distance :math:`u` along the scan, with a beam and a pulse of Gaussian
-profiles of widths a and b,
+the echo is late by :math:`v` at the distance :math:`u` along the scan, with the profile P along it and a
+pulse of Gaussian profile of width b,
 
-.. math:: I = \exp\Bigl(-\frac{u^2}{2a^2} - \frac{(v - h(u))^2}{2b^2}\Bigr), \qquad
+.. math:: I = P(u) \exp\Bigl(-\frac{(v - h(u))^2}{2b(u)^2}\Bigr), \qquad
           h(u) = \frac{\sqrt{1 + \kappa^2 u^2} - 1}{\kappa} ,
 
 since ranges :math:`\sqrt{d^2 + u^2}` lie on a hyperbola of curvature :math:`\kappa = 1/d` at its vertex. In
 an image all this is rotated by the tilt. The spot of a display, the lens and the pixel widen both profiles;
 the widths here are those in the image. A pixel integrates: a Gaussian of width s convolved with the pixel is
 one of :math:`\sqrt{s^2 + 1/12}` within 1e-3 of its height, for s above 0.6 px.
+
+The profile along is that of a beam, of an even line, or anything between: a line of the half length w with
+Gaussian ends of width s, of the rms width :math:`a = \sqrt{s^2 + w^2/3}` and the flatness
+:math:`f = w^2/3a^2`; f = 0 is a Gaussian, f near 1 an even line with soft ends. Its brightness may fade
+towards one end (g) or taper towards both (c), its width may change towards both ends (d), and the film or
+tube may saturate (q). With t = u/a,
+
+.. math:: P = \frac{\Phi(\frac{u+w}s) - \Phi(\frac{u-w}s)}{2\Phi(\frac ws) - 1}\, e^{gt + ct^2}, \qquad
+          b(u) = b\, e^{dt^2}, \qquad I' = \frac{1 - e^{-qI}}{1 - e^{-q}} .
+
+The position is the middle between the two ends, whatever the brightness does between them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from ..core.data import Array, Rows
 
 __all__ = ["Arcs"]
+
+_LEAST_FLATNESS = 1e-6
+"""Flatness below which a profile is formed as one of this flatness: Gaussian within 1e-6 of its height."""
+_LINEAR = 1e-8
+"""Saturation below which a response is formed as one of this saturation."""
+_MOST_EXPONENT = 50.0
+"""Bound of exponents, for parameters that an iteration tries and refuses."""
+
+
+def _normal(z: Array) -> Array:
+    density: Array = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    return density
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +61,12 @@ class Arcs:
         Curvature κ at the centre, 1/px; positive if the ends of a horizontal arc lie below its centre.
     tilt : ndarray (k,)
         Angle from the x axis towards the y axis (rad).
+    flatness : ndarray (k,), optional
+        Flatness f of the profile, from 0 (Gaussian) to below 1 (even line). By default 0, as all that follow.
+    fading, tapering, thickening : ndarray (k,), optional
+        Logarithmic changes of the brightness along the line, g and c, and of the width across, d.
+    saturation : ndarray (k,), optional
+        Saturation q of the response, 0 if it is linear.
 
     Examples
     --------
@@ -43,19 +74,49 @@ class Arcs:
     >>> image = one.image(np.zeros((1, 2)), np.arange(-9.0, 10)[None], np.arange(-9.0, 10)[None])
     >>> image.shape, float(image[0, 9, 9])
     ((1, 19, 19), 1.0)
+
+    An even line, 40 px long, with ends as soft as its width:
+
+    >>> line = Arcs.lines(np.array([40.0]), np.array([1.8]), np.array([0.01]), np.array([0.0]))
+    >>> image = line.image(np.zeros((1, 2)), np.array([[0.0, 10.0, 20.0]]), np.array([[0.0, 0.5, 2.0]]))
+    >>> np.diagonal(image[0]).round(2).tolist()
+    [1.0, 1.0, 0.5]
     """
 
     along: Array
     across: Array
     curvature: Array
     tilt: Array
+    flatness: Array | None = None
+    fading: Array | None = None
+    tapering: Array | None = None
+    thickening: Array | None = None
+    saturation: Array | None = None
+
+    @classmethod
+    def lines(
+        cls, length: Array, across: Array, curvature: Array, tilt: Array, softness: Array | None = None
+    ) -> Arcs:
+        """Even lines of a length (k,) between the points of half brightness, with soft ends.
+
+        Parameters
+        ----------
+        length, across, curvature, tilt : ndarray (k,)
+            Length and width (px), curvature and tilt of each line.
+        softness : ndarray (k,), optional
+            Width (one sigma) of the ends; by default the width across.
+        """
+        soft = across if softness is None else softness
+        long = length**2 / 12
+        return cls(np.sqrt(long + soft**2), across, curvature, tilt, long / (long + soft**2))
 
     def __len__(self) -> int:
         return len(self.along)
 
     def select(self, rows: Rows) -> Arcs:
         """A subset of the arcs."""
-        return Arcs(self.along[rows], self.across[rows], self.curvature[rows], self.tilt[rows])
+        columns: list[Any] = [getattr(self, column.name) for column in fields(self)]
+        return Arcs(*(None if values is None else values[rows] for values in columns))
 
     def image(self, xy: Array, columns: Array, rows: Array) -> Array:
         """Brightness of the pixels of windows, 1 at the centre of the line.
@@ -71,11 +132,7 @@ class Arcs:
         -------
         ndarray (k, r, c)
         """
-        u, v = self._own(xy, columns, rows)
-        root = np.sqrt(1 + (self._k * u) ** 2)
-        late = v - self._k * u * u / (1 + root)
-        image: Array = np.exp(-0.5 * ((u / self._a) ** 2 + (late / self._b) ** 2))
-        return image
+        return self._formed(xy, columns, rows, derivatives=False)[0]
 
     def derivatives(self, xy: Array, columns: Array, rows: Array) -> tuple[Array, Array]:
         """Brightness, and its derivatives with respect to position, widths and form.
@@ -83,41 +140,92 @@ class Arcs:
         Returns
         -------
         image : ndarray (k, r, c)
-        derivatives : ndarray (k, 6, r, c)
-            With respect to x, y, `across`, the logarithm of `along`, `curvature` and `tilt`.
+        derivatives : ndarray (k, 11, r, c)
+            With respect to x, y, `across`, the logarithm of `along`, `curvature`, `tilt`, the logit
+            ln(f/(1 − f)) of `flatness`, `fading`, `tapering`, `thickening` and `saturation`.
         """
-        u, v = self._own(xy, columns, rows)
-        k, a, b = self._k, self._a, self._b
+        return self._formed(xy, columns, rows, derivatives=True)
+
+    def _formed(self, xy: Array, columns: Array, rows: Array, *, derivatives: bool) -> tuple[Array, Array]:
+        # Coordinates along and across the tangent of each arc, (k, r, c).
+        c, s = np.cos(self._of("tilt")), np.sin(self._of("tilt"))
+        x, y = (columns - xy[:, :1])[:, None, :], (rows - xy[:, 1:])[:, :, None]
+        u, v = c * x + s * y, c * y - s * x
+        k, a = self._of("curvature"), self._of("along")
         root = np.sqrt(1 + (k * u) ** 2)
         late = v - k * u * u / (1 + root)
-        image = np.exp(-0.5 * ((u / a) ** 2 + (late / b) ** 2))
-        # Derivatives of the exponent with respect to v, and to u along and across.
-        by_v = -image * late / b**2
-        by_u = -image * u / a**2 - by_v * k * u / root
-        c, s = np.cos(self.tilt)[:, None, None], np.sin(self.tilt)[:, None, None]
-        parts = np.empty((len(u), 6, *u.shape[1:]))
+        b = self._of("across")
+        t = u / a
+        thick = self._changes("thickening")
+        if thick is not None:
+            b = b * np.exp(np.clip(thick * t * t, -_MOST_EXPONENT, _MOST_EXPONENT))
+        late_b = late / b
+        pulse = np.exp(-0.5 * late_b * late_b)
+        fades = self._changes("fading", "tapering") is not None
+        if fades:
+            g, taper = self._of("fading"), self._of("tapering")
+            pulse *= np.exp(np.clip(g * t + taper * t * t, -_MOST_EXPONENT, _MOST_EXPONENT))
+        f = np.clip(self._of("flatness"), _LEAST_FLATNESS, 1 - _LEAST_FLATNESS)
+        w, soft = a * np.sqrt(3 * f), a * np.sqrt(1 - f)
+        even = self._changes("flatness") is not None
+        if even:
+            whole = 2 * ndtr(w / soft) - 1
+            # Symmetric in u; differences of the lower tails lose no digits.
+            far = np.abs(u) / soft
+            line = (ndtr(w / soft - far) - ndtr(-w / soft - far)) / whole
+        else:
+            line = np.exp(-0.5 * t * t)
+        linear = line * pulse
+        saturates = self._changes("saturation")
+        image: Array = linear
+        if saturates is not None:
+            q = np.where(np.abs(saturates) < _LINEAR, _LINEAR, saturates)
+            scale = -np.expm1(-q)
+            image = -np.expm1(-q * linear) / scale
+        if not derivatives:
+            return image, image
+        parts = np.empty((len(u), 11, *u.shape[1:]))
+        by_v = -linear * late_b / b
+        by_thick = -by_v * late  # with respect to the logarithm of b
+        if even:
+            ahead, behind = _normal((u + w) / soft) / soft, _normal((u - w) / soft) / soft
+            by_u = (ahead - behind) / whole * pulse
+            middle = 2 * _normal(w / soft) / soft
+            by_w = (ahead + behind - line * middle) / whole
+            by_soft = ((u - w) * behind - (u + w) * ahead + line * middle * w) / (soft * whole)
+            parts[:, 3] = pulse * (w * by_w + soft * by_soft)
+            parts[:, 6] = pulse * (by_w * w * (1 - f) - by_soft * soft * f) / 2
+        else:
+            by_u = -linear * t / a
+            parts[:, 3] = linear * t * t
+            parts[:, 6] = 0.0  # of first order in f
+        by_u = by_u - by_v * k * u / root
+        if fades or thick is not None:
+            inner = self._of("fading") + 2 * self._of("tapering") * t
+            by_t = linear * inner + 2 * self._of("thickening") * t * by_thick
+            by_u += by_t / a
+            parts[:, 3] -= t * by_t
         parts[:, 0] = s * by_v - c * by_u
         parts[:, 1] = -s * by_u - c * by_v
-        parts[:, 2] = -by_v * late / b
-        parts[:, 3] = image * (u / a) ** 2
+        parts[:, 2] = by_thick / self._of("across")
         parts[:, 4] = -by_v * u * u / (root * (1 + root))
         parts[:, 5] = by_u * v - by_v * u
+        parts[:, 7] = linear * t
+        parts[:, 8] = parts[:, 7] * t
+        parts[:, 9] = by_thick * t * t
+        if saturates is not None:
+            parts[:, :10] *= (q * np.exp(-q * linear) / scale)[:, None]
+            parts[:, 10] = (linear * np.exp(-q * linear) - image * np.exp(-q)) / scale
+        else:
+            parts[:, 10] = 0.5 * linear * (1 - linear)
         return image, parts
 
-    def _own(self, xy: Array, columns: Array, rows: Array) -> tuple[Array, Array]:
-        """Coordinates along and across the tangent of each arc, (k, r, c)."""
-        c, s = np.cos(self.tilt)[:, None, None], np.sin(self.tilt)[:, None, None]
-        x, y = (columns - xy[:, :1])[:, None, :], (rows - xy[:, 1:])[:, :, None]
-        return c * x + s * y, c * y - s * x
+    def _changes(self, *names: str) -> Array | None:
+        """The last of some columns as (k, 1, 1), if any value of them is not 0."""
+        given = [getattr(self, name) for name in names]
+        return self._of(names[-1]) if any(one is not None and one.any() for one in given) else None
 
-    @property
-    def _a(self) -> Array:
-        return self.along[:, None, None]
-
-    @property
-    def _b(self) -> Array:
-        return self.across[:, None, None]
-
-    @property
-    def _k(self) -> Array:
-        return self.curvature[:, None, None]
+    def _of(self, name: str) -> Array:
+        """A column as (k, 1, 1); zeros where it was not given."""
+        values = getattr(self, name)
+        return np.zeros((len(self), 1, 1)) if values is None else values[:, None, None]

@@ -80,6 +80,9 @@ class MatchOptions:
         Degree of the polynomial of the background: 1, or 2 in front of a scene.
     start_px : float
         Uncertainty of the approximate positions, pixels.
+    held : (float, float), optional
+        Standard deviations of x and y about the approximate positions, if these are known; by default half
+        the half side of the window.
     settled : float
         Iterations end when corrections fall below this share of their standard deviation. Images formed in
         single precision are not smooth enough for values below 0.05.
@@ -105,6 +108,7 @@ class MatchOptions:
     row_jitter_px: float = 0.0
     background: int = 1
     start_px: float = 1.0
+    held: tuple[float, float] | None = None
     settled: float = 0.01
     variance: tuple[float, float] | None = None
 
@@ -386,6 +390,8 @@ class Matches:
         Whether the adjustment converged.
     residuals : ndarray (k, rows, columns)
         Adjusted minus observed, NaN where a pixel was not used.
+    form_sigma : ndarray (k, m)
+        Standard deviations of `form`.
 
     Examples
     --------
@@ -393,7 +399,7 @@ class Matches:
     >>> xy, cov = np.array([[10.3, 9.6], [40.1, 9.8]]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
     >>> seen = np.array([1.0, 0.4])
     >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
-    ...                 one > 0, np.zeros((2, 17, 17)))
+    ...                 one > 0, np.zeros((2, 17, 17)), none)
     >>> len(marks.select(marks.seen > 0.5))
     1
     """
@@ -411,6 +417,7 @@ class Matches:
     rejected: Array
     converged: Mask
     residuals: Array
+    form_sigma: Array
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -506,7 +513,7 @@ def match(
         outline = GrownOutline(outline, np.zeros((0, 2, 2)) if form is None else form)
     patch = Patches(pixels, valid, outline, xy, options, claims, others)
     free = np.full(patch.form_at + patch.forms, np.inf)
-    free[[X, Y]], free[WIDTH] = np.array(options.half) / 2, options.psf_log_sigma
+    free[[X, Y]], free[WIDTH] = options.held or np.array(options.half) / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
     free[patch.ground.stop : patch.form_at] = options.contrast_slope or np.inf
     if form_sigma is not None:
@@ -634,6 +641,7 @@ def _columns(
         rejected=(flat * (patch.weights - used)).sum(axis=1) / sight,
         converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
         residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
+        form_sigma=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, patch.form_at :]),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,10 +12,20 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
-from ..matching import Matches, MatchOptions, Window, match
+from ..matching import MatchOptions, Window, match
 from .echoes import Echoes
 
-__all__ = ["ArcMatches", "ArcShape", "match_arcs"]
+__all__ = [
+    "BEAM",
+    "FURTHER",
+    "LINE",
+    "ArcMatches",
+    "ArcShape",
+    "Form",
+    "Windows",
+    "ends_of",
+    "lines_with",
+]
 
 _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
 """Half sides of windows, pixels; arcs of similar size are matched in one batch."""
@@ -21,19 +33,25 @@ _RELIABLE = 8.0
 """Minimum contrast over its standard deviation of an arc whose light is subtracted from others."""
 _MARGIN_PX = 4.0
 """Background shown by a window around an arc, pixels."""
-_FORM_SIGMA = np.array([0.5, 0.05, 0.3])
-"""Prior standard deviations: logarithm of the width along, sag at that width over it, tilt (rad)."""
+_BOLD = 5.0
+"""Bound of the logarithm of a width, for steps that an iteration tries and refuses."""
 _ACROSS_SIGMA = 0.5
 """Prior standard deviation of the logarithm of the width across."""
 _LAGS = 4
 """Distance in pixels, along both axes, up to which the autocorrelation of residuals is summed."""
-_NUMBERS = ("contrast", "t", "noise", "correlation", "seen", "rejected")
+_NUMBERS = (
+    *("xy", "cov", "contrast", "t", "noise", "correlation", "seen", "rejected", "converged", "pixels"),
+)
 _TIGHTENED = 0.2
 """Factor of these in a second attempt, where the first did not converge."""
 _ROUND = 1.5
 """Length over thickness below which a spot has no direction."""
 _OF_MOMENTS = 1.7
 """Approximate width of a Gaussian over that of its part above one third of its height."""
+_OF_LINES = 1.1
+"""The same of an even line."""
+_FLAT = 0.8
+"""Flatness with which the matching of a line starts."""
 _REACH = 2.6
 """Half size of a window, in widths of the arc."""
 _HALF_HIDDEN = 0.5
@@ -42,34 +60,81 @@ _WIDER_GAP_PX = 2
 """Width of the additional margin next to hidden pixels that is left out to test the position of an arc."""
 
 
+@dataclass(frozen=True)
+class Form:
+    """What is unknown about the form of an arc, beside its position and its width across.
+
+    Parameters
+    ----------
+    sigma : mapping of str to float
+        Prior standard deviations of the corrections to the start values: of the logarithm of `along`, or of
+        those of the `length` of a line and the `softness` of its ends; of the sag at the width along over
+        that width (`curvature`), of `tilt` (rad), and of `fading`, `tapering`, `thickening` and `saturation`,
+        see :class:`reseau.optics.Arcs`. What is not named is kept at its start value.
+    """
+
+    sigma: Mapping[str, float]
+
+    def with_(self, **sigma: float) -> Form:
+        """The same form with further unknowns, or with other standard deviations."""
+        return Form({**self.sigma, **sigma})
+
+    def tightened(self, factor: float) -> Form:
+        """The same form with priors that are tighter by a factor."""
+        return Form({name: factor * value for name, value in self.sigma.items()})
+
+
+BEAM = Form({"along": 0.5, "curvature": 0.05, "tilt": 0.3})
+"""The Gaussian profile of a beam."""
+LINE = Form({"length": 1.0, "softness": 1.0, "curvature": 0.15, "tilt": 0.3})
+"""An even line with soft ends."""
+FURTHER = {"fading": 0.5, "tapering": 0.4, "thickening": 0.2, "saturation": 2.0}
+"""Deviations from these and their prior standard deviations."""
+_COLUMNS = ("along", "curvature", "tilt", "flatness", *FURTHER)
+"""Order of the derivatives of :class:`reseau.optics.Arcs`, after x, y and `across`."""
+_ALONG, _CURVATURE, _FLATNESS = (3 + _COLUMNS.index(name) for name in ("along", "curvature", "flatness"))
+
+
 @dataclass(frozen=True, eq=False)
 class ArcShape:
-    """Arcs as functions of corrections: logarithm of the width along, sag over that width, tilt.
+    """Arcs as functions of the corrections that a form leaves free.
 
     The width of the point-spread function is that of the arc across.
 
     Parameters
     ----------
     start : Arcs (k,)
-        Approximate arcs.
+        Approximate arcs, with all their columns.
+    free : tuple of str
+        Names of the unknowns of the form.
     """
 
     start: Arcs
+    free: tuple[str, ...]
 
     @property
     def parameters(self) -> int:
         """Number of parameters of the form."""
-        return 3
+        return len(self.free)
 
     def arcs(self, width: Array, form: Array, at: Rows) -> Arcs:
-        """The arcs `at` with widths across (m,) and corrections (m, 3)."""
-        s = self.start
-        return Arcs(
-            s.along[at] * np.exp(form[:, 0]),
-            width,
-            s.curvature[at] + form[:, 1] / s.along[at],
-            s.tilt[at] + form[:, 2],
-        )
+        """The arcs `at` with widths across (m,) and corrections (m, p)."""
+        s = self.start.select(at)
+        columns = {name: getattr(s, name) for name in _COLUMNS}
+        values = dict(zip(self.free, form.T, strict=True))
+        if "along" in values:
+            columns["along"] = s.along * np.exp(np.clip(values.pop("along"), -_BOLD, _BOLD))
+        if "curvature" in values:
+            columns["curvature"] = s.curvature + values.pop("curvature") / s.along
+        if "length" in values:
+            half, soft = ends_of(s)
+            half = half * np.exp(np.clip(values.pop("length"), -_BOLD, _BOLD))
+            soft = soft * np.exp(np.clip(values.pop("softness"), -_BOLD, _BOLD))
+            columns["along"] = np.sqrt(half**2 / 3 + soft**2)
+            columns["flatness"] = half**2 / 3 / columns["along"] ** 2
+        for name, value in values.items():
+            columns[name] = columns[name] + value
+        return Arcs(across=width, **columns)
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.measure.matching.shapes.Shape`."""
@@ -79,9 +144,21 @@ class ArcShape:
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`reseau.measure.matching.shapes.Shape`."""
-        image, parts = self.arcs(width, form, at).derivatives(xy, window.columns, window.rows)
-        parts[:, 4] /= self.start.along[at, None, None]
-        return image, parts
+        arcs = self.arcs(width, form, at)
+        image, parts = arcs.derivatives(xy, window.columns, window.rows)
+        rows = []
+        assert arcs.flatness is not None
+        flat = arcs.flatness[:, None, None]
+        for name in self.free:
+            if name == "length":
+                rows.append(flat * parts[:, _ALONG] + 2 * parts[:, _FLATNESS])
+            elif name == "softness":
+                rows.append((1 - flat) * parts[:, _ALONG] - 2 * parts[:, _FLATNESS])
+            elif name == "curvature":
+                rows.append(parts[:, _CURVATURE] / self.start.along[at, None, None])
+            else:
+                rows.append(parts[:, 3 + _COLUMNS.index(name)])
+        return image, np.concatenate([parts[:, :3], np.stack(rows, axis=1)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +169,12 @@ class ArcMatches:
     ----------
     xy, cov, contrast, t, noise, correlation, seen, rejected, converged : ndarray
         As in :class:`reseau.measure.matching.Matches`; `cov` is corrected for correlated residuals.
-    form : Arcs
+    pixels : ndarray (m,)
+        Number of pixels that are as good as independent.
+    arcs : Arcs
         The matched arcs.
+    sigma : dict of str to ndarray (m,)
+        Standard deviations of the unknowns of the form.
     """
 
     xy: Array
@@ -105,13 +186,30 @@ class ArcMatches:
     seen: Array
     rejected: Array
     converged: Mask
-    form: Arcs
+    pixels: Array
+    arcs: Arcs
+    sigma: dict[str, Array]
+
+    def replaced(self, rows: Rows, other: ArcMatches) -> ArcMatches:
+        """These matches with `rows` replaced by others."""
+        columns: dict[str, Any] = {}
+        for name in _NUMBERS:
+            columns[name] = getattr(self, name).copy()
+            columns[name][rows] = getattr(other, name)
+        sigma = {name: values.copy() for name, values in self.sigma.items()}
+        for name in other.sigma:
+            sigma.setdefault(name, np.zeros(len(self.xy)))
+        for name, values in sigma.items():
+            values[rows] = other.sigma.get(name, 0.0)
+        return ArcMatches(**columns, arcs=_replaced(self.arcs, rows, other.arcs), sigma=sigma)
+
+    def moved(self, before: ArcMatches, rows: Rows) -> Array:
+        """Shifts (k, 2) from the `rows` of other matches to these; NaN where these did not converge."""
+        return np.where(self.converged[:, None], self.xy - before.xy[rows], np.nan)
 
 
-def match_arcs(
-    grey: NDArray[np.float32], valid: Mask, echoes: Echoes, at: Rows, options: MatchOptions, noise: float
-) -> ArcMatches:
-    """Match the echoes `at`, grouped by size.
+class Windows:
+    """Arcs of a frame and the windows in which they are matched, grouped by size.
 
     Parameters
     ----------
@@ -128,27 +226,6 @@ def match_arcs(
     noise : float
         Standard deviation of the grey values.
     """
-    work = _Matching(grey, valid, echoes, at, options, noise)
-    found = _in_order(work.all(), len(at))
-    touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
-    if len(touching):
-        # It is unknown how the instrument combines overlapping echoes: behind a logarithmic amplifier the
-        # stronger one is shown; otherwise their sum. The first match assumed the former; the difference to
-        # the latter is added to the uncertainty.
-        pulled = work.shift_without_others(touching, found)
-        found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
-    half_hidden = np.flatnonzero((work.hidden_flanks(found) > _HALF_HIDDEN) & found.converged)
-    if len(half_hidden):
-        # If one flank of an arc is hidden, its centre follows from the shape of the other. Effects of raster
-        # lines or reverberation on this shape no longer cancel and are not noise of single pixels. Their size
-        # is estimated by leaving out slightly more of the arc.
-        pulled = work.shift_with_wider_gap(half_hidden, found)
-        found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
-    return found
-
-
-class _Matching:
-    """Arcs of a frame and their windows."""
 
     def __init__(
         self,
@@ -161,31 +238,59 @@ class _Matching:
     ) -> None:
         self.grey, self.valid, self.echoes, self.at = grey, valid, echoes, at
         self.options, self.noise = options, noise
-        self.start = _start(echoes, at)
+        self.start, self.start_of_lines = _starts(echoes, at)
         self.half = _half_sides(self.start)
 
-    def all(self) -> list[tuple[Rows, Matches, Arcs]]:
-        """Match every arc, excluding the pixels of others."""
-        parts = []
-        for rows in self._of_like_size(np.arange(len(self.at))):
-            parts.append(self._adjusted(rows, self.start, self.echoes.xy[self.at], _FORM_SIGMA))
-            # A round spot has no tilt: if it does not converge, tighten the prior of the form.
-            again = rows[~parts[-1][1].converged]
-            if len(again):
-                parts.append(
-                    self._adjusted(again, self.start, self.echoes.xy[self.at], _TIGHTENED * _FORM_SIGMA)
-                )
-        return parts
+    def resized(self, arcs: Arcs) -> None:
+        """Let the windows have the size of these arcs (m,)."""
+        self.half = _half_sides(arcs)
 
-    def shift_without_others(self, touching: Rows, found: ArcMatches) -> Array:
+    @property
+    def every(self) -> Rows:
+        """Rows of all echoes to be matched."""
+        return np.arange(len(self.at))
+
+    def matched(
+        self, rows: Rows, form: Form, start: Arcs, xy: Array, valid: Mask | None = None
+    ) -> ArcMatches:
+        """Match the arcs `rows`, excluding the pixels of others.
+
+        Parameters
+        ----------
+        rows : ndarray of int (k,)
+            Which ones.
+        form : Form
+            What is unknown of their form.
+        start, xy : Arcs (k,), ndarray (k, 2)
+            Where to start.
+        valid : ndarray (h, w) of bool, optional
+            Pixels that may be used, if these are others.
+        """
+        parts = []
+        for part in self._of_like_size(rows):
+            here = np.searchsorted(rows, part)
+            found = self._adjusted(part, form, start.select(here), xy[here], valid=valid)
+            # A round spot has no tilt: if it does not converge, tighten the prior of the form.
+            again = np.flatnonzero(~found.converged)
+            if len(again):
+                which = here[again]
+                found = found.replaced(
+                    again,
+                    self._adjusted(
+                        part[again], form.tightened(_TIGHTENED), start.select(which), xy[which], valid=valid
+                    ),
+                )
+            parts.append((here, found))
+        return _merged(parts, len(rows))
+
+    def shift_without_others(self, touching: Rows, found: ArcMatches, form: Form) -> Array:
         """Shifts (m, 2) of arcs if the light of others is subtracted instead of excluded."""
         modelled = found.converged & (found.t > _RELIABLE)
         pulled = np.zeros((len(touching), 2))
         for rows in self._of_like_size(touching):
             others = np.stack([self._light_of_others(k, found, modelled) for k in rows])
-            _, again, _ = self._adjusted(rows, found.form, found.xy, _FORM_SIGMA, others, modelled)
-            moved = np.where(again.converged[:, None], again.xy - found.xy[rows], np.nan)
-            pulled[np.searchsorted(touching, rows)] = moved
+            again = self._adjusted(rows, form, found.arcs.select(rows), found.xy[rows], others, modelled)
+            pulled[np.searchsorted(touching, rows)] = again.moved(found, rows)
         return pulled
 
     def hidden_flanks(self, found: ArcMatches) -> Array:
@@ -193,7 +298,7 @@ class _Matching:
         share = np.zeros(len(self.at))
         for rows in self._of_like_size(np.flatnonzero(found.converged)):
             window = self._window(rows, found.xy[rows])
-            _, parts = found.form.select(rows).derivatives(found.xy[rows], *window)
+            _, parts = found.arcs.select(rows).derivatives(found.xy[rows], *window)
             columns, lines = (np.rint(axis).astype(np.intp) for axis in window)
             height, width = self.valid.shape
             shown = self.valid[
@@ -204,16 +309,102 @@ class _Matching:
                 share[rows] = np.maximum(share[rows], hidden.max(axis=1))
         return share
 
-    def shift_with_wider_gap(self, half_hidden: Rows, found: ArcMatches) -> Array:
+    def hidden_ends(self, found: ArcMatches) -> Array:
+        """Hidden shares of both ends of each arc, (m, 2)."""
+        arcs = found.arcs
+        half, soft = ends_of(arcs)
+        across = np.linspace(-1.5, 1.5, 7)
+        u, v = (grid.ravel() for grid in np.meshgrid(across, across))
+        c, s = np.cos(arcs.tilt)[:, None], np.sin(arcs.tilt)[:, None]
+        height, width = self.valid.shape
+        share = np.zeros((len(self.at), 2))
+        for k, side in enumerate((-1.0, 1.0)):
+            along = side * half[:, None] + soft[:, None] * u
+            down = 0.5 * arcs.curvature[:, None] * along**2 + arcs.across[:, None] * v
+            x = found.xy[:, :1] + c * along - s * down
+            y = found.xy[:, 1:] + s * along + c * down
+            column, row = (np.nan_to_num(np.rint(at), nan=-1).astype(np.intp) for at in (x, y))
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            seen = inside & self.valid[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+            share[:, k] = 1 - seen.mean(axis=1)
+        return share
+
+    def costs_of_ends(
+        self, found: ArcMatches, row: int, side: float, steps: Array, tilt: tuple[float, float]
+    ) -> tuple[Array, Array, float]:
+        """Squared residuals over their variance, with one end of a line displaced along its curve.
+
+        Parameters
+        ----------
+        found : ArcMatches
+            The matches.
+        row : int
+            Which line.
+        side : float
+            1 for the end in the direction of the tilt, -1 for the other.
+        steps : ndarray (n,)
+            Displacements of the end outwards, pixels.
+        tilt : (float, float)
+            Expected tilt, and its standard deviation.
+
+        Returns
+        -------
+        costs : ndarray (n,)
+            Infinite where nothing would be left of the line.
+        middles : ndarray (n, 2)
+            The middle of the line.
+        variance : float
+            Variance of the middle due to the other end alone.
+        """
+        one = found.arcs.select(np.full(len(steps), row))
+        half, soft = ends_of(one)
+        longer = half + steps / 2
+        possible = longer > soft
+        longer = np.maximum(longer, soft)
+        moved = 0.5 * side * steps
+        turned = one.tilt + one.curvature * moved
+        course = 0.5 * (one.tilt + turned)
+        middles = found.xy[row] + moved[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
+        arcs = replace(lines_with(longer, soft, one), tilt=turned)
+        window = tuple(
+            np.broadcast_to(axis, (len(steps), axis.shape[1]))
+            for axis in self._window(np.array([row]), found.xy[[row]])
+        )
+        columns, lines = (np.rint(axis[0]).astype(np.intp) for axis in window)
+        height, width = self.valid.shape
+        at = np.ix_(np.clip(lines, 0, height - 1), np.clip(columns, 0, width - 1))
+        inside = ((lines >= 0) & (lines < height))[:, None] & ((columns >= 0) & (columns < width))
+        owner = self.echoes.claimed[at]
+        used = inside & self.valid[at] & ((owner < 0) | (owner == self.at[row]))
+        grey, images = self.grey[at][used].astype(np.float64), arcs.image(middles, *window)[:, used]
+        y, x = np.nonzero(used)
+        plane = np.stack([np.ones(len(x)), (x - x.mean()) / width, (y - y.mean()) / height])
+        # Brightness and background by least squares for every place of the end.
+        design = np.concatenate([images[:, None], np.broadcast_to(plane, (len(steps), *plane.shape))], axis=1)
+        normal = design @ np.swapaxes(design, 1, 2) + 1e-9 * np.eye(4)
+        solved = np.linalg.solve(normal, (design @ grey)[..., None])[..., 0]
+        variance = found.noise[row] ** 2 * used.sum() / max(found.pixels[row], 1.0)
+        rest = (grey - np.einsum("np,npk->nk", solved, design)) ** 2 / variance
+        costs = np.minimum(rest, self.options.rejection**2).sum(axis=1)
+        costs += ((turned - tilt[0]) / tilt[1]) ** 2
+        # The derivative with respect to the end that is seen.
+        middle = np.array([len(steps) // 2])
+        _, parts = one.select(middle).derivatives(found.xy[[row]], window[0][:1], window[1][:1])
+        c, s = np.cos(one.tilt[0]), np.sin(one.tilt[0])
+        shift = found.contrast[row] * (c * parts[0, 0] + s * parts[0, 1])
+        u = c * (window[0][:1] - found.xy[row, 0]) + s * (window[1][:1] - found.xy[row, 1]).T
+        seen = used & (side * u < 0)
+        information = float((shift[seen] ** 2).sum()) / variance
+        return np.where(possible, costs, np.inf), middles, 0.25 / max(information, 1e-12)
+
+    def shift_with_wider_gap(self, half_hidden: Rows, found: ArcMatches, form: Form) -> Array:
         """Shifts (m, 2) of arcs if the pixels next to hidden ones are left out, too."""
         side = 2 * _WIDER_GAP_PX + 1
         less = cv2.erode(self.valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-        pulled = np.zeros((len(half_hidden), 2))
-        for rows in self._of_like_size(half_hidden):
-            _, again, _ = self._adjusted(rows, found.form, found.xy, _FORM_SIGMA, valid=less)
-            moved = np.where(again.converged[:, None], again.xy - found.xy[rows], np.nan)
-            pulled[np.searchsorted(half_hidden, rows)] = moved
-        return pulled
+        again = self.matched(
+            half_hidden, form, found.arcs.select(half_hidden), found.xy[half_hidden], valid=less
+        )
+        return again.moved(found, half_hidden)
 
     def _window(self, rows: Rows, xy: Array) -> tuple[Array, Array]:
         """Columns and rows of the pixels around arcs of one size, (k, c) and (k, r)."""
@@ -228,12 +419,12 @@ class _Matching:
     def _light_of_others(self, arc: int, found: ArcMatches, modelled: Mask) -> Array:
         """Light of the other arcs in the window of one, (rows, columns)."""
         window = self._window(np.array([arc]), found.xy[[arc]])
-        reach = 5 * found.form.along + 5 * found.form.across
+        reach = 5 * found.arcs.along + 5 * found.arcs.across
         off = np.abs(found.xy - np.rint(found.xy[arc]))
         near = (off < reach[:, None] + self.half[arc]).all(axis=1) & modelled
         near[arc] = False
         others = np.flatnonzero(near)
-        image = found.form.select(others).image(
+        image = found.arcs.select(others).image(
             found.xy[others], *(np.broadcast_to(axis, (len(others), axis.shape[1])) for axis in window)
         )
         return np.asarray(np.tensordot(found.contrast[others], image, axes=1))
@@ -241,15 +432,15 @@ class _Matching:
     def _adjusted(
         self,
         rows: Rows,
+        form: Form,
         start: Arcs,
         xy: Array,
-        form_sigma: Array,
         others: Array | None = None,
         modelled: Mask | None = None,
         valid: Mask | None = None,
-    ) -> tuple[Rows, Matches, Arcs]:
+    ) -> ArcMatches:
         """Match the arcs `rows`, all with the same size of window."""
-        shape = ArcShape(start.select(rows))
+        shape = ArcShape(start, tuple(form.sigma))
         owner = self.echoes.claimed
         if modelled is not None:
             open_ = np.append(np.zeros(len(self.echoes), dtype=bool), True)
@@ -258,7 +449,7 @@ class _Matching:
         windowed = replace(
             self.options,
             half_px=(int(self.half[rows[0], 0]), int(self.half[rows[0], 1])),
-            psf_px=shape.start.across,
+            psf_px=start.across,
             psf_log_sigma=_ACROSS_SIGMA,
             polarity="bright",
         )
@@ -266,18 +457,38 @@ class _Matching:
             self.grey,
             self.valid if valid is None else valid,
             shape,
-            xy[rows],
+            xy,
             windowed,
             noise=self.noise,
-            form_sigma=form_sigma,
+            form_sigma=np.array(list(form.sigma.values())),
             claims=(owner, self.at[rows]),
             others=others,
         )
-        return rows, found, shape.arcs(found.psf_px, found.form, np.arange(len(rows)))
+        inflation = _inflation(found.residuals)
+        arcs = shape.arcs(found.psf_px, found.form, np.arange(len(rows)))
+        # An arc rotated by 180° with opposite curvature is the same arc; its ends change places.
+        turns = np.round(arcs.tilt / np.pi)
+        sign = np.where(turns % 2 == 0, 1.0, -1.0)
+        assert arcs.fading is not None
+        return ArcMatches(
+            **{name: getattr(found, name) for name in _NUMBERS if name not in ("cov", "pixels")},
+            cov=found.cov * inflation[:, None, None],
+            pixels=np.isfinite(found.residuals).sum(axis=(1, 2)) / inflation,
+            arcs=replace(
+                arcs,
+                tilt=arcs.tilt - np.pi * turns,
+                curvature=arcs.curvature * sign,
+                fading=arcs.fading * sign,
+            ),
+            sigma={
+                name: np.sqrt(inflation) * values
+                for name, values in zip(form.sigma, found.form_sigma.T, strict=True)
+            },
+        )
 
 
-def _start(echoes: Echoes, at: Rows) -> Arcs:
-    """Approximate arcs from the moments of the light."""
+def _starts(echoes: Echoes, at: Rows) -> tuple[Arcs, Arcs]:
+    """Approximate arcs from the moments of the light, as beams and as lines."""
     long, wide, tilt = echoes.length[at], echoes.thickness[at], echoes.tilt[at]
     # A spot without direction starts horizontal, like the echo of a rod.
     round_ = long < _ROUND * wide
@@ -287,12 +498,27 @@ def _start(echoes: Echoes, at: Rows) -> Arcs:
     along, across = (_OF_MOMENTS / 4 * values for values in (long, wide))
     # The moments determine the curvature of a short arc poorly; its matching starts with a straight one.
     bend = np.clip(echoes.curvature[at] * along, -0.3, 0.3) * (long > 2 * wide)
-    return Arcs(along, across, bend / along, tilt)
+    beams = Arcs(along, across, bend / along, tilt, *np.zeros((5, len(at))))
+    shorter = _OF_LINES / _OF_MOMENTS * along
+    return beams, replace(beams, along=shorter, flatness=np.full(len(at), _FLAT))
+
+
+def ends_of(arcs: Arcs) -> tuple[Array, Array]:
+    """Half lengths of lines, and widths of their ends, (k,)."""
+    assert arcs.flatness is not None
+    return arcs.along * np.sqrt(3 * arcs.flatness), arcs.along * np.sqrt(1 - arcs.flatness)
+
+
+def lines_with(half: Array, soft: Array, arcs: Arcs) -> Arcs:
+    """The arcs as lines of half lengths (k,) with ends of widths (k,)."""
+    along = np.sqrt(half**2 / 3 + soft**2)
+    return replace(arcs, along=along, flatness=half**2 / 3 / along**2)
 
 
 def _half_sides(start: Arcs) -> Rows:
     """Half sides of the windows (k, 2), from a few sizes."""
-    u, v = _REACH * start.along, _REACH * start.across
+    half, soft = ends_of(start)
+    u, v = half + _REACH * soft, _REACH * start.across
     v = v + 0.5 * np.abs(start.curvature) * u**2
     c, s = np.abs(np.cos(start.tilt)), np.abs(np.sin(start.tilt))
     reach = np.stack([np.hypot(c * u, s * v), np.hypot(s * u, c * v)], axis=1) + _MARGIN_PX
@@ -323,26 +549,30 @@ def _inflation(residuals: Array) -> Array:
     return total
 
 
-def _in_order(parts: list[tuple[Rows, Matches, Arcs]], count: int) -> ArcMatches:
-    """Columns in the order of the echoes."""
+def _merged(parts: list[tuple[Rows, ArcMatches]], count: int) -> ArcMatches:
+    """Columns of matches from parts of them."""
+    names = {name for _, found in parts for name in found.sigma}
 
-    def column(name: str, tail: tuple[int, ...] = ()) -> Array:
-        values = np.empty((count, *tail))
-        for rows, found, arcs in parts:
-            values[rows] = getattr(found if hasattr(found, name) else arcs, name)
-        return values
+    def column(values: list[Array], tail: tuple[int, ...] = (), dtype: type = float) -> Array:
+        whole = np.zeros((count, *tail), dtype=dtype)
+        for (rows, _), part in zip(parts, values, strict=True):
+            whole[rows] = part
+        return whole
 
-    cov = column("cov", (2, 2))
-    for rows, found, _ in parts:
-        cov[rows] *= _inflation(found.residuals)[:, None, None]
-    tilt, curvature = column("tilt"), column("curvature")
-    # An arc rotated by 180° with opposite curvature is the same arc.
-    turns = np.round(tilt / np.pi)
-    tilt, curvature = tilt - np.pi * turns, curvature * np.where(turns % 2 == 0, 1.0, -1.0)
-    return ArcMatches(
-        xy=column("xy", (2,)),
-        cov=cov,
-        **{name: column(name) for name in _NUMBERS},
-        converged=column("converged") > 0,
-        form=Arcs(column("along"), column("across"), curvature, tilt),
-    )
+    tails: dict[str, tuple[int, ...]] = {"xy": (2,), "cov": (2, 2)}
+    columns: dict[str, Any] = {
+        name: column([getattr(found, name) for _, found in parts], tails.get(name, ())) for name in _NUMBERS
+    }
+    columns["converged"] = columns["converged"] > 0
+    arcs = {f.name: column([getattr(found.arcs, f.name) for _, found in parts]) for f in fields(Arcs)}
+    sigma = {name: column([found.sigma[name] for _, found in parts]) for name in sorted(names)}
+    return ArcMatches(**columns, arcs=Arcs(**arcs), sigma=sigma)
+
+
+def _replaced(arcs: Arcs, rows: Rows, other: Arcs) -> Arcs:
+    """Arcs with `rows` replaced by others."""
+    columns = {}
+    for f in fields(Arcs):
+        columns[f.name] = getattr(arcs, f.name).copy()
+        columns[f.name][rows] = getattr(other, f.name)
+    return Arcs(**columns)

@@ -6,10 +6,6 @@
 4. Test each by its own image and by the other spots. Rejected spots are reported with the reason.
 
 y is measured on the line, x at its centre (Wishahy: "the pin's images appear as horizontal curved lines").
-
-Phosphor, tube and lens reduce the light towards the corners, of the image and of the raster's glow alike.
-Over the length of an echo this is a slope that shifts its centre to the brighter side, by the relative slope
-times the square of its width. The falloff is estimated from the glow between the echoes.
 """
 
 from __future__ import annotations
@@ -27,72 +23,16 @@ from ...core.failure import Code
 from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
-from .arcs import ArcMatches, match_arcs
-from .echoes import Echoes, Grey, find_echoes, ground_of
+from .arcs import ArcMatches, ends_of
+from .echoes import Echoes, find_echoes, ground_of
+from .forms import match_arcs
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
+from .screenlight import blur_of_wires, falloff
 
 if TYPE_CHECKING:
     from ...core.overlay import Layer
 
-__all__ = ["PinDetections", "PinOptions", "falloff", "find_pins"]
-
-_STEP = 20
-"""Distance of the places at which the glow is sampled, pixels."""
-_INSIDE = 0.08
-"""Margin of the reseau's extent that is not sampled, as a share: the screen may end there."""
-_LEAST = 10.0
-"""Minimum glow of a lit raster over the noise."""
-_ROUGH = 0.1
-"""Largest scatter of the glow about a parabola, as a share of it; a larger one belongs to an image."""
-_LIMITS = (0.5, 2.0)
-
-
-def falloff(ground: Grey, hidden: Mask, noise: float) -> Grey | None:
-    """Light of the raster relative to the centre: a paraboloid fitted to the glow between the echoes.
-
-    Parameters
-    ----------
-    ground : ndarray (h, w)
-        The frame without small structures.
-    hidden : ndarray (h, w) of bool
-        Pixels covered by a reseau; the raster is sampled within its extent.
-    noise : float
-        Standard deviation of the grey values.
-
-    Returns
-    -------
-    ndarray (h, w) or None
-        None if no raster is lit, or too little of it is visible.
-    """
-    ends = [np.flatnonzero(hidden.any(axis=axis))[[0, -1]] for axis in (0, 1) if hidden.any()]
-    lengths = [int(high - low) for low, high in ends]
-    if not ends or min(lengths) < 8 * _STEP:
-        return None
-    x, y = (
-        np.arange(low + _INSIDE * n, high - _INSIDE * n, _STEP).astype(np.intp)
-        for (low, high), n in zip(ends, lengths, strict=True)
-    )
-    h, w = ground.shape
-    middle, size = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
-    u, v = np.meshgrid((x - middle[0]) / size, (y - middle[1]) / size)
-    glow = ground[np.ix_(y, x)].astype(np.float64).ravel()
-    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
-    weight: Array = np.ones_like(glow)
-    values: Array = np.zeros(6)
-    scatter = np.inf
-    for _ in range(6):  # Tukey's weights reject places where an echo is as wide as the window of the ground
-        found = np.linalg.lstsq(design * weight[:, None], glow * weight, rcond=None)[0]
-        values = np.asarray(found, dtype=np.float64)
-        off = np.abs(glow - design @ values)
-        scatter = float(max(1.4826 * np.median(off), 1e-3 * noise))
-        weight = np.clip(1 - (off / (5 * scatter)) ** 2, 0, None)
-    if values[0] < _LEAST * noise or scatter > _ROUGH * values[0]:
-        return None
-    across, down = (np.arange(w) - middle[0]) / size, ((np.arange(h) - middle[1]) / size)[:, None]
-    c = values / values[0]
-    light = 1 + c[1] * across + c[2] * down + c[3] * across**2 + c[4] * across * down + c[5] * down**2
-    return np.asarray(np.clip(light, *_LIMITS), dtype=np.float32)
-
+__all__ = ["PinDetections", "PinOptions", "find_pins"]
 
 _UPRIGHT_FROM = 1.8
 """Minimum length over thickness from which the direction of an arc is determined."""
@@ -128,7 +68,8 @@ class PinOptions:
     most_touching : float
         A spot must not touch another above this share of its height.
     sharpest_px : float
-        Minimum width (one sigma) of an echo across; sharper lines are drawn by the instrument.
+        Minimum width (one sigma) of an echo across, and of its ends; sharper lines are drawn by the
+        instrument.
     least_seen, most_rejected : float
         Minimum share of an arc in the frame; largest share that may be rejected as disturbed.
     most_wire_px : int
@@ -155,7 +96,7 @@ class PinOptions:
     least_correlation: float = 0.92
     most_touching: float = 0.6
     sharpest_px: float = 0.66
-    least_seen: float = 0.6
+    least_seen: float = 0.4
     most_rejected: float = 0.35
     most_wire_px: int = 5
     most_sigma_px: float = 0.5
@@ -316,8 +257,11 @@ def find_pins(
     screened = screen(frame, run=None)
     longest = o.most_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
-    if hidden is not None and (dim := falloff(ground, hidden, screened.noise)) is not None:
-        screened, ground = replace(screened, grey=screened.grey / dim), ground / dim
+    blur = None
+    if hidden is not None:
+        blur = blur_of_wires(screened.grey, hidden, screened.noise)
+        if (dim := falloff(ground, hidden, screened.noise)) is not None:
+            screened, ground = replace(screened, grey=screened.grey / dim), ground / dim
     light = screened.grey - ground
     least = max(2.5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
     covered = find_cuts(light, screened.noise, o.most_wire_px)
@@ -325,7 +269,7 @@ def find_pins(
         covered |= hidden
     echoes = find_echoes(bridged(light, covered), o.psf_px, least)
     open_ = replace(screened, valid=screened.valid & ~covered)
-    return _Judge(frame, open_, echoes, longest, o, tuple(others)).verdict()
+    return _Judge(frame, open_, echoes, longest, o, tuple(others), blur).verdict()
 
 
 class _Judge:
@@ -339,7 +283,9 @@ class _Judge:
         longest: float,
         options: PinOptions,
         others: tuple[Frame, ...],
+        blur: tuple[float, float] | None,
     ) -> None:
+        self.blur = blur
         self.frame, self.screened, self.echoes, self.options = frame, screened, echoes, options
         self.longest = longest
         self.still = same_in_all(frame, others)
@@ -404,7 +350,7 @@ class _Judge:
         s = self.screened
         # The hidden part of an echo is assumed to be about as bright as the visible part.
         options = MatchOptions(contrast_sigma=self.frame.full_scale)
-        return match_arcs(s.grey, s.valid, self.echoes, at, options, max(s.noise, 0.3))
+        return match_arcs(s.grey, s.valid, self.echoes, at, options, max(s.noise, 0.3), self.blur)
 
     def _objections(self, at: Rows, found: ArcMatches) -> list[tuple[Mask, Reason]]:
         """Objections to spots from their own images, the most serious first."""
@@ -415,14 +361,14 @@ class _Judge:
         moved = np.hypot(*(found.xy - e.xy[at]).T) > np.maximum(3.0, 0.5 * e.length[at])
         border = np.array([self.frame.width, self.frame.height]) - 1
         outside = ((found.xy < 0) | (found.xy > border)).any(axis=1)
-        near = (np.minimum(found.xy, border - found.xy) < 2 * found.form.along[:, None] + 2).any(axis=1)
+        near = (np.minimum(found.xy, border - found.xy) < 2 * found.arcs.along[:, None] + 2).any(axis=1)
         unseen = found.seen < o.least_seen
         return [
             (outside | (unseen & near), Reason("cut off by the edge of the frame", Code.OUTSIDE)),
             (unseen, Reason("largely hidden by a wire or a neighbour", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
             (
-                found.form.across < o.sharpest_px,
+                (found.arcs.across < o.sharpest_px) | (ends_of(found.arcs)[1] < o.sharpest_px),
                 Reason("sharper than an echo: drawn by the instrument", Code.DRAWN),
             ),
             (self._likeness(found) < o.least_correlation, Reason("not the image of an arc", Code.UNLIKE)),
@@ -432,7 +378,7 @@ class _Judge:
             ),
             (moved, Reason("the match moved away from the spot", Code.DEVIATES)),
             (upright, Reason("too steep for the arc of a pin", Code.UNLIKE)),
-            (4 * found.form.along > 1.6 * self.longest, Reason("longer than a pin", Code.UNLIKE)),
+            (4 * found.arcs.along > 1.6 * self.longest, Reason("longer than a pin", Code.UNLIKE)),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
@@ -445,7 +391,8 @@ class _Judge:
     def _looks_drawn(self, at: Rows, found: ArcMatches) -> Mask:
         suspect = np.zeros(len(self.echoes), dtype=bool)
         suspect[at] = (self._likeness(found) < self.options.least_correlation) | (
-            found.form.across < self.options.sharpest_px
+            (found.arcs.across < self.options.sharpest_px)
+            | (ends_of(found.arcs)[1] < self.options.sharpest_px)
         )
         return suspect
 
@@ -461,7 +408,7 @@ class _Judge:
         xy[at] = np.where(np.isfinite(found.xy), found.xy, e.xy[at])
         names = [f.name for f in fields(found) if f.name in PinDetections.__dataclass_fields__]
         columns = {name: spread(getattr(found, name)) for name in names if name != "xy"}
-        arcs = found.form
+        arcs = found.arcs
         return PinDetections(
             image=self.frame.name,
             sha256=self.frame.sha256,

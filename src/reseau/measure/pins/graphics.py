@@ -157,6 +157,8 @@ _SOFT = 0.1
 """Largest ratio of squared steps along the rows to squared light in an echo: a Gaussian of 2.2 px."""
 _FILL_PX = 2.0
 """Width of the Gaussian that interpolates light across a wire."""
+_LYING_PX = 25
+"""Length of a wire that runs along rows or columns, pixels; others are narrower."""
 _SLENDER = 1.0
 """Minimum height over width of the dark gap of a wire, as opposed to the space between two echoes."""
 
@@ -238,4 +240,16 @@ def bridged(light: Grey, hidden: Mask) -> Grey:
         cv2.GaussianBlur(image, (0, 0), _FILL_PX, sigmaY=0.3) for image in (seen, seen * light)
     )
     filled: Grey = np.where(hidden & (weight > 1e-3), carried / np.maximum(weight, 1e-3), light)
-    return filled
+    # Beneath a wire along the rows nothing is seen on either side; the wire itself may be bright.
+    weight, carried = (
+        cv2.GaussianBlur(image, (0, 0), 0.3, sigmaY=_FILL_PX) for image in (seen, seen * light)
+    )
+    along = hidden & _lying(hidden)
+    return np.where(along, carried / np.maximum(weight, 1e-3), filled).astype(np.float32)
+
+
+def _lying(hidden: Mask) -> Mask:
+    """Hidden pixels in runs along the rows that are longer than those along the columns."""
+    bar = np.ones((1, _LYING_PX), np.uint8)
+    rows, columns = (cv2.morphologyEx(hidden.astype(np.uint8), cv2.MORPH_OPEN, k) for k in (bar, bar.T))
+    return np.asarray((rows > 0) & (columns == 0))

@@ -1,0 +1,321 @@
+"""The form of the echoes of a frame: chosen by their images, and what the echoes have in common.
+
+The echoes of a frame come from one instrument: they are all beams or all even lines, fade towards the same
+end, have ends of the same softness. What the clear ones tell is the prior of the others, with the scatter
+between echoes as its standard deviation. It matters where a wire hides an end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.data import Array, Mask, Rows
+from ...optics import Arcs
+from ..matching import MatchOptions
+from .arcs import BEAM, FURTHER, LINE, ArcMatches, Form, Windows, ends_of, lines_with
+from .echoes import Echoes
+
+__all__ = ["match_arcs"]
+
+_CLEAR = 10.0
+"""Minimum contrast over its standard deviation of an echo by which a form is chosen."""
+_WHOLE, _LONG = 0.9, 1.5
+"""Minimum visible share of such an echo, and minimum of its width along over that across."""
+_MOST = 40
+"""Largest number of echoes that tell what all have in common, the brightest."""
+_FEW = 16
+"""Number of these by which forms are compared."""
+_EVIDENCE, _EACH = 12.0, 3.0
+"""Minimum of twice the logarithm of the ratio of likelihoods by which a form must be better, and what is
+subtracted from it for every echo."""
+_EXPLAINED = 0.6
+"""Share of the squared residuals beyond the noise that another form than a beam must explain."""
+_IMPROVED = 0.7
+"""Share of the clear echoes that it must explain better: they are all of one form."""
+_PLAUSIBLE = 3.0
+"""Largest median deviation from a form, over its prior standard deviation."""
+_SHARED = 6
+"""Minimum number of clear echoes that determine what all have in common; for their tilt, twice as many."""
+_LEAST_SCATTER = {"softness": 0.01, "tilt": 0.002, "fading": 0.01, "tapering": 0.01, "thickening": 0.01}
+"""Smallest scatter between echoes that is assumed."""
+_BLUR_SHARE = 0.25
+"""Standard deviation of an unknown blur's variance, as a share of that of the width across."""
+_COURSE = 27 / 560
+"""Half the shift of the middle of a line, over κ³a⁴, between fits of a parabola and of a hyperbola."""
+_BOLD_PX = 10.0
+_ORDER = 0.7
+"""Uncertainty of the order in which a line fades and its ends become soft: 0 or 1, and the fading itself."""
+_HALF_HIDDEN = 0.5
+"""Hidden share of a flank from which the position of an arc depends on the other flank."""
+_END_HIDDEN = 0.15
+"""Hidden share of an end of a line from which its place is integrated over."""
+_BEYOND_PX, _STEP_PX = 24.0, 0.5
+"""Largest displacement of a hidden end, and steps."""
+_UNLIKELY, _FINER = 25.0, 81
+"""Costs over the least of places that are left out, and number of steps between the others."""
+
+
+def match_arcs(
+    grey: NDArray[np.float32],
+    valid: Mask,
+    echoes: Echoes,
+    at: Rows,
+    options: MatchOptions,
+    noise: float,
+    blur: tuple[float, float] | None = None,
+) -> ArcMatches:
+    """Match the echoes `at` with arcs of the form that suits those of the frame.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w)
+        Frame.
+    valid : ndarray (h, w) of bool
+        Pixels that may be used.
+    echoes : Echoes
+        All echoes of the frame; pixels of the others are excluded.
+    at : ndarray of int (m,)
+        Indices of the echoes to match.
+    options : MatchOptions
+        Options of the matching; window and widths are set here.
+    noise : float
+        Standard deviation of the grey values.
+    blur : (float, float), optional
+        Width of the camera's blur and its standard deviation, pixels, if it is known.
+    """
+    work = Windows(grey, valid, echoes, at, options, noise)
+    form, found, start = _chosen(work)
+    touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
+    if len(touching):
+        # It is unknown how the instrument combines overlapping echoes: behind a logarithmic amplifier the
+        # stronger one is shown; otherwise their sum. The first match assumed the former; the difference to
+        # the latter is added to the uncertainty.
+        pulled = work.shift_without_others(touching, found, form)
+        found.cov[touching] += pulled[:, :, None] * pulled[:, None, :]
+    half_hidden = np.flatnonzero((work.hidden_flanks(found) > _HALF_HIDDEN) & found.converged)
+    if len(half_hidden):
+        # If one flank of an arc is hidden, its centre follows from the shape of the other. Effects of raster
+        # lines or reverberation on this shape no longer cancel and are not noise of single pixels. Their size
+        # is estimated by leaving out slightly more of the arc.
+        pulled = work.shift_with_wider_gap(half_hidden, found, form)
+        found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
+    if "length" in form.sigma:
+        _integrate_over_hidden_ends(work, found, form, start)
+    _correct_for_blur(found, blur)
+    if "fading" in form.sigma:
+        # Whether a line fades before its ends become soft, or after, shifts its middle by g s²/a.
+        arcs = found.arcs
+        assert arcs.fading is not None
+        shift = _ORDER * arcs.fading * ends_of(arcs)[1] ** 2 / arcs.along
+        along = shift[:, None] * np.stack([np.cos(arcs.tilt), np.sin(arcs.tilt)], axis=1)
+        found.cov[:] += along[:, :, None] * along[:, None, :]
+    return found
+
+
+def _correct_for_blur(found: ArcMatches, blur: tuple[float, float] | None) -> None:
+    """Correct the ridges for the blur, which shifts a bent line to the inside of its bend.
+
+    By half the curvature times the variance of the blur along the line. If the blur is not known, it is at
+    most that of the echo itself, but mostly much less.
+    """
+    arcs = found.arcs
+    along2, across2 = arcs.along**2, arcs.across**2
+    if blur is None:
+        variance, sigma = np.zeros(len(arcs)), _BLUR_SHARE * np.minimum(across2, along2)
+    else:
+        squared = blur[0] ** 2
+        variance = squared * along2 / (along2 + squared)
+        sigma = np.full(len(arcs), 2 * blur[0] * blur[1])
+    normal = np.stack([-np.sin(arcs.tilt), np.cos(arcs.tilt)], axis=1)
+    half = 0.5 * arcs.curvature
+    found.xy[:] -= normal * (half * variance)[:, None]
+    # The fourth power of u in the course of the arc: a hyperbola for a range, but a display bends it.
+    course = _COURSE * np.clip(arcs.curvature**3 * along2**2, -_BOLD_PX, _BOLD_PX)
+    uncertain = (half * sigma) ** 2 + course**2
+    found.cov[:] += uncertain[:, None, None] * normal[:, :, None] * normal[:, None, :]
+
+
+def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
+    """The form of the frame's echoes, all of them matched with it, and the means of its priors."""
+    form, start = BEAM, work.start
+    found = work.matched(work.every, form, start, work.echoes.xy[work.at])
+    clear = _clear(found)
+    if not len(clear):
+        return form, found, start
+    sample = clear[:_FEW]
+    first, xy = work.start_of_lines.select(sample), work.echoes.xy[work.at[sample]]
+    best = 0.0
+    # An uneven line may be as unlike an even one as it is unlike a beam.
+    for candidate in (LINE, *(LINE.with_(**{name: sigma}) for name, sigma in FURTHER.items())):
+        line = work.matched(sample, candidate, first, xy)
+        ratio, _, _ = _compared(found, line, sample, work.noise)
+        if ratio > 2 * best and _better(found, line, sample, work.noise) and _plausible(line):
+            best, form = ratio, candidate
+    if form is not BEAM:
+        start = work.start_of_lines
+        work.resized(start)
+        found = work.matched(work.every, form, start, work.echoes.xy[work.at])
+    if "fading" in form.sigma:
+        # The brightness need not decrease exponentially.
+        form = form.with_(tapering=FURTHER["tapering"])
+        found = work.matched(work.every, form, found.arcs, found.xy)
+    while (further := _further(work, form, found)) is not None:
+        form = form.with_(**{further: FURTHER[further]})
+        found = work.matched(work.every, form, found.arcs, found.xy)
+    shared, start = _in_common(form, found, start)
+    if shared is not form:
+        form, found = shared, work.matched(work.every, shared, start, found.xy)
+    return form, found, start
+
+
+def _clear(found: ArcMatches) -> Rows:
+    """The echoes by which a form is chosen: the clearest of those that are seen whole, and no round spots."""
+    whole = found.converged & (found.t > _CLEAR) & (found.seen > _WHOLE)
+    whole &= found.arcs.along > _LONG * found.arcs.across
+    return np.flatnonzero(whole)[:_MOST]
+
+
+def _compared(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -> tuple[float, float, float]:
+    """How much better another form explains the clear echoes `rows`.
+
+    Returns
+    -------
+    ratio : float
+        Twice the logarithm of the ratio of likelihoods, less what an unknown explains by chance.
+    explained : float
+        Share of the squared residuals beyond the noise that the other form explains.
+    improved : float
+        Share of the echoes that it explains better.
+    """
+    both = before.converged[rows] & after.converged
+    old, new = before.noise[rows][both], np.maximum(after.noise[both], 1e-12)
+    pixels = after.pixels[both]
+    ratio = pixels * np.log((old / new) ** 2) - _EACH
+    excess = float((pixels * np.maximum((old / noise) ** 2 - 1, 0)).sum())
+    explained = float((pixels * (old**2 - new**2)).sum()) / noise**2
+    return float(ratio.sum()), explained / max(excess, 1e-12), float((ratio > 0).sum()) / len(rows)
+
+
+def _better(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -> bool:
+    """Whether another form with one more unknown is the form of the clear echoes `rows`."""
+    ratio, explained, improved = _compared(before, after, rows, noise)
+    # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance.
+    enough = explained > _EXPLAINED or "length" in before.sigma
+    return ratio > _EVIDENCE and enough and improved >= _IMPROVED
+
+
+def _further(work: Windows, form: Form, found: ArcMatches) -> str | None:
+    """The deviation from a form that explains most of the residuals; None if there is none."""
+    rows = _clear(found)[:_FEW]
+    if not len(rows):
+        return None
+    best, most = None, 0.0
+    for name, sigma in FURTHER.items():
+        # A change of the brightness of a Gaussian beam is a shift, or another width.
+        if name in form.sigma or ("length" not in form.sigma and name in ("fading", "tapering")):
+            continue
+        other = work.matched(rows, form.with_(**{name: sigma}), found.arcs.select(rows), found.xy[rows])
+        ratio, _, _ = _compared(found, other, rows, work.noise)
+        if ratio > most and _better(found, other, rows, work.noise) and _plausible(other):
+            best, most = name, ratio
+    return best
+
+
+def _plausible(found: ArcMatches) -> bool:
+    """Whether the deviations from a form have a usual size."""
+    return all(
+        float(np.median(np.abs(getattr(found.arcs, name)))) < _PLAUSIBLE * sigma
+        for name, sigma in FURTHER.items()
+        if name in found.sigma
+    )
+
+
+def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
+    """The form with priors from the clear echoes, and where the matching with these priors starts."""
+    rows, arcs = _clear(found), found.arcs
+    names = [name for name in form.sigma if name in ("softness", *FURTHER)]
+    if len(rows) < _SHARED:
+        return form, start
+    columns = {f: getattr(arcs, f) for f in Arcs.__dataclass_fields__}
+    # The priors of all else stay where they were.
+    columns["curvature"], columns["tilt"] = start.curvature, start.tilt
+    half, soft = ends_of(arcs)
+    sigma = {}
+    for name in names:
+        values = np.log(soft) if name == "softness" else columns[name]
+        mean, scatter = _population(values[rows], found.sigma[name][rows], np.ones((len(rows), 1)))
+        sigma[name] = max(scatter, _LEAST_SCATTER.get(name, 0.01))
+        if name == "softness":
+            soft = np.full(len(soft), np.exp(mean[0]))
+        else:
+            columns[name] = np.full(len(soft), mean[0])
+    if len(rows) >= 2 * _SHARED:
+        # The arcs are parallel but for the distortion of display and camera.
+        place = np.column_stack([np.ones(len(arcs)), found.xy / 1000])
+        mean, scatter = _population(arcs.tilt[rows], found.sigma["tilt"][rows], place[rows])
+        sigma["tilt"] = max(scatter, _LEAST_SCATTER["tilt"])
+        usual = place @ mean
+        if sigma["tilt"] < form.sigma["tilt"]:
+            columns["tilt"] = np.where(np.isfinite(usual), usual, start.tilt)
+        else:
+            del sigma["tilt"]
+    if not sigma:
+        return form, start
+    common = Arcs(**columns)
+    return form.with_(**sigma), lines_with(half, soft, common) if "softness" in sigma else common
+
+
+def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, float]:
+    """Coefficients of a linear model, and the scatter of a population around it (DerSimonian and Laird)."""
+    scatter, coefficients = 0.0, np.zeros(design.shape[1])
+    for _ in range(20):
+        weight = 1 / (sigma**2 + scatter**2)
+        # Some echoes may be others: Huber's weights.
+        off = np.abs(values - design @ coefficients) * np.sqrt(weight) if _ else np.zeros(len(values))
+        weight = weight * np.minimum(1, 3 / np.maximum(off, 1e-12))
+        normal = (design * weight[:, None]).T @ design
+        coefficients = np.linalg.solve(normal, (design * weight[:, None]).T @ values)
+        rest = values - design @ coefficients
+        excess = (weight * rest**2).sum() - (len(values) - design.shape[1])
+        slope = weight.sum() - np.trace(np.linalg.solve(normal, (design * (weight**2)[:, None]).T @ design))
+        grown = max(scatter**2 + excess / max(slope, 1e-300), 0.0)
+        if abs(grown - scatter**2) < 1e-3 * (scatter**2 + np.median(sigma) ** 2):
+            break
+        scatter = float(np.sqrt(grown))
+    # The mean is uncertain, too.
+    return coefficients, float(np.sqrt(scatter**2 * (1 + 1 / len(values)) + 1 / (1 / sigma**2).sum()))
+
+
+def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, start: Arcs) -> None:
+    """Replace positions of lines of which one end is hidden by their mean over all places of that end.
+
+    What is seen of a line determines its other end and the curve on which it lies. With the hidden end
+    displaced by e along the curve, the middle moves by e/2, and the tilt there changes by κe/2. The
+    likelihood of the visible pixels over e, which is far from normal where a wire hides the end, gives mean
+    and variance of the middle.
+    """
+    hidden = work.hidden_ends(found) > _END_HIDDEN
+    steps = np.arange(-_BEYOND_PX, _BEYOND_PX + _STEP_PX / 2, _STEP_PX)
+    for row in np.flatnonzero(found.converged & hidden.any(axis=1)):
+        tilt = found.arcs.tilt[row]
+        along, across = np.array([np.cos(tilt), np.sin(tilt)]), np.array([-np.sin(tilt), np.cos(tilt)])
+        if hidden[row].all():
+            found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
+            continue
+        expected = (float(start.tilt[row]), form.sigma["tilt"])
+        side = 1.0 if hidden[row, 1] else -1.0
+        cost, _, _ = work.costs_of_ends(found, row, side, steps, expected)
+        likely = np.flatnonzero(cost < cost.min() + _UNLIKELY)
+        finer = np.linspace(*steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)], _FINER)
+        cost, middle, rest = work.costs_of_ends(found, row, side, finer, expected)
+        weight = np.exp(-0.5 * (cost - cost.min()))
+        weight /= weight.sum()
+        if likely[0] == 0 or likely[-1] == len(steps) - 1:
+            rest += _BEYOND_PX**2
+        off = middle - weight @ middle
+        found.xy[row] = weight @ middle
+        # The adjustment linearises the hidden end; the other end and the line itself remain.
+        level = across @ found.cov[row] @ across
+        found.cov[row] = level * np.outer(across, across) + rest * np.outer(along, along)
+        found.cov[row] += np.einsum("n,ni,nj->ij", weight, off, off)
