@@ -116,7 +116,8 @@ class Arcs:
     def select(self, rows: Rows) -> Arcs:
         """A subset of the arcs."""
         columns: list[Any] = [getattr(self, column.name) for column in fields(self)]
-        return Arcs(*(None if values is None else values[rows] for values in columns))
+        parts: list[Any] = [None if values is None else values[rows] for values in columns]
+        return Arcs(*parts)
 
     def image(self, xy: Array, columns: Array, rows: Array) -> Array:
         """Brightness of the pixels of windows, 1 at the centre of the line.

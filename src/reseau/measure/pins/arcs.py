@@ -553,8 +553,8 @@ def _merged(parts: list[tuple[Rows, ArcMatches]], count: int) -> ArcMatches:
     """Columns of matches from parts of them."""
     names = {name for _, found in parts for name in found.sigma}
 
-    def column(values: list[Array], tail: tuple[int, ...] = (), dtype: type = float) -> Array:
-        whole = np.zeros((count, *tail), dtype=dtype)
+    def column(values: list[Array], tail: tuple[int, ...] = ()) -> Array:
+        whole: Array = np.zeros((count, *tail))
         for (rows, _), part in zip(parts, values, strict=True):
             whole[rows] = part
         return whole

@@ -268,14 +268,17 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
 
 def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, float]:
     """Coefficients of a linear model, and the scatter of a population around it (DerSimonian and Laird)."""
-    scatter, coefficients = 0.0, np.zeros(design.shape[1])
+    scatter = 0.0
+    coefficients: Array = np.zeros(design.shape[1])
     for _ in range(20):
         weight = 1 / (sigma**2 + scatter**2)
         # Some echoes may be others: Huber's weights.
         off = np.abs(values - design @ coefficients) * np.sqrt(weight) if _ else np.zeros(len(values))
         weight = weight * np.minimum(1, 3 / np.maximum(off, 1e-12))
         normal = (design * weight[:, None]).T @ design
-        coefficients = np.linalg.solve(normal, (design * weight[:, None]).T @ values)
+        coefficients = np.asarray(
+            np.linalg.solve(normal, (design * weight[:, None]).T @ values), dtype=np.float64
+        )
         rest = values - design @ coefficients
         excess = (weight * rest**2).sum() - (len(values) - design.shape[1])
         slope = weight.sum() - np.trace(np.linalg.solve(normal, (design * (weight**2)[:, None]).T @ design))
@@ -297,7 +300,7 @@ def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, st
     """
     hidden = work.hidden_ends(found) > _END_HIDDEN
     steps = np.arange(-_BEYOND_PX, _BEYOND_PX + _STEP_PX / 2, _STEP_PX)
-    for row in np.flatnonzero(found.converged & hidden.any(axis=1)):
+    for row in np.flatnonzero(found.converged & hidden.any(axis=1)).tolist():
         tilt = found.arcs.tilt[row]
         along, across = np.array([np.cos(tilt), np.sin(tilt)]), np.array([-np.sin(tilt), np.cos(tilt)])
         if hidden[row].all():
@@ -307,7 +310,8 @@ def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, st
         side = 1.0 if hidden[row, 1] else -1.0
         cost, _, _ = work.costs_of_ends(found, row, side, steps, expected)
         likely = np.flatnonzero(cost < cost.min() + _UNLIKELY)
-        finer = np.linspace(*steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)], _FINER)
+        first, last = steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)].tolist()
+        finer = np.linspace(first, last, _FINER)
         cost, middle, rest = work.costs_of_ends(found, row, side, finer, expected)
         weight = np.exp(-0.5 * (cost - cost.min()))
         weight /= weight.sum()
