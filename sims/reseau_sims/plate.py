@@ -8,16 +8,90 @@ import numpy as np
 
 from reseau.core.data import Array, Mask
 from reseau.core.errors import UsageError
-from reseau.io import ReseauDesign
+from reseau.designs import regular_reseau
+from reseau.io import Mark, ReseauDesign
 from reseau.optics.formation import Outline, draw, mark_outline
-from reseau.optics.grids import line_grid
+from reseau.optics.grids import Wires, line_grid, wire_grid
 
 from .camera import FilmCamera
 
-__all__ = ["Plate"]
+__all__ = ["Plate", "uneven_wires", "wired"]
 
 _SPACING_PX = 0.7
 """Distance of the nodes of an outline in widths of the point-spread function; see `Outline.polygon`."""
+
+_APART_MM = 1e-3
+"""Largest distance of a mark of a design from the crossing of two wires that it is."""
+
+
+def uneven_wires(
+    rng: np.random.Generator,
+    columns: int = 15,
+    rows: int = 11,
+    pitch: float = 10.0,
+    *,
+    turn_deg: float = 0.0,
+    skew_deg: float = 0.0,
+    slope: float = 0.003,
+    offset: float = 0.05,
+    bend: float = 0.0,
+) -> tuple[Wires, Wires]:
+    """Wires that were strung by hand, in the system of a comparator that is not parallel to them.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Random numbers.
+    columns, rows, pitch
+        Number of wires of either direction, and their mean distance (mm).
+    turn_deg : float
+        Rotation of all wires against the axes of the coordinates.
+    skew_deg : float
+        Deviation of the two directions from a right angle.
+    slope, offset, bend : float
+        Largest deviation of a single wire in direction (rad), position (mm) and curvature (1/mm).
+
+    Returns
+    -------
+    (Wires, Wires)
+        Wires that run down from the left to the right, and wires that run right from the top to the bottom.
+
+    Examples
+    --------
+    >>> upright, level = uneven_wires(np.random.default_rng(1), 3, 2, turn_deg=30.0)
+    >>> level.crossings(upright).shape
+    (2, 3, 2)
+    """
+
+    def one(angle: float, at: Array) -> Wires:
+        n = len(at)
+        single = [rng.uniform(-most, most, n) for most in (slope, offset, bend)]
+        return Wires(angle + np.deg2rad(turn_deg) + single[0], at + single[1], single[2])
+
+    x: Array = np.asarray((np.arange(columns) - (columns - 1) / 2) * pitch, dtype=np.float64)
+    y: Array = np.asarray(((rows - 1) / 2 - np.arange(rows)) * pitch, dtype=np.float64)
+    # To the left of a wire that runs down, x grows; to the left of one that runs right, y does.
+    return one(-np.pi / 2 + np.deg2rad(skew_deg), x), one(0.0, y)
+
+
+def wired(wires: tuple[Wires, Wires], line_width: float = 0.3, name: str = "wires") -> ReseauDesign:
+    """The design of a reseau of such wires: its marks are their crossings, as a comparator measures them.
+
+    Examples
+    --------
+    >>> design = wired(uneven_wires(np.random.default_rng(1), 3, 2, slope=0.0, offset=0.0))
+    >>> design.ids, design.xy[0].round(6).tolist()
+    (('A1', 'A2', 'A3', 'B1', 'B2', 'B3'), [-10.0, 5.0])
+    """
+    upright, level = wires
+    crossings = level.crossings(upright)
+    mark = Mark(shape="line-grid", line_width=line_width)
+    grid = regular_reseau(len(upright), len(level), 100 * line_width, mark, name=name)
+    points = tuple(
+        point.model_copy(update={"x": float(x), "y": float(y)})
+        for point, (x, y) in zip(grid.points, crossings.reshape(-1, 2), strict=True)
+    )
+    return grid.model_copy(update={"points": points})
 
 
 @dataclass
@@ -38,11 +112,14 @@ class Plate:
         Broken marks.
     false_marks : ndarray (k, 2)
         Positions of dirt that looks like a mark (mm).
+    wires : (Wires, Wires), optional
+        The wires of a line grid, each with its own direction; the marks of the design are their crossings. By
+        default they are parallel to the axes of the design, through its marks.
 
     Raises
     ------
     UsageError
-        When marks of the design have no coordinates.
+        When marks of the design have no coordinates, or are no crossings of the wires.
 
     Examples
     --------
@@ -57,6 +134,7 @@ class Plate:
     beyond_mm: float = 13.0
     missing: frozenset[str] = frozenset()
     false_marks: Array = field(default_factory=lambda: np.empty((0, 2)))
+    wires: tuple[Wires, Wires] | None = None
     _kept: tuple[tuple[object, ...], Array] = field(
         default=((None,), np.empty(0)), init=False, repr=False, compare=False
     )
@@ -74,7 +152,7 @@ class Plate:
 
     def _share(self, camera: FilmCamera, row_shifts: Array | None) -> Array:
         """Fraction (height, width) of the light that falls on marks; the last result is cached."""
-        of = (camera, self.design, self.missing, self.false_marks, self.beyond_mm)
+        of = (camera, self.design, self.missing, self.false_marks, self.beyond_mm, self.wires)
         # The reseau is the same in consecutive photographs, and drawing it takes most of the time.
         if row_shifts is None and all(a is b for a, b in zip(self._kept[0], of, strict=False)):
             return self._kept[1]
@@ -101,6 +179,16 @@ class Plate:
 
     def _wires(self, there: Mask, spacing: float) -> list[Outline]:
         xy = self.design.xy
+        if self.wires is not None:
+            upright, level = self.wires
+            crossings = level.crossings(upright)
+            apart = np.hypot(*np.moveaxis(crossings.reshape(-1, 1, 2) - xy, -1, 0))
+            if self.design.mark.line_width is None or not (apart.min(axis=0) < _APART_MM).all():
+                raise UsageError("has marks that are no crossings", where=f"design {self.design.name}")
+            gone = np.zeros(len(apart), dtype=bool)
+            gone[apart.argmin(axis=0)[~there]] = True
+            width, broken = self.design.mark.line_width, gone.reshape(crossings.shape[:2])
+            return wire_grid(upright, level, width, spacing, beyond=self.beyond_mm, broken=broken)
         x, column = np.unique(xy[:, 0], return_inverse=True)
         y, row = np.unique(xy[:, 1], return_inverse=True)
         if len(x) * len(y) != len(xy) or self.design.mark.line_width is None:

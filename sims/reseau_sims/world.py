@@ -27,11 +27,12 @@ from reseau.optics import (
     angles_to_matrix,
     matrix_to_vector,
 )
+from reseau.optics.grids import Wires
 
 from .camera import FilmCamera, film
 from .display import Display
 from .faults import Faults
-from .plate import Plate
+from .plate import Plate, wired
 from .reflectors import Reflectors, body_of, rods_of
 from .scanner import Scanner, Video
 from .screen import Screen
@@ -131,6 +132,7 @@ class World:
         display: Display | Literal["wong", "polynomial"] = "wong",
         scanner: Scanner | None = None,
         rods: ReseauDesign | None = None,
+        wires: tuple[Wires, Wires] | None = None,
     ) -> World:
         """The bench of the oscilloscope procedure, with random non-metric components.
 
@@ -150,6 +152,9 @@ class World:
             Scanner; random by default.
         rods : ReseauDesign, optional
             The test object; by default the 100 mm one. The rods as made are drawn from its sigmas.
+        wires : (Wires, Wires), optional
+            Wires of the reseau, as of :func:`reseau_sims.plate.uneven_wires`; by default regular ones.
+            Without a design, the reseau is that of their crossings.
         """
         faults, rods = faults or Faults(), rods or test_object()
         if not isinstance(display, Display):
@@ -158,7 +163,7 @@ class World:
         world = cls(
             seed,
             Screen(),
-            Plate(design or standard_reseau()),
+            Plate(design or (standard_reseau() if wires is None else wired(wires)), wires=wires),
             camera or _non_metric(stream(seed, "camera")),
             display,
             scanner or Scanner.drawn(stream(seed, "scanner")),

@@ -86,3 +86,14 @@ def test_every_target_and_line_of_a_testfield_is_drawn_at_its_position() -> None
         top = triangle[triangle[:, 1].argmin()]
         assert top[0] == pytest.approx(triangle[:, 0].mean(), abs=2e-4)
     assert b"/MediaBox" in design_pdf(field)
+
+
+def test_wires_that_are_not_parallel_to_the_axes_are_refused() -> None:
+    design = standard_reseau()
+    x, y = design.xy.T
+    turned = [
+        point.model_copy(update={"x": float(a), "y": float(b)})
+        for point, a, b in zip(design.points, x - 0.02 * y, y + 0.02 * x, strict=True)
+    ]
+    with pytest.raises(UsageError, match="not parallel to its axes"):
+        design_svg(design.model_copy(update={"points": tuple(turned)}))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from reseau.core.data import Array
@@ -18,7 +19,7 @@ from reseau.optics.formation import (
     mark_outline,
     rectangles,
 )
-from reseau.optics.grids import line_grid
+from reseau.optics.grids import Wires, line_grid, wire_grid
 
 SIGMA = 0.8
 SPACING = 0.7 * SIGMA
@@ -271,3 +272,58 @@ def test_impossible_shapes_are_refused() -> None:
         line_grid([0.0, 1.0, 0.5], [0.0, 1.0], 0.1, 0.1)
     with pytest.raises(UsageError, match="no crossing"):
         line_grid([0.0, 1.0], [0.0], 0.1, 0.1, broken=np.ones((1, 2), dtype=bool))
+
+
+def union_of(upright: Wires, level: Wires, half: float, shape: tuple[int, int], fine: int = 16) -> Array:
+    """Share of the pixels on wires, counted at fine points of wires drawn as distances from their lines."""
+    row, column = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in shape)
+    at = np.stack(np.meshgrid(column, row), axis=-1)
+    covered = np.zeros(at.shape[:2], dtype=bool)
+    for wires in (upright, level):
+        for angle, offset, bend in zip(wires.angle, wires.offset, wires.bend, strict=True):
+            u = np.array([np.cos(angle), np.sin(angle)])
+            t, away = at @ u, at @ np.array([-u[1], u[0]])
+            # To the second order of the bend, the distance from a parabola.
+            covered |= np.abs(away - offset - bend * t**2 / 2) < half * np.sqrt(1 + (bend * t) ** 2)
+    blurred = gaussian_filter(covered.astype(float), SIGMA * fine, mode="nearest", truncate=6)
+    return blurred.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+
+
+def slanted(bend: float = 0.0) -> tuple[Wires, Wires]:
+    """Three wires along y and two along x, skew and turned by several degrees, in a frame of 32 × 56."""
+    upright = Wires(np.deg2rad([94.0, 88.0, 97.0]), np.array([-9.0, -25.0, -40.0]), np.full(3, bend))
+    level = Wires(np.deg2rad([-3.0, 5.0]), np.array([9.0, 18.0]), np.full(2, -bend))
+    return upright, level
+
+
+@pytest.mark.parametrize("bend", [0.0, 1e-3])
+def test_wires_of_any_direction_are_the_union_of_their_strips(bend: float) -> None:
+    upright, level = slanted(bend)
+    pieces = wire_grid(upright, level, 2.4, SPACING, beyond=60.0)
+    formed = sum((draw(piece.oriented(), (32, 56), SIGMA) for piece in pieces), np.zeros((32, 56)))
+    inner = (slice(4, -4), slice(4, -4))  # the blur of the fine picture repeats its border
+    np.testing.assert_allclose(
+        formed[inner], union_of(upright, level, 1.2, (32, 56))[inner], rtol=0, atol=0.01
+    )
+
+
+def test_wires_along_the_axes_are_a_line_grid() -> None:
+    zero = np.zeros(3)
+    # The direction of an upright wire is y: its left side has smaller x.
+    upright = Wires(np.full(3, np.pi / 2), -np.array([10.3, 25.1, 44.0]), zero)
+    level = Wires(np.zeros(2), np.array([8.2, 20.7]), zero[:2])
+    broken = np.zeros((2, 3), dtype=bool)
+    broken[1, 1] = True
+    for missing in (None, broken):
+        pieces = wire_grid(upright, level, 2.4, SPACING, beyond=60.0, broken=missing)
+        formed = sum((draw(piece.oriented(), (32, 56), SIGMA) for piece in pieces), np.zeros((32, 56)))
+        np.testing.assert_allclose(formed, drawn_grid(missing), rtol=0, atol=EXACT)
+
+
+def test_wires_in_another_order_or_without_a_crossing_are_refused() -> None:
+    upright, level = slanted()
+    turned = Wires(upright.angle[::-1], upright.offset[::-1], upright.bend)
+    with pytest.raises(UsageError, match="ascend along each other"):
+        wire_grid(turned, level, 2.4, SPACING)
+    with pytest.raises(UsageError, match="no crossing"):
+        wire_grid(upright, level, 2.4, SPACING, broken=np.ones((2, 3), dtype=bool))

@@ -11,6 +11,7 @@ from reseau.designs import regular_reseau, standard_reseau
 from reseau.io import Mark, ReseauDesign
 from reseau.optics.formation import coverage, mark_outline
 from reseau_sims import Faults, World, film
+from reseau_sims.plate import uneven_wires
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,46 @@ def test_wires_are_drawn_at_their_true_positions(world: World) -> None:
         # Over 1 mm the mapping bends by less than 1/1000 px.
         found = share[row - 5 : row + 6, column - 5 : column + 6]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("turn_deg", "slope"), [(2.0, 0.003), (-8.0, 0.1), (90.0, 0.02)])
+def test_uneven_wires_cross_at_the_marks_of_their_design(turn_deg: float, slope: float) -> None:
+    rng = np.random.default_rng(5)
+    wires = uneven_wires(rng, 9, 7, 14.0, turn_deg=turn_deg, slope=slope, offset=0.3, bend=2e-5)
+    uneven = World.standard(3, wires=wires)
+    share = 1 - noise_free(uneven) / uneven.screen.seen(uneven.view(), uneven.camera.shape)
+    truth = uneven.truth()
+    assert len(truth.names) == 63
+    offset = np.arange(-16.0, 17.0)
+    for at in truth.xy[::8]:
+        column, row = np.rint(at).astype(int)
+        if not (16 <= column < 1583 and 16 <= row < 1183):
+            continue
+        window = share[row - 16 : row + 17, column - 16 : column + 17]
+        # A crossing is symmetric about its point: seen through a round window there, so is its light.
+        shift = at - [column, row]
+        distance = (offset - shift[0]) ** 2 + (offset[:, None] - shift[1]) ** 2
+        weighed = window * np.exp(-0.5 * distance / 4.0**2)
+        mean = np.array([(weighed * offset).sum(), (weighed * offset[:, None]).sum()]) / weighed.sum()
+        np.testing.assert_allclose(mean, shift, rtol=0, atol=3e-3)
+        assert window[16, 16] > 0.7 * uneven.plate.opacity
+
+
+def test_a_broken_crossing_of_uneven_wires_leaves_a_gap() -> None:
+    wires = uneven_wires(np.random.default_rng(5), 9, 7, 14.0, turn_deg=5.0)
+    uneven = World.standard(3, wires=wires, faults=Faults(missing=2))
+    share = 1 - noise_free(uneven) / uneven.screen.seen(uneven.view(), uneven.camera.shape)
+    truth = uneven.truth()
+    for name, at in zip(truth.names, truth.xy, strict=True):
+        column, row = np.rint(at).astype(int)
+        if 0 <= column < 1600 and 0 <= row < 1200:
+            assert (share[row, column] < 0.05) == (name in uneven.plate.missing)
+
+
+def test_marks_that_are_no_crossings_are_refused() -> None:
+    wires = uneven_wires(np.random.default_rng(5), 15, 11)
+    with pytest.raises(UsageError, match="no crossings"):
+        World.standard(3, design=standard_reseau(), wires=wires).photo_i()
 
 
 def design_of(mark: Mark, polarity: str) -> ReseauDesign:

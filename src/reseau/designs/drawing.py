@@ -86,7 +86,7 @@ def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
     Raises
     ------
     UsageError
-        When coordinates are missing, or the unit is not the millimetre.
+        When coordinates are missing, the unit is not the millimetre, or wires are not parallel to the axes.
     """
     content = _testfield(design) if isinstance(design, TestfieldDesign) else _reseau(design)
     size = content.high - content.low
@@ -128,9 +128,14 @@ def _reseau(design: ReseauDesign) -> _Content:
     low, high = xy.min(axis=0) - around, xy.max(axis=0) + around
     polygons, circles = [], []
     if mark.shape == "line-grid":
-        w = (mark.line_width or 0.0) / 2
-        polygons = [_box(x - w, low[1], x + w, high[1]) for x in np.unique(xy[:, 0])]
-        polygons += [_box(low[0], y - w, high[0], y + w) for y in np.unique(xy[:, 1])]
+        w, (columns, rows) = (mark.line_width or 0.0) / 2, (np.unique(xy[:, axis]) for axis in (0, 1))
+        if len(columns) * len(rows) != len(xy):
+            raise UsageError(
+                "has wires that are not parallel to its axes; such a reseau was measured, not drawn",
+                where=f"design {design.name}",
+            )
+        polygons = [_box(x - w, low[1], x + w, high[1]) for x in columns]
+        polygons += [_box(low[0], y - w, high[0], y + w) for y in rows]
     elif mark.shape in ("disk", "rod"):
         circles = [(float(x), float(y), size / 2) for x, y in xy]
         polygons = list(_ring_sectors(design))

@@ -35,6 +35,7 @@ __all__ = [
     "draw",
     "mark_outline",
     "rectangles",
+    "side_rule",
 ]
 
 _MOST_NODES = 20
@@ -45,8 +46,15 @@ _BATCH = 5e4
 """Number of values processed at a time."""
 
 
-def _side_rule(length: float, spacing: float) -> tuple[Array, Array]:
-    """Nodes and weights on [0, 1] of a Gauss–Legendre rule for a side; long sides have several panels."""
+def side_rule(length: float, spacing: float) -> tuple[Array, Array]:
+    """Nodes and weights on [0, 1] of a Gauss–Legendre rule for a side; long sides have several panels.
+
+    Examples
+    --------
+    >>> along, weight = side_rule(3.0, 0.5)
+    >>> len(along), round(float(weight @ along**2), 12)
+    (8, 0.333333333333)
+    """
     nodes = max(2.0, length / spacing + 2)  # two more compensate for the ends of a short side
     panels = int(np.ceil(nodes / _MOST_NODES))
     t, w = _panel(int(np.ceil(nodes / panels)))
@@ -90,7 +98,7 @@ class Outline:
         xy, dxy = [], []
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             side = end - start
-            along, weight = _side_rule(float(np.hypot(*side)), spacing)
+            along, weight = side_rule(float(np.hypot(*side)), spacing)
             xy.append(start + along[:, None] * side)
             dxy.append(weight[:, None] * side)
         return cls(np.concatenate(xy), np.concatenate(dxy))
@@ -151,7 +159,7 @@ def rectangles(edges: Array, spacing: float) -> Outline:
     # Sides of the unit square with as many panels as the largest rectangle needs.
     unit, turn = Outline(np.empty((0, 2)), np.empty((0, 2))), np.array([[0.0, 1.0], [-1.0, 0.0]])
     for side in range(4):
-        along, weight = _side_rule(float(size[:, side % 2].max(initial=0.0)), spacing)
+        along, weight = side_rule(float(size[:, side % 2].max(initial=0.0)), spacing)
         # The lower side; each further one is rotated by 90° about the centre.
         quarter = np.linalg.matrix_power(turn, side)
         xy = (np.stack([along, np.zeros_like(along)], axis=-1) - 0.5) @ quarter + 0.5
