@@ -86,9 +86,33 @@ def test_several_scans_have_one_picture_each(reseau: Run, tmp_path: Path) -> Non
     assert {path.name for path in (tmp_path / "folder").iterdir()} == {"a-overlay.png", "b-overlay.png"}
 
 
+def test_a_mirrored_frame_is_numbered_as_the_option_says(reseau: Run, photo: Any, tmp_path: Path) -> None:
+    write_image(tmp_path / "back.png", np.ascontiguousarray(np.rint(photo.pixels[:, ::-1]).astype(np.uint8)))
+    found = {}
+    for option in ("--mirrored", "--not-mirrored"):
+        status, out, _ = reseau(
+            "measure", "reseau", tmp_path / "back.png", "-d", photo.design, option, "--json"
+        )
+        assert status == 0
+        found[option] = {p["id"]: (p["x"], p["y"]) for p in json.loads(out)["points"] if p["ok"]}
+    # Seen from behind, the first column is on the right.
+    assert found["--mirrored"]["A1"][0] > found["--mirrored"]["A9"][0]
+    assert found["--not-mirrored"]["A1"][0] < found["--not-mirrored"]["A9"][0]
+
+
 def test_a_rotated_frame_is_found_with_a_larger_maximum(reseau: Run, photo: Any, tmp_path: Path) -> None:
     write_image(tmp_path / "on-its-side.png", np.rot90(np.rint(photo.pixels).astype(np.uint8)).copy())
     arguments = ("measure", "reseau", tmp_path / "on-its-side.png", "-d", photo.design)
     status, out, _ = reseau(*arguments, "--max-rotation", "100", "--not-mirrored", "--json")
     assert status == 0
     assert json.loads(out)["found"] == 63
+
+
+def test_refine_takes_a_reseau_that_is_seen_from_behind(reseau: Run, photo: Any, tmp_path: Path) -> None:
+    write_image(tmp_path / "back.png", np.ascontiguousarray(np.rint(photo.pixels[:, ::-1]).astype(np.uint8)))
+    residuals = []
+    for image, option in ((photo.image, "--not-mirrored"), (tmp_path / "back.png", "--mirrored")):
+        status, out, err = reseau("refine", "--photo-i", image, "--reseau", photo.design, option)
+        assert (status, err) == (0, "")
+        residuals.append(float(out.split("residuals ")[1].split()[0]))
+    assert residuals[1] == pytest.approx(residuals[0], rel=0.3)

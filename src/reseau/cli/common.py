@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
+    from ..io import ReseauDesign
     from ..io.images import Channel
 
 T = TypeVar("T")
@@ -60,13 +61,21 @@ MaxRotation = Annotated[
 ]
 
 
+def seen(design: ReseauDesign, mirrored: bool | None) -> ReseauDesign:
+    """The design as the image shows it: from behind if the option says so and it has no nominal positions."""
+    import numpy as np
+
+    placed = np.isfinite(design.nominal_px).all()
+    return design.from_behind() if mirrored and not placed else design
+
+
 def orientation(mirrored: bool | None, max_rotation: float | None) -> dict[str, Any]:
     """Options of a measurement from those of a command; what is not given keeps its default.
 
-    The design has y up and the image y down: they have opposite handedness if the design is seen from the
-    front.
+    A design has y up and the image y down: they have opposite handedness, also a design that was reflected
+    because the image shows it from behind.
     """
-    given: dict[str, Any] = {"mirrored": None if mirrored is None else not mirrored}
+    given: dict[str, Any] = {} if mirrored is None else {"mirrored": True}
     return given if max_rotation is None else given | {"max_rotation_deg": max_rotation}
 
 

@@ -22,6 +22,7 @@ from .common import (
     read_frame,
     required,
     say,
+    seen,
     suffix_of,
     writable,
 )
@@ -78,7 +79,7 @@ def reseau(
     from ..measure import ReseauOptions, measure_reseau
 
     task = _Task(image, out, overlay, as_json, "marks")
-    target = ReseauDesign.read(design)
+    target = seen(ReseauDesign.read(design), mirrored)
     options = ReseauOptions(
         mark_px=mark_px,
         row_jitter_px=row_jitter,
@@ -114,7 +115,7 @@ def pins(
     from ..measure import PinOptions, measure_pins
 
     task = _Task(image, out, overlay, as_json, "rods")
-    target = ReseauDesign.read(design)
+    target = seen(ReseauDesign.read(design), mirrored)
     options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
     task.run(
         lambda: corrected(read_frame(image), sensor),

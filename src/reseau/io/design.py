@@ -207,6 +207,36 @@ class ReseauDesign(Document):
         """Approximate positions in the image, (n, 2); NaN where unknown."""
         return np.array([p.nominal_px or (np.nan, np.nan) for p in self.points], dtype=np.float64)
 
+    def from_behind(self) -> Self:
+        """Return the design as it is seen from behind: left and right exchanged, without nominal positions.
+
+        Examples
+        --------
+        >>> mark = Mark(shape="disk", size=1.0)
+        >>> points = (DesignPoint(id="A", x=1.0, y=2.0), DesignPoint(id="B", x=10.0, y=2.0))
+        >>> design = ReseauDesign(name="two", unit="mm", mark=mark, polarity="dark", points=points)
+        >>> design.from_behind().xy.tolist()
+        [[-1.0, 2.0], [-10.0, 2.0]]
+        """
+        points = [
+            point.model_copy(
+                update={
+                    "x": None if point.x is None else -point.x,
+                    "end": None if point.end is None else (-point.end[0], point.end[1]),
+                    "nominal_px": None,
+                }
+            )
+            for point in self.points
+        ]
+        rings = self.rings
+        if rings is not None:  # an angle from x towards y is reflected as the place
+            sectors = {
+                name: tuple((180.0 - end, 180.0 - start) for start, end in each)
+                for name, each in rings.sectors.items()
+            }
+            rings = rings.model_copy(update={"sectors": sectors})
+        return self.model_copy(update={"points": tuple(points), "rings": rings})
+
     def expected_at(self, nominal_px: Array) -> Self:
         """Return the design with approximate positions in an image (n, 2); NaN where unknown."""
         places = [(float(x), float(y)) if np.isfinite([x, y]).all() else None for x, y in nominal_px]
