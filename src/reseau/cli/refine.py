@@ -73,7 +73,7 @@ class _Files:
         """Write the overlay of a photograph, if one is wanted: its marks and rods, or why there are none."""
         from ..core.data import Frame
         from ..core.failure import Failure
-        from ..core.overlay import draw_overlay
+        from ..core.overlay import FOUND, OTHER, draw_overlay
 
         if path not in self.overlays or not isinstance(photo, Frame):
             return
@@ -82,8 +82,16 @@ class _Files:
             return
         marks = getattr(found, "marks", None)
         layers = [] if found.measured is None else found.measured.layers()
-        if marks is not None:  # beside the rods, the marks have no names
-            layers += [replace(layer, names=()) for layer in marks.layers()]
+        if marks is not None:  # beside the rods, the marks have no names and another colour
+            layers += [
+                replace(
+                    layer,
+                    names=(),
+                    label=f"reseau: {layer.label}",
+                    colour=OTHER if layer.colour == FOUND else layer.colour,
+                )
+                for layer in marks.layers()
+            ]
         draw_overlay(photo.pixels, layers, photo.name, [str(n) for n in found.notes], self.overlays[path])
 
     def provenance(self) -> Provenance:

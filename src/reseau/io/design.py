@@ -153,13 +153,14 @@ class ReseauDesign(Document):
             )
         pair = at_one_place(places)
         what, at = "lie at one place", "({:g}, {:g})"
-        if pair is None:  # where coordinates are missing, the nominal positions stand for them
-            pair = at_one_place(np.where(known[:, None], np.nan, self.nominal_px))
+        by_nominal = pair is None
+        if by_nominal:
+            pair = at_one_place(self.nominal_px)
             what, at = "have one nominal position", "({:g}, {:g}) px"
         if pair is None:
             return
         one, other = (self.points[i] for i in pair)
-        place = one.nominal_px if one.x is None else (one.x, one.y)
+        place = one.nominal_px if by_nominal else (one.x, one.y)
         assert place is not None
         raise ValueError(
             f"points {one.id!r} and {other.id!r} {what}, {at.format(*place)}; correct or remove one of them"
