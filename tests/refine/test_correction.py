@@ -177,7 +177,16 @@ def test_absent_coefficients_are_dropped_but_never_the_scales():
     assert {name for name, verdict in verdicts.items() if verdict == "dropped"} == set(dropped)
     points = measured(world=world)
     nothing = corrected(ImagePoints(points.names, points.xy, points.cov * 1e10))
-    assert set(nothing.model.names) == {"a1", "b2"}
+    assert set(nothing.model.names) - set(nothing.fit.elimination.dropped) == {"a1", "b2"}
+
+
+def test_the_correction_keeps_what_is_not_significant_with_its_sigma():
+    """Dropped at the level of the test, a coefficient that is not zero would bend the others."""
+    camera = corrected(measured(world=WORLD.with_values({"h1": 0.0}), seed=4), alpha=1e-3)
+    assert "h1" in camera.fit.elimination.dropped
+    assert camera.model.names == RationalPolynomial.camera().names
+    row = camera.model.names.index("h1")
+    assert 0 < abs(camera.model.values[row]) < 4 * np.sqrt(camera.cofactor[row, row])
 
 
 def test_another_model_is_given_by_a_table_of_terms():
@@ -221,6 +230,22 @@ def test_the_covariance_of_model_and_corrected_marks_is_that_of_repeated_measure
     # 11 marks a run, which share the model's error: the rms of 2200 coordinates is sure to about 2 %.
     assert np.sqrt(np.mean(np.square(marks))) == pytest.approx(1.0, abs=0.06)
     assert np.mean(passed) == pytest.approx(0.95, abs=0.07)
+
+
+@pytest.mark.parametrize("lost", [(), (GRID.origin,), (GRID.axis,)], ids=["all", "without O", "without S"])
+def test_the_covariance_of_coefficients_contains_the_errors_of_o_and_s(lost):
+    # In a world that is projective, an unmeasured O or S is predicted without a systematic error.
+    keep = [name for name in GRID.ids if name not in lost]
+    exact = corrected(measured(world=PROJECTIVE))
+    squares, alone = 0.0, 0.0
+    for seed in range(60):
+        camera = corrected(measured(world=PROJECTIVE, seed=seed).select(keep))
+        off = camera.model.values - exact.model.values
+        squares += off @ np.linalg.solve(camera.coefficient_covariance, off)
+        alone += off @ np.linalg.solve(camera.cofactor, off)
+    low, high = chi2.ppf([0.0005, 0.9995], 60 * 13)
+    assert low < squares < high
+    assert alone > (5 if not lost else 1) * squares
 
 
 def test_corrected_covariances_are_those_of_points_and_model():
@@ -343,7 +368,7 @@ def test_the_calibration_contains_accuracy_and_validity():
     assert {name: units[name] for name in expected} == expected
     for name, quantity in made.parameters.items():
         row = camera.model.names.index(name)
-        assert quantity.sigma**2 == pytest.approx(camera.cofactor[row, row], rel=1e-12)
+        assert quantity.sigma**2 == pytest.approx(camera.coefficient_covariance[row, row], rel=1e-12)
 
 
 def test_the_unit_of_a_shift_is_that_of_the_design():

@@ -5,7 +5,7 @@ from .compare import FieldDifference, calibration_difference
 from .document import Calibration, Covariance, Quantity
 from .film import FilmFrameMapping, calibration_of_frame
 from .mapping import CalibratedMapping
-from .oscilloscope import CameraCorrection, InstrumentCorrection, LocalModel, ObjectPlane
+from .oscilloscope import CameraCorrection, Datum, InstrumentCorrection, LocalModel, ObjectPlane
 from .raster import CorrectedImage, undistorted_camera, write_corrected
 from .reader import parse_calibration, read_calibration
 from .sensor import Fields, SensorCorrection
@@ -17,6 +17,7 @@ __all__ = [
     "CameraMapping",
     "CorrectedImage",
     "Covariance",
+    "Datum",
     "FieldDifference",
     "Fields",
     "FilmFrameMapping",

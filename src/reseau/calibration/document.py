@@ -65,13 +65,17 @@ class Covariance(Strict):
 
 @with_config(_STRICT)
 class OscilloscopeModel(TypedDict):
-    """Groups A and B of an oscilloscope's photographs; `reseau` and `instrument` belong to group B."""
+    """Groups A and B of an oscilloscope's photographs; `reseau` and `instrument` belong to group B.
+
+    `datum` holds the errors of the marks O and S, and the covariance of the coefficients without them.
+    """
 
     name: Literal["oscilloscope group A", "oscilloscope group A and group B"]
     unit: str
     mapping: dict[str, Any]
     photo_system: dict[str, Any]
     object_system: dict[str, Any]
+    datum: NotRequired[dict[str, Any]]
     reseau: NotRequired[dict[str, Any]]
     instrument: NotRequired[dict[str, Any]]
 

@@ -24,6 +24,7 @@ from .mapping import BEYOND, CalibratedMapping, Target, beyond, carried, extent_
 
 __all__ = [
     "CameraCorrection",
+    "Datum",
     "FitRecord",
     "InstrumentCorrection",
     "LocalModel",
@@ -53,6 +54,57 @@ class FitRecord(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Datum:
+    """Errors δ of the marks O and S, which define the common system, and their effect on the coefficients.
+
+    Coefficients refer to the system of the *measured* O and S, in which their errors have the covariance Q.
+    Compared with the coefficients of the system of the true O and S, they are also off by J δ:
+    Q + J Kᵀ + K Jᵀ + J Σ Jᵀ is the covariance matrix of all these errors. Corrected coordinates do not depend
+    on δ.
+
+    Parameters
+    ----------
+    influence : ndarray (u, 4)
+        J, derivatives of the coefficients by the positions of O and S in the common system.
+    shared : ndarray (u, 4)
+        K, covariance of the coefficients' errors in the measured system with δ.
+    covariance : ndarray (4, 4)
+        Σ, of δ.
+
+    Examples
+    --------
+    >>> datum = Datum(np.eye(4), np.zeros((4, 4)), 0.01 * np.eye(4))
+    >>> datum.added.diagonal()
+    array([0.01, 0.01, 0.01, 0.01])
+    """
+
+    influence: Array
+    shared: Array
+    covariance: Array
+
+    @property
+    def added(self) -> Array:
+        """What it adds to the covariance matrix of the coefficients, (u, u)."""
+        cross = self.influence @ self.shared.T
+        added: Array = cross + cross.T + self.influence @ self.covariance @ self.influence.T
+        return added
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON-ready data."""
+        return {
+            "influence": self.influence.tolist(),
+            "shared": self.shared.tolist(),
+            "covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> Self:
+        """Read back; KeyError, TypeError or ValueError where something is missing or wrong."""
+        keys = ("influence", "shared", "covariance")
+        return cls(*(np.array(content[key], dtype=np.float64).reshape(-1, 4) for key in keys))
+
+
+@dataclass(frozen=True, eq=False)
 class CameraCorrection(CalibratedMapping):
     """From pixels to the plane of the reseau, corrected for lens distortion and film deformation.
 
@@ -61,7 +113,8 @@ class CameraCorrection(CalibratedMapping):
     model : RationalPolynomial
         Photo-coordinates to coordinates of the reseau, both in the common system, mm.
     cofactor : ndarray (u, u)
-        Covariance matrix of the model's parameters: a priori after χ² tests, else a posteriori.
+        Covariance matrix of the model's parameters in `photo_system`, which counts as free of error: a priori
+        after χ² tests, else a posteriori. Corrected coordinates have it.
     photo_system : Similarity
         Pixels into the common system: scaled to the reseau, of the handedness of its design.
     object_system : Similarity
@@ -74,6 +127,8 @@ class CameraCorrection(CalibratedMapping):
         Left, low, right and high end of the marks it was fitted to, in the common system.
     size : (int, int), optional
         Width and height of the photograph in pixels.
+    datum : Datum, optional
+        Errors of the marks that define `photo_system`; None where they are not known.
 
     Examples
     --------
@@ -95,6 +150,7 @@ class CameraCorrection(CalibratedMapping):
     fit: FitRecord | None = None
     extent: tuple[float, ...] | None = None
     size: tuple[int, int] | None = None
+    datum: Datum | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -105,8 +161,13 @@ class CameraCorrection(CalibratedMapping):
 
     @property
     def parameter_covariance(self) -> Array:
-        """That of the model's parameters."""
+        """That of the model's parameters in the system of the measured O and S."""
         return self.cofactor
+
+    @property
+    def coefficient_covariance(self) -> Array:
+        """Covariance matrix (u, u) of the coefficients with the errors of the marks O and S."""
+        return self.cofactor if self.datum is None else self.cofactor + self.datum.added
 
     def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
         """See :meth:`CalibratedMapping.derivatives`."""
@@ -147,7 +208,8 @@ class CameraCorrection(CalibratedMapping):
         self, *, name: str, provenance: dict[str, Any] | None = None, times: dict[str, str] | None = None
     ) -> Calibration:
         """The calibration file; `CameraCorrection.from_calibration` reads it back."""
-        sigma = np.sqrt(np.diagonal(self.cofactor))
+        covariance = self.coefficient_covariance
+        sigma = np.sqrt(np.diagonal(covariance))
         free = [i for i, s in enumerate(sigma) if s > 0]
         names = self.model.names
         model: OscilloscopeModel = {
@@ -157,11 +219,13 @@ class CameraCorrection(CalibratedMapping):
             "photo_system": system_to_dict(self.photo_system),
             "object_system": system_to_dict(self.object_system),
         }
+        if self.datum is not None:
+            model["datum"] = self.datum.to_dict() | {"in_system": self.cofactor.tolist()}
         parameters = {
             key: Quantity(value=float(value), sigma=float(s), unit=unit_of(self.model, key, self.unit))
             for key, value, s in zip(names, self.model.values, sigma, strict=True)
         }
-        matrix = self.cofactor[np.ix_(free, free)]
+        matrix = covariance[np.ix_(free, free)]
         return Calibration(
             kind="oscilloscope",
             name=name,
@@ -211,6 +275,13 @@ class CameraCorrection(CalibratedMapping):
             unit = str(content["unit"])
             row_of = {name: i for i, name in enumerate(calibration.parameters)}
             order = [row_of[name] for name in model.names]
+            datum, cofactor = None, calibration.matrix()[np.ix_(order, order)]
+            if content.get("datum") is not None:
+                u = len(order)
+                datum = Datum.from_dict(content["datum"])
+                cofactor = np.array(content["datum"]["in_system"], dtype=np.float64)[:u, :u]
+                if cofactor.shape != (u, u) or len(datum.influence) != u:
+                    raise ValueError(f"datum of {len(datum.influence)} instead of {u} coefficients")
         except (KeyError, TypeError, ValueError, UsageError) as error:
             raise FormatError(
                 f"has a damaged or missing entry: {error}", where=f"model of calibration {calibration.name}"
@@ -218,12 +289,13 @@ class CameraCorrection(CalibratedMapping):
         size = calibration.validity.get("size")
         return cls(
             model,
-            calibration.matrix()[np.ix_(order, order)],
+            cofactor,
             systems[0],
             systems[1],
             unit,
             extent=extent_of(calibration.validity),
             size=None if size is None else (int(size[0]), int(size[1])),
+            datum=datum,
         )
 
 
@@ -350,8 +422,8 @@ class InstrumentCorrection(CalibratedMapping):
     plane : ObjectPlane
         Between the common system and object coordinates.
     covariance : ndarray (a + b, a + b)
-        Of the coefficients of both groups, those of the camera first. Group B was fitted after group A and
-        absorbs part of its errors; their covariance says how much.
+        Of the coefficients of both groups, those of the camera first, in the camera's `photo_system`. Group B
+        was fitted after group A and absorbs part of its errors; their covariance says how much.
     unit : str
         Of object coordinates.
     pins : ImagePoints
@@ -401,8 +473,30 @@ class InstrumentCorrection(CalibratedMapping):
 
     @property
     def parameter_covariance(self) -> Array:
-        """That of the coefficients of both groups."""
+        """That of the coefficients of both groups in the system of the measured O and S."""
         return self.covariance
+
+    @property
+    def coefficient_covariance(self) -> Array:
+        """Covariance matrix of the coefficients of both groups with the errors of the marks O and S.
+
+        Group B starts from corrected coordinates, which do not depend on these errors. With group A it has in
+        common what it absorbed of the errors of PHOTO I.
+        """
+        datum, a = self.camera.datum, len(self.camera.model.names)
+        if datum is None:
+            return self.covariance
+        found = self.covariance.copy()
+        sigma = np.sqrt(np.diagonal(self.camera.cofactor))
+        sigma = np.where(sigma > 0, sigma, 1.0)[
+            :, None
+        ]  # columns of one size: the smallest ones count as well
+        correlation = self.camera.cofactor / (sigma * sigma.T)
+        absorbed = np.linalg.pinv(correlation, hermitian=True) @ (found[:a, a:] / sigma) / sigma
+        found[:a, a:] += datum.influence @ datum.shared.T @ absorbed
+        found[a:, :a] = found[:a, a:].T
+        found[:a, :a] += datum.added
+        return found
 
     def to_pixels(self, xy: Array) -> Array:
         """Pixels (n, 2) at which points of the object appear; NaN where a model has no inverse."""
@@ -450,9 +544,19 @@ class InstrumentCorrection(CalibratedMapping):
         slope = plane @ by_refined @ by_photo @ by_pixel
         return self.plane.from_common(common), slope, plane @ by_both
 
-    def apply(self, points: ImagePoints) -> ImagePoints:
-        """True object coordinates of points in pixels (Wishahy, step viii), with propagated covariances."""
+    def apply(self, points: ImagePoints, by_camera: Array | None = None) -> ImagePoints:
+        """True object coordinates of points in pixels (Wishahy, step viii), with propagated covariances.
+
+        Parameters
+        ----------
+        points : ImagePoints
+            In pixels of PHOTO I.
+        by_camera : ndarray (n, 2, a), optional
+            Derivatives of the points by the coefficients of group A, where these referred them to PHOTO I.
+        """
         value, slope, by_coefficients = self.derivatives(points.xy)
+        if by_camera is not None:
+            by_coefficients[:, :, : by_camera.shape[2]] += slope @ by_camera
         cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
         cov = cov + by_coefficients @ self.covariance @ np.swapaxes(by_coefficients, 1, 2)
         if self.local is not None:
@@ -472,7 +576,8 @@ class InstrumentCorrection(CalibratedMapping):
         camera = self.camera.calibration(name=name, provenance=provenance, times=times)
         names = self.camera.model.names + self.model.names
         values = np.concatenate([self.camera.model.values, self.model.values])
-        sigma = np.sqrt(np.diagonal(self.covariance))
+        covariance = self.coefficient_covariance
+        sigma = np.sqrt(np.diagonal(covariance))
         free = [i for i, s in enumerate(sigma) if s > 0]
         units = [camera.parameters[key].unit for key in self.camera.model.names]
         units += [unit_of(self.model, key, self.unit) for key in self.model.names]
@@ -480,7 +585,7 @@ class InstrumentCorrection(CalibratedMapping):
             key: Quantity(value=float(value), sigma=float(s), unit=unit)
             for key, value, s, unit in zip(names, values, sigma, units, strict=True)
         }
-        matrix = tuple(tuple(map(float, row)) for row in self.covariance[np.ix_(free, free)])
+        matrix = tuple(tuple(map(float, row)) for row in covariance[np.ix_(free, free)])
         instrument = {
             "mapping": self.model.to_dict(values=False),
             "unit": self.unit,
@@ -496,6 +601,8 @@ class InstrumentCorrection(CalibratedMapping):
             "reseau": reseau.to_dict(),
             "instrument": instrument,
         }
+        if self.camera.datum is not None:
+            both["datum"] = self.camera.datum.to_dict() | {"in_system": self.covariance.tolist()}
         fit = self.fit
         return camera.model_copy(
             update={
@@ -540,6 +647,10 @@ class InstrumentCorrection(CalibratedMapping):
         except (KeyError, TypeError, ValueError, UsageError) as error:
             raise FormatError(f"has a damaged or missing entry: {error}", where=f"model of {where}") from None
         covariance = calibration.matrix()[np.ix_(order, order)]
+        if camera.datum is not None:
+            covariance = np.array(content["datum"]["in_system"], dtype=np.float64)
+            if covariance.shape != (len(order), len(order)):
+                raise FormatError(f"has a covariance of {covariance.shape}", where=f"datum of {where}")
         return cls(camera, model, plane, covariance, unit, pins, local), designs[0], designs[1]
 
 

@@ -468,8 +468,9 @@ def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str
 
 
 def _say_first(path: Path, first: PhotoI, design: ReseauDesign) -> None:
-    fit = first.camera.fit
-    say(f"{path.name}: {len(first.points)} marks, {len(first.camera.model.names)} significant coefficients\n")
+    fit, names = first.camera.fit, first.camera.model.names
+    dropped = () if fit is None else fit.elimination.dropped
+    say(f"{path.name}: {len(first.points)} marks, {len(names) - len(dropped)} significant coefficients\n")
     if fit is not None:
         x, y = (fit.residuals**2).mean(axis=0) ** 0.5
         say(f"  residuals {x:.2g} {design.unit} in x, {y:.2g} {design.unit} in y (rms)\n")

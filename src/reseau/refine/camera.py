@@ -14,8 +14,8 @@ import numpy as np
 
 from ..adjust import Adjustment, Elimination, Options
 from ..calibration.mapping import carried
-from ..calibration.oscilloscope import CameraCorrection, tests_of
-from ..core.data import Array, ImagePoints
+from ..calibration.oscilloscope import CameraCorrection, Datum, tests_of
+from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping, is_mirrored, on_one_line, reduce_mapping, residual_field
@@ -44,8 +44,8 @@ class CorrectionFit:
     check_target : ndarray (c, 2)
         Their coordinates in the design.
     local : SmoothField or None
-        Remaining residuals as a smooth field; `local.need` is the probability, per axis, of a field as
-        large from white noise alone. None with fewer than 20 marks.
+        Residuals of the significant coefficients as a smooth field; `local.need` is the probability, per axis,
+        of a field as large from white noise alone. None with fewer than 20 marks.
 
     Examples
     --------
@@ -70,8 +70,8 @@ class CorrectionFit:
 
     @property
     def adjustment(self) -> Adjustment:
-        """With the coefficients that remained."""
-        return self.elimination.adjustment
+        """With all coefficients, as the correction applies them."""
+        return self.elimination.full
 
     @property
     def residuals(self) -> Array:
@@ -100,7 +100,7 @@ class FittedCamera(CameraCorrection):
     >>> seen = ImagePoints.with_sigma(reseau.ids, reseau.xy * [9.0, -9.0] + [800.0, 600.0], 0.01)
     >>> camera = correct_camera(seen, reseau, model=RationalPolynomial.affine()).required()
     >>> len(camera.apply(seen)), camera.fit.adjustment.redundancy
-    (16, 30)
+    (16, 26)
     """
 
     fit: CorrectionFit | None = None
@@ -128,7 +128,8 @@ def correct_camera(
     model : RationalPolynomial, optional
         Any model whose terms are data; by default equations (5a, b).
     alpha : float
-        Level of the tests of the coefficients; those not significant are dropped one by one.
+        Level of the tests of the coefficients; the record drops those not significant one by one. The
+        correction keeps them all: what is not significant is not zero, and its sigma says what it may be.
     criterion : {"t", "chi2", "F"}
         The test.
     check : iterable of str
@@ -144,8 +145,9 @@ def correct_camera(
     Notes
     -----
     The common system is a choice of coordinates, fixed by the measured images of O and S. Their errors
-    shift, rotate and scale it; a, b and c absorb that. The sigmas of the coefficients are conditional on
-    this system.
+    shift, rotate and scale it; a, b and c absorb that. `cofactor` is the covariance of the coefficients in
+    this system, which corrected coordinates have; `coefficient_covariance` contains the errors of O and S,
+    and is for comparisons of coefficients with those of another photograph or with true ones.
 
     Examples
     --------
@@ -179,7 +181,7 @@ def correct_camera(
     systems = _common_system(marks, plane, design)
     if isinstance(systems, Failure):
         return systems
-    photo_system, object_system = systems
+    photo_system, object_system, base = systems
     photo, target = carried(photo_system, marks), object_system(plane)
     used = np.array([name not in held for name in known])
     elimination = reduce_mapping(
@@ -194,19 +196,26 @@ def correct_camera(
     )
     if isinstance(elimination, Failure):
         return elimination
-    fit = elimination.adjustment
-    reduced = model.with_values(fit.values).without(*elimination.dropped)
-    rows = [model.names.index(name) for name in reduced.names]
-    cofactor = fit.covariance[np.ix_(rows, rows)]
+    fit = elimination.full
+    full = model.with_values(fit.values)
+    datum = _datum(marks, plane, design, photo_system, full, used, sigma, fit, base)
     correction = FittedCamera(
-        reduced, cofactor, photo_system, object_system, design.unit, extent=_extent(target[used])
+        full,
+        fit.covariance,
+        photo_system,
+        object_system,
+        design.unit,
+        extent=_extent(target[used]),
+        datum=datum,
     )
-    corrected = correction.apply(marks)
-    residuals = (corrected.xy - target)[used]
-    local = residual_field(reduced, photo.select(used), target[used], residuals, sigma[used, None], trials)
+    corrected, seen = correction.apply(marks), photo.select(used)
+    # Whether a local model is needed is asked of what is significant: further terms would take off its power.
+    reduced = model.with_values(elimination.adjustment.values).without(*elimination.dropped)
+    left = reduced(seen.xy) - target[used]
+    local = residual_field(reduced, seen, target[used], left, sigma[used, None], trials)
     record = CorrectionFit(
         elimination,
-        photo.select(used),
+        seen,
         target[used],
         corrected.select(used),
         corrected.select(~used),
@@ -214,6 +223,69 @@ def correct_camera(
         local,
     )
     return replace(correction, fit=record)
+
+
+def _datum(
+    marks: ImagePoints,
+    plane: Array,
+    design: ReseauDesign,
+    photo_system: Similarity,
+    model: RationalPolynomial,
+    used: Mask,
+    sigma: Array,
+    fit: Adjustment,
+    base: float,
+) -> Datum:
+    """Errors of O and S, and their effect on the coefficients.
+
+    With the errors ε of all marks in photo-coordinates, the coefficients are off by H ε in the system of the
+    measured O and S, H = −Q Aᵀ W F with F the derivatives of the conditions by the photo-coordinates. Errors
+    δ = E ε of O and S, at the distance D, move a point z of the photograph (as a complex number) by
+    −(1 − z/D) δ_O − (z/D) δ_S. The coefficients follow with the same H.
+    """
+    photo = carried(photo_system, marks)
+    _, slope, by_coefficient = model.derivatives(photo.xy)
+    spread = sigma[:, None, None] ** 2 * np.eye(2)
+    weights = np.linalg.inv(slope @ photo.cov @ np.swapaxes(slope, 1, 2) + spread) * used[:, None, None]
+    response = -np.einsum("pq,niq,nij,njk->pnk", fit.cofactor, by_coefficient, weights, slope)
+    x, y = photo.xy.T / base
+    of_o, of_s = (
+        -np.stack([np.stack([re, -im], axis=-1), np.stack([im, re], axis=-1)], axis=1)
+        for re, im in ((1 - x, -y), (x, y))
+    )
+    shares = _shares(marks, plane, design, photo_system)
+    influence = np.einsum("pnk,nkj->pj", response, np.concatenate([of_o, of_s], axis=2))
+    shared = np.einsum("pni,nij,qnj->pq", response, photo.cov, shares)
+    covariance = np.einsum("pni,nij,qnj->pq", shares, photo.cov, shares)
+    scale = float(fit.covariance[0, 0] / fit.cofactor[0, 0])  # a posteriori, the marks are as good as that
+    return Datum(influence, scale * shared, scale * covariance)
+
+
+def _shares(marks: ImagePoints, plane: Array, design: ReseauDesign, photo_system: Similarity) -> Array:
+    """Derivatives E of the positions of O and S by those of all marks, in photo-coordinates, (4, n, 2).
+
+    A measured one depends on itself, a predicted one on the projectivity through the others.
+    """
+    shares = np.zeros((4, len(marks), 2))
+    linear = photo_system.derivatives(marks.xy[:1]).d_xy[0]
+    back = np.linalg.inv(linear)
+    centre = plane.mean(axis=0)
+    for k, name in enumerate(_origin_and_axis(marks, plane, design)):
+        if name in marks.names:
+            shares[2 * k : 2 * k + 2, marks.names.index(name)] = np.eye(2)
+            continue
+        projective = _projective(marks, plane)
+        assert not isinstance(projective, Failure)  # asked by `defining_marks`
+        at = next(p for p in design.points if p.id == name)
+        _, slope, by_parameter = projective.derivatives(plane - centre)
+        _, _, there = projective.derivatives(np.array([[at.x, at.y]], dtype=np.float64) - centre)
+        weights = np.linalg.inv(slope @ np.swapaxes(slope, 1, 2))
+        normal = np.einsum("nip,nij,njq->pq", by_parameter, weights, by_parameter)
+        size = np.sqrt(np.diagonal(normal))
+        cofactor = np.linalg.inv(normal / np.outer(size, size)) / np.outer(size, size)
+        found = np.einsum("ip,pq,njq,njk->ink", there[0], cofactor, by_parameter, weights)
+        shares[2 * k : 2 * k + 2] = np.einsum("ij,jnk,kl->inl", linear, found, back)
+    return shares
 
 
 def _extent(xy: Array) -> tuple[float, float, float, float]:
@@ -224,8 +296,8 @@ def _extent(xy: Array) -> tuple[float, float, float, float]:
 
 def _common_system(
     marks: ImagePoints, plane: Array, design: ReseauDesign
-) -> tuple[Similarity, Similarity] | Failure:
-    """Pixels and design into the system of O and S, at the scale of the design."""
+) -> tuple[Similarity, Similarity, float] | Failure:
+    """Pixels and design into the system of O and S, at the scale of the design, and their distance."""
     ends = defining_marks(marks, plane, design)
     if isinstance(ends, Failure):
         return ends
@@ -233,9 +305,9 @@ def _common_system(
     object_system = Similarity.common_system(o1, s1)
     mirrored = is_mirrored(plane, marks.xy)
     turned = Similarity.common_system(o, s, mirrored=mirrored)
-    scale = np.hypot(*(s1 - o1)) / np.hypot(*(s - o))
-    photo_system = Similarity(turned.values * scale, mirrored=mirrored)
-    return photo_system, object_system
+    base = float(np.hypot(*(s1 - o1)))
+    photo_system = Similarity(turned.values * (base / np.hypot(*(s - o))), mirrored=mirrored)
+    return photo_system, object_system, base
 
 
 def defining_marks(
@@ -270,16 +342,19 @@ def defining_marks(
         if name in row_of:
             ends.append((marks.xy[row_of[name]], designed))
             continue
-        fitted = fit_mapping(
-            RationalPolynomial.projective(),
-            ImagePoints.with_sigma(marks.names, plane - plane.mean(axis=0), 1.0),
-            marks.xy - marks.xy.mean(axis=0),
-        )
-        if isinstance(fitted, Failure):
-            return fitted
-        projective = RationalPolynomial.projective().with_values(fitted.values)
+        projective = _projective(marks, plane)
+        if isinstance(projective, Failure):
+            return projective
         ends.append((projective((designed - plane.mean(axis=0))[None])[0] + marks.xy.mean(axis=0), designed))
     return ends[0], ends[1]
+
+
+def _projective(marks: ImagePoints, plane: Array) -> RationalPolynomial | Failure:
+    """Projectivity from the plane to the image, both reduced to the centres of the marks."""
+    model = RationalPolynomial.projective()
+    reduced = ImagePoints.with_sigma(marks.names, plane - plane.mean(axis=0), 1.0)
+    fitted = fit_mapping(model, reduced, marks.xy - marks.xy.mean(axis=0))
+    return fitted if isinstance(fitted, Failure) else model.with_values(fitted.values)
 
 
 def _origin_and_axis(marks: ImagePoints, plane: Array, design: ReseauDesign) -> tuple[str, str]:
