@@ -281,7 +281,14 @@ def photo_ii(
     images, registration, measured, shown = seen
     # (iv) to (vii)
     instrument = correct_instrument(
-        images, test_object, camera, model=model, alpha=alpha, criterion=criterion, check=check
+        images,
+        test_object,
+        camera,
+        model=model,
+        alpha=alpha,
+        criterion=criterion,
+        check=check,
+        registration=registration,
     )
     if isinstance(instrument, Failure):
         return instrument if measured is None else replace(instrument, places=measured.points.xy)
@@ -355,14 +362,15 @@ def photo_iii(
         body = photo
     if not len(body):
         return Failure("no echo of a body found", Code.NOT_FOUND)
-    registration = None
+    registration, moves = None, None
     if marks is not None:
         registered = register(marks, reseau, instrument.camera)
         if isinstance(registered, Failure):
             return registered
         registration, body = registered, registered.apply(body)
+        moves = registration.moves(body.xy)
     notes = of_the_camera(instrument.camera, registration) + _of_the_measurements(shown)
-    return PhotoIII(body, instrument.apply(body), registration, notes, measured, shown)
+    return PhotoIII(body, instrument.apply(body, moves), registration, notes, measured, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,7 +489,7 @@ def _pins_in(
     registration = register(marks, reseau, camera)
     if isinstance(registration, Failure):
         return registration
-    return registration.apply(images), registration, measured, shown
+    return registration.carry(images), registration, measured, shown
 
 
 def _of_the_measurements(*results: ReseauResult | PinResult | None) -> tuple[Remark, ...]:

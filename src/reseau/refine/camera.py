@@ -44,8 +44,8 @@ class CorrectionFit:
     check_target : ndarray (c, 2)
         Their coordinates in the design.
     local : SmoothField or None
-        Residuals of the significant coefficients as a smooth field; `local.need` is the probability, per axis,
-        of a field as large from white noise alone. None with fewer than 20 marks.
+        Residuals of the significant coefficients as a smooth field; `local.need` is the probability, per
+        axis, of a field as large from white noise alone. None with fewer than 20 marks.
 
     Examples
     --------

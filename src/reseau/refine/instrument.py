@@ -29,6 +29,7 @@ from ..measure.fitting import is_mirrored, reduce_mapping, residual_field
 from ..optics import RationalPolynomial, Similarity, wong_display
 from ..optics.field import SmoothField
 from .camera import defining_marks
+from .registration import Registration
 from .rivals import Rivalry, rivals
 
 __all__ = ["FittedInstrument", "InstrumentFit", "correct_instrument"]
@@ -130,6 +131,7 @@ def correct_instrument(
     criterion: Literal["t", "chi2", "F"] = "F",
     check: Iterable[str] = (),
     trials: int = 499,
+    registration: Registration | None = None,
 ) -> FittedInstrument | Failure:
     """Correct an instrument by the rods of a test object (Wishahy, steps iv–vii).
 
@@ -151,6 +153,8 @@ def correct_instrument(
         Rods held out, for an independent check.
     trials : int
         Simulated sets of residuals for the test whether a local model is needed on top.
+    registration : Registration, optional
+        How the images were referred to PHOTO I; its errors, which they share, are part of the covariance.
 
     Returns
     -------
@@ -209,7 +213,7 @@ def correct_instrument(
     monomials = reduced(model.split())
     fit = elimination.full
     full = model.with_values(fit.values)
-    covariance = _joint_covariance(camera, rods.select(used), full, fit)
+    covariance = _joint_covariance(camera, rods.select(used), full, fit, registration)
     left = residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials)
     correction = FittedInstrument(
         camera,
@@ -235,22 +239,36 @@ def correct_instrument(
 
 
 def _joint_covariance(
-    camera: CameraCorrection, rods: ImagePoints, model: RationalPolynomial, fit: Adjustment
+    camera: CameraCorrection,
+    rods: ImagePoints,
+    model: RationalPolynomial,
+    fit: Adjustment,
+    registration: Registration | None,
 ) -> Array:
     """Covariance of the coefficients of both groups.
 
     An error δ of the coefficients of group A changes the estimates of group B by −Q Aᵀ W G δ, with A and W
     the design matrix and the weights of its adjustment, Q its cofactor matrix and G the derivatives of its
-    conditions by the coefficients of group A.
+    conditions by the coefficients of group A. The registration of the photograph follows them, which is part
+    of G, and has errors of its own, which act in the same way.
     """
-    photo = camera.photo_system(rods.xy)
-    refined, _, by_a = camera.model.derivatives(photo)
+    photo, by_pixel, _ = camera.photo_system.derivatives(rods.xy)
+    refined, by_photo, by_a = camera.model.derivatives(photo)
     _, by_refined, by_b = model.derivatives(refined)
-    conditions = by_refined @ by_a
+    by_image = by_photo @ by_pixel
     cofactors = by_refined @ np.asarray(fit.problem.covariance) @ np.swapaxes(by_refined, 1, 2)
     weights = np.linalg.inv(cofactors)
     q_b = fit.cofactor
-    moved = -q_b @ np.einsum("nib,nij,nja->ba", by_b, weights, conditions)
+
+    def response(conditions: Array) -> Array:
+        found: Array = -q_b @ np.einsum("nib,nij,nja->ba", by_b, weights, by_refined @ conditions)
+        return found
+
+    common = None if registration is None else registration.moves(rods.xy)
+    moved = response(by_a if common is None else by_a + by_image @ common)
+    if registration is not None and registration.similar:
+        own = response(by_image @ registration.by_parameters(rods.xy))
+        q_b = q_b + own @ registration.cofactor @ own.T
     q_a = camera.cofactor
     cross = moved @ q_a
     return np.block([[q_a, cross.T], [cross, q_b + cross @ moved.T]])

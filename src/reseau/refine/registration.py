@@ -9,7 +9,7 @@ of the marks, a smooth field through the marks replaces it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.stats
@@ -54,6 +54,12 @@ class Registration:
         Probability of a difference from the identity at least as large when nothing has moved.
     moved : bool
         Whether the camera has moved: significantly at 0.001, and by more than 0.05 px.
+    centre, length : ndarray (2,), float
+        Pixels of PHOTO I to which the coordinates of a similarity's parameters (X0, Y0, a, b) are reduced.
+    cofactor : ndarray (4, 4)
+        Covariance of these parameters from the errors of the marks.
+    by_camera : ndarray (4, u), optional
+        Their derivatives by the coefficients of the camera, which predict the marks.
 
     Examples
     --------
@@ -69,6 +75,10 @@ class Registration:
     displacement_px: float
     p: float
     moved: bool
+    centre: Array = field(default_factory=lambda: np.zeros(2))
+    length: float = 1.0
+    cofactor: Array = field(default_factory=lambda: np.zeros((4, 4)))
+    by_camera: Array | None = None
 
     @property
     def similar(self) -> bool:
@@ -76,12 +86,45 @@ class Registration:
         return isinstance(self.system, Similarity)
 
     def apply(self, points: ImagePoints) -> ImagePoints:
-        """Transform points of this photograph to PHOTO I; the errors of the marks are neglected."""
+        """Transform points of this photograph to PHOTO I; covariances contain the errors of its marks.
+
+        The errors of the camera's coefficients move all photographs together; see `moves`.
+        """
+        found = self.carry(points)
+        if isinstance(self.system, Similarity):
+            by_parameters = self.by_parameters(found.xy)
+            own = by_parameters @ self.cofactor @ np.swapaxes(by_parameters, 1, 2)
+        else:
+            _, sigma = self.system.leave_one_out()
+            noise = self.system.noise * self.system.sigma[:, None]
+            own = np.diag(np.maximum(sigma**2 - noise**2, 0.0).mean(axis=0))
+        return ImagePoints(found.names, found.xy, found.cov + own)
+
+    def carry(self, points: ImagePoints) -> ImagePoints:
+        """Transform points of this photograph to PHOTO I, with their own errors alone."""
         if isinstance(self.system, Similarity):
             return carried(self.system, points)
         slope = self.system.jacobian(points.xy)
         cov = slope @ points.cov @ np.swapaxes(slope, 1, 2)
         return ImagePoints(points.names, self.system(points.xy), cov)
+
+    def by_parameters(self, xy: Array) -> Array:
+        """Derivatives (n, 2, 4) of pixels of PHOTO I by the parameters of a similarity."""
+        local = (xy - self.centre) / self.length
+        by_local = RationalPolynomial.similarity().derivatives(local).d_parameters
+        found: Array = self.length * by_local
+        return found
+
+    def moves(self, xy: Array) -> Array | None:
+        """Derivatives (n, 2, u) of pixels of PHOTO I by the coefficients of the camera; None where unknown.
+
+        A similarity through the marks follows the camera's prediction of them: what is wrong with it moves
+        the photograph as well, and largely cancels in the corrected coordinates.
+        """
+        if self.by_camera is None or not self.similar:
+            return None
+        found: Array = self.by_parameters(xy) @ self.by_camera
+        return found
 
 
 def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection) -> Registration | Failure:
@@ -129,7 +172,8 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     if isinstance(fit, Failure):
         return fit
     off = fit.values - [0.0, 0.0, 1.0, 0.0]
-    cofactor = fit.cofactor + _of_the_camera(camera, marks, expected, length, fit.cofactor)
+    by_camera = _by_camera(camera, marks, expected, length, fit.cofactor)
+    cofactor = fit.cofactor + by_camera @ camera.cofactor @ by_camera.T
     statistic = float(off @ np.linalg.solve(cofactor, off)) / 4 / max(1.0, fit.sigma0**2)
     p = float(scipy.stats.f.sf(statistic, 4, fit.redundancy))
     system: Similarity | SmoothField = _about(fit.values, centre, length)
@@ -140,15 +184,27 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     displacement = float(np.hypot(*(system(marks.xy) - marks.xy).T).max())
     moved = (fit.sigma0 > _UNLIKE or p < 0.001) and displacement > _LEAST_PX
     left_px = float(np.sqrt((left**2).mean()))
-    return Registration(system, len(marks), float(fit.sigma0), left_px, displacement, p, moved)
+    return Registration(
+        system,
+        len(marks),
+        float(fit.sigma0),
+        left_px,
+        displacement,
+        p,
+        moved,
+        centre,
+        length,
+        fit.cofactor * max(1.0, fit.sigma0**2),
+        by_camera,
+    )
 
 
-def _of_the_camera(
+def _by_camera(
     camera: CameraCorrection, marks: ImagePoints, expected: Array, length: float, cofactor: Array
 ) -> Array:
-    """Contribution of the errors of the camera's coefficients to the covariance of the similarity, (4, 4).
+    """Derivatives of the parameters of the similarity by the camera's coefficients, (4, u).
 
-    They move the expected positions together, by −(∂X/∂x)⁻¹ ∂X/∂a.
+    Errors of the coefficients move the expected positions together, by −(∂X/∂x)⁻¹ ∂X/∂a.
     """
     photo, by_pixel, _ = camera.photo_system.derivatives(expected)
     _, by_photo, by_a = camera.model.derivatives(photo)
@@ -156,9 +212,8 @@ def _of_the_camera(
     local = (expected - expected.mean(axis=0)) / length
     by_parameter = RationalPolynomial.similarity().derivatives(local).d_parameters
     weights = np.linalg.inv(marks.cov / length**2)
-    k = cofactor @ np.einsum("nip,nij,nja->pa", by_parameter, weights, moves)
-    added: Array = k @ camera.cofactor @ k.T
-    return added
+    found: Array = cofactor @ np.einsum("nip,nij,nja->pa", by_parameter, weights, moves)
+    return found
 
 
 def _about(values: Array, centre: Array, length: float) -> Similarity:
