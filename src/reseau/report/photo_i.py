@@ -117,7 +117,7 @@ def _overlay(found: PhotoI, frame: Frame, fit: CorrectionFit) -> str:
 
 
 def _estimates(found: PhotoI) -> Estimates:
-    """Estimates of the remaining coefficients."""
+    """Estimates of the coefficients, including the uncertainty of O and S."""
     camera = found.camera
     quantities = camera.calibration(name="").parameters
     return Estimates(
