@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from reseau.core.data import Frame, ImagePoints
 from reseau.core.errors import ImageError, UsageError
+from reseau.io import MeasuredEdge
+from reseau.measure.film import FrameResult
 
 
 def test_a_frame_knows_its_size() -> None:
@@ -49,3 +52,17 @@ def test_impossible_points_are_refused() -> None:
         ImagePoints(("a", "b"), np.zeros((3, 2)), np.zeros((3, 2, 2)))
     with pytest.raises(UsageError, match="x: is not among the points"):
         ImagePoints.with_sigma(["a"], [[0, 0]], 1.0).select(["x"])
+
+
+def test_axes_that_are_drawn_into_twice_keep_y_down() -> None:
+    figure = Figure()
+    axes = figure.subplots()
+    points = ImagePoints.with_sigma(["a", "b"], [[1.0, 2.0], [30.0, 40.0]], 0.1)
+    edges = {
+        "upper": MeasuredEdge(found=False, points=0, rejected=0, rms_px=None, curvature_px=None),
+    }
+    declined = FrameResult("07.tif", "declined", "of one tone", None, None, None, edges)
+    for draw in (points.plot, declined.plot, points.plot, declined.plot):
+        draw(axes)
+        assert axes.yaxis_inverted()
+    assert not points.plot(Figure().subplots(), y_down=False).yaxis_inverted()
