@@ -57,7 +57,7 @@ class MatchOptions:
         Expected width (one sigma) of the point-spread function, for all marks or for each.
     psf_log_sigma : float
         Uncertainty of that width: standard deviation of its logarithm.
-    contrast : float, optional
+    contrast : float or ndarray (k,), optional
         Expected contrast. By default 0.5 for a dark mark, and the brightest pixel for a bright one.
     contrast_sigma : float
         Standard deviation of the expected contrast; infinite if nothing is known.
@@ -99,7 +99,7 @@ class MatchOptions:
     half_px: int | tuple[int, int] = 6
     psf_px: float | Array = 0.8
     psf_log_sigma: float = 0.5
-    contrast: float | None = None
+    contrast: float | Array | None = None
     contrast_sigma: float = np.inf
     contrast_slope: float | None = None
     response: PixelResponse = field(default_factory=PixelResponse)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
@@ -14,7 +17,7 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
 from ..points import Reason
-from .placement import Placement
+from .placement import Placement, spacing
 from .wires import grid_wires
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
@@ -29,11 +32,32 @@ _BLURRED = 1.55
 """A mark counts as blurred from this multiple of the width of the others' images: it is another object."""
 _LIKE_OTHERS = 4.0
 """Spreads by which the contrast of a mark may differ from that of the others."""
-_CONTRAST_SPREAD = 0.25
-"""Smallest spread of contrasts within a frame, relative to the median: the light and the marks are uneven. It
-leaves the contrast of a distinct mark to its own image and supports only that of a faint one."""
+_ALL_LIGHT = 1.6
+"""Share of the light that a dark mark may seem to take: a camera's zero may be above that of the light."""
+_ANOTHER = 2.0
+"""Spreads from which a distinct mark has a contrast of its own."""
+_DISTINCT = 1.6
+"""Multiple of the tolerated deviation from the neighbours' prediction for a distinct mark."""
+_CERTAIN = 0.8
+"""Correlation with its formed image from which a distinct mark may have any contrast."""
 _ARMS = ("cross", "line-grid")
 """Shapes with arms, whose directions are estimated."""
+_CLEARINGS = 2
+"""Rounds of excluding what lies beside marks; in the second, predictions are those of cleared neighbours."""
+_UNEASY = 1.2
+"""Multiple of the others' residuals from which something is suspected over or beside a mark."""
+_FEWEST_PLAIN = 8
+"""Number of neighbours without suspicion whose median is the expected appearance of a mark."""
+_FIXED = 1e-4
+"""Standard deviation of a parameter that is not adjusted."""
+_PREDICTABLE = 4.0
+"""Scatter of marks about the predictions of their neighbours, in their own standard deviations, up to which a
+prediction shows what does not belong to a mark."""
+_PULLED, _HALF = 4.0, 0.7
+"""Deviation of such a mark from its prediction, in standard deviations, from which it is not accepted, if its
+residuals are still large or less than this share of it is left."""
+_FLANK = 2.5
+"""Margin around an intruder in widths of the point-spread function."""
 _MOVED = 0.5
 """Shift against the start, in widths of the mark's image, from which a mark is matched again."""
 _TURN, _TURNED = 0.12, 0.02
@@ -52,8 +76,9 @@ class ReseauOptions:
         Uncertainty of the nominal positions; by default any smooth distortion and a shift of up to one pitch.
     mirrored : bool, optional
         See :class:`reseau.measure.reseau.placement.GridOptions`.
-    max_rotation_deg : float
-        Largest rotation of the design in the image, used without nominal positions.
+    max_rotation_deg : float, optional
+        Largest rotation of the design in the image, used without nominal positions. By default any; if a
+        symmetric design fits in several ways, it is taken as upright, with a note.
     mark_px : float, optional
         Size of a mark in the image (width of the line for a line grid); by default from the design.
     psf_px : float
@@ -78,7 +103,7 @@ class ReseauOptions:
     nominal: bool = True
     nominal_within_px: float | None = None
     mirrored: bool | None = None
-    max_rotation_deg: float = 12.0
+    max_rotation_deg: float | None = None
     mark_px: float | None = None
     psf_px: float = 0.6
     row_jitter_px: float = 0.0
@@ -122,6 +147,8 @@ class MarkMeasurement:
             else np.broadcast_to(np.eye(2), (len(source), 2, 2))
         )
 
+        self.covered = np.zeros(len(source), dtype=bool)
+
     def result(self) -> tuple[Rows, Matches, Verdict]:
         """Match, learn the appearance of marks, match again, test."""
         placed = self.assignment
@@ -144,7 +171,89 @@ class MarkMeasurement:
         if 0 < len(again) < len(at):
             found = found.replaced(again, self._match_all(at[again], judged.predicted[at[again]]))
             judged = self._judged(at, found)
+        for _ in range(_CLEARINGS):
+            cleared = self._without_intruders(at, found, judged)
+            if cleared is found:
+                break
+            found, judged = cleared, self._judged(at, cleared)
         return at, found, judged
+
+    def _without_intruders(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
+        """Match marks with large residuals again, without the pixels of what lies over or beside them.
+
+        An echo beside a wire, or any other object at a mark, pulls the mark as long as its position is free:
+        the brightest parts of the object are rejected, its flanks are not. At the position that the
+        neighbours predict and with the appearance of the other marks, the object stands out as a whole.
+        """
+        plain = found.converged & (judged.why[at] == "")
+        if plain.sum() < _FEWEST_PLAIN:
+            return found
+        ordinary = float(np.median(found.noise[plain]))
+        suspect = np.flatnonzero((found.noise > _UNEASY * ordinary) & (found.seen > _SEEN))
+        plain &= found.noise <= _UNEASY * ordinary
+        if not len(suspect) or plain.sum() < max(_FEWEST_PLAIN, 2 * len(suspect)):
+            return found  # a scene lies behind all of them
+        scatter = 1.4826 * float(np.nanmedian(np.abs(judged.deviation[at[plain]])))
+        sigma = float(np.median(np.sqrt(np.trace(found.cov[plain], axis1=1, axis2=2) / 2)))
+        if not scatter < _PREDICTABLE * sigma:
+            return found  # the neighbours do not tell where a mark is
+        near = KDTree(self.source[at[plain]]).query(self.source[at[suspect]], k=_FEWEST_PLAIN)[1]
+        left_out = np.nan_to_num(judged.deviation[at[suspect]])
+        predicted = np.where(left_out != 0, found.xy[suspect] - left_out, judged.predicted[at[suspect]])
+        options = replace(
+            self._options(),
+            psf_px=np.median(found.psf_px[plain][near], axis=1),
+            psf_log_sigma=_FIXED,
+            held=(_FIXED, _FIXED),
+            contrast=np.median(found.contrast[plain][near], axis=1),
+            contrast_sigma=_FIXED * abs(float(np.median(found.contrast[plain]))),
+        )
+        expected = self._match(at[suspect], predicted, options, _FIXED, _FIXED)
+        valid = self.screened.valid & ~self._intruders(expected, predicted, ordinary, 3 * scatter)
+        again = self._match(at[suspect], predicted, self._options(), self.size_spread, _TURNED, valid)
+        better = again.converged & (again.noise < found.noise[suspect])
+        cleared = found.replaced(suspect[better], again.select(better))
+        # What could not be told apart from the mark itself still pulls it.
+        own = np.sqrt(np.trace(cleared.cov[suspect], axis1=1, axis2=2) / 2)
+        # Residual distortion has more large values than a normal distribution.
+        usual = max(scatter, float(np.nanquantile(np.abs(judged.deviation[at[plain]]), 0.98)) / 2.3)
+        pulled = np.hypot(*(cleared.xy[suspect] - predicted).T) > _PULLED * np.hypot(own, usual)
+        left = (cleared.noise[suspect] > _UNEASY * ordinary) | (cleared.seen[suspect] < _HALF)
+        self.covered[at[suspect]] = pulled & left
+        return cleared
+
+    def _intruders(self, expected: Matches, centres: Array, noise: float, off_px: float) -> Mask:
+        """Mask (h, w) of pixels that differ from the images expected at `centres`, with a margin for blur.
+
+        Images may be displaced by `off_px`.
+        """
+        h, w = self.screened.grey.shape
+        intruders = np.zeros((h, w), dtype=np.uint8)
+        rows, columns = expected.residuals.shape[1:]
+        reach = int(np.ceil(_FLANK * float(np.median(expected.psf_px))))
+        disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        for residuals, (x, y) in zip(expected.residuals, np.rint(centres).astype(int), strict=True):
+            top, left = y - rows // 2, x - columns // 2
+            inner = slice(max(0, top), min(h, top + rows)), slice(max(0, left), min(w, left + columns))
+            own = (
+                slice(inner[0].start - top, inner[0].stop - top),
+                slice(inner[1].start - left, inner[1].stop - left),
+            )
+            if min(part.stop - part.start for part in inner) < 2:
+                continue
+            off = residuals[own]
+            steps = np.hypot(*np.gradient(self.screened.grey[inner] + np.nan_to_num(off)))
+            differs = ~(np.abs(off) < 4 * noise + off_px * steps) & self.screened.valid[inner]
+            # A single pixel is noise or a bit error.
+            count, labels, stats, _ = cv2.connectedComponentsWithStats(
+                differs.astype(np.uint8), connectivity=8
+            )
+            large = stats[:, cv2.CC_STAT_AREA] > 2
+            large[0] = False
+            if count > 1:
+                strange = np.asarray(cv2.dilate(large[labels].astype(np.uint8), disk), dtype=np.uint8)
+                intruders[inner] = np.maximum(intruders[inner], strange)
+        return intruders > 0
 
     def _near_frame(self, xy: Array) -> Mask:
         """Mask of marks that may lie in the frame, at least in part."""
@@ -185,7 +294,13 @@ class MarkMeasurement:
         return axes
 
     def _match(
-        self, at: Rows, start: Array, options: MatchOptions, size_sigma: float, turn_sigma: float
+        self,
+        at: Rows,
+        start: Array,
+        options: MatchOptions,
+        size_sigma: float,
+        turn_sigma: float,
+        valid: Mask | None = None,
     ) -> Matches:
         form, sigma = SIZE, np.array([size_sigma])
         if self.design.mark.shape in _ARMS:
@@ -200,16 +315,18 @@ class MarkMeasurement:
         def matched(rows: Rows, start: Array) -> Matches:
             return match(
                 self.screened.grey,
-                self.screened.valid,
+                self.screened.valid if valid is None else valid,
                 Outline(outline.xy[rows], outline.dxy[rows]),
                 start,
-                options,
+                replace(options, **_of_each(options, rows)),
                 noise=self.screened.noise,
                 form=form[rows] if form.ndim == 4 else form,
                 form_sigma=sigma,
             )
 
         found = matched(np.arange(len(at)), start)
+        if options.held is not None:
+            return found
         # From a poor start, pixels of the mark are taken for objects in its background and rejected.
         moved = found.converged & (np.hypot(*(found.xy - start).T) > _MOVED * self._image_width(0.0))
         again = np.flatnonzero(moved & (found.t > self.options.least_t))
@@ -235,9 +352,10 @@ class MarkMeasurement:
         log_psf, self.psf_spread = _robust(np.log(first.psf_px[sure]), 0.08)
         self.psf_px = float(np.exp(log_psf))
         self.contrast, spread = _robust(first.contrast[sure], 0.03)
-        # Contrasts may be of several kinds, of which the smallest has a share of one tenth.
+        # Contrasts may be of several kinds; the rarest that is considered has a share of one twentieth.
+        own = np.median(np.abs(first.contrast[sure] / first.t[sure]))
         low, high = np.quantile(first.contrast[sure], [0.05, 0.95])
-        spread = max(spread, float(high - low) / 2, _CONTRAST_SPREAD * abs(self.contrast))
+        spread = max(spread, float(np.sqrt(max(0.0, ((high - low) / 2) ** 2 - (2 * own) ** 2))))
         self.contrast_spread = 1.5 * spread
         growth, self.size_spread = _robust(first.form[sure, 0], 0.02)
         self.size *= 1 + growth
@@ -251,9 +369,9 @@ class MarkMeasurement:
         arms = self.arms @ np.array([[1.0, second], [first, 1.0]])
         return np.asarray(arms / np.linalg.norm(arms, axis=1, keepdims=True))
 
-    def _match_all(self, at: Rows, start: Array) -> Matches:
-        """Match with the learnt appearance; with a curved background where that is better."""
-        options = replace(
+    def _options(self) -> MatchOptions:
+        """Options with the learnt appearance."""
+        return replace(
             self._first_options(),
             psf_px=self.psf_px,
             psf_log_sigma=max(0.25, 1.5 * self.psf_spread),
@@ -263,7 +381,21 @@ class MarkMeasurement:
             start_px=1.0,
             variance=self.variance,
         )
+
+    def _match_all(self, at: Rows, start: Array) -> Matches:
+        """Match with the learnt appearance; with a curved background where that is better."""
+        options = self._options()
         found = self._match(at, start, options, self.size_spread, _TURNED)
+        if self.contrast is not None:
+            # A distinct mark of another contrast is no worse a mark: it is matched without this expectation.
+            distinct = found.converged & (found.t > 8)
+            another = np.flatnonzero(
+                distinct & (np.abs(found.contrast - self.contrast) > _ANOTHER * self.contrast_spread)
+            )
+            own = replace(options, contrast_sigma=np.inf)
+            if len(another):
+                again = self._match(at[another], found.xy[another], own, self.size_spread, _TURNED)
+                found = found.replaced(another, again)
         ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
         uneasy = np.flatnonzero(~found.converged | (found.noise > 1.5 * ordinary) | (found.rejected > 0.1))
         if not len(uneasy):
@@ -281,14 +413,29 @@ class MarkMeasurement:
         outside = np.ones(n, dtype=bool)
         outside[at] = False
         why[outside] = Reason("outside the frame", Code.OUTSIDE)
-        for mask, reason in self._objections(at, found):
+        for mask, reason in self._objections(at, found, self.predicted[at]):
             why[at[mask & (why[at] == "")]] = reason
         xy, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
         xy[at], cov[at] = found.xy, found.cov
         deviation = self._judge_by_neighbours(at, found, xy, cov, why)
         return Verdict(xy, cov, why, deviation, self.field(self.source))
 
-    def _objections(self, at: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+    def found_by_chance(self, at: Rows) -> tuple[int, int]:
+        """How many of the places beside the marks `at`, where there are none, pass for marks; of how many."""
+        step = 0.5 * spacing(self.predicted)
+        angle = np.arange(16) * np.pi / 8
+        around = self.predicted[at, None] + step * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        free = KDTree(self.predicted).query(around)[0].argmax(axis=1)
+        beside = around[np.arange(len(at)), free]
+        inside = self._near_frame(beside)
+        at, beside = at[inside], beside[inside]
+        if not len(at):
+            return 0, 0
+        found = self._match_all(at, beside)
+        refused = np.any([mask for mask, _ in self._objections(at, found, beside)], axis=0)
+        return int((~refused).sum()), len(at)
+
+    def _objections(self, at: Rows, found: Matches, predicted: Array) -> list[tuple[Mask, Reason]]:
         """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
@@ -299,11 +446,18 @@ class MarkMeasurement:
         unlike = np.abs(found.contrast - expected) > _LIKE_OTHERS * np.hypot(
             self.contrast_spread, contrast_sigma
         )
-        moved = np.hypot(*(found.xy - self.predicted[at]).T) > max(2.5, 0.6 * self.extent_px)
+        unlike &= ~(strong & (found.correlation > _CERTAIN))
+        moved = np.hypot(*(found.xy - predicted).T) > max(2.5, 0.6 * self.extent_px)
+        # A dark mark takes no more than all the light; in the dark any noise looks like a larger share.
+        impossible = found.contrast > _ALL_LIGHT + 3 * contrast_sigma
+        impossible &= self.design.polarity == "dark"
         return [
             (found.seen <= _SEEN, Reason("on lost lines or beyond the edge of the frame", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
-            (~(found.t >= o.least_t), Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST)),
+            (
+                ~(found.t >= o.least_t) | impossible,
+                Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST),
+            ),
             (
                 self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary),
                 Reason("less sharp than the other marks", Code.BLURRED),
@@ -311,6 +465,7 @@ class MarkMeasurement:
             (unlike, Reason("contrast differs from the other marks", Code.UNLIKE)),
             (strong & (found.correlation < 0.5), Reason("the image is not that of a mark", Code.UNLIKE)),
             (found.rejected > 0.4, Reason("disturbed by bit errors or the scene", Code.DISTURBED)),
+            (self.covered[at], Reason("disturbed by an object over or beside it", Code.DISTURBED)),
             (moved, Reason("no mark at the position predicted by its neighbours", Code.DEVIATES)),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
@@ -326,6 +481,8 @@ class MarkMeasurement:
         """Reject marks that deviate from the prediction of their neighbours, the worst first."""
         deviation = np.full(xy.shape, np.nan)
         limit = self.options.neighbour_px
+        distinct = np.zeros(len(xy), dtype=bool)
+        distinct[at] = (found.t > 15) & (found.correlation > _CERTAIN)
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = self._relative(cov[good])
             # The length scale found first is used in all rounds; without one, the likeliest is chosen.
@@ -334,7 +491,9 @@ class MarkMeasurement:
             deviation[:] = np.nan
             deviation[good], sigma = self.field.leave_one_out()
             # A prediction that is uncertain by more than a pixel cannot reject a mark.
-            excess = (np.abs(deviation[good]) / np.maximum(limit, 3 * sigma)).max(axis=1)
+            # A distinct mark is where it is, though the distortion between its neighbours is less smooth.
+            tolerated = np.where(distinct[good], _DISTINCT, 1.0)[:, None] * limit
+            excess = (np.abs(deviation[good]) / np.maximum(tolerated, 3 * sigma)).max(axis=1)
             worst = int(excess.argmax())
             if excess[worst] <= 1:
                 break
@@ -350,6 +509,12 @@ class MarkMeasurement:
         variance = np.trace(cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         relative: Array = np.sqrt(variance / np.median(variance))
         return relative
+
+
+def _of_each(options: MatchOptions, rows: Rows) -> dict[str, Any]:
+    """Options that differ from mark to mark, for some of the marks."""
+    each = {name: getattr(options, name) for name in ("psf_px", "contrast")}
+    return {name: values[rows] for name, values in each.items() if isinstance(values, np.ndarray)}
 
 
 def _sure(found: Matches) -> Mask:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy.stats
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
@@ -31,6 +32,10 @@ from .wires import grid_wires
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
+_CLEARLY = 0.6
+"""Share of the visible marks from which nobody doubts that they are those of the design."""
+_BY_CHANCE = 1e-5
+"""Largest probability that as many marks are found where there are none; many positions were tried."""
 _DISTORTED = 0.03
 """Largest rms deviation of marks from their prediction, as a share of their spacing."""
 
@@ -169,7 +174,8 @@ def measure_reseau(
     if design.rings is not None and not use_nominal:
         columns = measure_sheet(frame, design, options)
         return columns if isinstance(columns, Failure) else ReseauResult(**columns)
-    grid = GridOptions(np.deg2rad(options.max_rotation_deg), options.mirrored)
+    most = options.max_rotation_deg
+    grid = GridOptions(None if most is None else float(np.deg2rad(most)), options.mirrored)
     placed = place(
         frame,
         design,
@@ -186,7 +192,7 @@ def measure_reseau(
         return placed
     measurement = MarkMeasurement(frame, design, source[known], placed, options)
     at, found, judged = measurement.result()
-    why_not = _disagreement(source[known], judged, options)
+    why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
             f"design {design.name!r} was not found in the frame: {why_not}",
@@ -216,6 +222,23 @@ def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str
     if off <= max(options.neighbour_px, _DISTORTED * spacing(judged.predicted)):
         return ""
     return f"{len(good)} places look like its marks, but deviate by {off:.1f} px from each other's prediction"
+
+
+def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
+    """Why the measured marks may be there by chance; empty if they cannot.
+
+    Where only some of the marks were found, the same measurement is made beside them: in a picture of
+    something else, as many places there look like marks.
+    """
+    good = int((judged.why == "").sum())
+    visible = at[[why == "" or getattr(why, "code", None) != Code.OUTSIDE for why in judged.why[at]]]
+    if good > _CLEARLY * len(visible):
+        return ""
+    passed, tried = measurement.found_by_chance(visible)
+    share = (passed + 1) / (tried + 2)
+    if scipy.stats.binom.sf(good - 1, len(visible), share) < _BY_CHANCE:
+        return ""
+    return f"{good} of {len(visible)} places look like its marks, and {passed} of {tried} where it has none"
 
 
 def _source(design: ReseauDesign) -> Array:

@@ -18,16 +18,29 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField, trend_degree
 from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
 from .candidates import Candidates, find_candidates
 
-__all__ = ["Assignment", "GridOptions", "Placement", "PlacingOptions", "assign", "place", "place_grid"]
+__all__ = [
+    "Assignment",
+    "GridOptions",
+    "Placement",
+    "PlacingOptions",
+    "assign",
+    "climbed",
+    "place",
+    "place_grid",
+]
 
 _NEIGHBOURS = 6
+_UPRIGHT = np.deg2rad(12.0)
+"""Rotation up to which a design counts as upright in the image."""
+_TRIED = 8
+"""Number of start positions without prior knowledge that are followed."""
 _NEARLY = 0.75
 """Share of the marks from which a layout is correct except for a shift by steps of the grid."""
 
@@ -38,8 +51,9 @@ class GridOptions:
 
     Parameters
     ----------
-    max_rotation : float
-        Largest rotation of the design against the image (rad).
+    max_rotation : float, optional
+        Largest rotation of the design against the image (rad). By default any; a design that fits upright is
+        not turned.
     mirrored : bool, optional
         Whether the design has the handedness of the image (x right, y down; False) or the opposite (True);
         None to determine it. A symmetric grid does not determine it; then the handedness of the nominal
@@ -48,9 +62,14 @@ class GridOptions:
         Number of peaks of the vote for scale and rotation that are followed.
     """
 
-    max_rotation: float = np.deg2rad(12.0)
+    max_rotation: float | None = None
     mirrored: bool | None = None
     hypotheses: int = 4
+
+    def rotations(self) -> tuple[float, ...]:
+        """Largest rotations (rad) that are tried one after the other."""
+        most = np.pi if self.max_rotation is None else self.max_rotation
+        return (most,) if most <= _UPRIGHT else (_UPRIGHT, most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,24 +297,35 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
     # crossings; with the strongest only, a scene behind the marks may. Therefore first one, then the other.
     electorates = (_strongest(candidates, 3 * len(source) // 2), strong)
     best: Assignment | None = None
-    # Hypotheses with y up come first: of two that explain the image equally, the first is kept.
-    for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
-        plane = source * [1, -1 if mirrored else 1]
-        for start in chain.from_iterable(_starts(plane, voters, options) for voters in electorates):
-            found = assign(source, start, strong, valid, shifts=1)
-            if found is None:
-                continue
-            if found.score > _NEARLY * len(source):
-                found = _climbed(found, source, strong, valid)
-            if best is None or found.score > best.score + 0.75:
-                best = found
-            # If no grid step improves it and nearly all marks support it, no other hypothesis is better.
-            if found.score > _NEARLY * len(source):
-                break
+    for turned in options.rotations():
+        # Hypotheses with y up come first: of two that explain the image equally, the first is kept.
+        for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
+            plane = source * [1, -1 if mirrored else 1]
+            starts = (_starts(plane, voters, turned, options.hypotheses) for voters in electorates)
+            for start in _supported(list(chain.from_iterable(starts)), strong, _TRIED):
+                found = assign(source, start, strong, valid, shifts=1)
+                if found is None:
+                    continue
+                if found.score > _NEARLY * len(source):
+                    found = climbed(found, source, strong, valid)
+                if best is None or found.score > best.score + 0.75:
+                    best = found
+                # If no grid step improves it and nearly all marks support it, no other hypothesis is better.
+                if found.score > _NEARLY * len(source):
+                    break
+        if best is not None and best.score > _NEARLY * len(source):
+            break
     return best
 
 
-def _climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
+def _supported(starts: list[Array], candidates: Candidates, count: int) -> list[Array]:
+    """The start positions near which most marks have a candidate."""
+    tree = KDTree(candidates.xy)
+    near = [int((tree.query(start)[0] < 0.25 * spacing(start)).sum()) for start in starts]
+    return [starts[k] for k in np.argsort(-np.array(near, dtype=int), kind="stable")[:count]]
+
+
+def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
     """Move the design by steps of its grid as long as that assigns more marks.
 
     A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
@@ -317,9 +347,9 @@ def _strongest(candidates: Candidates, count: int) -> Candidates:
     return replace(candidates, xy=candidates.xy[:count], t=candidates.t[:count])
 
 
-def _starts(plane: Array, voters: Candidates, options: GridOptions) -> Iterator[Array]:
-    """Start positions of the marks, the likeliest first."""
-    for similarity in _similarities(plane, voters, options):
+def _starts(plane: Array, voters: Candidates, most: float, count: int) -> Iterator[Array]:
+    """Start positions of the marks at rotations up to `most`, the likeliest first."""
+    for similarity in _similarities(plane, voters, most, count if most <= _UPRIGHT else 2 * count):
         yield from _shifted(plane, similarity, voters)
 
 
@@ -328,7 +358,7 @@ def _complex(xy: Array) -> NDArray[np.complex128]:
     return z
 
 
-def _similarities(plane: Array, candidates: Candidates, options: GridOptions) -> list[complex]:
+def _similarities(plane: Array, candidates: Candidates, most: float, count: int) -> list[complex]:
     """Scales and rotations, as complex factors, that map design neighbours to neighbouring candidates."""
 
     def steps(xy: Array, count: int) -> NDArray[np.complex128]:
@@ -344,16 +374,16 @@ def _similarities(plane: Array, candidates: Candidates, options: GridOptions) ->
     ratio = (seen[:, None] / (designed * grain)).ravel()
     weights = np.broadcast_to(weight, (len(seen), len(weight))).ravel()
     angle = np.angle(ratio)
-    keep = (np.abs(angle) < options.max_rotation) & (np.abs(ratio) > 0)
+    keep = (np.abs(angle) <= most) & (np.abs(ratio) > 0)
     logs = np.log(np.abs(ratio[keep]))
     limits = [
         (float(logs.min()) - 0.1, float(logs.max()) + 0.1),
-        (-options.max_rotation, options.max_rotation),
+        (-most, most),
     ]
     values = np.stack([logs, angle[keep]], axis=1)
     votes, (x, y) = _vote(values, weights[keep].astype(float), limits, (0.01, 0.01), 2.0)
     found = []
-    for _ in range(options.hypotheses):
+    for _ in range(count):
         i, j = np.unravel_index(votes.argmax(), votes.shape)
         found.append(complex(np.exp(x[i] + 1j * y[j])))
         votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
@@ -379,6 +409,10 @@ def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[
     return starts
 
 
+_SOME = 0.2
+"""Share of the marks near their nominal positions below which the whole frame is searched."""
+_BETTER = 0.05
+"""Share of all marks that another position must find in addition to contradict the nominal positions."""
 _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
 """Sizes of a mark in the image that are tried if the size is unknown."""
 
@@ -418,13 +452,25 @@ class Placement:
         The screened frame.
     assignment : Assignment
         Marks with their candidates and the field through them.
+    candidates : Candidates
+        Places that look like a mark.
     mark_px : float
         Approximate size of a mark in the image; the width of the line for a line grid.
+    notes : tuple of Remark
+        Notes for the user.
     """
 
     screened: Screened
     assignment: Assignment
+    candidates: Candidates
     mark_px: float
+    notes: tuple[Remark, ...] = ()
+
+    @property
+    def strength(self) -> float:
+        """Score of the assignment, and strength of its marks."""
+        has = self.assignment.candidate[self.assignment.candidate >= 0]
+        return self.assignment.score + float(np.log1p(self.candidates.t[has]).sum())
 
 
 def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions) -> Placement | Failure:
@@ -451,39 +497,83 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     ImageError
         When the frame is all black, saturated, or of one grey.
     """
-    mark = design.mark
-    size = mark.line_width if mark.shape == "line-grid" else mark.size
-    axes = np.eye(2) if options.nominal is None else _nominal_axes(source, options.nominal)
-    best: tuple[float, Placement] | None = None
-    likeliest = np.empty((0, 2))
-    for mark_px in _sizes(source, size, options):
-        screened = screen(frame, run=max(15, round(4 * mark_px)))
-        template = _template(design, mark_px, options.psf_px, axes)
-        if len(template) > min(frame.pixels.shape):
-            continue
-        candidates = find_candidates(screened.grey, screened.valid, template)
-        if not len(likeliest):
-            likeliest = candidates.xy[: 3 * len(source)]
-        found = _lay(source, size, candidates, screened, mark_px, options)
-        if found is None:
-            continue
-        strength = float(np.log1p(candidates.t[found.candidate[found.candidate >= 0]]).sum())
-        if best is None or strength + found.score > best[0]:
-            best = (strength + found.score, Placement(screened, found, mark_px))
-        # All marks found, at the size of the design: no other size can be better.
-        if size is not None and found.score >= len(source) - 1:
-            break
-    marks = 0 if best is None else int((best[1].assignment.candidate >= 0).sum())
+    best = _placed(frame, design, source, options)
+    if options.nominal is not None and options.within_px is None:
+        best = _despite_nominal(best, frame, design, source, options)
+    marks = 0 if best is None else int((best.assignment.candidate >= 0).sum())
     least = max(4, min(10, len(source) // 3))
-    if best is None or marks < least or best[1].assignment.score < -0.1 * len(source):
+    if best is None or marks < least or best.assignment.score < -0.1 * len(source):
         return Failure(
             f"design {design.name!r} was not found in the frame of "
             f"{frame.width}×{frame.height} px ({marks} of {len(source)} marks agree with it)",
             Code.NOT_FOUND,
             where=frame.name,
-            places=likeliest,
+            places=np.empty((0, 2)) if best is None else best.candidates.xy[: 3 * len(source)],
         )
-    return best[1]
+    return best
+
+
+def _placed(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions) -> Placement | None:
+    """The best position over all sizes and rotations of a mark."""
+    mark = design.mark
+    size = mark.line_width if mark.shape == "line-grid" else mark.size
+    best: Placement | None = None
+    sizes = _sizes(source, size, options)
+    strengths: list[tuple[float, float]] = []
+    for turn in _turns(design, options):
+        if turn:
+            # A mark that is not upright still looks most like one of its own size.
+            sizes = tuple(size for _, size in sorted(strengths, reverse=True)[:2])
+        for mark_px in sizes:
+            screened = screen(frame, run=max(15, round(4 * mark_px)))
+            template = _template(design, mark_px, options.psf_px, _axes(source, options.nominal, turn))
+            if len(template) > min(frame.pixels.shape):
+                continue
+            candidates = find_candidates(screened.grey, screened.valid, template)
+            if not turn:
+                strengths.append((float(candidates.t[: len(source)].sum()), mark_px))
+            found = _lay(source, size, candidates, screened, mark_px, options)
+            if found is None:
+                continue
+            placed = Placement(screened, found, candidates, mark_px)
+            if best is None or placed.strength > best.strength:
+                best = placed
+            # All marks found, at the size of the design: no other size can be better.
+            if size is not None and found.score >= len(source) - 1:
+                return placed
+        if best is not None and best.assignment.score > _NEARLY * len(source):
+            break
+    return best
+
+
+def _turns(design: ReseauDesign, options: PlacingOptions) -> tuple[float, ...]:
+    """Rotations of a mark (rad) that are tried; marks look the same after a quarter of a turn."""
+    most = options.grid.rotations()[-1]
+    if options.nominal is not None or most <= _UPRIGHT or design.mark.shape in ("disk", "rod"):
+        return (0.0,)
+    return (0.0, np.pi / 8, -np.pi / 8, np.pi / 4)
+
+
+def _despite_nominal(
+    best: Placement | None, frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions
+) -> Placement | None:
+    """The position found from nominal positions, or a much better one that contradicts them."""
+    assert options.nominal is not None
+    n = len(source)
+    if best is not None and (best.assignment.candidate >= 0).sum() > _SOME * n:
+        better = climbed(best.assignment, source, best.candidates, best.screened.valid)
+        rival: Placement | None = replace(best, assignment=better)
+    else:
+        rival = _placed(frame, design, source, replace(options, nominal=None))
+    if rival is None or (best is not None and rival.assignment.score < best.assignment.score + _BETTER * n):
+        return best
+    off = np.hypot(*np.median(rival.assignment.predicted - options.nominal, axis=0))
+    found, of_them = ((p.assignment.candidate >= 0).sum() if p else 0 for p in (rival, best))
+    text = (
+        f"the nominal positions are wrong by about {off:.0f} px: near them {of_them} marks were found, "
+        f"elsewhere {found}"
+    )
+    return replace(rival, notes=(Remark(text, Code.DEVIATES),))
 
 
 def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[float, ...]:
@@ -494,8 +584,11 @@ def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[
     return _TRIAL_PX
 
 
-def _nominal_axes(source: Array, nominal: Array) -> Array:
-    """Linear mapping (2, 2) of unit determinant from the design to the image, by the nominal positions."""
+def _axes(source: Array, nominal: Array | None, turn: float) -> Array:
+    """Linear mapping (2, 2) of unit determinant from a mark to its image, by nominal positions if known."""
+    if nominal is None:
+        c, s = np.cos(turn), np.sin(turn)
+        return np.array([[c, -s], [s, c]])
     from_mean = source - source.mean(axis=0)
     linear = np.linalg.lstsq(from_mean, nominal - nominal.mean(axis=0), rcond=None)[0].T
     size = abs(float(np.linalg.det(linear)))
