@@ -56,6 +56,8 @@ prediction shows what does not belong to a mark."""
 _PULLED, _HALF = 4.0, 0.7
 """Deviation of such a mark from its prediction, in standard deviations, from which it is not accepted, if its
 residuals are still large or less than this share of it is left."""
+_ENOUGH = 0.35
+"""Share of a mark that must be left beside intruders for it to be matched without them."""
 _FLANK = 2.5
 """Margin around an intruder in widths of the point-spread function."""
 _MOVED = 0.5
@@ -211,7 +213,7 @@ class MarkMeasurement:
         expected = self._match(at[suspect], predicted, options, _FIXED, _FIXED)
         valid = self.screened.valid & ~self._intruders(expected, predicted, ordinary, 3 * scatter)
         again = self._match(at[suspect], predicted, self._options(), self.size_spread, _TURNED, valid)
-        better = again.converged & (again.noise < found.noise[suspect])
+        better = again.converged & (again.noise < found.noise[suspect]) & (again.seen > _ENOUGH)
         cleared = found.replaced(suspect[better], again.select(better))
         # What could not be told apart from the mark itself still pulls it.
         own = np.sqrt(np.trace(cleared.cov[suspect], axis1=1, axis2=2) / 2)
@@ -482,7 +484,7 @@ class MarkMeasurement:
         deviation = np.full(xy.shape, np.nan)
         limit = self.options.neighbour_px
         distinct = np.zeros(len(xy), dtype=bool)
-        distinct[at] = (found.t > 15) & (found.correlation > _CERTAIN)
+        distinct[at] = (found.t > 10) & (found.correlation > _CERTAIN)
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = self._relative(cov[good])
             # The length scale found first is used in all rounds; without one, the likeliest is chosen.
