@@ -34,8 +34,8 @@ _LIKE_OTHERS = 4.0
 """Spreads by which the contrast of a mark may differ from that of the others."""
 _ALL_LIGHT = 1.6
 """Share of the light that a dark mark may seem to take: a camera's zero may be above that of the light."""
-_ANOTHER = 2.0
-"""Spreads from which a distinct mark has a contrast of its own."""
+_OTHER_KIND = 0.3
+"""Relative difference from which two contrasts are not the same kind of mark in uneven light."""
 _DISTINCT = 1.6
 """Multiple of the tolerated deviation from the neighbours' prediction for a distinct mark."""
 _CERTAIN = 0.8
@@ -50,7 +50,7 @@ _FEWEST_PLAIN = 8
 """Number of neighbours without suspicion whose median is the expected appearance of a mark."""
 _FIXED = 1e-4
 """Standard deviation of a parameter that is not adjusted."""
-_PREDICTABLE = 4.0
+_PREDICTABLE = 2.5
 """Scatter of marks about the predictions of their neighbours, in their own standard deviations, up to which a
 prediction shows what does not belong to a mark."""
 _PULLED, _HALF = 4.0, 0.7
@@ -346,20 +346,22 @@ class MarkMeasurement:
     def _learn(self, first: Matches, start: Array) -> None:
         """Learn width, contrast, size and noise of the marks of this frame."""
         sure = _sure(first)
-        self.variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
-        if sure.sum() < 5:
+        # The strongest marks show this best; the others are added for their contrasts only.
+        strongest = sure & (np.arange(len(sure)) < _LEARN_FROM)
+        self.variance = grey_variance(self.screened.grey, start[strongest], first.residuals[strongest])
+        if strongest.sum() < 5:
             self.psf_px, self.psf_spread = self.options.psf_px, 0.3
             self.contrast, self.contrast_spread, self.size_spread = None, np.inf, 0.1
             return
-        log_psf, self.psf_spread = _robust(np.log(first.psf_px[sure]), 0.08)
+        log_psf, self.psf_spread = _robust(np.log(first.psf_px[strongest]), 0.08)
         self.psf_px = float(np.exp(log_psf))
         self.contrast, spread = _robust(first.contrast[sure], 0.03)
         # Contrasts may be of several kinds; the rarest that is considered has a share of one twentieth.
-        own = np.median(np.abs(first.contrast[sure] / first.t[sure]))
         low, high = np.quantile(first.contrast[sure], [0.05, 0.95])
-        spread = max(spread, float(np.sqrt(max(0.0, ((high - low) / 2) ** 2 - (2 * own) ** 2))))
+        if high - low > 2 * _OTHER_KIND * abs(self.contrast):
+            spread = max(spread, float(high - low) / 2)
         self.contrast_spread = 1.5 * spread
-        growth, self.size_spread = _robust(first.form[sure, 0], 0.02)
+        growth, self.size_spread = _robust(first.form[strongest, 0], 0.02)
         self.size *= 1 + growth
         self.extent_px *= 1 + growth
         if self.design.mark.shape in _ARMS:
@@ -391,8 +393,11 @@ class MarkMeasurement:
         if self.contrast is not None:
             # A distinct mark of another contrast is no worse a mark: it is matched without this expectation.
             distinct = found.converged & (found.t > 8)
+            off = np.abs(found.contrast - self.contrast)
             another = np.flatnonzero(
-                distinct & (np.abs(found.contrast - self.contrast) > _ANOTHER * self.contrast_spread)
+                distinct
+                & (off > _LIKE_OTHERS * self.contrast_spread)
+                & (off > _OTHER_KIND * abs(self.contrast))
             )
             own = replace(options, contrast_sigma=np.inf)
             if len(another):
