@@ -50,12 +50,12 @@ _FEWEST_PLAIN = 8
 """Number of neighbours without suspicion whose median is the expected appearance of a mark."""
 _FIXED = 1e-4
 """Standard deviation of a parameter that is not adjusted."""
-_PREDICTABLE = 2.5
+_PREDICTABLE = 3.5
 """Scatter of marks about the predictions of their neighbours, in their own standard deviations, up to which a
 prediction shows what does not belong to a mark."""
-_PULLED, _HALF = 4.0, 0.7
-"""Deviation of such a mark from its prediction, in standard deviations, from which it is not accepted, if its
-residuals are still large or less than this share of it is left."""
+_PULLED, _BEYOND, _HALF = 4.0, 1.35, 0.7
+"""Deviation of such a mark from its prediction, in standard deviations and relative to the largest of the
+others, from which it is not accepted if its residuals are still large, or less than this share is left."""
 _ENOUGH = 0.35
 """Share of a mark that must be left beside intruders for it to be matched without them."""
 _FLANK = 2.5
@@ -218,8 +218,9 @@ class MarkMeasurement:
         # What could not be told apart from the mark itself still pulls it.
         own = np.sqrt(np.trace(cleared.cov[suspect], axis1=1, axis2=2) / 2)
         # Residual distortion has more large values than a normal distribution.
-        usual = max(scatter, float(np.nanquantile(np.abs(judged.deviation[at[plain]]), 0.98)) / 2.3)
-        pulled = np.hypot(*(cleared.xy[suspect] - predicted).T) > _PULLED * np.hypot(own, usual)
+        largest = float(np.nanmax(np.abs(judged.deviation[at[plain]])))
+        limit = np.maximum(_PULLED * np.hypot(own, scatter), _BEYOND * largest)
+        pulled = np.hypot(*(cleared.xy[suspect] - predicted).T) > limit
         left = (cleared.noise[suspect] > _UNEASY * ordinary) | (cleared.seen[suspect] < _HALF)
         self.covered[at[suspect]] = pulled & left
         return cleared
@@ -489,7 +490,7 @@ class MarkMeasurement:
         deviation = np.full(xy.shape, np.nan)
         limit = self.options.neighbour_px
         distinct = np.zeros(len(xy), dtype=bool)
-        distinct[at] = (found.t > 10) & (found.correlation > _CERTAIN)
+        distinct[at] = (found.t > 15) & (found.correlation > _CERTAIN)
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = self._relative(cov[good])
             # The length scale found first is used in all rounds; without one, the likeliest is chosen.
