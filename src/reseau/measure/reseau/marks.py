@@ -40,6 +40,8 @@ _DISTINCT = 1.6
 """Multiple of the tolerated deviation from the neighbours' prediction for a distinct mark."""
 _CERTAIN = 0.8
 """Correlation with its formed image from which a distinct mark may have any contrast."""
+_BOTH_ARMS = 0.8
+"""Least correlation with the formed image, corrected for noise, of a mark with arms; one arm alone has 0.7."""
 _ARMS = ("cross", "line-grid")
 """Shapes with arms, whose directions are estimated."""
 _CLEARINGS = 2
@@ -193,7 +195,7 @@ class MarkMeasurement:
         ordinary = float(np.median(found.noise[plain]))
         suspect = np.flatnonzero((found.noise > _UNEASY * ordinary) & (found.seen > _SEEN))
         plain &= found.noise <= _UNEASY * ordinary
-        if not len(suspect) or plain.sum() < max(_FEWEST_PLAIN, 2 * len(suspect)):
+        if not len(suspect) or plain.sum() < max(_FEWEST_PLAIN, 3 * len(suspect)):
             return found  # a scene lies behind all of them
         scatter = 1.4826 * float(np.nanmedian(np.abs(judged.deviation[at[plain]])))
         sigma = float(np.median(np.sqrt(np.trace(found.cov[plain], axis1=1, axis2=2) / 2)))
@@ -471,12 +473,23 @@ class MarkMeasurement:
                 Reason("less sharp than the other marks", Code.BLURRED),
             ),
             (unlike, Reason("contrast differs from the other marks", Code.UNLIKE)),
-            (strong & (found.correlation < 0.5), Reason("the image is not that of a mark", Code.UNLIKE)),
+            (strong & ~self._alike(found), Reason("the image is not that of a mark", Code.UNLIKE)),
             (found.rejected > 0.4, Reason("disturbed by bit errors or the scene", Code.DISTURBED)),
             (self.covered[at], Reason("disturbed by an object over or beside it", Code.DISTURBED)),
             (moved, Reason("no mark at the position predicted by its neighbours", Code.DEVIATES)),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
+
+    def _alike(self, found: Matches) -> Mask:
+        """Mask of matches whose images are those of marks, apart from the noise of the frame.
+
+        A single wire looks like half a crossing, and its position along the wire is arbitrary.
+        """
+        if self.design.mark.shape not in _ARMS:
+            return np.asarray(found.correlation >= 0.5)
+        white = np.clip((self.screened.noise / np.maximum(found.noise, 1e-12)) ** 2, 0, 1)
+        squared = np.clip(found.correlation, 0, 1) ** 2
+        return np.asarray(1 - (1 - squared) * (1 - white) >= _BOTH_ARMS**2)
 
     def _image_width(self, psf_px: ArrayLike) -> Array:
         """Width (one sigma) of the images of marks: point-spread function, pixel, and the mark itself."""
