@@ -41,7 +41,7 @@ _DISTINCT = 1.6
 _CERTAIN = 0.8
 """Correlation with its formed image from which a distinct mark may have any contrast."""
 _BOTH_ARMS = 0.8
-"""Least correlation with the formed image, corrected for noise, of a mark with arms; one arm alone has 0.7."""
+"""Least correlation with the formed image, corrected for noise, of a mark with arms; one alone has 0.7."""
 _ARMS = ("cross", "line-grid")
 """Shapes with arms, whose directions are estimated."""
 _CLEARINGS = 2
