@@ -26,7 +26,7 @@ RESEAU = ReseauDesign(
     ),
 )
 _RODS = [(x, y) for y in (0, 20, 40, 60, 80) for x in (0, 25, 50, 75, 100)] + [
-    (10 * i + 5, 30 + 5 * i) for i in range(9)
+    (10 * i + 5, 31 + 5 * i) for i in range(9)
 ]
 RODS = ReseauDesign(
     name="rods",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
 from reseau.optics import Similarity
 from reseau.refine import correct_camera, register
@@ -56,3 +58,28 @@ def test_three_marks_are_too_few_to_register_a_photograph():
     found = register(marks.select(marks.names[:3]), RESEAU, _camera())
     assert isinstance(found, Failure)
     assert "3 marks" in found.reason
+
+
+def test_marks_that_contradict_the_others_do_not_pull_the_photograph():
+    """Echoes beside crossings move single marks of PHOTO II."""
+    marks = reseau_marks(np.random.default_rng(4))
+    pulled = marks.xy.copy()
+    pulled[[7, 30, 90]] += [0.1, 1.0]
+    found = register(ImagePoints(marks.names, pulled, marks.cov), RESEAU, _camera())
+    assert set(found.rejected) == {marks.names[k] for k in (7, 30, 90)}
+    assert not found.moved
+    assert found.displacement_px < 0.02
+
+
+def test_the_errors_of_the_marks_are_part_of_the_registered_points():
+    body = ImagePoints.with_sigma(["p", "q"], [[400.0, 300.0], [1300.0, 900.0]], 1e-6)
+    off = []
+    for seed in range(60):
+        rng, camera = np.random.default_rng(200 + seed), _camera(seed)
+        found = register(reseau_marks(rng), RESEAU, camera)
+        there = found.apply(body)
+        moved = found.moves(body.xy)
+        cov = there.cov + moved @ camera.cofactor @ np.swapaxes(moved, 1, 2)
+        root = np.linalg.cholesky(cov)
+        off.append(np.linalg.solve(root, (there.xy - body.xy)[..., None])[..., 0])
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.2)

@@ -44,7 +44,7 @@ from ..refine import (
     register,
     still_standard,
 )
-from ..refine.remarks import of_the_camera, of_the_change, of_the_object
+from ..refine.remarks import ANOTHER_SHAPE_PX, of_the_camera, of_the_change, of_the_object
 
 __all__ = [
     "OscilloscopeProcedure",
@@ -503,17 +503,30 @@ def _reseau_in(
 ) -> ReseauResult | Failure:
     """Measure the reseau at its position in PHOTO I; search it if that may have missed a row.
 
-    If the camera was moved by the pitch of the reseau, marks appear at the positions of others.
+    If the camera was moved by the pitch of the reseau, marks appear at the positions of others; if by half of
+    it, a single wire passes there. Neither has the shape that PHOTO I predicts.
     """
     o = options or ReseauOptions()
     expected = camera.to_pixels(camera.object_system(reseau.xy))
     near = replace(o, nominal=True, nominal_within_px=_STATIONARY_PX)
     known = measure_reseau(photo, reseau.expected_at(expected), near)
-    found = known.found if isinstance(known, ReseauResult) else 0
-    if len(reseau.ids) - found <= 0.5 * np.sqrt(len(reseau.ids)):
+    found, left = 0, np.inf
+    if isinstance(known, ReseauResult):
+        found, left = known.found, _left_px(known, reseau, camera)
+    if len(reseau.ids) - found <= 0.5 * np.sqrt(len(reseau.ids)) and left <= ANOTHER_SHAPE_PX:
         return known
     anew = measure_reseau(photo, reseau, o)
-    return anew if isinstance(anew, ReseauResult) and anew.found > found else known
+    if not isinstance(anew, ReseauResult):
+        return known
+    if left > ANOTHER_SHAPE_PX:
+        return anew if _left_px(anew, reseau, camera) < left else known
+    return anew if anew.found > found else known
+
+
+def _left_px(seen: ReseauResult, reseau: ReseauDesign, camera: CameraCorrection) -> float:
+    """Residuals of the marks of a photograph against PHOTO I, pixels rms; see `Registration`."""
+    registered = register(seen.points, reseau, camera)
+    return registered.left_px if isinstance(registered, Registration) else np.inf
 
 
 class OscilloscopeProcedure:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.stats
 
+from ..adjust import Adjustment
 from ..calibration.mapping import carried
 from ..calibration.oscilloscope import CameraCorrection
-from ..core.data import Array, ImagePoints
+from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
@@ -31,6 +32,10 @@ _UNLIKE = 2.0
 """Standard deviation of unit weight above which a similarity is not sufficient."""
 _FIELD_FROM = 20
 """Least number of marks for a smooth field."""
+_FAR_SQUARED, _MEDIAN_OF_TWO = 20.0, 1.386
+"""Squared distance, in sigmas, beyond which a mark is rejected: 5e-5 of χ² with 2 degrees; its median."""
+_MOST_REJECTED, _ROUNDS = 0.2, 10
+"""Largest share of rejected marks, and number of rounds in which they are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,8 @@ class Registration:
         Covariance of these parameters from the errors of the marks.
     by_camera : ndarray (4, u), optional
         Their derivatives by the coefficients of the camera, which predict the marks.
+    rejected : tuple of str
+        Marks that contradict the others and were not used.
 
     Examples
     --------
@@ -79,6 +86,7 @@ class Registration:
     length: float = 1.0
     cofactor: Array = field(default_factory=lambda: np.zeros((4, 4)))
     by_camera: Array | None = None
+    rejected: tuple[str, ...] = ()
 
     @property
     def similar(self) -> bool:
@@ -167,10 +175,16 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
             Code.TOO_FEW_POINTS,
         )
     centre, length = expected.mean(axis=0), float(np.ptp(expected, axis=0).max())
-    local = ImagePoints(marks.names, (marks.xy - centre) / length, marks.cov / length**2)
-    fit = fit_mapping(RationalPolynomial.similarity(), local, (expected - centre) / length)
+    fit = _similarity(marks, expected, centre, length)
     if isinstance(fit, Failure):
         return fit
+    kept = _consistent(marks, expected, centre, length, fit)
+    rejected: tuple[str, ...] = ()
+    if not kept.all():
+        again = _similarity(marks.select(kept), expected[kept], centre, length)
+        if isinstance(again, Adjustment) and again.sigma0 <= _UNLIKE:
+            rejected = tuple(name for name, k in zip(marks.names, kept.tolist(), strict=True) if not k)
+            fit, marks, expected = again, marks.select(kept), expected[kept]
     off = fit.values - [0.0, 0.0, 1.0, 0.0]
     by_camera = _by_camera(camera, marks, expected, length, fit.cofactor)
     cofactor = fit.cofactor + by_camera @ camera.cofactor @ by_camera.T
@@ -196,7 +210,38 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
         length,
         fit.cofactor * max(1.0, fit.sigma0**2),
         by_camera,
+        rejected,
     )
+
+
+def _similarity(marks: ImagePoints, expected: Array, centre: Array, length: float) -> Adjustment | Failure:
+    """Adjust a similarity of coordinates reduced to a centre and a length."""
+    local = ImagePoints(marks.names, (marks.xy - centre) / length, marks.cov / length**2)
+    return fit_mapping(RationalPolynomial.similarity(), local, (expected - centre) / length)
+
+
+def _consistent(marks: ImagePoints, expected: Array, centre: Array, length: float, fit: Adjustment) -> Mask:
+    """Marks (n,) that agree with a similarity; those beside an echo or a reflection may not.
+
+    Residuals are compared with the sigmas of the marks, or with the scatter of most of them if that is
+    larger. With more than a fifth of them rejected, the photograph has another shape and none is.
+    """
+    weights, kept = np.linalg.inv(marks.cov), np.ones(len(marks), dtype=bool)
+    for _ in range(_ROUNDS):
+        off = _about(fit.values, centre, length)(marks.xy) - expected
+        squared = np.einsum("ni,nij,nj->n", off, weights, off)
+        scale = max(1.0, float(np.median(squared)) / _MEDIAN_OF_TWO)
+        now = squared <= _FAR_SQUARED * scale
+        if now.mean() < 1 - _MOST_REJECTED or now.sum() < 4:
+            return np.ones(len(marks), dtype=bool)
+        if (now == kept).all():
+            break
+        kept = now
+        again = _similarity(marks.select(kept), expected[kept], centre, length)
+        if not isinstance(again, Adjustment):
+            return np.ones(len(marks), dtype=bool)
+        fit = again
+    return kept
 
 
 def _by_camera(

@@ -11,11 +11,11 @@ from ..io import ReseauDesign
 from .registration import Registration
 from .standard import StandardTest
 
-__all__ = ["of_the_camera", "of_the_change", "of_the_object"]
+__all__ = ["ANOTHER_SHAPE_PX", "of_the_camera", "of_the_change", "of_the_object"]
 
 _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is accepted."""
-_ANOTHER_SHAPE_PX = 0.3
+ANOTHER_SHAPE_PX = 0.3
 """Largest rms residual of the marks of a photograph that has the shape of PHOTO I."""
 
 
@@ -45,7 +45,7 @@ def of_the_camera(camera: CameraCorrection, registration: Registration | None) -
                 Code.CAMERA_MOVED,
             )
         )
-    if registration is not None and registration.left_px > _ANOTHER_SHAPE_PX:
+    if registration is not None and registration.left_px > ANOTHER_SHAPE_PX:
         notes.append(
             Remark(
                 f"the marks of the reseau differ from PHOTO I by {registration.left_px:.2f} px (rms): "
