@@ -29,7 +29,7 @@ _FEW = 16
 _EVIDENCE, _EACH = 12.0, 3.0
 """Minimum of twice the logarithm of the ratio of likelihoods by which a form must be better, and what is
 subtracted from it for every echo."""
-_EXPLAINED = 0.6
+_EXPLAINED = 0.9
 """Share of the squared residuals beyond the noise that another form than a beam must explain."""
 _IMPROVED = 0.7
 """Share of the clear echoes that it must explain better: they are all of one form."""

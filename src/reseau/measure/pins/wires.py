@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
+from scipy.special import gammaln
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
@@ -30,6 +31,10 @@ _ANISOTROPY = 1.4
 """Largest ratio of the scales in two directions."""
 _ALIKE = 0.1
 """Minimum difference in score (wires found, minus half the relative rms) between two positions."""
+_BY_CHANCE = 0.01
+"""Largest number of positions, as good as the one found, that may be expected by chance."""
+_EXACT_PX = 0.5
+"""Residuals below this are as good as any: no rods are straighter."""
 _BEYOND = 0.15
 """A wire may be seen beyond the ends of its segment by this share of its length."""
 
@@ -160,7 +165,7 @@ def lay_wires(
     Returns
     -------
     Layout or Failure
-        A failure if fewer than four points agree with the pattern.
+        A failure if fewer than four points agree with the pattern, or if as many would agree by chance.
 
     Examples
     --------
@@ -184,7 +189,9 @@ def lay_wires(
         )
     if start is not None:
         near = _refined(wires, seen, *_affinity(points, start[wires.fixed]), o)
-        return near or Failure("fewer than four echoes lie near the nominal positions", Code.TOO_FEW_POINTS)
+        if near is None:
+            return Failure("fewer than four echoes lie near the nominal positions", Code.TOO_FEW_POINTS)
+        return _supported(wires, seen, near, 1.0)
     tried: list[tuple[float, bool, Layout]] = []
     for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
         linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
@@ -204,7 +211,50 @@ def lay_wires(
     chosen = alike[0][2]
     there = chosen(points)
     rivals = any(np.abs(one[2](points) - there).max() > chosen.gate_px for one in alike[1:])
-    return replace(chosen, ambiguous=rivals)
+    # Every pair of echoes, for every pair of points, that is not turned too far.
+    pairs = len(seen) * (len(seen) - 1) * min(2 * o.max_rotation / np.pi, 1.0)
+    return _supported(
+        wires, seen, replace(chosen, ambiguous=rivals), pairs * (2 if o.mirrored is None else 1)
+    )
+
+
+def _supported(wires: Wires, seen: Array, layout: Layout, positions: float) -> Layout | Failure:
+    """The layout, or a failure if as good a one is to be expected by chance.
+
+    Of `positions` that each pair of points can take, C(n, m) p^(m − 2) have m of n points near one of the
+    echoes, were these anywhere in their area A: p = M π g²/A with M echoes and the gate g. Of these, the share
+    (m ρ²/g²)^(r/2)/Γ(r/2 + 1) has residuals as small as ρ in the r = 2 m − 6 dimensions that an affinity
+    leaves: a ball in as many dimensions, over the gates. A segment is met with probability M 2 g L/A.
+    """
+    fixed = wires.fixed
+    n, m = int(fixed.sum()), int((layout.row[fixed] >= 0).sum())
+    gate, echoes = layout.gate_px, len(seen)
+    width, height = np.ptp(np.concatenate([seen, layout(wires.start[fixed])]), axis=0) + 2 * gate
+    area = float(width * height)
+    near = min(echoes * np.pi * gate**2 / area, 1.0)
+    chance = np.log(positions) + _log_choose(n, m) + (m - 2) * np.log(near)
+    half = m - 3.0
+    ball = m * (max(layout.rms_px, _EXACT_PX) / gate) ** 2
+    chance += min(half * np.log(ball) - float(gammaln(half + 1)), 0.0)
+    askew = np.flatnonzero(~fixed)
+    met = askew[layout.row[askew] >= 0]
+    if len(askew):
+        long = np.hypot(*(layout(wires.end[askew]) - layout(wires.start[askew])).T)
+        hit = min(max(echoes - m, 1) * 2 * gate * float(long.mean()) / area, 1.0)
+        chance += min(_log_choose(len(askew), len(met)) + len(met) * np.log(hit), 0.0)
+    if chance < np.log(_BY_CHANCE):
+        return layout
+    expected = float(np.exp(min(chance, 20.0)))
+    return Failure(
+        f"{m} of {n} wires fit {m} of {echoes} echoes to {layout.rms_px:.2g} px, which proves nothing:"
+        f" {expected:.2g} such positions are to be expected by chance;"
+        " give nominal positions, more wires, or a smaller rotation",
+        Code.AMBIGUOUS,
+    )
+
+
+def _log_choose(n: int, m: int) -> float:
+    return float(gammaln(n + 1) - gammaln(m + 1) - gammaln(n - m + 1))
 
 
 def _hypotheses(
