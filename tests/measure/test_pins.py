@@ -337,6 +337,41 @@ def test_a_missing_pattern_is_a_failure_with_the_reason():
     assert "0 echoes" in blank.reason
 
 
+FOUR = np.array([[0.0, 0.0], [30.1, 0.9], [0.7, -15.1], [30.5, -16.0]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_four_rods_are_not_laid_over_echoes_of_other_things(seed: int):
+    others = np.random.default_rng(seed).uniform([15, 15], [585, 385], (16, 2))
+    layout = lay_wires(Wires.of_points(tuple("abcd"), FOUR), others)
+    assert not layout
+    if layout.code is Code.AMBIGUOUS:
+        assert "by chance" in layout.reason
+
+
+def test_four_rods_that_fit_exactly_are_found_among_others():
+    truth = FOUR @ np.array([[5.0, 0.3], [-0.3, 5.0]]) * [1, -1] + [220.3, 150.2]
+    others = np.random.default_rng(3).uniform([15, 15], [585, 385], (5, 2))
+    layout = lay_wires(Wires.of_points(tuple("abcd"), FOUR), np.concatenate([others, truth]))
+    assert layout
+    assert (np.sort(layout.row) == [5, 6, 7, 8]).all()
+
+
+def test_four_rods_of_a_turned_phantom_are_found_or_declined(reference_data: Callable[[str], Path]):
+    folder = reference_data("independent") / "pins"
+    reference = json.loads((folder / "reference.json").read_text("utf-8"))
+    design = ReseauDesign.read(folder / "wires.design.json")
+    for record in reference["frames"]:
+        wires = dict(zip(("R1", "N1", "L1", "R2", "N2", "L2"), record["points"], strict=True))
+        for turn in (12.0, 30.0):
+            found = measure_pins(
+                read_image(folder / record["image"]), design, PinOptions(max_rotation_deg=turn)
+            )
+            if found:
+                truth = np.array([wires[name] for name in design.ids])
+                assert np.abs(found.xy - truth)[found.ok].max() < 3
+
+
 def test_misuse_is_reported():
     shown = frame(picture(np.array([[100.0, 100.0]]), arcs(1), (200, 200)))
     with pytest.raises(UsageError, match="cross"):

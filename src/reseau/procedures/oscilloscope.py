@@ -292,7 +292,9 @@ def photo_ii(
     )
     if isinstance(instrument, Failure):
         return instrument if measured is None else replace(instrument, places=measured.points.xy)
-    notes = of_the_camera(camera, registration) + of_the_object(instrument, images, test_object)
+    notes = of_the_camera(camera, registration) + of_the_object(
+        instrument, images, test_object, {} if measured is None else _declined(measured)
+    )
     notes += _of_the_measurements(shown, measured)
     causes = None if instrument.fit is None else causes_of(instrument.fit.adjustment)
     return PhotoII(images, instrument, registration, causes, notes, measured, shown)
@@ -490,6 +492,16 @@ def _pins_in(
     if isinstance(registration, Failure):
         return registration
     return registration.carry(images), registration, measured, shown
+
+
+def _declined(measured: PinResult) -> dict[str, str]:
+    """Reasons of the rods that were seen, and not measured, by name."""
+    unseen = (None, Code.NOT_FOUND, Code.OUTSIDE, Code.NO_COORDINATES)
+    return {
+        name: str(why)
+        for name, why, code in zip(measured.ids, measured.why, measured.codes, strict=True)
+        if code not in unseen
+    }
 
 
 def _of_the_measurements(*results: ReseauResult | PinResult | None) -> tuple[Remark, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ..calibration.oscilloscope import CameraCorrection, InstrumentCorrection
@@ -86,9 +88,12 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
 
 
 def of_the_object(
-    instrument: InstrumentCorrection, pins: ImagePoints, design: ReseauDesign
+    instrument: InstrumentCorrection,
+    pins: ImagePoints,
+    design: ReseauDesign,
+    declined: Mapping[str, str] | None = None,
 ) -> tuple[Remark, ...]:
-    """Remarks on the test object."""
+    """Remarks on the test object; `declined` gives the reasons of rods that were seen and not measured."""
     notes, plane = [], instrument.plane
     if abs(plane.rotation) > np.pi - _UPRIGHT:
         notes.append(Remark("the test object is upside down, or M and N are swapped", Code.TARGET_ROTATED))
@@ -104,12 +109,8 @@ def of_the_object(
         for value in np.unique(np.round(design.xy[:, axis], 6)):
             line = np.flatnonzero(np.abs(design.xy[:, axis] - value) < 1e-6)
             if len(line) >= 3 and set(line) <= set(missing):
-                notes.append(
-                    Remark(
-                        f"the whole {word} of rods at {'xy'[axis]} = {value:g} {design.unit} is missing",
-                        Code.NOT_FOUND,
-                    )
-                )
+                where = f"{word} of rods at {'xy'[axis]} = {value:g} {design.unit}"
+                notes.append(_of_a_line(where, [design.ids[i] for i in line], declined or {}))
     ratio = plane.scale[0] / plane.scale[1]
     if abs(ratio - 1) > 0.1:
         notes.append(
@@ -119,3 +120,16 @@ def of_the_object(
             )
         )
     return tuple(notes)
+
+
+def _of_a_line(where: str, names: list[str], declined: Mapping[str, str]) -> Remark:
+    """Why none of a row or column of rods was measured."""
+    reasons = [declined[name] for name in names if name in declined]
+    if not reasons:
+        return Remark(f"the whole {where} is missing", Code.NOT_FOUND)
+    usual = max(reasons, key=reasons.count)
+    number = "all" if len(reasons) == len(names) else f"{len(reasons)} of {len(names)}"
+    others = "" if len(reasons) == len(names) else ", the others are missing"
+    return Remark(
+        f"the whole {where} was not measured: {number} were declined ({usual}){others}", Code.DECLINED
+    )

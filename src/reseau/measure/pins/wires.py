@@ -222,8 +222,9 @@ def _supported(wires: Wires, seen: Array, layout: Layout, positions: float) -> L
     """The layout, or a failure if as good a one is to be expected by chance.
 
     Of `positions` that each pair of points can take, C(n, m) p^(m − 2) have m of n points near one of the
-    echoes, were these anywhere in their area A: p = M π g²/A with M echoes and the gate g. Of these, the share
-    (m ρ²/g²)^(r/2)/Γ(r/2 + 1) has residuals as small as ρ in the r = 2 m − 6 dimensions that an affinity
+    share (m ρ²/g²)^(r/2)/Γ(r/2 + 1) has residuals as small as ρ in the r = 2 m − 6
+    dimensions that an affinity leaves: a ball, over the gates. A segment is met with probability M 2 g L/A.
+
     leaves: a ball in as many dimensions, over the gates. A segment is met with probability M 2 g L/A.
     """
     fixed = wires.fixed
