@@ -58,6 +58,35 @@ class Reason(str):
         return str(self), self.code
 
 
+_FAR_ABOVE = 5.0
+"""Ratio of deviations from predictions to their standard deviations from which the user is told."""
+
+
+def deviating(deviation: Array, cov: Array) -> tuple[Remark, ...]:
+    """A note where points deviate from the predictions by the others far more than their sigmas say.
+
+    Parameters
+    ----------
+    deviation : ndarray (n, 2)
+        Measured minus predicted, NaN where unknown.
+    cov : ndarray (n, 2, 2)
+        Covariances of the measured points.
+    """
+    known = np.isfinite(deviation).all(axis=1)
+    if known.sum() < 8:
+        return ()
+    sigma = np.sqrt(np.trace(cov[known], axis1=1, axis2=2) / 2)
+    rms = float(np.sqrt(np.mean(deviation[known] ** 2)))
+    typical = float(np.sqrt(np.mean(sigma**2)))
+    if not rms > _FAR_ABOVE * typical:
+        return ()
+    text = (
+        f"each point deviates from the prediction by the others by {rms:.2g} px (rms), far more than the "
+        f"{typical:.2g} px of its sigmas: the distortion is not smooth, or sigmas do not contain all errors"
+    )
+    return (Remark(text, Code.INCONSISTENT),)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Measured(Display):
     """Points of a design measured in one frame, in columns over all n points of the design.

@@ -135,7 +135,7 @@ class MarkMeasurement:
         self, frame: Frame, design: ReseauDesign, source: Array, placed: Placement, options: ReseauOptions
     ) -> None:
         self.frame, self.design, self.source, self.options = frame, design, source, options
-        self.screened, self.assignment = placed.screened, placed.assignment
+        self.placed, self.screened, self.assignment = placed, placed.screened, placed.assignment
         self.field, self.predicted = placed.assignment.field, placed.assignment.predicted
         mark = design.mark
         scale = np.sqrt(np.abs(np.linalg.det(self.field.jacobian(source))))

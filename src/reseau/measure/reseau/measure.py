@@ -12,7 +12,7 @@ A sheet of disks with coded rings is found by its rings; see :mod:`reseau.measur
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,14 +24,21 @@ from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..matching import Matches
-from ..points import Measured, Reason
+from ..points import Measured, Reason, deviating
 from .marks import MarkMeasurement, ReseauOptions, Verdict
-from .placement import GridOptions, PlacingOptions, place, spacing
+from .orientation import misfit, rival_orientations
+from .placement import GridOptions, Placement, PlacingOptions, place, spacing
 from .sheet import measure_sheet
 from .wires import grid_wires
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
+_ALIKE = 0.03
+"""Share of the marks by which an orientation may explain fewer and still count as a rival."""
+_ORIENTATIONS = 3
+"""Largest number of orientations that are tried one after the other; the second is the best of all."""
+_UNEVEN = 0.5
+"""Ratio of the deviations from a smooth mapping below which an uneven grid shows its orientation."""
 _CLEARLY = 0.6
 """Share of the visible marks from which nobody doubts that they are those of the design."""
 _BY_CHANCE = 1e-5
@@ -192,6 +199,14 @@ def measure_reseau(
         return placed
     measurement = MarkMeasurement(frame, design, source[known], placed, options)
     at, found, judged = measurement.result()
+    notes = placed.notes
+    for _ in range(0 if use_nominal else _ORIENTATIONS):
+        placed, oriented = _oriented(source[known], placed, judged, grid)
+        if placed is measurement.placed:
+            notes += oriented
+            break
+        measurement = MarkMeasurement(frame, design, source[known], placed, options)
+        at, found, judged = measurement.result()
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
@@ -200,7 +215,8 @@ def measure_reseau(
             where=frame.name,
             places=judged.xy[judged.why == ""],
         )
-    return _columns(frame, design, known, at, found, judged, measurement.field)
+    notes += deviating(judged.deviation, judged.cov)
+    return _columns(frame, design, known, at, found, judged, measurement.field, notes)
 
 
 def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str:
@@ -222,6 +238,36 @@ def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str
     if off <= max(options.neighbour_px, _DISTORTED * spacing(judged.predicted)):
         return ""
     return f"{len(good)} places look like its marks, but deviate by {off:.1f} px from each other's prediction"
+
+
+def _oriented(
+    source: Array, placed: Placement, judged: Verdict, grid: GridOptions
+) -> tuple[Placement, tuple[Remark, ...]]:
+    """The orientation that fits the measured marks best, and a note if others fit as well."""
+    good = judged.why == ""
+    place = np.full(len(placed.candidates), -1)
+    has = placed.assignment.candidate >= 0
+    place[placed.assignment.candidate[has]] = np.flatnonzero(has)
+    chosen = misfit(source, judged.xy, good)
+    alike = []
+    for name, rival in rival_orientations(source, placed, grid, _ALIKE * len(source)):
+        # The rival gives other names to the same measured marks.
+        same = np.where(rival.candidate >= 0, place[rival.candidate], -1)
+        known = (same >= 0) & good[same]
+        fit = misfit(source, judged.xy[same], known)
+        clearly = rival.score > placed.assignment.score + _ALIKE * len(source)
+        if fit < _UNEVEN * chosen or (clearly and fit < 2 * chosen):
+            return replace(placed, assignment=rival), ()
+        if chosen >= _UNEVEN * fit:
+            alike.append(name)
+    if not alike:
+        return placed, ()
+    others = ", ".join(alike[:-1]) + (" or " if len(alike) > 1 else "") + alike[-1]
+    text = (
+        f"the orientation is ambiguous: {others}, the design fits as well; its names are those of the "
+        "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned)"
+    )
+    return placed, (Remark(text, Code.AMBIGUOUS),)
 
 
 def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
@@ -256,6 +302,7 @@ def _columns(
     found: Matches,
     judged: Verdict,
     field: SmoothField,
+    notes: tuple[Remark, ...],
 ) -> ReseauResult:
     """Spread results over all marks of the design, including those without coordinates."""
     good = judged.why == ""
@@ -288,4 +335,5 @@ def _columns(
         noise=spread(found.noise, inside),
         deviation=spread(judged.deviation, known),
         field=field,
+        notes=notes,
     )

@@ -39,6 +39,8 @@ __all__ = [
 _NEIGHBOURS = 6
 _UPRIGHT = np.deg2rad(12.0)
 """Rotation up to which a design counts as upright in the image."""
+_AS_STRONG = 0.6
+"""Strength of a mark relative to the strongest ones, at least, where marks are equally distinct."""
 _TRIED = 8
 """Number of start positions without prior knowledge that are followed."""
 _NEARLY = 0.75
@@ -100,6 +102,26 @@ class Assignment:
     def score(self) -> float:
         """Number of marks found, minus half the number missed."""
         return int((self.candidate >= 0).sum()) - 0.5 * self.missed
+
+    def likeness(self, t: Array) -> Array:
+        """Strength of the candidates of the marks (k,) relative to the strongest ones, at most 1.
+
+        Of the marks of a frame none is much fainter than the others; places along a wire that only resemble a
+        crossing are.
+
+        Parameters
+        ----------
+        t : ndarray (m,)
+            Strengths of all candidates, in descending order.
+        """
+        has = self.candidate >= 0
+        usual = float(np.median(t[: max(4, len(self.candidate) // 2)]))
+        likeness: Array = np.minimum(t[self.candidate[has]] / usual, 1.0)
+        return likeness
+
+    def support(self, t: Array) -> float:
+        """The score with every mark weighted with its likeness."""
+        return float(self.likeness(t).sum()) - 0.5 * self.missed
 
 
 def spacing(xy: Array) -> float:
@@ -295,7 +317,12 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
         return None
     # Many places along a wire look somewhat like a crossing: with all candidates voting, they may outvote the
     # crossings; with the strongest only, a scene behind the marks may. Therefore first one, then the other.
-    electorates = (_strongest(candidates, 3 * len(source) // 2), strong)
+    # A frame that shows only part of the design has fewer crossings than expected, all about as strong.
+    usual = np.median(strong.t[: max(4, len(source) // 2)])
+    alike = int((strong.t > _AS_STRONG * usual).sum())
+    electorates = [_strongest(candidates, 3 * len(source) // 2), strong]
+    if 8 <= alike < len(source):
+        electorates.insert(0, _strongest(candidates, alike))
     best: Assignment | None = None
     for turned in options.rotations():
         # Hypotheses with y up come first: of two that explain the image equally, the first is kept.
@@ -308,12 +335,12 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
                     continue
                 if found.score > _NEARLY * len(source):
                     found = climbed(found, source, strong, valid)
-                if best is None or found.score > best.score + 0.75:
+                if best is None or found.support(strong.t) > best.support(strong.t) + 0.75:
                     best = found
                 # If no grid step improves it and nearly all marks support it, no other hypothesis is better.
-                if found.score > _NEARLY * len(source):
+                if found.support(strong.t) > _NEARLY * len(source):
                     break
-        if best is not None and best.score > _NEARLY * len(source):
+        if best is not None and best.support(strong.t) > _NEARLY * len(source):
             break
     return best
 
@@ -467,6 +494,11 @@ class Placement:
     notes: tuple[Remark, ...] = ()
 
     @property
+    def support(self) -> float:
+        """See :meth:`Assignment.support`."""
+        return self.assignment.support(self.candidates.t)
+
+    @property
     def strength(self) -> float:
         """Score of the assignment, and strength of its marks."""
         has = self.assignment.candidate[self.assignment.candidate >= 0]
@@ -539,9 +571,9 @@ def _placed(frame: Frame, design: ReseauDesign, source: Array, options: PlacingO
             if best is None or placed.strength > best.strength:
                 best = placed
             # All marks found, at the size of the design: no other size can be better.
-            if size is not None and found.score >= len(source) - 1:
+            if size is not None and found.score >= len(source) - 1 and placed.support > _NEARLY * len(source):
                 return placed
-        if best is not None and best.assignment.score > _NEARLY * len(source):
+        if best is not None and best.support > _NEARLY * len(source):
             break
     return best
 
@@ -565,15 +597,18 @@ def _despite_nominal(
         rival: Placement | None = replace(best, assignment=better)
     else:
         rival = _placed(frame, design, source, replace(options, nominal=None))
-    if rival is None or (best is not None and rival.assignment.score < best.assignment.score + _BETTER * n):
+    if rival is not None and (best is None or rival.assignment.score >= best.assignment.score + _BETTER * n):
+        best = rival
+    if best is None:
+        return None
+    off = np.hypot(*np.median(best.assignment.predicted - options.nominal, axis=0))
+    if off < 0.5 * spacing(options.nominal):
         return best
-    off = np.hypot(*np.median(rival.assignment.predicted - options.nominal, axis=0))
-    found, of_them = ((p.assignment.candidate >= 0).sum() if p else 0 for p in (rival, best))
     text = (
-        f"the nominal positions are wrong by about {off:.0f} px: near them {of_them} marks were found, "
-        f"elsewhere {found}"
+        f"the nominal positions are wrong by about {off:.0f} px, more than half the distance of the marks: "
+        "the names of the marks may be wrong by a row or a column"
     )
-    return replace(rival, notes=(Remark(text, Code.DEVIATES),))
+    return replace(best, notes=(Remark(text, Code.DEVIATES),))
 
 
 def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[float, ...]:

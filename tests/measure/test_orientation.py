@@ -1,0 +1,83 @@
+"""A regular grid does not tell its orientation; an uneven one does; a foreign picture shows neither."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array, Frame
+from reseau.core.failure import Code
+from reseau.measure import ReseauOptions, measure_reseau
+from reseau.measure.reseau.orientation import misfit
+
+from .formed import Scene, form
+
+SCENE = Scene(columns=11, rows=9, width=700, height=600)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> Array:
+    return np.asarray(form(SCENE, np.random.default_rng(0)).frame.pixels)
+
+
+def shown(pixels: Array) -> Frame:
+    return Frame(np.ascontiguousarray(pixels), 255.0, "turned.png")
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2])
+def test_a_regular_grid_is_found_at_any_turn_and_called_ambiguous(pixels, quarters):
+    found = measure_reseau(shown(np.rot90(pixels, quarters)), SCENE.design()).required()
+    assert found.found == 99
+    assert [note.code for note in found.notes] == [Code.AMBIGUOUS]
+    assert "turned by 180°" in found.notes[0].text
+
+
+def test_nothing_is_ambiguous_where_handedness_and_turn_are_known(pixels):
+    known = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    found = measure_reseau(shown(pixels), SCENE.design(), known).required()
+    assert found.found == 99
+    assert found.notes == ()
+
+
+def test_a_grid_of_which_columns_and_rows_are_cropped_is_found(pixels):
+    found = measure_reseau(shown(pixels[110:, 165:]), SCENE.design()).required()
+    assert found.found == 72
+
+
+def test_nominal_positions_wrong_by_one_pitch_are_noticed():
+    formed = form(SCENE, np.random.default_rng(1))
+    design = SCENE.design()
+    truth = measure_reseau(formed.frame, design, ReseauOptions(mirrored=True)).required()
+    wrong = design.expected_at(truth.xy + np.array([52.0, 0.0]))
+    found = measure_reseau(formed.frame, wrong).required()
+    assert found.found == 99
+    assert np.abs(found.xy - truth.xy).max() < 0.05
+    assert [note.code for note in found.notes] == [Code.DEVIATES]
+    assert "wrong by about 52 px" in found.notes[0].text
+
+
+def test_a_picture_of_something_else_is_not_the_reseau():
+    rng = np.random.default_rng(2)
+    light = rng.normal(0, 1, (500, 600)).cumsum(axis=0).cumsum(axis=1)
+    scene = 128 + 100 * (light - light.mean()) / np.abs(light - light.mean()).max()
+    specks = rng.integers(20, 480, (60, 2))
+    scene[specks[:, 0], specks[:, 1]] -= 40
+    found = measure_reseau(Frame(scene + rng.normal(0, 2, scene.shape), 255.0, "foreign.png"), SCENE.design())
+    assert not found
+    assert found.code == Code.NOT_FOUND
+
+
+def test_an_uneven_grid_fits_its_own_names_only():
+    rng = np.random.default_rng(3)
+    source = np.stack(np.meshgrid(np.arange(9.0), np.arange(7.0)), axis=-1).reshape(-1, 2)
+    uneven = source + rng.normal(0, 0.02, source.shape)
+    seen, every = 50 * uneven, np.ones(63, dtype=bool)
+    turned = 8 - source[:, 0] + 9 * (6 - source[:, 1])
+    assert misfit(uneven, seen, every) < 1e-9
+    assert misfit(uneven[turned.astype(int)], seen, every) > 0.5
+    assert misfit(uneven, seen, four_of(every)) == np.inf
+
+
+def four_of(every: Array) -> Array:
+    """Only four points known."""
+    return np.asarray(np.arange(len(every)) < 4)
