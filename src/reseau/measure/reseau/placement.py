@@ -24,6 +24,7 @@ from ...optics.field import SmoothField, trend_degree
 from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
 from .candidates import Candidates, find_candidates
+from .wires import grid_wires
 
 __all__ = [
     "Assignment",
@@ -558,7 +559,9 @@ def _placed(frame: Frame, design: ReseauDesign, source: Array, options: PlacingO
             sizes = tuple(size for _, size in sorted(strengths, reverse=True)[:2])
         for mark_px in sizes:
             screened = screen(frame, run=max(15, round(4 * mark_px)))
-            template = _template(design, mark_px, options.psf_px, _axes(source, options.nominal, turn))
+            template = _template(
+                design, mark_px, options.psf_px, _axes(design, source, options.nominal, turn)
+            )
             if len(template) > min(frame.pixels.shape):
                 continue
             candidates = find_candidates(screened.grey, screened.valid, template)
@@ -619,13 +622,15 @@ def _sizes(source: Array, size: float | None, options: PlacingOptions) -> tuple[
     return _TRIAL_PX
 
 
-def _axes(source: Array, nominal: Array | None, turn: float) -> Array:
+def _axes(design: ReseauDesign, source: Array, nominal: Array | None, turn: float) -> Array:
     """Linear mapping (2, 2) of unit determinant from a mark to its image, by nominal positions if known."""
     if nominal is None:
         c, s = np.cos(turn), np.sin(turn)
         return np.array([[c, -s], [s, c]])
     from_mean = source - source.mean(axis=0)
     linear = np.linalg.lstsq(from_mean, nominal - nominal.mean(axis=0), rcond=None)[0].T
+    if design.mark.shape == "line-grid":
+        linear = linear @ grid_wires(source).directions.mean(axis=0)
     size = abs(float(np.linalg.det(linear)))
     return np.asarray(linear / np.sqrt(size)) if size > 1e-12 else np.eye(2)
 
