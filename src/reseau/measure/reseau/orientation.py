@@ -9,14 +9,17 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
 from ...optics.field import SmoothField, trend_degree
-from .placement import Assignment, GridOptions, Placement, assign, climbed
+from .placement import Assignment, GridOptions, Placement, assign, climbed, spacing
 from .wires import grid_wires
 
 __all__ = ["misfit", "rival_orientations"]
 
+_SAME, _SYMMETRIC = 0.2, 0.5
+"""Distance, in pitches, at which two marks are in one place; share of such marks in a symmetric design."""
 _MIRROR = np.diag([1.0, -1.0])
 
 
@@ -56,10 +59,15 @@ def rival_orientations(
         moved = ((along - middle) @ change.T + middle) @ axes.T
         if not _allowed(found.field.jacobian(source.mean(axis=0)[None])[0] @ axes @ change @ axes.T, options):
             continue
+        near = KDTree(source).query(moved)[0] < _SAME * spacing(source)
+        if near.mean() < _SYMMETRIC:
+            continue
         rival = assign(source, found.field(moved), placed.candidates, valid, shifts=1)
         if rival is None:
             continue
-        rival = climbed(rival, source, placed.candidates, valid)
+        if (found.candidate < 0).sum() > found.missed + lost:
+            # The frame shows a part of the design, and it may be another part.
+            rival = climbed(rival, source, placed.candidates, valid)
         if rival.score >= found.score - lost:
             rivals.append((_name(quarters, mirrored), rival))
     return sorted(rivals, key=lambda rival: -rival[1].score)
