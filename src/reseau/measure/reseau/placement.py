@@ -437,8 +437,6 @@ def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[
     return starts
 
 
-_SOME = 0.2
-"""Share of the marks near their nominal positions below which the whole frame is searched."""
 _BETTER = 0.05
 """Share of all marks that another position must find in addition to contradict the nominal positions."""
 _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
@@ -532,7 +530,7 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     """
     best = _placed(frame, design, source, options)
     if options.nominal is not None and options.within_px is None:
-        best = _despite_nominal(best, frame, design, source, options)
+        best = _despite_nominal(best, source, options)
     marks = 0 if best is None else int((best.assignment.candidate >= 0).sum())
     least = max(4, min(10, len(source) // 3))
     if best is None or marks < least or best.assignment.score < -0.1 * len(source):
@@ -589,21 +587,15 @@ def _turns(design: ReseauDesign, options: PlacingOptions) -> tuple[float, ...]:
     return (0.0, np.pi / 8, -np.pi / 8, np.pi / 4)
 
 
-def _despite_nominal(
-    best: Placement | None, frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions
-) -> Placement | None:
+def _despite_nominal(best: Placement | None, source: Array, options: PlacingOptions) -> Placement | None:
     """The position found from nominal positions, or a much better one that contradicts them."""
     assert options.nominal is not None
     n = len(source)
-    if best is not None and (best.assignment.candidate >= 0).sum() > _SOME * n:
-        better = climbed(best.assignment, source, best.candidates, best.screened.valid)
-        rival: Placement | None = replace(best, assignment=better)
-    else:
-        rival = _placed(frame, design, source, replace(options, nominal=None))
-    if rival is not None and (best is None or rival.assignment.score >= best.assignment.score + _BETTER * n):
-        best = rival
     if best is None:
         return None
+    better = climbed(best.assignment, source, best.candidates, best.screened.valid)
+    if better.score >= best.assignment.score + _BETTER * n:
+        best = replace(best, assignment=better)
     off = np.hypot(*np.median(best.assignment.predicted - options.nominal, axis=0))
     if off < 0.5 * spacing(options.nominal):
         return best
