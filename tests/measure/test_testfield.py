@@ -157,6 +157,13 @@ def test_images_without_the_testfield_are_failures_with_a_reason(
     assert found.reason
 
 
+def test_a_mirrored_frame_is_measured_with_the_design_from_behind() -> None:
+    found, first = answer(np.ascontiguousarray(FRAME[:, ::-1]), DESIGN.from_behind()), answer(FRAME)
+    both = first.ok & found.ok
+    assert both.sum() > 330
+    np.testing.assert_allclose(found.xy[both] * [-1, 1] + [239, 0], first.xy[both], rtol=0, atol=0.02)
+
+
 def test_a_frame_without_an_image_is_an_error() -> None:
     with pytest.raises(ImageError, match="of one grey"):
         answer(np.full((240, 240), 90, dtype=np.uint8))

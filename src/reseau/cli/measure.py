@@ -135,6 +135,9 @@ def coded_field(
     fill: Annotated[
         float, typer.Option(min=0, max=1, help="Light-sensitive fraction of the pixel pitch.")
     ] = 1.0,
+    mirrored: Annotated[
+        bool, typer.Option("--mirrored", help="The image shows the testfield from behind, or in a mirror.")
+    ] = False,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -144,6 +147,8 @@ def coded_field(
 
     task = _Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
+    if mirrored:
+        target = target.from_behind()
     options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
     task.run(
         lambda: corrected(read_frame(image), sensor),

@@ -129,6 +129,36 @@ class TestfieldDesign(Document):
             )
         return self
 
+    def from_behind(self) -> Self:
+        """Return the design as it is seen from behind: left and right exchanged; targets keep their names.
+
+        Examples
+        --------
+        >>> from reseau.designs import coded_testfield
+        >>> design = coded_testfield()
+        >>> behind = design.from_behind()
+        >>> behind.ids == design.ids, bool((behind.xy == design.xy * [-1.0, 1.0]).all())
+        (True, True)
+        """
+        columns, targets, lines = self.squares[0], self.targets, self.lines
+        x0, y0, x1, y1 = lines.extent
+        # Squares are numbered by their places, which are reflected: the first of a row becomes the last.
+        square = [(k - 1) // columns * columns + columns - (k - 1) % columns for k in targets.square]
+        reflected = {
+            "square": tuple(square),
+            "x": tuple(-x for x in targets.x),
+            "angle": tuple(-angle for angle in targets.angle),
+        }
+        bounds = {
+            "vertical_x": tuple(-x for x in reversed(lines.vertical_x)),
+            "extent": (-x1, y0, -x0, y1),
+        }
+        update = {
+            "targets": targets.model_copy(update=reflected),
+            "lines": lines.model_copy(update=bounds),
+        }
+        return self.model_copy(update=update)
+
     @property
     def ids(self) -> tuple[str, ...]:
         """Names of the targets."""

@@ -1,0 +1,194 @@
+"""Testfield and sheet in pictures of another program: what is found, errors, sigmas and processor time.
+
+Run from the checkout: ``RESEAU_DATA=… python benchmarks/boards.py [--target tf|sheet] [--data FOLDER]
+[--condition C …] [--each] [--others]``. The pictures of ``independent/boards`` share neither the camera nor
+the formation of pixels with the project. Poses are pooled; with ``--each`` every picture has its own row.
+``--others`` also measures the pictures of all other targets with the design: they must be declined.
+
+A target counts as inside where its whole image, and two pixels more, lies in the picture and nothing hides
+it. Wrong is a position in error by more than 0.15 px and 5 sigma.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from reseau.core.data import Array, Frame, Mask
+from reseau.core.failure import Failure
+from reseau.io import parse_design
+from reseau.io.images import read_image
+from reseau.measure import ReseauOptions, measure_reseau, measure_testfield
+
+DESIGNS = {"tf": "testfield.design.json", "sheet": "sheet.design.json"}
+DECLINED = {"defoc3", "mirror"}
+"""Conditions in which declining is right; those mirrored are measured with the design from behind, too."""
+ROUGH = {"jpeg60", "sharpened", "motion3", "motion6", "specular"}
+MARGIN_PX, LEAST_FOUND, WRONG_PX, WRONG_SIGMA = 2.0, 0.95, 0.15, 5.0
+NORMALISED, NORMALISED_ROUGH = (0.85, 1.2), (0.7, 1.25)
+LABELS = {"tn": "near", "td": "near, distorted"}
+
+Measure = Callable[[Frame], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Errors and sigmas (n, 2) of the measured points of a picture, and counts."""
+
+    error: Array
+    sigma: Array
+    inside: int
+    found: int
+    seconds: float
+
+
+def measurers(target: str, design: Any) -> tuple[Measure, Measure]:
+    """Functions that measure the target, from the front and from behind."""
+    behind = design.from_behind()
+    if target == "tf":
+        return partial(measure_testfield, design=design), partial(measure_testfield, design=behind)
+    options = ReseauOptions(mirrored=True)
+    return partial(measure_reseau, design=design), partial(measure_reseau, design=behind, options=options)
+
+
+def reaches(target: str, design: Any, xy: Array) -> Array:
+    """Half the width and height (n, 2) of the targets in the image, from a projectivity through the truth."""
+    found: Any = cv2.findHomography(design.xy, xy)[0]
+    depth = np.column_stack([design.xy, np.ones(len(xy))]) @ found[2]
+    ends = [np.column_stack([design.xy + d, np.ones(len(xy))]) @ found.T for d in np.eye(2)]
+    image = np.column_stack([design.xy, np.ones(len(xy))]) @ found.T / depth[:, None]
+    slope = np.stack([end[:, :2] / end[:, 2:] - image[:, :2] for end in ends], axis=2)
+    size = np.array(design.targets.size) if target == "tf" else np.full(len(xy), design.mark.size)
+    reach: Array = np.abs(slope).sum(axis=2) * size[:, None] * (0.6 if target == "tf" else 0.5)
+    return reach
+
+
+def measured(frame: Frame, measure: Measure, xy: Array, whole: Mask) -> Measured | str:
+    """Errors of a picture, or why it was declined or what was raised."""
+    gc.collect()
+    start = time.process_time()
+    try:
+        found = measure(frame)
+    except Exception as error:  # whatever is raised is a finding
+        return f"RAISED {type(error).__name__}: {str(error).splitlines()[-1][:80]}"
+    seconds = time.process_time() - start
+    if isinstance(found, Failure):
+        return f"declined: {found.reason} [{found.code}] ({seconds:.2f} s)"
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
+    error = (found.xy - xy)[found.ok]
+    return Measured(error, sigma, int(whole.sum()), int((found.ok & whole).sum()), seconds)
+
+
+def pictures(folder: Path, target: str) -> Iterator[tuple[str, str, Any]]:
+    """Name of each picture of a target, its condition, and its truth."""
+    for name, truth in sorted(json.loads((folder / "truth.json").read_text()).items()):
+        if truth.get("target", truth.get("kind")) == target and (folder / name).is_file():
+            yield name, truth.get("condition") or LABELS.get(name[:2], name[:2]), truth
+
+
+def line(name: str, done: list[Measured], rough: bool) -> bool:
+    """Print a row of the table; whether it is within its limits."""
+    error, sigma = (np.concatenate([getattr(part, k) for part in done]) for k in ("error", "sigma"))
+    inside, found = sum(part.inside for part in done), sum(part.found for part in done)
+    seconds = np.mean([part.seconds for part in done])
+    if not len(error):
+        print(f"{name:26} {found:5} of {inside:5}", flush=True)
+        return False
+    off, scaled = np.hypot(*error.T), np.abs(error / sigma).max(axis=1)
+    wrong = int(((off > WRONG_PX) & (scaled > WRONG_SIGMA)).sum())
+    ratio = float(np.sqrt(((error / sigma) ** 2).mean()))
+    low, high = NORMALISED_ROUGH if rough else NORMALISED
+    good = found >= LEAST_FOUND * inside and not wrong and low <= ratio <= high
+    print(
+        f"{name:26} {found:5} of {inside:5}  {np.sqrt((error**2).mean()):.4f}  {off.max():.3f} px "
+        f"{scaled.max():5.1f}  {wrong:5}  {ratio:11.3f}  {seconds:6.2f} s  {'ok' if good else 'MISSED'}",
+        flush=True,
+    )
+    return good
+
+
+def table(folder: Path, target: str, design: Any, conditions: list[str], each: bool) -> bool:
+    """Measure the pictures of a target and print a row for each condition."""
+    front, behind = measurers(target, design)
+    parts: dict[str, list[Measured]] = {}
+    good = True
+    print(f"{target:26} {'measured':>14}  {'rms':6}  {'worst':8} {'sigma':>5}  wrong  error/sigma")
+    for name, condition, truth in pictures(folder, target):
+        if conditions and condition not in conditions:
+            continue
+        frame, xy = read_image(folder / name), np.array(truth["xy"])
+        hidden = np.array(truth.get("hidden", truth.get("hid")) or np.zeros(len(xy))) > 0
+        size = np.array([frame.width, frame.height])
+        edge = reaches(target, design, xy) + MARGIN_PX
+        whole = ((xy > edge - 0.5) & (xy < size - 0.5 - edge)).all(axis=1) & ~hidden
+        for label, measure in [(condition, front)] + [("mirrored", behind)] * (condition == "mirror"):
+            found = measured(frame, measure, xy, whole)
+            if isinstance(found, str):
+                right = label in DECLINED and found.startswith("declined")
+                good &= right
+                print(f"{name:26} {found}  {'ok' if right else 'MISSED'}", flush=True)
+                continue
+            parts.setdefault(label, []).append(found)
+            if each:
+                line(name, [found], label in ROUGH)
+    for label, done in parts.items():
+        good &= line(label, done, label in ROUGH)
+    return good
+
+
+def others(folder: Path, target: str, design: Any) -> bool:
+    """Measure the pictures of all other targets with this design; none may be accepted, none may raise."""
+    front, _ = measurers(target, design)
+    wrong = 0
+    names = [
+        n
+        for n, t in json.loads((folder / "truth.json").read_text()).items()
+        if t.get("target", t.get("kind")) != target
+    ]
+    for name in sorted(names):
+        none = np.zeros((len(design.xy), 2))
+        found = measured(read_image(folder / name), front, none, np.zeros(len(none), dtype=bool))
+        if not isinstance(found, str) or found.startswith("RAISED"):
+            wrong += 1
+            print(f"{name:26} {found if isinstance(found, str) else f'{len(found.error)} points'}  MISSED")
+    print(f"{target}: {len(names)} pictures of other targets, {wrong} not declined")
+    return wrong == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--target", choices=tuple(DESIGNS))
+    parser.add_argument("--data", type=Path, help="folder of the pictures")
+    parser.add_argument("--condition", nargs="+", default=[], help="only these conditions")
+    parser.add_argument("--each", action="store_true", help="a row for every picture")
+    parser.add_argument("--others", action="store_true", help="pictures of other targets, too")
+    options = parser.parse_args()
+    root = os.environ.get("RESEAU_DATA")
+    folder = options.data or (Path(root) / "independent" / "boards" if root else None)
+    if folder is None:
+        print("RESEAU_DATA is not set, and --data not given: nothing to measure")
+        return 1
+    good = True
+    for target in DESIGNS if options.target is None else (options.target,):
+        path = folder / DESIGNS[target]
+        design = parse_design(path.read_text(), path)
+        good &= table(folder, target, design, options.condition, options.each)
+        if options.others:
+            good &= others(folder, target, design)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
