@@ -24,11 +24,11 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ...io import ReseauDesign
+from ...io import ReseauDesign, Rings
 from ...optics import Chain, RationalPolynomial
 from ...optics.field import SmoothField
-from ...optics.formation import Outline, PixelResponse
-from ..matching import Matches, MatchOptions, grey_variance, match
+from ...optics.formation import Outline, PixelResponse, draw
+from ..matching import GrownOutline, Matches, MatchOptions, Window, grey_variance, match
 from ..points import Reason
 from ..screening import Screened, screen
 from ..testfield.lattice import refit, second_order
@@ -349,16 +349,24 @@ _CLASS_PX = 4
 """Step of the window sizes."""
 _GROUND_PX = 5
 """Background shown by a window around its disk, pixels."""
-_EDGE_PX = 3
-"""Pixels next to a ring that its blur may reach."""
-_OWN_PX = 2
-"""Pixels next to a disk that its own blur reaches."""
+_RING = 0.05
+"""Share of a pixel from which a ring hides it from the matching; the light of fainter tails is subtracted."""
+_FAR_PX = 1e5
+"""Coordinates from which the mapping is not used: it is extrapolated far beyond the disks."""
 _SLOPE = 0.3
 """Standard deviation of the change of contrast from the centre of a disk to the edge of its window, caused by
 reflected light."""
-_SEEN = 0.95
-_HIGH_RESIDUALS = 1.4
-"""Multiple of the usual residuals from which a curved background is tried."""
+_SEEN = 0.6
+_HIGH_RESIDUALS = 1.25
+"""Multiple of the usual residuals from which something is suspected in front of a disk."""
+_DISTURBED = 1.6
+"""Multiple of the usual residuals from which a disk is declined."""
+_FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
+"""Tolerances of the prediction of a disk by its neighbours: noise, share of the light, and shift."""
+_NEIGHBOURS = 6
+"""Number of neighbours whose light is taken."""
+_PSF_LOG_SIGMA, _SIZE_SIGMA = 0.2, 0.03
+"""Spread of sharpness (logarithm) and relative size over the disks of one frame."""
 _BLURRED, _GROWN, _BENT = 1.8, 0.2, 0.12
 """Tolerances of sharpness (factor), size and shape (shares) of a disk."""
 _BULGED = 0.3
@@ -397,14 +405,17 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
             where=frame.name,
             places=disks.strongest(_STRONGEST * len(design.ids)).xy,
         )
-    valid = screened.valid & (frame.pixels < frame.full_scale)
+    # Whether a pixel beside a clipped one is itself clipped depends on its noise.
+    clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
+    valid = screened.valid & (clipped == 0)
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
 
 
-def _arc(start: float, end: float) -> Array:
-    """Points (40, 2) on the unit circle from one angle to another, degrees."""
+def _sector(rings: Rings, start: float, end: float) -> Array:
+    """Corners (80, 2) of a sector of a ring around the origin, from one angle to another, degrees."""
     angle = np.deg2rad(np.linspace(start, end, 40))
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([rings.outer / 2 * arc, rings.inner / 2 * arc[::-1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,8 +423,12 @@ class _Appearance:
     """Appearance of the disks of this frame."""
 
     psf_px: float
+    psf_log_sigma: float
     size: float
+    form_sigma: Array
     variance: tuple[float, float] | None
+    light: Array | None
+    """Grey values (n,) that full ink adds at each disk of the design; negative for dark ink."""
 
 
 class _Sheet:
@@ -435,7 +450,8 @@ class _Sheet:
         self.at = design.xy @ placed.frame.T + placed.origin
         self.found = placed.disk >= 0
         self.start = np.where(self.found[:, None], disks.xy[placed.disk], self.mapping(self.at))
-        self.look = _Appearance(options.psf_px, design.mark.size, None)
+        self.look = _Appearance(options.psf_px, 0.5, design.mark.size, _FORM_SIGMA, None, None)
+        self.hidden = np.zeros(screened.grey.shape, dtype=bool)
 
     def columns(self) -> dict[str, Any]:
         """Columns of the result."""
@@ -444,17 +460,14 @@ class _Sheet:
         sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
         self._learn(first, rows, sure)
         rows = self._in_sight()
-        found = self._match_all(rows)
+        found = self._match(rows)
         why, field = self._judged(rows, found)
-        again = np.flatnonzero((why != "") & (found.seen > 0.5))
-        if 0 < len(again) < len(rows) and field is not None:
-            # Look again for missed disks where their neighbours predict them.
-            self.start[rows[again]] = field(self._straight(rows[again]))
-            good = why == ""
-            found = merged(
-                [np.flatnonzero(good | (found.seen <= 0.5)), again],
-                [found.select(good | (found.seen <= 0.5)), self._match_all(rows[again])],
-            )
+        doubtful = (why != "") | self._uneasy(found)
+        if doubtful.any() and (~doubtful).sum() >= _NEIGHBOURS and field is not None:
+            # Look again where their neighbours predict them, without what lies in front of them.
+            self._uncover(rows, found, ~doubtful, field)
+            parts = [np.flatnonzero(~doubtful), np.flatnonzero(doubtful)]
+            found = merged(parts, [found.select(~doubtful), self._match(rows[doubtful])])
             why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
 
@@ -481,27 +494,22 @@ class _Sheet:
         )
         return Outline(nodes, tangents).oriented().single()
 
-    def _match(self, rows: Rows, background: int = 1) -> Matches:
+    def _match(self, rows: Rows) -> Matches:
         """Match disks, grouped by window size."""
-        outline, start = self._outline(rows), self.start[rows]
-        reach = np.abs(outline.xy).max(axis=1)
-        sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
-        of = of.ravel()
-        valid = self.screened.valid & ~self._rings()
+        outline, ring = self._outline(rows), self._rings()
+        valid = self.screened.valid & (ring < _RING) & ~self.hidden
         parts, found = [], []
-        for k, size in enumerate(sizes):
-            part = np.flatnonzero(of == k)
-            half = size * _CLASS_PX + _GROUND_PX
+        for part, half in self._windows(outline):
             options = MatchOptions(
-                half_px=(int(half[0]), int(half[1])),
+                half_px=half,
                 psf_px=self.look.psf_px,
-                psf_log_sigma=0.5,
+                psf_log_sigma=self.look.psf_log_sigma,
                 response=PixelResponse(self.options.fill),
                 polarity=self.design.polarity,
                 row_jitter_px=self.options.row_jitter_px,
                 settled=0.05,
                 contrast_slope=_SLOPE,
-                background=background,
+                background=2,
                 variance=self.look.variance,
             )
             found.append(
@@ -509,40 +517,61 @@ class _Sheet:
                     self.screened.grey,
                     valid,
                     Outline(outline.xy[part], outline.dxy[part]),
-                    start[part],
+                    self.start[rows[part]],
                     options,
                     noise=self.screened.noise,
                     form=_FORM,
-                    form_sigma=_FORM_SIGMA,
+                    form_sigma=self.look.form_sigma,
+                    others=self._light_of(ring, rows[part], half),
                 )
             )
             parts.append(part)
         return merged(parts, found)
 
-    def _rings(self) -> Mask:
-        """Mask of the pixels of coded rings, which do not belong to the background."""
-        hidden, own = np.zeros((2, *self.screened.grey.shape), dtype=np.uint8)
+    @staticmethod
+    def _windows(outline: Outline) -> Iterator[tuple[Rows, tuple[int, int]]]:
+        """Disks with windows of one size, and half their width and height."""
+        reach = np.abs(outline.xy).max(axis=1)
+        sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
+        for k, size in enumerate(sizes):
+            half = size * _CLASS_PX + _GROUND_PX
+            yield np.flatnonzero(of.ravel() == k), (int(half[0]), int(half[1]))
+
+    def _pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns (k, 1, c) and rows (k, r, 1) of the windows of disks, within the frame."""
+        h, w = self.screened.grey.shape
+        centre = np.rint(self.start[rows]).astype(np.intp)
+        x, y = (centre[:, k, None] + np.arange(-half[k], half[k] + 1) for k in (0, 1))
+        return np.clip(x, 0, w - 1)[:, None, :], np.clip(y, 0, h - 1)[:, :, None]
+
+    def _rings(self) -> Array:
+        """Share (h, w) of each pixel that the coded rings take."""
         rings = self.design.rings
         assert rings is not None
+        sheet = []
         for name, sectors in rings.sectors.items():
             centre = self.design.xy[self.design.ids.index(name)]
-            self._fill(own, self.look.size / 2 * _arc(0, 360) + centre)
             for start, end in sectors:
-                arc = _arc(start, end)
-                edge = np.concatenate([rings.inner / 2 * arc, rings.outer / 2 * arc[::-1]])
-                self._fill(hidden, edge + centre)
-        # At strong tilt a ring comes close to its disk; pixels between them are assigned to the disk.
-        hidden, own = (
-            cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8))
-            for mask, reach in ((hidden, _EDGE_PX), (own, _OWN_PX))
-        )
-        return np.asarray((hidden > 0) & (own == 0))
+                sheet.append(_sector(rings, start, end) + centre)
+        shape = self.image.height, self.image.width
+        share: Array = np.zeros(shape)
+        if not sheet:
+            return share
+        corners = self.mapping(np.concatenate(sheet) @ self.frame.T + self.origin)
+        if not np.abs(corners).max() < _FAR_PX:  # the mapping is extrapolated far beyond the disks
+            return share
+        for one in np.split(corners, len(sheet)):
+            outline = Outline.polygon(one, self.look.psf_px).oriented()
+            share += draw(Outline(outline.xy[None], outline.dxy[None]), shape, self.look.psf_px)
+        return share
 
-    def _fill(self, mask: NDArray[np.uint8], corners: Array) -> None:
-        """Fill the image of a polygon of the sheet."""
-        xy = self.mapping(corners @ self.frame.T + self.origin)
-        if np.abs(xy).max() < 1e5:  # otherwise the mapping is extrapolated far beyond the disks
-            cv2.fillPoly(mask, [np.rint(xy).astype(np.int32)], 1)
+    def _light_of(self, ring: Array, rows: Rows, half: tuple[int, int]) -> Array | None:
+        """Light (k, rows, columns) that the blurred edges of rings take in the windows of disks."""
+        light = self.look.light
+        if light is None:
+            return None
+        x, y = self._pixels(rows, half)
+        return np.asarray(ring[y, x] * light[rows, None, None])
 
     def _learn(self, first: Matches, rows: Rows, sure: Mask) -> None:
         """Learn mapping, sharpness, size and noise from the reliable disks."""
@@ -550,27 +579,61 @@ class _Sheet:
             return
         rows = rows[sure]
         self.mapping = through(self.at[rows], first.xy[sure], self.screened.grey.shape)
+        depth = first.contrast * (-first.level if self.design.polarity == "dark" else 1)
+        light = np.full(len(self.at), np.median(depth[sure]))
+        light[rows] = depth[sure]
         self.look = _Appearance(
             float(np.median(first.psf_px[sure])),
+            _PSF_LOG_SIGMA,
             self.look.size * (1 + float(np.median(first.form[sure, 0]))),
+            np.array([_SIZE_SIGMA, *_FORM_SIGMA[1:]]),
             grey_variance(self.screened.grey, self.start[rows], first.residuals[sure]),
+            light,
         )
         self.start = np.where(self.found[:, None], self.start, self.mapping(self.at))
         self.start[rows] = first.xy[sure]
 
-    def _match_all(self, rows: Rows) -> Matches:
-        """Match disks; on an uneven background with a curved one if that is better."""
-        found = self._match(rows)
-        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
-        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.05)
-        if not uneasy.any():
-            return found
-        curved = self._match(rows[uneasy], background=2)
-        better = curved.converged & ~(curved.noise > 0.9 * found.noise[uneasy])
-        keep = ~uneasy
-        keep[uneasy] = ~better
-        parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
-        return merged(parts, [found.select(keep), curved.select(better)])
+    def _uneasy(self, found: Matches) -> Mask:
+        """Disks with larger residuals than the others, or that did not converge."""
+        known = found.noise[found.converged]
+        ordinary = np.median(known) if len(known) else np.inf
+        spread = 1.4826 * np.median(np.abs(known / ordinary - 1)) if len(known) else 0.0
+        return ~found.converged | (found.noise > max(_HIGH_RESIDUALS, 1 + 4 * spread) * ordinary)
+
+    def _uncover(self, rows: Rows, found: Matches, good: Mask, field: SmoothField) -> None:
+        """Mask the pixels of windows that show neither paper nor ink, but something in front of them.
+
+        The images of disks are predicted from their neighbours. The tolerance contains what a shift of a
+        quarter of a pixel makes of them.
+        """
+        near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
+        dark = self.design.polarity == "dark"
+        depth = found.contrast * (-found.level if dark else 1)
+        level, depth = (np.median(values[good][near], axis=1) for values in (found.level, depth))
+        noise = float(np.median(found.noise[good]))
+        uneasy = self._uneasy(found) | ~good
+        some = rows[uneasy]
+        xy = field(self._straight(some))
+        self.start[some] = xy
+        outline = self._outline(some)
+        foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
+        seen = np.zeros(foreign.shape, dtype=bool)
+        for part, half in self._windows(outline):
+            x, y = self._pixels(some[part], half)
+            window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
+            shape = GrownOutline(Outline(outline.xy[part], outline.dxy[part]), _FORM)
+            width, form = np.full(len(part), self.look.psf_px), np.zeros((len(part), len(_FORM)))
+            share, slopes = shape.derivatives(xy[part], width, form, np.arange(len(part)), window)
+            here, ink = (values[uneasy][part, None, None] for values in (level, depth))
+            off = self.screened.grey[y, x] - here - ink * share
+            tolerance = _FOREIGN * noise + _SHADE * np.abs(here)
+            tolerance = tolerance + _SHIFT_PX * np.abs(ink) * np.hypot(slopes[:, 0], slopes[:, 1])
+            np.maximum.at(foreign, (y, x), np.abs(off) > tolerance)
+            seen[y, x] = True
+        foreign = cv2.morphologyEx(foreign, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        reach = int(np.ceil(2 * self.look.psf_px)) + 1
+        foreign = cv2.dilate(foreign, np.ones((2 * reach + 1,) * 2, np.uint8))
+        self.hidden |= (foreign > 0) & seen
 
     def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to disks from their own images, the most serious first."""
@@ -578,6 +641,7 @@ class _Sheet:
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
         ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
+        usual = float(np.median(found.noise[strong])) if strong.any() else np.inf
         return [
             (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
@@ -592,7 +656,10 @@ class _Sheet:
                 Reason("the outline is not that of a disk", Code.UNLIKE),
             ),
             (found.correlation < 0.8, Reason("the image is not that of a disk", Code.UNLIKE)),
-            (found.rejected > 0.25, Reason("partly hidden or disturbed", Code.DISTURBED)),
+            (
+                (found.rejected > 0.25) | (found.noise > _DISTURBED * usual),
+                Reason("partly hidden or disturbed", Code.DISTURBED),
+            ),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
