@@ -47,11 +47,14 @@ class Camera:
         Degrees.
     shift : (float, float)
         Of the whole image, pixels.
+    blur_px : float
+        Width of the point-spread function.
     """
 
     roll: float
     tilt: float
     shift: tuple[float, float] = (0.0, 0.0)
+    blur_px: float = 0.9
 
     def image(self, xy: Array) -> tuple[Array, Array]:
         """Images (n, 2) of points of the sheet (n, 2), millimetres, and the derivatives (n, 2, 2)."""
@@ -75,8 +78,8 @@ class Camera:
         return straight.with_values((h / h[2, 2]).ravel()[:8])
 
     def share(self, outline: Outline) -> Array:
-        """Share of each pixel that plane shapes take, blurred by 0.9 px."""
-        return draw(outline.mapped(self.image).oriented(), _SHAPE, 0.9)
+        """Share of each pixel that plane shapes take."""
+        return draw(outline.mapped(self.image).oriented(), _SHAPE, self.blur_px)
 
 
 def exposed(share: Array, seed: int = 0) -> Frame:

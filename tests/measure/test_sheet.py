@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.cli import run
-from reseau.core.data import Frame
+from reseau.core.data import Array, Frame
 from reseau.core.errors import FormatError
 from reseau.core.failure import Code
 from reseau.designs import coded_sheet
@@ -59,6 +59,36 @@ def test_a_disk_that_is_half_hidden_is_declined_with_a_reason() -> None:
     assert result.why[12]
     # Its neighbours are none the worse.
     assert np.abs((result.xy - formed.truth)[result.ok]).max() < 0.1
+
+
+def errors_over_sigmas(result: ReseauResult, truth: Array) -> Array:
+    """Lengths (n,) of errors in units of their standard deviations; 0 where a disk was declined."""
+    error = np.where(result.ok[:, None], result.xy - truth, 0.0)
+    weight = np.linalg.inv(np.where(result.ok[:, None, None], result.cov, np.eye(2)))
+    return np.asarray(np.sqrt(np.einsum("ki,kij,kj->k", error, weight, error)))
+
+
+def test_the_blurred_light_of_a_ring_does_not_shift_the_disk_inside() -> None:
+    formed = sheets.form(sheets.Camera(25.0, 50.0, blur_px=2.0))
+    result = measured(formed)
+    assert sheets.DESIGN.rings is not None
+    coded = [sheets.DESIGN.ids.index(name) for name in sheets.DESIGN.rings.sectors]
+    assert result.ok[coded].all(), [result.why[k] for k in coded]
+    assert errors_over_sigmas(result, formed.truth)[coded].max() < 4
+
+
+@pytest.mark.parametrize("grey", [30, 120, 240])
+def test_disks_are_measured_by_what_an_object_in_front_leaves_of_them(grey: int) -> None:
+    formed = sheets.form(sheets.Camera(10.0, 20.0))
+    x, y = np.rint(formed.truth[[20, 31]]).astype(int).T
+    radius = 9
+    for k, share in enumerate((0.3, 0.45)):
+        formed.frame.pixels[y[k] - 25 : y[k] + 25, x[k] + radius - round(2 * radius * share) : x[k] + 35] = (
+            grey
+        )
+    result = measured(formed)
+    assert result.ok[20]
+    assert errors_over_sigmas(result, formed.truth).max() < 4.5
 
 
 def test_a_sheet_with_hidden_rings_cannot_be_numbered() -> None:
