@@ -9,9 +9,8 @@ from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.measure.screening import quiet_noise
 from reseau.measure.testfield.lattice import (
-    Lattice,
     LatticeFit,
-    find_lattice,
+    find_lattices,
     lattices,
     refit,
     ridge_points,
@@ -24,8 +23,8 @@ from reseau_sims import FieldBench, Station
 def fitted(bench: FieldBench, station: Station) -> LatticeFit:
     grey = bench.record(station).pixels.astype(np.float32)
     ridges = ridge_points(grey, quiet_noise(grey))
-    found = find_lattice(ridges)
-    assert isinstance(found, Lattice), found.reason
+    found = find_lattices(ridges)
+    assert isinstance(found, list), found.reason
     return next(lattices(grey, ridges, found, 2 / 125, blur_of(0.8, bench.response)))
 
 
@@ -86,6 +85,6 @@ def test_a_mapping_passes_through_its_points() -> None:
 
 def test_an_image_without_lines_gives_no_lattice() -> None:
     grey = np.random.default_rng(1).normal(100, 3, (200, 200)).astype(np.float32)
-    found = find_lattice(ridge_points(grey, 3.0))
+    found = find_lattices(ridge_points(grey, 3.0))
     assert isinstance(found, Failure)
     assert "no straight lines" in found.reason

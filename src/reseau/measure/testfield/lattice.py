@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...adjust import BatchOptions, adjust_batch, weight_function
-from ...core.data import Array, Rows
+from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...optics import Chain, PlaneMapping, RationalPolynomial
 from ...optics.field import trend_degree
@@ -34,7 +34,7 @@ __all__ = [
     "Lattice",
     "LatticeFit",
     "Ridges",
-    "find_lattice",
+    "find_lattices",
     "fit_lattice",
     "lattices",
     "refit",
@@ -52,10 +52,49 @@ _SIGNIFICANT = 4.0
 """Minimum curvature in noise sigmas."""
 _LEAST_SHARE = 0.85
 """Minimum dark share of the length of a line; rows of targets reach three quarters."""
+_BESIDE_PX, _BETWEEN_SIDES = 2.5, 0.8
+"""Distance from a line at which either side is compared with it, and the quantile that must be brighter."""
 _SECTION = 90
 """Length in pixels of the sections in which a line is tested; short enough for distorted lines."""
-_OFF_STEP = 0.2
-"""Largest deviation of a gap between lines from an integer number of steps, as a share of the gap."""
+_OFF_STEP = 0.15
+"""Largest deviation of a line from its place in its family, in steps."""
+_NEAREST = 0.15
+"""Least distance from the vanishing line, relative to that of the lines that determine the numbering."""
+_NEXT_GAP = 1.5
+"""Largest ratio of neighbouring gaps between lines."""
+_FAMILY, _CROSSING = np.deg2rad(40.0), np.deg2rad(30.0)
+"""Largest angle between the strongest line of a family and the others in the image; smallest between the
+strongest lines of both families."""
+_MOST_PEAKS, _MOST_LINES = 250, 48
+_APART_PX = 5.0
+"""Distance below which two lines are the same."""
+_OWN = 0.5
+"""Minimum share of ridge points of a line that are not those of a stronger one."""
+_PARALLEL = float(np.cos(np.deg2rad(12.0)))
+_FEW_POINTS, _ENOUGH_FOR_LINES = 10, 15000
+_ALIKE = 0.7
+"""Share of lines with the same numbers from which two numberings are the same."""
+_MOST_TRIED, _NUMBERINGS, _MOST_PAIRS, _CONSISTENT = 300, 5, 6, 0.04
+"""Numberings of a family that are compared, that are kept, and pairs of both families that are tried; rms
+deviation of lines from a common lattice, in steps, that halves the worth of a pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbering:
+    """Rows of lines of one family, their numbers, and how much speaks for these."""
+
+    rows: Rows
+    number: Rows
+    worth: float
+
+    def agrees(self, other: _Numbering) -> bool:
+        """Whether most of the lines have the same numbers in both, except for an offset."""
+        mine, yours = (
+            dict(zip(one.rows.tolist(), one.number.tolist(), strict=True)) for one in (self, other)
+        )
+        offsets = [mine[row] - yours[row] for row in mine.keys() & yours.keys()]
+        most = max(map(offsets.count, offsets), default=0)
+        return most > 1 and most >= _ALIKE * min(len(mine), len(yours))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,58 +182,113 @@ def _darkness(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     return lack
 
 
-def find_lattice(ridges: Ridges) -> Lattice | Failure:
+def find_lattices(ridges: Ridges) -> list[Lattice] | Failure:
     """Find two families of straight lines and number them.
 
     Returns
     -------
-    Lattice or Failure
-        A failure if either family has fewer than two lines.
+    list of Lattice, or Failure
+        Possible numberings, the likeliest first. A failure if either family has fewer than two lines.
     """
-    candidates = _candidates(ridges)
-    if len(candidates) < 4:
+    lines = _candidates(ridges)
+    if len(lines) < 4:
         return Failure("no straight lines were found", Code.NOT_FOUND)
-    families = _families(candidates)
-    numbered = [_numbered(family, ridges.darkness.shape) for family in families]
-    if min(len(number) for _, number in numbered) < 2:
-        found = " and ".join(str(len(number)) for _, number in numbered)
+    first = _family(lines, np.ones(len(lines), dtype=bool))
+    numbered = [_numbered(lines, first)]
+    of_first = np.isin(np.arange(len(lines)), numbered[0][0].rows)
+    main = lines.turn_from(int(first[0]))
+    second = _family(lines, ~of_first & (main > np.sin(_CROSSING)))
+    numbered.append(_numbered(lines, second) if len(second) else [])
+    most = [max((len(one.rows) for one in each), default=0) for each in numbered]
+    if min(most) < 2:
         return Failure(
-            f"{found} equally spaced straight lines were found; two and two are needed", Code.NOT_FOUND
+            f"{most[0]} and {most[1]} equally spaced straight lines were found; two and two are needed",
+            Code.NOT_FOUND,
         )
-    (first, i), (second, j) = numbered
-    homography = _homography(first, i, second, j)
-    middle = np.array([i.mean(), j.mean(), 1.0])
-    # The derivative of a projectivity has the sign of its determinant times that of the denominator cubed.
-    if np.linalg.det(homography) * (homography[2] @ middle) > 0:
-        homography, j = homography * [1.0, -1.0, 1.0], -j
-    return Lattice(homography, i, j)
+    found = []
+    for one, other in product(*numbered):
+        lattice = _lattice(lines, one, other, ridges.darkness.shape)
+        if lattice is not None:
+            off = _off_lattice(lattice, lines, one, other)
+            found.append((one.worth * other.worth / (1 + (off / _CONSISTENT) ** 2), lattice))
+    if not found:
+        return Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
+    found.sort(key=lambda each: -each[0])
+    return [lattice for _, lattice in found[:_MOST_PAIRS]]
 
 
-def _candidates(ridges: Ridges) -> Array:
-    """Straight lines (n, 4): angle of the normal, distance from the frame's centre, votes, dark share."""
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Straight lines in columns: normal · x = distance, ends of the points on them, and their weights."""
+
+    normal: Array
+    distance: Array
+    ends: Array
+    weight: Array
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    def turn_from(self, one: int) -> Array:
+        """Sine of the angle between each line and one of them."""
+        (x, y), (u, v) = self.normal.T, self.normal[one]
+        return np.asarray(np.abs(x * v - y * u))
+
+
+def _candidates(ridges: Ridges) -> _Lines:
+    """Straight lines that are dark along their length between bright surroundings, the strongest first."""
     votes, reach = _hough(ridges)
     peak = votes == cv2.dilate(votes, np.ones((3, 3), np.uint8))
     least = max(20.0, 0.12 * min(ridges.darkness.shape))
     turn, distance = np.nonzero(peak & (votes > least))
-    if not len(turn):
-        return np.zeros((0, 4))
-    strongest = np.argsort(-votes[turn, distance], kind="stable")[:250]
+    strongest = np.argsort(-votes[turn, distance], kind="stable")[:_MOST_PEAKS]
     turn, distance = turn[strongest], distance[strongest]
     angle, rho = turn * _TURN, (distance - reach).astype(np.float64)
-    share = _dark_share(ridges.darkness, angle, rho)
-    lines = np.stack([angle, rho, votes[turn, distance], share], axis=1)[share > _LEAST_SHARE]
-    # Strongest first; a line that is nearly the same as a stronger one is skipped.
-    kept: list[Array] = []
-    for line in lines[np.argsort(-lines[:, 2] * lines[:, 3], kind="stable")]:
-        if all(_apart(line, other) for other in kept):
-            kept.append(line)
-    return np.array(kept).reshape(-1, 4)
+    share = _dark_share(ridges.darkness, angle, rho) if len(turn) else rho
+    weight = votes[turn, distance] * share
+    order = np.argsort(-weight, kind="stable")
+    order = order[share[order] > _LEAST_SHARE]
+    thin = slice(None, None, max(1, len(ridges.xy) // _ENOUGH_FOR_LINES))
+    xy, normal, centre = ridges.xy[thin], ridges.normal[thin], _centre(ridges.darkness.shape)
+    kept: list[tuple[Array, float, Array, float]] = []
+    free = np.ones(len(xy), dtype=bool)
+    for k in order:
+        across = np.array([np.cos(angle[k]), np.sin(angle[k])])
+        distance_k = float(rho[k] + across @ centre)
+        *fitted, near = _line_through(xy, normal, across, distance_k)
+        # A line that nearly coincides with a stronger one, or consists of points of such, is skipped.
+        if len(near) and free[near].mean() < _OWN:
+            continue
+        if all(np.abs(fitted[2] @ n - d).max() > _APART_PX for n, d, _, _ in kept):
+            kept.append((fitted[0], fitted[1], fitted[2], float(weight[k])))
+            free[near] = False
+        if len(kept) == _MOST_LINES:
+            break
+    columns = [np.array(column) for column in zip(*kept, strict=True)] if kept else [np.zeros(0)] * 4
+    return _Lines(*columns)
 
 
-def _apart(line: Array, other: Array) -> bool:
-    turn = line[0] - other[0]
-    rho = other[1] * (1 if np.cos(turn) > 0 else -1)
-    return bool(abs(np.sin(turn)) > np.sin(np.deg2rad(12)) or abs(line[1] - rho) > 6)
+def _line_through(xy: Array, normal: Array, across: Array, distance: float) -> tuple[Any, ...]:
+    """A line adjusted to the ridge points along it: normal, distance, ends (2, 2), and rows of its points."""
+    along = np.array([-across[1], across[0]])
+    off = xy @ across - distance
+    near = np.flatnonzero((np.abs(off) < _APART_PX / 2) & (np.abs(normal @ across) > _PARALLEL))
+    at, off = xy[near] @ along, off[near]
+    if len(near) < _FEW_POINTS:
+        return across, distance, across * distance + np.zeros((2, 1)) * along, near
+    low, high = np.quantile(at, [0.02, 0.98])
+    middle = at.mean()
+    weight = np.clip(1 - (2 * off / _APART_PX) ** 2, 0, None)
+    slope = (weight * (at - middle) * off).sum() / max((weight * (at - middle) ** 2).sum(), 1e-9)
+    level = (weight * off).sum() / max(weight.sum(), 1e-9) - slope * (
+        (weight * (at - middle)).sum() / max(weight.sum(), 1e-9)
+    )
+    # off = level + slope (at − middle), as a normal of unit length.
+    scale = np.hypot(1.0, slope)
+    turned = (across - slope * along) / scale
+    through = float((distance + level - slope * middle) / scale)
+    ends = np.stack([t * along + (distance + level + slope * (t - middle)) * across for t in (low, high)])
+    return turned, through, ends, near
 
 
 def _centre(shape: tuple[int, ...]) -> Array:
@@ -227,83 +321,155 @@ def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Arra
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
     y = _centre(darkness.shape)[1] + rho[:, None] * normal[:, 1:] + along * normal[:, :1]
     inside = (x > 0) & (x < w - 1) & (y > 0) & (y < h - 1)
-    # Search two pixels on either side: the position of the line is approximate.
+    # Search a pixel on either side: the position of the line is approximate.
     across = [
         cv2.remap(darkness, (x + d * c).astype(np.float32), (y + d * s).astype(np.float32), cv2.INTER_LINEAR)
-        for d in (-1.0, 0.0, 1.0)
+        for d in (-_BESIDE_PX, -1.0, 0.0, 1.0, _BESIDE_PX)
         for c, s in ((normal[:, :1], normal[:, 1:]),)
     ]
-    dark = np.max(across, axis=0)
+    dark = np.max(across[1:-1], axis=0)
     inside[:, 0] |= ~inside.any(axis=1)  # a median needs at least one value
     middle = np.nanmedian(np.where(inside, dark, np.nan), axis=1, keepdims=True)
     section = (min(_SECTION, int(0.6 * min(h, w))), 1)
     seen, dark_part = (
         cv2.blur(mask.astype(np.float32), section) for mask in (inside, (dark > 0.5 * middle) & inside)
     )
+    # The edge of the board is dark on one side only; a line is darker than both sides.
+    rises = [np.where(inside, dark - beside, np.nan) for beside in (across[0], across[-1])]
+    least = np.min([np.nanquantile(rise, _BETWEEN_SIDES, axis=1) for rise in rises], axis=0)
+    between = least > 0.1 * middle[:, 0]
     # A small part of a section is not sufficient.
     return np.asarray(
-        np.where(seen > 0.8, dark_part / np.maximum(seen, 0.1), 0).max(axis=1), dtype=np.float64
+        np.where(seen > 0.8, dark_part / np.maximum(seen, 0.1), 0).max(axis=1) * between, dtype=np.float64
     )
 
 
-def _families(lines: Array) -> tuple[Array, Array]:
-    """Lines nearly parallel to the strongest one, and those that cross it."""
-    turn = np.abs(np.sin(lines[:, 0] - lines[0, 0]))
-    first, others = lines[turn < np.sin(np.deg2rad(25))], lines[turn > np.sin(np.deg2rad(35))]
-    if not len(others):
-        return first, others
-    turn = np.abs(np.sin(others[:, 0] - others[0, 0]))
-    return first, others[turn < np.sin(np.deg2rad(25))]
+def _family(lines: _Lines, among: Mask) -> Rows:
+    """Lines that may belong to one family: the strongest one, first, and those less than 40° from it."""
+    rows = np.flatnonzero(among)
+    if not len(rows):
+        return rows
+    return np.asarray(rows[lines.turn_from(int(rows[0]))[rows] < np.sin(_FAMILY)])
 
 
-def _numbered(lines: Array, shape: tuple[int, ...]) -> tuple[Array, Rows]:
-    """Equally spaced lines (n, 3) of a family, as a·x + b·y + c = 0, and their numbers."""
-    if len(lines) < 2:
-        return lines[:, :3], np.arange(len(lines))
-    main = lines[0, 0]
-    sign = np.where(np.cos(lines[:, 0] - main) < 0, -1.0, 1.0)
-    normal = sign[:, None] * np.stack([np.cos(lines[:, 0]), np.sin(lines[:, 0])], axis=1)
-    rho, weight = sign * lines[:, 1], lines[:, 2] * lines[:, 3]
-    # Their crossings with the perpendicular line through the centre of the frame.
-    at = rho / (normal @ [np.cos(main), np.sin(main)])
+def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
+    """Numberings of equally spaced lines among others: their rows and numbers, the likeliest first.
+
+    On any straight line the crossings of lines that are equally spaced in the plane of the testfield are a
+    projective function of their numbers, n = α t / (1 + β t), which three of them determine. Such triples are
+    tried, and the lines are counted that agree (Fischler and Bolles 1981).
+    """
+    if len(rows) < 3:
+        return [_Numbering(rows, np.arange(len(rows)), float(lines.weight[rows].sum()))]
+    along = lines.normal[rows[0]]
+    # The crossings with a line through the middle of the family, perpendicular to its strongest line.
+    middle = np.average(lines.ends[rows].mean(axis=1), axis=0, weights=lines.weight[rows])
+    at = (lines.distance[rows] - lines.normal[rows] @ middle) / (lines.normal[rows] @ along)
     order = np.argsort(at, kind="stable")
-    at, weight = at[order], weight[order]
-    best, number, keep = -1.0, np.zeros(0, dtype=np.intp), order[:0]
-    for start in range(len(at) - 1):
-        for next_one in range(start + 1, min(start + 3, len(at))):
-            steps, kept = _walk(at, start, next_one)
-            # With a sufficiently small step any lines fit; therefore gaps are penalized.
-            worth = float(weight[kept].sum() * len(kept) / (np.ptp(steps) + 1))
-            if worth > best:
-                best, number, keep = worth, steps, kept
-    chosen = order[keep]
-    constant = -rho[chosen] - normal[chosen] @ _centre(shape)
-    return np.column_stack([normal[chosen], constant]), number
+    rows, at, weight = rows[order], at[order], lines.weight[rows[order]]
+    ones, twos, threes, gaps, more = (
+        v.ravel()
+        for v in np.meshgrid(
+            np.arange(len(rows)),
+            np.arange(1, 5),
+            np.arange(1, 5),
+            np.arange(1, 4),
+            np.arange(1, 4),
+            indexing="ij",
+        )
+    )
+    twos, threes = ones + twos, ones + twos + threes
+    keep = threes < len(rows)
+    if not keep.any():
+        keep, twos, threes = ones == 0, np.minimum(twos, 1), np.full(len(threes), 2)
+    ones, twos, threes, one, two = (v[keep] for v in (ones, twos, threes, gaps, gaps + more))
+    near, far = at[twos] - at[ones], at[threes] - at[ones]
+    # one (1 + β near) = α near, two (1 + β far) = α far.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beta = (two * near - one * far) / (near * far * (one - two))
+        alpha = one / near + one * beta
+        t = at - at[ones, None]
+        depth = 1 + beta[:, None] * t
+        number = alpha[:, None] * t / depth
+        # Gaps change slowly from one to the next in any perspective in which all can be seen.
+        change = np.abs(np.log((far - near) / (two - one) / (near / one)))
+        smooth = change < 0.5 * two * np.log(_NEXT_GAP)
+    whole = np.rint(np.nan_to_num(number, posinf=1e6, neginf=-1e6).clip(-1e6, 1e6))
+    fits = (np.abs(number - whole) < _OFF_STEP) & (depth > _NEAREST) & smooth[:, None]
+    # Of two lines with one number the stronger one counts.
+    same = fits[:, 1:] & fits[:, :-1] & (whole[:, 1:] == whole[:, :-1])
+    value = np.where(fits, weight * (1 - (np.nan_to_num(number - whole) / _OFF_STEP) ** 2), 0.0)
+    worth = value.sum(axis=1) - (same * np.minimum(value[:, 1:], value[:, :-1])).sum(axis=1)
+    count = fits.sum(axis=1) - same.sum(axis=1)
+    span = np.where(fits, whole, -np.inf).max(axis=1) - np.where(fits, whole, np.inf).min(axis=1) + 1
+    # With a sufficiently small step any lines fit; therefore gaps are penalized.
+    worth = np.where(np.isfinite(worth) & (count >= 2), worth * count / np.maximum(span, 1), -np.inf)
+    found: list[_Numbering] = []
+    for k in np.argsort(-worth, kind="stable")[:_MOST_TRIED]:
+        if not np.isfinite(worth[k]):
+            break
+        kept: dict[int, int] = {}
+        for line in np.flatnonzero(fits[k]):
+            n = int(whole[k, line])
+            if n not in kept or weight[line] > weight[kept[n]]:
+                kept[n] = int(line)
+        numbers = np.array(sorted(kept), dtype=np.intp)
+        one = _Numbering(rows[[kept[int(n)] for n in numbers]], numbers, float(worth[k]))
+        if not any(one.agrees(other) for other in found):
+            found.append(one)
+        if len(found) == _NUMBERINGS:
+            break
+    # The two strongest may be the only ones.
+    pair = np.sort(np.argsort(-weight, kind="stable")[:2])
+    found.append(_Numbering(rows[pair], np.arange(2), float(weight[pair].sum())))
+    return found
 
 
-def _walk(at: Array, start: int, next_one: int) -> tuple[Rows, Rows]:
-    """Number lines outwards from two of them; lines that do not fit are left out."""
-    number = {start: 0, next_one: 1}
-    for way, first in ((1, next_one), (-1, start)):
-        step, last = at[next_one] - at[start], first
-        for k in range(first + way, len(at) if way > 0 else -1, way):
-            gap = abs(at[k] - at[last])
-            whole = round(gap / step)
-            if whole < 1 or abs(gap / step - whole) > _OFF_STEP * whole:
-                continue
-            number[k] = number[last] + way * whole
-            step, last = gap / whole, k
-    rows = np.array(sorted(number), dtype=np.intp)
-    return np.array([number[int(k)] for k in rows], dtype=np.intp), rows
+def _lattice(lines: _Lines, first: _Numbering, second: _Numbering, shape: tuple[int, ...]) -> Lattice | None:
+    """The lattice of two numbered families; None if they do not determine one."""
+    i, j = first.number, second.number
+    if min(len(i), len(j)) < 2:
+        return None
+    equations = [
+        np.column_stack([lines.normal[one.rows], -lines.distance[one.rows]]) for one in (first, second)
+    ]
+    homography = _homography(equations[0], i, equations[1], j, shape)
+    if homography is None:
+        return None
+    middle = np.array([i.mean(), j.mean(), 1.0])
+    # The derivative of a projectivity has the sign of its determinant times that of the denominator cubed.
+    if np.linalg.det(homography) * (homography[2] @ middle) > 0:
+        homography, j = homography * [1.0, -1.0, 1.0], -j
+    return Lattice(homography, np.sort(i), np.sort(j))
 
 
-def _homography(first: Array, i: Rows, second: Array, j: Rows) -> Array:
-    """Homography from line numbers to the image, from the crossings of all lines."""
-    crossing = np.cross(first[:, None], second[None])
-    xy = (crossing[..., :2] / crossing[..., 2:]).reshape(-1, 2)
+def _off_lattice(lattice: Lattice, lines: _Lines, first: _Numbering, second: _Numbering) -> float:
+    """Rms deviation of the ends of lines from integer lattice coordinates."""
+    back = np.linalg.inv(lattice.homography)
+    off = []
+    for axis, one in enumerate((first, second)):
+        ends = lines.ends[one.rows].reshape(-1, 2)
+        at = np.column_stack([ends, np.ones(len(ends))]) @ back.T
+        number = at[:, axis] / at[:, 2]
+        off.append(number - np.rint(number))
+    return _rms(np.concatenate(off))
+
+
+def _homography(first: Array, i: Rows, second: Array, j: Rows, shape: tuple[int, ...]) -> Array | None:
+    """Homography from line numbers to the image, from the crossings of lines in and around the frame."""
+    crossing = np.cross(first[:, None], second[None]).reshape(-1, 3)
     number = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
-    found: Any = cv2.findHomography(number, xy)[0]
-    return np.asarray(found if found is not None else np.eye(3), dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = crossing[:, :2] / crossing[:, 2:]
+    size = np.array([shape[1], shape[0]])
+    for margin in (0.2, 1.0, 10.0):
+        # Crossings far outside are extrapolated.
+        near = ((xy > -margin * size) & (xy < (1 + margin) * size)).all(axis=1)
+        if near.sum() >= 4 and all(len(np.unique(n)) > 1 for n in number[near].T):
+            found: Any = cv2.findHomography(number[near], xy[near])[0]
+            if found is not None and abs(found[2, 2]) > 1e-12 and np.isfinite(found).all():
+                return np.asarray(found, dtype=np.float64)
+    return None
 
 
 _DEGREE = 3
@@ -312,13 +478,23 @@ _MOST_PX = 20.0
 """Prior standard deviation of the coefficients of the polynomial, pixels."""
 _POINT_PX = 0.1
 """Typical distance of a ridge point from its line."""
-_NEAR = (0.2, 25.0)
-_GATES = ((0.08, 15.0), (0.04, 12.0))
+_GATES = ((0.12, 25.0), (0.08, 20.0), (0.05, 20.0))
 """Largest distance of a ridge point from its line, in lattice steps and in degrees, for each round."""
+_MOST_TURNS = 16
+"""Maximum number of rounds of adjusting the lattice and adding lines."""
+_RADIAL_TIMES = 4
+_DISTORTED, _MOST_DISTORTED = 0.1, 0.3
+"""Prior standard deviation and largest value of the radial distortion at the edge of the frame."""
+_LONGEST = 0.5
+"""Longest step, in lattice coordinates, of the inversion of a mapping."""
+_BESIDE = 0.07
+"""Distance from a line, in steps, at which both sides are compared with it; no targets are so near."""
 _SUPPORT = 0.25
 """Minimum number of ridge points per sample along a line."""
 _LEAST_DARK = 0.7
 """Minimum dark share of the length of a line, part of which may be hidden."""
+_PARTS = (1, 2, 3)
+"""Numbers of parts into which lines that were not found may divide the distance between those found."""
 _BETWEEN = 0.85
 """Minimum dark share of the length of lines between those found."""
 _BENT_PX = 0.13
@@ -328,7 +504,6 @@ _TIMES, _STILL_PX = 4, 0.1
 _LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
 """Minimum number of ridge points of a lattice, number that is sufficient at first, and number of ridge points
 of the frame (most not on lines) among which they are selected."""
-_MIDDLE = 0.5
 """Central part of the frame, relative to half its size, that determines the projectivity."""
 _SHORTEST = 20
 """Minimum number of samples of a line within the frame."""
@@ -381,7 +556,7 @@ def second_order(mapping: PlaneMapping, at: Array) -> tuple[Array, Array, Array]
 
 
 def lattices(
-    grey: NDArray[np.float32], ridges: Ridges, found: Lattice, width: float, blur: float
+    grey: NDArray[np.float32], ridges: Ridges, found: list[Lattice], width: float, blur: float
 ) -> Iterator[LatticeFit]:
     """Lattices adjusted to the lines of a frame, the likeliest first.
 
@@ -394,19 +569,21 @@ def lattices(
         Grey values with dark lines.
     ridges : Ridges
         Ridge points of the frame.
-    found : Lattice
-        The lines found.
+    found : list of Lattice
+        Possible numberings of the lines found, the likeliest first.
     width : float
         Width of the lines, in lattice steps.
     blur : float
         Approximate width (one sigma) of a blurred edge in pixels.
     """
-    parts = (1, 2, 3)
-    likely = [max(parts, key=lambda n: n * _between(ridges, found, axis, n)) for axis in (0, 1)]
-    others = [pair for pair in product(parts, parts) if pair != tuple(likely)]
-    for pair in [tuple(likely), *sorted(others, key=sum)]:
+    likely = [(_parts(ridges, one, 0), _parts(ridges, one, 1)) for one in found]
+    tried = list(zip(found, likely, strict=True))
+    tried += [
+        (found[0], pair) for pair in sorted(product(_PARTS, _PARTS), key=sum) if pair != tuple(likely[0])
+    ]
+    for one, pair in tried:
         scale = np.array([1 / pair[0], 1 / pair[1], 1.0])
-        lattice = Lattice(found.homography * scale, found.across * pair[0], found.along * pair[1])
+        lattice = Lattice(one.homography * scale, one.across * pair[0], one.along * pair[1])
         fit = fit_lattice(ridges, lattice)
         if fit is not None:
             # With strong distortion every round finds the line on more of its length.
@@ -421,6 +598,11 @@ def _moved(before: LatticeFit, after: LatticeFit) -> float:
     """Largest movement of the crossings of the lines, in pixels."""
     at = np.stack(np.meshgrid(before.across, before.along), axis=-1).reshape(-1, 2).astype(np.float64)
     return float(np.abs(after.mapping(at) - before.mapping(at)).max())
+
+
+def _parts(ridges: Ridges, found: Lattice, axis: int) -> int:
+    """The greatest number of parts into which lines divide the distance between those found."""
+    return max(_PARTS, key=lambda n: n * _between(ridges, found, axis, n))
 
 
 def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
@@ -439,6 +621,9 @@ def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
 def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
     """Adjust a lattice to the ridge points, add lines beyond those found, and drop false lines.
 
+    Projectivity and radial distortion are adjusted first, to the lines found and then, line by line, to those
+    next to them: few parameters can be extrapolated. The polynomial follows when all lines are known.
+
     Returns
     -------
     LatticeFit or None
@@ -446,32 +631,87 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
     """
     mapping = _start(lattice, ridges.darkness.shape)
     each = max(1, len(ridges.xy) // _SOME)
-    xy, normal = ridges.xy[::each], ridges.normal[::each]
-    near = _assigned(mapping, normal, _coordinates(mapping, xy), *_NEAR)[0]
-    xy, normal = xy[near], normal[near]
-    for gate, degrees in _GATES:
-        at = _coordinates(mapping, xy)
-        row, axis = _assigned(mapping, normal, at, gate, degrees)
+    all_xy, all_normal = ridges.xy[::each], ridges.normal[::each]
+    numbers = [lattice.across, lattice.along]
+    for turn in range(_MOST_TURNS):
+        gate, degrees = _GATES[min(turn, len(_GATES) - 1)]
+        at = _coordinates(mapping, all_xy)
+        row, axis = _assigned(mapping, all_normal, at, gate, degrees, numbers)
         if len(row) < _LEAST_POINTS:
             return None
-        at = at[row]
-        at[np.arange(len(at)), axis] = np.rint(at[np.arange(len(at)), axis])
-        # Two lines do not determine a bend, three no change of it.
-        lines = min(len(np.unique(at[axis == k, k])) for k in (0, 1))
-        degree = min(max(lines - 1, 1), _DEGREE)
-        thin = slice(None, None, max(1, len(at) // _ENOUGH))
-        given = xy[row][thin], normal[row][thin], at[thin]
-        mapping, residuals = _adjusted(mapping, degree, *given)
-        if _rms(residuals) > _BENT_PX:
-            other = _adjusted(_middled(mapping, at), degree, *given)
-            if _rms(other[1]) < _rms(residuals):
-                mapping, residuals = other
-    numbers = [lattice.across, lattice.along]
-    for k in (0, 1):
-        numbers[k] = _lines(mapping, ridges, np.repeat(at[axis == k][:, k], each), k, numbers[1 - k])
-        if len(numbers[k]) < 2:
+        mapping = _radially(mapping, all_xy[row], all_normal[row], at[row], axis)
+        if turn + 1 < len(_GATES):
+            continue
+        wider = [np.arange(lines.min() - 1, lines.max() + 2) for lines in numbers]
+        at = _coordinates(mapping, all_xy)
+        row, axis = _assigned(mapping, all_normal, at, gate, degrees, wider)
+        support = [np.repeat(at[row[axis == k], k], each) for k in (0, 1)]
+        before, numbers = (
+            numbers,
+            [_lines(mapping, ridges, support[k], k, wider[k], numbers[1 - k]) for k in (0, 1)],
+        )
+        if min(map(len, numbers)) < 2:
             return None
+        if all(map(np.array_equal, before, numbers)):
+            break
+    at = _coordinates(mapping, all_xy)
+    row, axis = _assigned(mapping, all_normal, at, *_GATES[-1], numbers)
+    if len(row) < _LEAST_POINTS:
+        return None
+    at, each = at[row], np.arange(len(row))
+    at[each, axis] = np.rint(at[each, axis])
+    thin = slice(None, None, max(1, len(at) // _ENOUGH))
+    degree = _degree_of(numbers)
+    mapping, residuals = _adjusted(mapping, degree, all_xy[row][thin], all_normal[row][thin], at[thin])
     return LatticeFit(mapping, numbers[0], numbers[1], _rms(residuals), 0)
+
+
+def _degree_of(numbers: list[Rows]) -> int:
+    """Degree of the polynomial: two lines do not determine a bend, three no change of it."""
+    return min(max(min(map(len, numbers)) - 1, 1), _DEGREE)
+
+
+def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -> Chain:
+    """The mapping as projectivity and radial distortion, adjusted robustly to points on lines.
+
+    With u the image of the projectivity from the middle of the frame, the image is u (1 + k u²).
+    """
+    assert isinstance(mapping.second, RationalPolynomial)
+    offset, scale = np.array(mapping.second.offset), mapping.second.scale
+    on, each = at.copy(), np.arange(len(at))
+    on[each, axis] = np.rint(on[each, axis])
+    matrix = np.append(mapping.first.values, 1.0)
+    k = float(mapping.second.value_of("X_30")) / scale if "X_30" in mapping.second.names else 0.0
+    place = np.column_stack([on, np.ones(len(on))])
+    lines = min(len(np.unique(on[axis == i, i])) for i in (0, 1))
+    prior = np.zeros(9)
+    # Two lines in each direction do not determine the distortion.
+    prior[8] = (_POINT_PX / scale / (_DISTORTED if lines > 2 else 1e-9)) ** 2
+    for _ in range(_RADIAL_TIMES):
+        seen = place @ matrix.reshape(3, 3).T
+        u = (seen[:, :2] / seen[:, 2:] - offset) / scale
+        r2 = (u**2).sum(axis=1)
+        off = (normal * (xy - offset - scale * u * (1 + k * r2)[:, None])).sum(axis=1)
+        # nᵀ dF/du, and du/dH.
+        by_u = scale * ((1 + k * r2)[:, None] * normal + 2 * k * (normal * u).sum(axis=1)[:, None] * u)
+        by_seen = by_u / (scale * seen[:, 2:])
+        third = -(by_seen * (seen[:, :2] / seen[:, 2:])).sum(axis=1, keepdims=True)
+        by_matrix = (np.concatenate([by_seen, third], axis=1)[:, :, None] * place[:, None]).reshape(-1, 9)
+        design = np.column_stack([by_matrix[:, :8], scale * (normal * u).sum(axis=1) * r2])
+        limit = max(4.0 * 1.4826 * float(np.median(np.abs(off))), 3 * _POINT_PX)
+        weight = np.clip(1 - (off / limit) ** 2, 0, None) ** 2
+        size = np.sqrt((design**2).sum(axis=0)) + 1e-12
+        scaled = design / size
+        cofactor = (scaled * weight[:, None]).T @ scaled + np.diag(prior / size**2 + 1e-9)
+        pull = (scaled * weight[:, None]).T @ off - np.append(np.zeros(8), prior[8] * k / size[8])
+        step = np.linalg.solve(cofactor, pull) / size
+        matrix[:8] += step[:8]
+        k = float(np.clip(k + step[8], -_MOST_DISTORTED, _MOST_DISTORTED))
+        if np.abs(design @ step).max() < 0.1 * _POINT_PX:
+            break
+    curved = RationalPolynomial.polynomial(3, offset=mapping.second.offset, scale=scale)
+    terms = dict.fromkeys(("X_30", "X_12", "Y_21", "Y_03"), k * scale)
+    return Chain(mapping.first.with_values(matrix[:8]), curved.with_values(terms))
 
 
 def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
@@ -497,7 +737,7 @@ def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: f
     points = [np.concatenate(column) for column in (xy, normal, at)]
     if len(points[0]) < _LEAST_POINTS:
         return fit
-    degree = min(max(min(len(fit.across), len(fit.along)) - 1, 1), _DEGREE)
+    degree = _degree_of([fit.across, fit.along])
     mapping, residuals = _adjusted(fit.mapping, degree, *points)
     return replace(fit, mapping=mapping, rms_px=_rms(residuals), points=len(residuals))
 
@@ -515,23 +755,6 @@ def _start(lattice: Lattice, shape: tuple[int, ...]) -> Chain:
     return Chain(straight.with_values(dict(zip(straight.names, matrix.ravel(), strict=False))), curved)
 
 
-def _middled(mapping: Chain, at: Array) -> Chain:
-    """The mapping with its projectivity fitted near the centre of the frame, where distortion is smallest.
-
-    A projectivity through straight lines fitted to curved ones cannot be corrected by the polynomial.
-    """
-    assert isinstance(mapping.second, RationalPolynomial)
-    xy = mapping(at)
-    near = np.hypot(*(xy - mapping.second.offset).T) < _MIDDLE * mapping.second.scale
-    if near.sum() < _LEAST_POINTS or min(np.ptp(at[near], axis=0)) < 1:
-        return mapping
-    found: Any = cv2.findHomography(at[near], xy[near])[0]
-    if found is None:
-        return mapping
-    straight = mapping.first.with_values((found / found[2, 2]).ravel()[:8])
-    return Chain(straight, mapping.second)
-
-
 def straightened(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points by the projectivity alone."""
     h = np.append(mapping.first.values, 1.0).reshape(3, 3)
@@ -546,8 +769,11 @@ def _coordinates(mapping: Chain, xy: Array) -> Array:
     if np.array_equal(mapping(at[:1]), mapping.first(at[:1])):
         return at  # the polynomial is still zero
     slope = _straight_slope(mapping, at)
-    for _ in range(3):
-        at = at + solve_2x2(slope, xy - mapping(at))
+    for _ in range(6):
+        step = solve_2x2(slope, xy - mapping(at))
+        at = at + step.clip(-_LONGEST, _LONGEST)
+        if np.abs(step).max(initial=0.0) < 1e-3:
+            break
     return at
 
 
@@ -566,11 +792,19 @@ def slope_of(mapping: PlaneMapping, at: Array) -> Array:
     return np.stack([(mapping(at + d) - mapping(at - d)) / (2 * step) for d in step * np.eye(2)], axis=-1)
 
 
-def _assigned(mapping: Chain, normal: Array, at: Array, gate: float, degrees: float) -> tuple[Rows, Rows]:
-    """Ridge points on a lattice line and parallel to it: their indices, and the axis numbering the line."""
+def _assigned(
+    mapping: Chain, normal: Array, at: Array, gate: float, degrees: float, numbers: list[Rows]
+) -> tuple[Rows, Rows]:
+    """Ridge points on a lattice line and parallel to it: their indices, and the axis numbering the line.
+
+    Only the lines of these numbers count, and points between the outermost of them and half a step beyond.
+    """
     rows, axes = [], []
+    low, high = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
+    within = ((at > low - 0.5) & (at < high + 0.5)).all(axis=1)
     for axis in (0, 1):
-        near = np.flatnonzero(np.abs(at[:, axis] - np.rint(at[:, axis])) < gate)
+        whole = np.rint(at[:, axis])
+        near = np.flatnonzero(within & (np.abs(at[:, axis] - whole) < gate) & np.isin(whole, numbers[axis]))
         # Along a line the other coordinate changes.
         along = _straight_slope(mapping, at[near])[:, :, 1 - axis]
         sine = (along * normal[near]).sum(axis=1) / np.maximum(np.hypot(*along.T), 1e-12)
@@ -660,12 +894,19 @@ def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, lines: Array, oth
     return [np.asarray(dark[keep], dtype=np.float64) for dark, keep in zip(seen, inside, strict=True)]
 
 
-def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, others: Rows) -> Rows:
-    """Numbers of the lines that exist: dark, and with ridge points."""
+def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows, others: Rows) -> Rows:
+    """Those of some lines that exist: dark between the other lines, and with ridge points at `number`."""
     found = []
-    lines = np.arange(number.min(), number.max() + 1)
-    for line, dark in zip(lines, _darkness_along(mapping, ridges, axis, lines, others), strict=True):
-        enough = (number == line).sum() > _SUPPORT * len(dark)
-        if len(dark) > _SHORTEST and enough and (dark > 0.5 * np.median(dark)).mean() > _LEAST_DARK:
+    whole = np.rint(number)
+    beside = (lines - _BESIDE, lines.astype(float), lines + _BESIDE)
+    left, middle, right = (_darkness_along(mapping, ridges, axis, at, others) for at in beside)
+    for k, (line, dark) in enumerate(zip(lines, middle, strict=True)):
+        enough = (whole == line).sum() > _SUPPORT * len(dark)
+        if len(dark) <= _SHORTEST or not enough:
+            continue
+        usual = float(np.median(dark))
+        # The edge of the board is dark on one side only.
+        rise = [np.quantile(usual - side[k], _BETWEEN_SIDES) for side in (left, right) if len(side[k])]
+        if (dark > 0.5 * usual).mean() > _LEAST_DARK and min(rise, default=1.0) > 0.05 * usual:
             found.append(int(line))
     return np.array(found, dtype=np.intp)

@@ -29,7 +29,7 @@ from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
-from .lattice import LatticeFit, Ridges, find_lattice, lattices, ridge_points, straightened
+from .lattice import LatticeFit, Ridges, find_lattices, lattices, ridge_points, straightened
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 
@@ -46,8 +46,12 @@ _WIDTH_PX = 0.2
 """Required accuracy of the width of the point-spread function for classification."""
 _LEAST_VARIANCE = 1e-6
 """Residual variance assumed where an image of a few pixels fits exactly."""
+_LEAST_STEP_PX = 2.5
+"""Least distance of targets in the image, along either direction, at which they can be told apart."""
 _FAINT = 0.3
 """Minimum contrast of a target relative to the usual contrast."""
+_SURE = 3
+"""Most targets of a single square that may be hidden or wrong, if there is no other square to confirm it."""
 _ANGLE = 7.5
 """Resolution of the directions of targets, degrees."""
 _SYMMETRY = {"square": 90.0, "cross": 90.0, "triangle": 120.0, "circle": np.inf}
@@ -181,13 +185,17 @@ class _Clusters:
         relative = design.xy[np.array(design.targets.square) == 1] - design.centres[0]
         order = np.lexsort((relative[:, 0], -relative[:, 1]))
         self.step = float(np.ptp(relative[:, 0]) / 3)
-        at = self.cell[:, None] + 0.5 + relative[order] / design.pitch
-        self.xy = fit.mapping(at.reshape(-1, 2)).reshape(-1, 16, 2)
+        # Only squares that are in the frame and large enough to be read; a wrong lattice may have any size.
+        xy = fit.mapping((self.cell[:, None] + 0.5 + relative[order] / design.pitch).reshape(-1, 2))
+        xy, (h, w) = xy.reshape(-1, 16, 2), grey.shape
         frames = fit.mapping.derivatives(self.cell + 0.5).d_xy / design.pitch
-        self.group, self.frames = _grouped(frames)
-        h, w = grey.shape
-        seen: Mask = (self.xy > 1) & (self.xy < [w - 2, h - 2])
-        self.visible: Mask = np.asarray(seen.all(axis=2))
+        seen: Mask = np.asarray(((xy > 1) & (xy < [w - 2, h - 2])).all(axis=2))
+        sides = np.linalg.svd(np.nan_to_num(frames), compute_uv=False) * self.step
+        legible = seen.any(axis=1) & (sides[:, 1] > _LEAST_STEP_PX) & (sides[:, 0] < max(h, w) / 2)
+        self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
+        if not legible.any():
+            return
+        self.group, self.frames = _grouped(frames[legible])
         reach = np.ceil(np.abs(self.frames).sum(axis=2).max(axis=0) * self.step / 2).astype(int)
         self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach)
         offset = np.stack(np.meshgrid(self.columns, self.rows), axis=-1).reshape(-1, 2)
@@ -294,12 +302,15 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
         A failure if no cluster can be read, if they contradict each other, or if the image is mirrored.
     """
     votes: Counter[tuple[bool, int, int, int]] = Counter()
+    best: dict[tuple[bool, int, int, int], int] = {}
     for cell, decoded in zip(reading.cell, reading.decoded, strict=True):
         if decoded:
             turn = _quarter(decoded.quarter_turns)
             origin = cell + 0.5 - turn @ design.centres[decoded.square - 1] / design.pitch
             key = np.rint(2 * origin).astype(int)
-            votes[decoded.mirrored, decoded.quarter_turns, int(key[0]), int(key[1])] += 1
+            vote = decoded.mirrored, decoded.quarter_turns, int(key[0]), int(key[1])
+            votes[vote] += 1
+            best[vote] = min(best.get(vote, 16), decoded.corrections + decoded.hidden)
     in_sight = int(((reading.joint != HIDDEN).sum(axis=1) >= 8).sum())
     if not votes:
         return Failure(
@@ -308,6 +319,12 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
         )
     (mirrored, quarters, *doubled), most = votes.most_common(1)[0]
     others = sum(votes.values()) - most
+    if most == 1 and (alone := best[mirrored, quarters, *doubled]) > _SURE:
+        return Failure(
+            f"{in_sight} squares are visible, and only one resembles a square of the design {design.name!r}, "
+            f"in {16 - alone} of 16 targets",
+            Code.OTHER_DESIGN,
+        )
     # In a mirrored image the squares contradict each other about the position.
     if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, 0.3 * in_sight):
         return Failure("shows the testfield mirrored", Code.MIRRORED)
@@ -391,7 +408,7 @@ class SearchedFrame:
             Ridge points in which lines are searched; all of the frame by default.
         """
         ridges = ridges or ridge_points(self.dark, quiet_noise(self.dark))
-        found = find_lattice(ridges)
+        found = find_lattices(ridges)
         if isinstance(found, Failure):
             return found
         design, failure = self.design, None
@@ -401,6 +418,8 @@ class SearchedFrame:
             placed = reading if isinstance(reading, Failure) else locate(reading, design)
             if isinstance(placed, Placement) and isinstance(reading, Reading):
                 return Read(ridges, lattice, reading, placed)
+            if isinstance(placed, Failure) and placed.code == Code.MIRRORED:
+                return placed
             if failure is None and isinstance(placed, Failure):
                 failure = placed
         if failure is None:
@@ -409,18 +428,25 @@ class SearchedFrame:
 
     def shows_second(self, read: Read) -> bool:
         """Whether a second testfield is visible beyond the one that was read."""
-        x0, y0, x1, y1 = self.design.lines.extent
-        corners = (
-            np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) @ read.placed.frame.T + read.placed.origin
-        )
+        identified = read.reading.cell[[bool(decoded) for decoded in read.reading.decoded]]
         # Keep a margin of half a square; the projectivity is accurate enough to locate the border.
-        low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
+        low, high = identified.min(axis=0) - 0.5, identified.max(axis=0) + 1.5
         at = straightened(read.lattice.mapping, read.ridges.xy)
         beyond = ((at < low) | (at > high)).any(axis=1)
         if beyond.mean() < _ELSEWHERE:
             return False
         rest = replace(read.ridges, xy=read.ridges.xy[beyond], normal=read.ridges.normal[beyond])
-        return not isinstance(self.read(rest), Failure)
+        other = self.read(rest)
+        if isinstance(other, Failure):
+            return False
+        # The rest may show other squares of the same testfield.
+        at = (self.design.centres @ other.placed.frame.T) + other.placed.origin
+        mine = (self.design.centres @ read.placed.frame.T) + read.placed.origin
+        ends = (at >= other.reading.cell.min(axis=0)) & (at <= other.reading.cell.max(axis=0) + 1)
+        seen = ends.all(axis=1)
+        apart = np.hypot(*(other.lattice.mapping(at[seen]) - read.lattice.mapping(mine[seen])).T)
+        step = np.hypot(*(other.lattice.mapping(at[seen] + [0.25, 0.0]) - other.lattice.mapping(at[seen])).T)
+        return bool(np.median(apart / step) > 1)
 
 
 def _sharpened(grey: NDArray[np.float32], power: float) -> NDArray[np.float32]:
