@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Frame
-from reseau.core.errors import UsageError
+from reseau.core.errors import ImageError, UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraOptions, calibrate_camera
@@ -29,6 +29,18 @@ def test_each_image_is_measured_or_declined_by_name() -> None:
         rows = [truth.names.index(target) for target in points.names]
         assert name == station.name
         assert np.abs(points.xy - truth.xy[rows]).max() < 0.05  # px
+
+
+def test_an_image_that_cannot_be_measured_does_not_end_the_others() -> None:
+    def measure(frame: Frame) -> Failure:
+        if frame.name == "dark":
+            raise ImageError("is all black", where=frame.name)
+        raise np.linalg.LinAlgError
+
+    frames = [Frame(np.zeros((9, 9), np.uint8), 255.0, name) for name in ("dark", "other")]
+    found = dict(measured_in_order(frames, measure))
+    assert all(isinstance(each, Failure) for each in found.values())
+    assert [each.reason[:19] for each in found.values()] == ["is all black", "could not be measur"]
 
 
 def test_two_images_of_one_name_are_refused() -> None:

@@ -9,10 +9,11 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 
 import cv2
+import numpy as np
 
 from ..core.data import Frame, ImagePoints
-from ..core.errors import EstimationError
-from ..core.failure import Failure
+from ..core.errors import EstimationError, ImageError
+from ..core.failure import Code, Failure
 from ..core.processes import process_context
 from ..core.threads import always_one_thread, one_thread
 from ..io import ReseauDesign, TestfieldDesign
@@ -94,8 +95,15 @@ def measured_in_order(
 
 def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
     # Sums of one and of several threads differ in the last digits; results must not depend on `workers`.
-    with one_thread():
-        found = measure(frame)
+    try:
+        with one_thread():
+            found = measure(frame)
+    except ImageError as error:
+        return Failure(error.what, Code.DECLINED, where=frame.name)
+    except (np.linalg.LinAlgError, cv2.error) as error:
+        # One photograph must not end the measurement of the others.
+        reason = f"could not be measured ({type(error).__name__}); please report it with the image"
+        return Failure(reason, Code.SINGULAR, where=frame.name)
     return found if isinstance(found, Failure) else found.points
 
 
