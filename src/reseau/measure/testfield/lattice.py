@@ -414,9 +414,9 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
             if n not in kept or weight[line] > weight[kept[n]]:
                 kept[n] = int(line)
         numbers = np.array(sorted(kept), dtype=np.intp)
-        one = _Numbering(rows[[kept[int(n)] for n in numbers]], numbers, float(worth[k]))
-        if not any(one.agrees(other) for other in found):
-            found.append(one)
+        numbering = _Numbering(rows[[kept[int(n)] for n in numbers]], numbers, float(worth[k]))
+        if not any(numbering.agrees(other) for other in found):
+            found.append(numbering)
         if len(found) == _NUMBERINGS:
             break
     # The two strongest may be the only ones.
@@ -658,8 +658,8 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
     row, axis = _assigned(mapping, all_normal, at, *_GATES[-1], numbers)
     if len(row) < _LEAST_POINTS:
         return None
-    at, each = at[row], np.arange(len(row))
-    at[each, axis] = np.rint(at[each, axis])
+    at, rows = at[row], np.arange(len(row))
+    at[rows, axis] = np.rint(at[rows, axis])
     thin = slice(None, None, max(1, len(at) // _ENOUGH))
     degree = _degree_of(numbers)
     mapping, residuals = _adjusted(mapping, degree, all_xy[row][thin], all_normal[row][thin], at[thin])
@@ -898,8 +898,10 @@ def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows
     """Those of some lines that exist: dark between the other lines, and with ridge points at `number`."""
     found = []
     whole = np.rint(number)
-    beside = (lines - _BESIDE, lines.astype(float), lines + _BESIDE)
-    left, middle, right = (_darkness_along(mapping, ridges, axis, at, others) for at in beside)
+    left, middle, right = (
+        _darkness_along(mapping, ridges, axis, lines.astype(np.float64) + shift, others)
+        for shift in (-_BESIDE, 0.0, _BESIDE)
+    )
     for k, (line, dark) in enumerate(zip(lines, middle, strict=True)):
         enough = (whole == line).sum() > _SUPPORT * len(dark)
         if len(dark) <= _SHORTEST or not enough:

@@ -317,9 +317,10 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             f"{in_sight} squares are visible, but none belongs to the design {design.name!r}",
             Code.OTHER_DESIGN,
         )
-    (mirrored, quarters, *doubled), most = votes.most_common(1)[0]
+    likely, most = votes.most_common(1)[0]
+    mirrored, quarters, *doubled = likely
     others = sum(votes.values()) - most
-    if most == 1 and (alone := best[mirrored, quarters, *doubled]) > _SURE:
+    if most == 1 and (alone := best[likely]) > _SURE:
         return Failure(
             f"{in_sight} squares are visible, and only one resembles a square of the design {design.name!r}, "
             f"in {16 - alone} of 16 targets",
