@@ -41,6 +41,7 @@ _LAGS = 4
 """Distance in pixels, along both axes, up to which the autocorrelation of residuals is summed."""
 _NUMBERS = (
     *("xy", "cov", "contrast", "t", "noise", "correlation", "seen", "rejected", "converged", "pixels"),
+    "inflation",
 )
 _TIGHTENED = 0.2
 """Factor of these in a second attempt, where the first did not converge."""
@@ -171,6 +172,8 @@ class ArcMatches:
         As in :class:`reseau.measure.matching.Matches`; `cov` is corrected for correlated residuals.
     pixels : ndarray (m,)
         Number of pixels that are as good as independent.
+    inflation : ndarray (m,)
+        Factor of the variances for correlated residuals, 1 if these are white.
     arcs : Arcs
         The matched arcs.
     sigma : dict of str to ndarray (m,)
@@ -187,6 +190,7 @@ class ArcMatches:
     rejected: Array
     converged: Mask
     pixels: Array
+    inflation: Array
     arcs: Arcs
     sigma: dict[str, Array]
 
@@ -471,7 +475,8 @@ class Windows:
         sign = np.where(turns % 2 == 0, 1.0, -1.0)
         assert arcs.fading is not None
         return ArcMatches(
-            **{name: getattr(found, name) for name in _NUMBERS if name not in ("cov", "pixels")},
+            **{name: getattr(found, name) for name in _NUMBERS if hasattr(found, name) and name != "cov"},
+            inflation=inflation,
             cov=found.cov * inflation[:, None, None],
             pixels=np.isfinite(found.residuals).sum(axis=(1, 2)) / inflation,
             arcs=replace(

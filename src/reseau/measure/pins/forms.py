@@ -31,6 +31,8 @@ _EVIDENCE, _EACH = 12.0, 3.0
 subtracted from it for every echo."""
 _EXPLAINED = 0.9
 """Share of the squared residuals beyond the noise that another form than a beam must explain."""
+_WHITE = 1.2
+"""Factor of the variances for correlated residuals below which these are as good as white noise."""
 _IMPROVED = 0.7
 """Share of the clear echoes that it must explain better: they are all of one form."""
 _PLAUSIBLE = 3.0
@@ -200,8 +202,10 @@ def _compared(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -
 def _better(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -> bool:
     """Whether another form with one more unknown is the form of the clear echoes `rows`."""
     ratio, explained, improved = _compared(before, after, rows, noise)
-    # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance.
-    enough = explained > _EXPLAINED or "length" in before.sigma
+    # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance. Noise is
+    # white; its size is that of the frame only where the light falls off little.
+    white = float(np.median(after.inflation)) < _WHITE
+    enough = white or explained > _EXPLAINED or "length" in before.sigma
     return ratio > _EVIDENCE and enough and improved >= _IMPROVED
 
 
