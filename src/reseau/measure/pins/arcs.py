@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...adjust import BatchOptions, adjust_batch
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
 from ..matching import MatchOptions, Window, match
@@ -57,6 +58,10 @@ _REACH = 2.6
 """Half size of a window, in widths of the arc."""
 _HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
+_HELD_SHARE, _HELD_ITERATIONS = 0.05, 6
+"""End of the iterations where an end of a line is held."""
+_OTHER = 2.0
+"""Factor of the limit of residuals where neither the end of a line nor its background are known."""
 _WIDER_GAP_PX = 2
 """Width of the additional margin next to hidden pixels that is left out to test the position of an arc."""
 
@@ -333,10 +338,10 @@ class Windows:
             share[:, k] = 1 - seen.mean(axis=1)
         return share
 
-    def costs_of_ends(
-        self, found: ArcMatches, row: int, side: float, steps: Array, tilt: tuple[float, float]
-    ) -> tuple[Array, Array, float]:
-        """Squared residuals over their variance, with one end of a line displaced along its curve.
+    def with_end_at(
+        self, found: ArcMatches, row: int, side: float, steps: Array, form: Form, start: Arcs
+    ) -> tuple[Array, Array, Array]:
+        """Lines adjusted anew with one end held, displaced by given steps along the curve.
 
         Parameters
         ----------
@@ -348,58 +353,124 @@ class Windows:
             1 for the end in the direction of the tilt, -1 for the other.
         steps : ndarray (n,)
             Displacements of the end outwards, pixels.
-        tilt : (float, float)
-            Expected tilt, and its standard deviation.
+        form : Form
+            What is unknown of the form.
+        start : Arcs
+            The means of its priors.
 
         Returns
         -------
         costs : ndarray (n,)
-            Infinite where nothing would be left of the line.
+            -2 times the logarithm of the likelihood of each place of the end, the other unknowns integrated
+            over; infinite where nothing would be left of the line.
         middles : ndarray (n, 2)
             The middle of the line.
-        variance : float
-            Variance of the middle due to the other end alone.
+        covs : ndarray (n, 2, 2)
+            Its covariances for a given place of the end.
         """
-        one = found.arcs.select(np.full(len(steps), row))
+        n, at = len(steps), np.full(len(steps), row)
+        one, mean = found.arcs.select(at), start.select(at)
         half, soft = ends_of(one)
-        longer = half + steps / 2
-        possible = longer > soft
-        longer = np.maximum(longer, soft)
+        half_of_mean, soft_of_mean = ends_of(mean)
         moved = 0.5 * side * steps
-        turned = one.tilt + one.curvature * moved
-        course = 0.5 * (one.tilt + turned)
-        middles = found.xy[row] + moved[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
-        arcs = replace(lines_with(longer, soft, one), tilt=turned)
-        window = tuple(
-            np.broadcast_to(axis, (len(steps), axis.shape[1]))
-            for axis in self._window(np.array([row]), found.xy[[row]])
+        course = one.tilt + 0.5 * one.curvature * moved
+        base = found.xy[row] + moved[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
+        tilt = one.tilt + one.curvature * moved
+        along, across = np.stack([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]).swapaxes(1, 2)
+        left = half + steps / 2
+        possible = left > soft
+        left = np.maximum(left, soft)
+        names = tuple(form.sigma)
+        shape = ArcShape(mean, names)
+        others = [name for name in names if name != "length"]
+        begun = {name: getattr(one, name) - getattr(mean, name) for name in others if name in FURTHER}
+        begun |= {
+            "softness": np.log(soft / soft_of_mean),
+            "curvature": (one.curvature - mean.curvature) * mean.along,
+            "tilt": tilt - mean.tilt,
+        }
+        grey, columns, lines, used = self._seen(found, row)
+        plane = np.stack([np.ones(used.sum()), *(g[used] for g in np.meshgrid(columns, lines))])
+        plane[1:] -= plane[1:].mean(axis=1, keepdims=True)
+        plane[1:] /= np.abs(plane[1:]).max(axis=1, keepdims=True)
+        free = 3 + len(others)
+
+        def placed(x: Array, k: Rows) -> tuple[Array, Array, Array]:
+            """Positions, widths and corrections of the form."""
+            xy = base[k] + x[:, :1] * across[k] - 0.5 * side * x[:, 1:2] * along[k]
+            longer = np.log(np.maximum(left[k] + 0.5 * x[:, 1], 0.1) / half_of_mean[k])
+            values = dict(zip(others, x[:, 3:free].T, strict=True)) | {"length": longer}
+            return xy, np.exp(np.clip(x[:, 2], -_BOLD, _BOLD)), np.stack([values[name] for name in names], axis=1)
+
+        def formed(x: Array, k: Rows) -> tuple[Array, Array]:
+            xy, width, corrections = placed(x, k)
+            window = Window(
+                np.broadcast_to(columns, (len(k), len(columns))),
+                np.broadcast_to(lines, (len(k), len(lines))),
+                self.options.response,
+            )
+            image, parts = shape.derivatives(xy, width, corrections, k, window)
+            image, parts = image[:, used], parts[:, :, used]
+            contrast = x[:, free, None]
+            by_along, by_across = (
+                (parts[:, :2] * axis[k][:, :, None]).sum(axis=1) for axis in (along, across)
+            )
+            by_length = parts[:, 3 + names.index("length")] / np.maximum(left[k] + 0.5 * x[:, 1], 0.1)[:, None]
+            jacobian = np.empty((len(k), image.shape[1], free + 4))
+            jacobian[:, :, 0] = contrast * by_across
+            jacobian[:, :, 1] = contrast * 0.5 * (by_length - side * by_along)
+            jacobian[:, :, 2] = contrast * width[:, None] * parts[:, 2]
+            for i, name in enumerate(others):
+                jacobian[:, :, 3 + i] = contrast * parts[:, 3 + names.index(name)]
+            jacobian[:, :, free] = image
+            jacobian[:, :, free + 1 :] = plane.T
+            return contrast * image + x[:, free + 1 :] @ plane, jacobian
+
+        x = np.zeros((n, free + 4))
+        x[:, 2] = np.log(one.across)
+        for i, name in enumerate(others):
+            x[:, 3 + i] = begun[name]
+        x[:, free] = found.contrast[row]
+        first, _ = formed(x, np.arange(n))
+        x[:, free + 1] = np.median(grey - first, axis=1)
+        sigma = np.full(free + 4, np.inf)
+        sigma[2], sigma[3:free] = _ACROSS_SIGMA, [form.sigma[name] for name in others]
+        expected = np.zeros(free + 4)
+        expected[2] = np.log(mean.across[0])
+        variance = found.noise[row] ** 2 * found.inflation[row]
+        adjusted = adjust_batch(
+            formed,
+            x,
+            np.broadcast_to(grey, (n, len(grey))),
+            weights=np.full((n, len(grey)), 1 / variance),
+            prior=(expected, sigma),
+            options=BatchOptions(share=_HELD_SHARE, max_iterations=_HELD_ITERATIONS, damping=1e-6),
         )
-        columns, lines = (np.rint(axis[0]).astype(np.intp) for axis in window)
+        cofactor = adjusted.cofactor
+        usable = possible & np.isfinite(cofactor).all(axis=(1, 2)) & np.isfinite(adjusted.sigma0)
+        costs = adjusted.sigma0**2 * adjusted.redundancy
+        costs[usable] -= np.linalg.slogdet(cofactor[usable])[1]
+        middles, _, _ = placed(adjusted.estimates, np.arange(n))
+        turned = np.stack([across, -0.5 * side * along], axis=2)
+        covs = turned @ cofactor[:, :2, :2] @ turned.swapaxes(1, 2)
+        return np.where(usable, costs, np.inf), middles, covs
+
+    def _seen(self, found: ArcMatches, row: int) -> tuple[Array, Array, Array, Mask]:
+        """Grey values of the pixels by which an arc was matched; columns, rows and mask of its window."""
+        columns, lines = (axis[0] for axis in self._window(np.array([row]), found.xy[[row]]))
+        c, r = (np.rint(axis).astype(np.intp) for axis in (columns, lines))
         height, width = self.valid.shape
-        at = np.ix_(np.clip(lines, 0, height - 1), np.clip(columns, 0, width - 1))
-        inside = ((lines >= 0) & (lines < height))[:, None] & ((columns >= 0) & (columns < width))
+        at = np.ix_(np.clip(r, 0, height - 1), np.clip(c, 0, width - 1))
+        inside = ((r >= 0) & (r < height))[:, None] & ((c >= 0) & (c < width))
         owner = self.echoes.claimed[at]
         used = inside & self.valid[at] & ((owner < 0) | (owner == self.at[row]))
-        grey, images = self.grey[at][used].astype(np.float64), arcs.image(middles, *window)[:, used]
-        y, x = np.nonzero(used)
-        plane = np.stack([np.ones(len(x)), (x - x.mean()) / width, (y - y.mean()) / height])
-        # Brightness and background by least squares for every place of the end.
-        design = np.concatenate([images[:, None], np.broadcast_to(plane, (len(steps), *plane.shape))], axis=1)
-        normal = design @ np.swapaxes(design, 1, 2) + 1e-9 * np.eye(4)
-        solved = np.linalg.solve(normal, (design @ grey)[..., None])[..., 0]
-        variance = found.noise[row] ** 2 * used.sum() / max(found.pixels[row], 1.0)
-        rest = (grey - np.einsum("np,npk->nk", solved, design)) ** 2 / variance
-        costs = np.minimum(rest, self.options.rejection**2).sum(axis=1)
-        costs += ((turned - tilt[0]) / tilt[1]) ** 2
-        # The derivative with respect to the end that is seen.
-        middle = np.array([len(steps) // 2])
-        _, parts = one.select(middle).derivatives(found.xy[[row]], window[0][:1], window[1][:1])
-        c, s = np.cos(one.tilt[0]), np.sin(one.tilt[0])
-        shift = found.contrast[row] * (c * parts[0, 0] + s * parts[0, 1])
-        u = c * (window[0][:1] - found.xy[row, 0]) + s * (window[1][:1] - found.xy[row, 1]).T
-        seen = used & (side * u < 0)
-        information = float((shift[seen] ** 2).sum()) / variance
-        return np.where(possible, costs, np.inf), middles, 0.25 / max(information, 1e-12)
+        grey = self.grey[at].astype(np.float64)
+        # Without what is no part of the line.
+        image = found.arcs.select(np.array([row])).image(found.xy[[row]], columns[None], lines[None])[0]
+        rest = grey - found.contrast[row] * image
+        rest -= np.median(rest[used])
+        used &= np.abs(rest) < _OTHER * self.options.rejection * found.noise[row]
+        return grey[used], columns, lines, used
 
     def shift_with_wider_gap(self, half_hidden: Rows, found: ArcMatches, form: Form) -> Array:
         """Shifts (m, 2) of arcs if the pixels next to hidden ones are left out, too."""

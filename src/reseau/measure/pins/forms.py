@@ -52,10 +52,12 @@ _HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
 _END_HIDDEN = 0.15
 """Hidden share of an end of a line from which its place is integrated over."""
-_BEYOND_PX, _STEP_PX = 24.0, 0.5
-"""Largest displacement of a hidden end, and steps."""
-_UNLIKELY, _FINER = 25.0, 81
-"""Costs over the least of places that are left out, and number of steps between the others."""
+_BEYOND_PX, _PLACES = 24.0, 33
+"""Largest displacement of a hidden end, and number of its places, twice: to find the likely ones, and there."""
+_SCALES_PX = 0.1, 6.0
+"""Bounds of the displacement up to which the places are equidistant, not in a ratio."""
+_UNLIKELY = 25.0
+"""Costs over the least of places that are left out."""
 
 
 def match_arcs(
@@ -297,33 +299,38 @@ def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, floa
 def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, start: Arcs) -> None:
     """Replace positions of lines of which one end is hidden by their mean over all places of that end.
 
-    What is seen of a line determines its other end and the curve on which it lies. With the hidden end
-    displaced by e along the curve, the middle moves by e/2, and the tilt there changes by κe/2. The
-    likelihood of the visible pixels over e, which is far from normal where a wire hides the end, gives mean
-    and variance of the middle.
+    The likelihood of the visible pixels as a function of the place e of the hidden end is far from normal.
+    For each e all other unknowns are adjusted anew; the middle has the mean m(e) and the covariance C(e)
+    then. With the weights w of the likelihoods, mean and covariance are Σwm and Σw(C + (m − Σwm)(m − Σwm)ᵀ).
     """
     hidden = work.hidden_ends(found) > _END_HIDDEN
-    steps = np.arange(-_BEYOND_PX, _BEYOND_PX + _STEP_PX / 2, _STEP_PX)
     for row in np.flatnonzero(found.converged & hidden.any(axis=1)).tolist():
         tilt = found.arcs.tilt[row]
-        along, across = np.array([np.cos(tilt), np.sin(tilt)]), np.array([-np.sin(tilt), np.cos(tilt)])
+        along = np.array([np.cos(tilt), np.sin(tilt)])
         if hidden[row].all():
             found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
             continue
-        expected = (float(start.tilt[row]), form.sigma["tilt"])
         side = 1.0 if hidden[row, 1] else -1.0
-        cost, _, _ = work.costs_of_ends(found, row, side, steps, expected)
+        scale = float(np.clip(2 * np.sqrt(along @ found.cov[row] @ along), *_SCALES_PX))
+        most = np.arcsinh(_BEYOND_PX / scale)
+        steps = scale * np.sinh(np.linspace(-most, most, _PLACES))
+        cost, _, _ = work.with_end_at(found, row, side, steps, form, start)
+        if not np.isfinite(cost).any():
+            found.converged[row] = False
+            continue
         likely = np.flatnonzero(cost < cost.min() + _UNLIKELY)
         first, last = steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)].tolist()
-        finer = np.linspace(first, last, _FINER)
-        cost, middle, rest = work.costs_of_ends(found, row, side, finer, expected)
+        finer = np.linspace(first, last, _PLACES)
+        cost, middle, cov = work.with_end_at(found, row, side, finer, form, start)
+        seen = np.isfinite(cost)
+        if not seen.any():
+            found.converged[row] = False
+            continue
+        cost, middle, cov = cost[seen], middle[seen], cov[seen]
         weight = np.exp(-0.5 * (cost - cost.min()))
         weight /= weight.sum()
-        if likely[0] == 0 or likely[-1] == len(steps) - 1:
-            rest += _BEYOND_PX**2
         off = middle - weight @ middle
         found.xy[row] = weight @ middle
-        # The adjustment linearises the hidden end; the other end and the line itself remain.
-        level = across @ found.cov[row] @ across
-        found.cov[row] = level * np.outer(across, across) + rest * np.outer(along, along)
-        found.cov[row] += np.einsum("n,ni,nj->ij", weight, off, off)
+        found.cov[row] = np.einsum("n,nij->ij", weight, cov) + np.einsum("n,ni,nj->ij", weight, off, off)
+        if likely[0] == 0 or likely[-1] == len(steps) - 1:
+            found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
