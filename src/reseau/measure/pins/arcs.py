@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from ...adjust import BatchOptions, adjust_batch
 from ...core.data import Array, Mask, Rows
@@ -22,6 +23,7 @@ __all__ = [
     "LINE",
     "ArcMatches",
     "ArcShape",
+    "Details",
     "Form",
     "Windows",
     "ends_of",
@@ -58,6 +60,10 @@ _REACH = 2.6
 """Half size of a window, in widths of the arc."""
 _HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
+_MOST_OF_WIDTH = 0.8
+"""Largest variance of a blur as a share of those of an arc across and of its ends."""
+_SAMPLES = 2
+"""Samples per pixel along each axis, to form a blurred arc."""
 _HELD_SHARE, _HELD_ITERATIONS = 0.05, 6
 """End of the iterations where an end of a line is held."""
 _OTHER = 2.0
@@ -215,6 +221,28 @@ class ArcMatches:
     def moved(self, before: ArcMatches, rows: Rows) -> Array:
         """Shifts (k, 2) from the `rows` of other matches to these; NaN where these did not converge."""
         return np.where(self.converged[:, None], self.xy - before.xy[rows], np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Details:
+    """What the forms of k arcs leave out, and how it shifts them.
+
+    Parameters
+    ----------
+    blur_px : ndarray (k, 2)
+        Shift due to the blur of a bent line, whose image is not the bent image of a blurred line.
+    course_px : ndarray (k, 2)
+        Shift if κ² is replaced by cκ² in the course of the arc, for each unit of c - 1: the course is a
+        hyperbola for c = 1, and a parabola for c = 0.
+    score, information : ndarray (k,)
+        Derivative of the logarithm of the likelihood with respect to c, all other unknowns eliminated, and
+        the information about c.
+    """
+
+    blur_px: Array
+    course_px: Array
+    score: Array
+    information: Array
 
 
 class Windows:
@@ -400,7 +428,11 @@ class Windows:
             xy = base[k] + x[:, :1] * across[k] - 0.5 * side * x[:, 1:2] * along[k]
             longer = np.log(np.maximum(left[k] + 0.5 * x[:, 1], 0.1) / half_of_mean[k])
             values = dict(zip(others, x[:, 3:free].T, strict=True)) | {"length": longer}
-            return xy, np.exp(np.clip(x[:, 2], -_BOLD, _BOLD)), np.stack([values[name] for name in names], axis=1)
+            return (
+                xy,
+                np.exp(np.clip(x[:, 2], -_BOLD, _BOLD)),
+                np.stack([values[name] for name in names], axis=1),
+            )
 
         def formed(x: Array, k: Rows) -> tuple[Array, Array]:
             xy, width, corrections = placed(x, k)
@@ -415,7 +447,9 @@ class Windows:
             by_along, by_across = (
                 (parts[:, :2] * axis[k][:, :, None]).sum(axis=1) for axis in (along, across)
             )
-            by_length = parts[:, 3 + names.index("length")] / np.maximum(left[k] + 0.5 * x[:, 1], 0.1)[:, None]
+            by_length = (
+                parts[:, 3 + names.index("length")] / np.maximum(left[k] + 0.5 * x[:, 1], 0.1)[:, None]
+            )
             jacobian = np.empty((len(k), image.shape[1], free + 4))
             jacobian[:, :, 0] = contrast * by_across
             jacobian[:, :, 1] = contrast * 0.5 * (by_length - side * by_along)
@@ -455,22 +489,119 @@ class Windows:
         covs = turned @ cofactor[:, :2, :2] @ turned.swapaxes(1, 2)
         return np.where(usable, costs, np.inf), middles, covs
 
-    def _seen(self, found: ArcMatches, row: int) -> tuple[Array, Array, Array, Mask]:
-        """Grey values of the pixels by which an arc was matched; columns, rows and mask of its window."""
-        columns, lines = (axis[0] for axis in self._window(np.array([row]), found.xy[[row]]))
+    def details(self, rows: Rows, found: ArcMatches, form: Form, blur: Array) -> Details:
+        """What forms leave out, and how it shifts the arcs `rows`, to first order.
+
+        Parameters
+        ----------
+        rows : ndarray of int (k,)
+            Which ones.
+        found : ArcMatches
+            The matches.
+        form : Form
+            What was unknown of the form.
+        blur : ndarray (m,)
+            Width of a camera's blur, pixels, for each of all arcs.
+        """
+        parts = []
+        for part in self._of_like_size(rows):
+            parts.append((np.searchsorted(rows, part), self._details(part, found, form, blur[part])))
+        columns: dict[str, Any] = {}
+        for f in fields(Details):
+            columns[f.name] = np.zeros((len(rows), 2) if f.name.endswith("_px") else len(rows))
+            for at, one in parts:
+                columns[f.name][at] = getattr(one, f.name)
+        return Details(**columns)
+
+    def _details(self, rows: Rows, found: ArcMatches, form: Form, blur: Array) -> Details:
+        """The same for arcs of one size."""
+        arcs, xy, noise = found.arcs.select(rows), found.xy[rows], found.noise[rows]
+        columns, lines = self._window(rows, xy)
+        shape = ArcShape(arcs, tuple(form.sigma))
+        window = Window(columns, lines, self.options.response)
+        none = np.zeros((len(rows), shape.parameters))
+        image, parts = shape.derivatives(xy, arcs.across, none, np.arange(len(rows)), window)
+        c, s = np.cos(arcs.tilt)[:, None, None], np.sin(arcs.tilt)[:, None, None]
+        x, y = (columns - xy[:, :1])[:, None, :], (lines - xy[:, 1:])[:, :, None]
+        u2 = (c * x + s * y) ** 2
+        bend = arcs.curvature[:, None, None]
+        # From -(dI/dv) u²/(r(1 + r)), r² = 1 + κ²u², to the derivative by c where κ² is replaced by cκ².
+        by_bend = parts[:, 3 + shape.free.index("curvature")] * arcs.along[:, None, None]
+        by_course = -by_bend * bend**3 * u2 / (2 * (1 + np.sqrt(1 + bend**2 * u2)))
+        count = len(rows)
+        flat = (count, 1, image[0].size)
+        used = self._usable(rows, columns, lines).reshape(flat)
+        contrast = found.contrast[rows][:, None, None]
+        parts[:, 2] *= arcs.across[:, None, None]
+        plane = np.stack(
+            np.broadcast_arrays(1.0 + 0 * x, x / columns.shape[1] + 0 * y, y / lines.shape[1] + 0 * x), axis=1
+        )
+        design = used * np.concatenate(
+            [
+                contrast * parts.reshape(count, parts.shape[1], -1),
+                image.reshape(flat),
+                plane.reshape(count, 3, -1),
+            ],
+            axis=1,
+        )
+        known = np.zeros(design.shape[1])
+        known[2 : parts.shape[1]] = 1 / np.array([_ACROSS_SIGMA, *form.sigma.values()]) ** 2
+        normal = design @ design.swapaxes(1, 2)
+        scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-12))
+        normal += noise[:, None, None] ** 2 * np.diag(known)
+        normal /= scale[:, :, None] * scale[:, None, :]
+        normal += 1e-9 * np.eye(len(known))
+        grey = self._grey(columns, lines)
+        columns_of = (
+            np.stack(
+                [
+                    contrast * (_blurred(arcs, xy, columns, lines, blur) - image),
+                    contrast * by_course,
+                    grey - contrast * image,
+                ],
+                axis=1,
+            ).reshape(count, 3, -1)
+            * used
+        )
+        right = (design @ columns_of.swapaxes(1, 2)) / scale[:, :, None]
+        solved = np.linalg.solve(normal, right) / scale[:, :, None]
+        left = columns_of - (solved.swapaxes(1, 2) @ design)
+        limit = (self.options.rejection * noise)[:, None]
+        rest = np.clip(left[:, 2] - left[:, 0], -limit, limit)
+        variance = noise**2 * found.inflation[rows]
+        return Details(
+            blur_px=solved[:, :2, 0],
+            course_px=solved[:, :2, 1],
+            score=(left[:, 1] * rest).sum(axis=1) / variance,
+            information=(left[:, 1] ** 2).sum(axis=1) / variance,
+        )
+
+    def _usable(self, rows: Rows, columns: Array, lines: Array) -> Mask:
+        """Pixels of the windows of some arcs that may be used, (k, r, c)."""
         c, r = (np.rint(axis).astype(np.intp) for axis in (columns, lines))
         height, width = self.valid.shape
-        at = np.ix_(np.clip(r, 0, height - 1), np.clip(c, 0, width - 1))
-        inside = ((r >= 0) & (r < height))[:, None] & ((c >= 0) & (c < width))
+        inside = ((r >= 0) & (r < height))[:, :, None] & ((c >= 0) & (c < width))[:, None, :]
+        at = np.clip(r, 0, height - 1)[:, :, None], np.clip(c, 0, width - 1)[:, None, :]
         owner = self.echoes.claimed[at]
-        used = inside & self.valid[at] & ((owner < 0) | (owner == self.at[row]))
-        grey = self.grey[at].astype(np.float64)
+        return np.asarray(inside & self.valid[at] & ((owner < 0) | (owner == self.at[rows][:, None, None])))
+
+    def _grey(self, columns: Array, lines: Array) -> Array:
+        """Grey values of windows, (k, r, c)."""
+        c, r = (np.rint(axis).astype(np.intp) for axis in (columns, lines))
+        height, width = self.valid.shape
+        at = np.clip(r, 0, height - 1)[:, :, None], np.clip(c, 0, width - 1)[:, None, :]
+        return np.asarray(self.grey[at], dtype=np.float64)
+
+    def _seen(self, found: ArcMatches, row: int) -> tuple[Array, Array, Array, Mask]:
+        """Grey values of the pixels by which an arc was matched; columns, rows and mask of its window."""
+        one = np.array([row])
+        columns, lines = self._window(one, found.xy[one])
+        grey, used = self._grey(columns, lines)[0], self._usable(one, columns, lines)[0]
         # Without what is no part of the line.
-        image = found.arcs.select(np.array([row])).image(found.xy[[row]], columns[None], lines[None])[0]
-        rest = grey - found.contrast[row] * image
+        rest = grey - found.contrast[row] * found.arcs.select(one).image(found.xy[one], columns, lines)[0]
         rest -= np.median(rest[used])
         used &= np.abs(rest) < _OTHER * self.options.rejection * found.noise[row]
-        return grey[used], columns, lines, used
+        return grey[used], columns[0], lines[0], used
 
     def shift_with_wider_gap(self, half_hidden: Rows, found: ArcMatches, form: Form) -> Array:
         """Shifts (m, 2) of arcs if the pixels next to hidden ones are left out, too."""
@@ -599,6 +730,30 @@ def _half_sides(start: Arcs) -> Rows:
     c, s = np.abs(np.cos(start.tilt)), np.abs(np.sin(start.tilt))
     reach = np.stack([np.hypot(c * u, s * v), np.hypot(s * u, c * v)], axis=1) + _MARGIN_PX
     return _WINDOWS[np.minimum(np.searchsorted(_WINDOWS, reach), len(_WINDOWS) - 1)]
+
+
+def _blurred(arcs: Arcs, xy: Array, columns: Array, lines: Array, blur: Array) -> Array:
+    """Images (k, r, c) of sharper arcs that a blur (k,) makes as wide as these, as bright as these."""
+    half, soft = ends_of(arcs)
+    variance = np.minimum(blur**2, _MOST_OF_WIDTH * np.minimum(arcs.across, soft) ** 2)
+    sharp = replace(
+        lines_with(half, np.sqrt(soft**2 - variance), arcs), across=np.sqrt(arcs.across**2 - variance)
+    )
+    pad, n = int(np.ceil(4 * np.sqrt(variance.max()))), _SAMPLES
+    x, y = (
+        axis[:, :1] - pad + np.arange((axis.shape[1] + 2 * pad) * n - n + 1) / n for axis in (columns, lines)
+    )
+    light = sharp.image(xy, x, y)
+    inner = slice(pad * n, -pad * n if pad else None, n)
+    found = np.stack(
+        [
+            gaussian_filter(one, n * width, mode="nearest", truncate=4.0)[inner, inner]
+            for one, width in zip(light, np.sqrt(variance), strict=True)
+        ]
+    )
+    image = arcs.image(xy, columns, lines)
+    bright = (image * found).sum(axis=(1, 2)) / np.maximum((found * found).sum(axis=(1, 2)), 1e-300)
+    return np.asarray(bright[:, None, None] * found)
 
 
 def _inflation(residuals: Array) -> Array:

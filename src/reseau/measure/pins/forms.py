@@ -43,9 +43,8 @@ _LEAST_SCATTER = {"softness": 0.01, "tilt": 0.002, "fading": 0.01, "tapering": 0
 """Smallest scatter between echoes that is assumed."""
 _BLUR_SHARE = 0.25
 """Standard deviation of an unknown blur's variance, as a share of that of the width across."""
-_COURSE = 27 / 560
-"""Half the shift of the middle of a line, over κ³a⁴, between fits of a parabola and of a hyperbola."""
-_BOLD_PX = 10.0
+_COURSE = 0.5, 0.5
+"""Expected course of an arc, and its standard deviation: 1 is a hyperbola, 0 a parabola."""
 _ORDER = 0.7
 """Uncertainty of the order in which a line fades and its ends become soft: 0 or 1, and the fading itself."""
 _HALF_HIDDEN = 0.5
@@ -53,7 +52,7 @@ _HALF_HIDDEN = 0.5
 _END_HIDDEN = 0.15
 """Hidden share of an end of a line from which its place is integrated over."""
 _BEYOND_PX, _PLACES = 24.0, 33
-"""Largest displacement of a hidden end, and number of its places, twice: to find the likely ones, and there."""
+"""Largest displacement of a hidden end, and number of its places; as many again among the likely ones."""
 _SCALES_PX = 0.1, 6.0
 """Bounds of the displacement up to which the places are equidistant, not in a ratio."""
 _UNLIKELY = 25.0
@@ -104,9 +103,10 @@ def match_arcs(
         # is estimated by leaving out slightly more of the arc.
         pulled = work.shift_with_wider_gap(half_hidden, found, form)
         found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
+    shift = _correct_for_details(work, found, form, blur)
     if "length" in form.sigma:
         _integrate_over_hidden_ends(work, found, form, start)
-    _correct_for_blur(found, blur)
+    found.xy[:] -= shift
     if "fading" in form.sigma:
         # Whether a line fades before its ends become soft, or after, shifts its middle by g s²/a.
         arcs = found.arcs
@@ -117,27 +117,29 @@ def match_arcs(
     return found
 
 
-def _correct_for_blur(found: ArcMatches, blur: tuple[float, float] | None) -> None:
-    """Correct the ridges for the blur, which shifts a bent line to the inside of its bend.
+def _correct_for_details(
+    work: Windows, found: ArcMatches, form: Form, blur: tuple[float, float] | None
+) -> Array:
+    """Shifts (m, 2) due to blur and course, by which arcs are to be corrected; adds their covariances.
 
-    By half the curvature times the variance of the blur along the line. If the blur is not known, it is at
-    most that of the echo itself, but mostly much less.
+    If the blur is not known, it is at most that of the echo itself, but mostly much less. The course of all
+    arcs is a hyperbola if a range bends them; a display may bend it to a parabola, or beyond.
     """
-    arcs = found.arcs
-    along2, across2 = arcs.along**2, arcs.across**2
-    if blur is None:
-        variance, sigma = np.zeros(len(arcs)), _BLUR_SHARE * np.minimum(across2, along2)
-    else:
-        squared = blur[0] ** 2
-        variance = squared * along2 / (along2 + squared)
-        sigma = np.full(len(arcs), 2 * blur[0] * blur[1])
-    normal = np.stack([-np.sin(arcs.tilt), np.cos(arcs.tilt)], axis=1)
-    half = 0.5 * arcs.curvature
-    found.xy[:] -= normal * (half * variance)[:, None]
-    # The fourth power of u in the course of the arc: a hyperbola for a range, but a display bends it.
-    course = _COURSE * np.clip(arcs.curvature**3 * along2**2, -_BOLD_PX, _BOLD_PX)
-    uncertain = (half * sigma) ** 2 + course**2
-    found.cov[:] += uncertain[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    arcs, shift = found.arcs, np.zeros_like(found.xy)
+    rows = np.flatnonzero(found.converged)
+    if not len(rows):
+        return shift
+    unknown = np.sqrt(_BLUR_SHARE) * np.minimum(arcs.across, ends_of(arcs)[1])
+    widths = unknown if blur is None else np.full(len(arcs), blur[0])
+    less = work.details(rows, found, form, widths)
+    clear = found.t[rows] > _CLEAR
+    information = float(less.information[clear].sum()) + 1 / _COURSE[1] ** 2
+    course = (float(less.score[clear].sum()) + (_COURSE[0] - 1) / _COURSE[1] ** 2) / information
+    relative = 1.0 if blur is None else 2 * blur[1] / blur[0]
+    shift[rows] = course * less.course_px + (0.0 if blur is None else 1.0) * less.blur_px
+    for uncertain in (relative * less.blur_px, less.course_px / np.sqrt(information)):
+        found.cov[rows] += uncertain[:, :, None] * uncertain[:, None, :]
+    return shift
 
 
 def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
@@ -204,8 +206,8 @@ def _compared(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -
 def _better(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -> bool:
     """Whether another form with one more unknown is the form of the clear echoes `rows`."""
     ratio, explained, improved = _compared(before, after, rows, noise)
-    # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance. Noise is
-    # white; its size is that of the frame only where the light falls off little.
+    # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance. Noise
+    # is white; its size is that of the frame only where the light falls off little.
     white = float(np.median(after.inflation)) < _WHITE
     enough = white or explained > _EXPLAINED or "length" in before.sigma
     return ratio > _EVIDENCE and enough and improved >= _IMPROVED
