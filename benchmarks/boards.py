@@ -102,7 +102,7 @@ def line(name: str, done: list[Measured], rough: bool) -> bool:
     """Print a row of the table; whether it is within its limits."""
     error, sigma = (np.concatenate([getattr(part, k) for part in done]) for k in ("error", "sigma"))
     inside, found = sum(part.inside for part in done), sum(part.found for part in done)
-    seconds = np.mean([part.seconds for part in done])
+    seconds = sum(part.seconds for part in done) / len(done)
     if not len(error):
         print(f"{name:26} {found:5} of {inside:5}", flush=True)
         return False

@@ -80,6 +80,18 @@ def test_there_are_no_unflagged_errors(case: str) -> None:
     assert np.nanmax(np.abs(error) / np.hypot(sigma, 0.01)) < 5.0
 
 
+def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
+    frame, truth = PLAIN.record(STATION), PLAIN.truth(STATION)
+    first = answer(frame.pixels)
+    coded = np.rint(255 * (frame.pixels / 255.0) ** (1 / 2.2)).astype(np.uint8)
+    found = answer(coded)
+    assert (first.notes, found.notes[0].code) == ((), "nonlinear")
+    assert found.found >= 0.97 * first.found
+    both = found.ok & first.ok
+    error, least = ((each.xy - truth.xy)[both].std() for each in (found, first))
+    assert error < 1.15 * least
+
+
 def test_hidden_and_saturated_targets_are_flagged_or_correct() -> None:
     stains = (Stain(80, 80, 30, 200.0), Stain(180, 170, 20, 90.0), Stain(100, 170, 20, 300.0, opaque=False))
     bench, station = FieldBench(stains=stains), Station(30)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Failure, Remark
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches
@@ -22,6 +22,7 @@ from ..screening import quiet_noise, screen
 from .lattice import LatticeFit, refit, slope_of
 from .recognition import Reading, SearchedFrame
 from .targets import Light, Scene, match_targets, merged
+from .tone import SHRUNK, ToneCurve, best_curve
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
@@ -97,6 +98,8 @@ class TestfieldResult(Measured):
         Classification of the clusters.
     squares : int
         Number of clusters that were read and agree with each other.
+    notes : tuple of Remark
+        How grey values that are not proportional to the light were linearised.
 
     Examples
     --------
@@ -119,6 +122,7 @@ class TestfieldResult(Measured):
     lattice: LatticeFit
     reading: Reading
     squares: int
+    notes: tuple[Remark, ...] = ()
 
 
 def measure_testfield(
@@ -204,6 +208,11 @@ def measure_testfield(
         PixelResponse(options.fill),
         options.row_jitter_px,
     )
+    work = _Measurement(scene, lattice, options)
+    work.learn()
+    curve = work.curve(float(frame.full_scale))
+    if curve is not None:
+        work.linearise(curve, float(frame.full_scale))
     return TestfieldResult(
         image=frame.name,
         sha256=frame.sha256,
@@ -211,8 +220,17 @@ def measure_testfield(
         lattice=lattice,
         reading=reading,
         squares=placed.squares,
-        **_Measurement(scene, lattice, options).columns(),
+        **work.columns(),
+        notes=() if curve is None else (_curved(curve),),
     )
+
+
+def _curved(curve: ToneCurve) -> Remark:
+    text = (
+        "grey values are not proportional to the light; they were linearised with a curve estimated from the "
+        f"edges of targets, {curve}"
+    )
+    return Remark(text, Code.NONLINEAR)
 
 
 class _Measurement:
@@ -220,6 +238,7 @@ class _Measurement:
 
     def __init__(self, scene: Scene, lattice: LatticeFit, options: TestfieldOptions) -> None:
         self.scene, self.options = scene, options
+        self.growth: float | None = None
         self.at = scene.lattice(scene.design.xy)
         ends = np.array([(lines.min(), lines.max()) for lines in (lattice.across, lattice.along)])
         self.middle, self.half = ends.mean(axis=1), np.ptp(ends, axis=1) / 2
@@ -255,7 +274,6 @@ class _Measurement:
 
     def columns(self) -> dict[str, Any]:
         """Columns of the result from `xy` to `noise`."""
-        self._learn_outwards()
         wanted = self.rows[self.inside]
         found = self._matched()
         why, predicted = self._judged(self.scene, wanted, found)
@@ -292,7 +310,43 @@ class _Measurement:
             "deviation": spread(found.xy - predicted[wanted], good),
         } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
 
-    def _learn_outwards(self) -> None:
+    def curve(self, full_scale: float) -> ToneCurve | None:
+        """The curve between light and grey values, if the size of the targets suggests that there is one."""
+        large = self.inside & self.scene.design.large[self.rows]
+        if self.growth is None or not large.any():
+            return None
+        if self.growth * (1 if self.scene.design.polarity == "dark" else -1) > -SHRUNK:
+            return None
+        some = np.zeros(len(self.rows), dtype=bool)
+        candidates = np.flatnonzero(large)
+        some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
+
+        def misfit(curve: ToneCurve) -> float:
+            scene = self._linearised(curve, full_scale)
+            found = match_targets(scene, self.rows, some, searching=False)
+            amplitude = found.contrast * (found.level if scene.design.polarity == "dark" else 1.0)
+            return float(np.median(found.noise / np.abs(amplitude)))
+
+        return best_curve(misfit)
+
+    def linearise(self, curve: ToneCurve, full_scale: float) -> None:
+        """Continue with grey values that are proportional to the light, and learn the scene again."""
+        self.scene = self._linearised(curve, full_scale)
+        self.learn()
+
+    def _linearised(self, curve: ToneCurve, full_scale: float) -> Scene:
+        scene = self.scene
+        xy = self.predicted[self.rows[self.inside]]
+        level, contrast = scene.light.at(xy)
+        sign = -1.0 if scene.design.polarity == "dark" else 1.0
+        bright = curve.light(level, full_scale)
+        amplitude = sign * (curve.light(level + sign * contrast, full_scale) - bright)
+        light = Light.through(xy, bright, amplitude, scene.light.size)
+        scale = float(np.median(amplitude / contrast))
+        grey = curve.light(scene.grey, full_scale)
+        return replace(scene, grey=grey, light=light, noise=scene.noise * scale)
+
+    def learn(self) -> None:
         """Learn mapping, light and sharpness from some of the large targets, matched first.
 
         Start between the lines, where the mapping is known, and continue outwards.
@@ -329,6 +383,7 @@ class _Measurement:
         psf_px = float(np.median(first.psf_px[sure]))
         # The light of neighbours was not known well yet: the targets with small residuals give the noise.
         noise = float(np.quantile(first.noise[sure], 0.2))
+        self.growth = float(np.median(first.form[sure, 0]))
         self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
