@@ -30,7 +30,13 @@ def edge(inside: Array, spacing: float) -> Array:
 
 
 def form(
-    scene: Scene, width: int, height: int, sigma: float, aperture: float = 1.0, oversampling: int = 8
+    scene: Scene,
+    width: int,
+    height: int,
+    sigma: float,
+    aperture: float = 1.0,
+    oversampling: int = 8,
+    motion: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
     """An image (height, width) of a scene.
 
@@ -46,12 +52,14 @@ def form(
         Side of the square light-sensitive part of a pixel, in pixels.
     oversampling : int
         Samples per pixel and axis.
+    motion : (float, float)
+        Even motion of the scene while it is exposed, pixels.
     """
     image = np.empty((height, width))
     for top in range(0, height, _TILE):
         for left in range(0, width, _TILE):
             down, across = min(_TILE, height - top), min(_TILE, width - left)
-            tile = form_at(scene, (left, top), (across, down), sigma, aperture, oversampling)
+            tile = form_at(scene, (left, top), (across, down), sigma, aperture, oversampling, motion=motion)
             image[top : top + down, left : left + across] = tile[0]
     return image
 
@@ -64,6 +72,7 @@ def form_at(
     aperture: float = 1.0,
     oversampling: int = 8,
     derivatives: bool = False,
+    motion: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
     """A part of an image, (1, height, width), see `form`; with derivatives (4, height, width).
 
@@ -77,17 +86,19 @@ def form_at(
         Its width and height.
     sigma, aperture, oversampling
         As for `form`.
+    motion
+        As for `form`.
     derivatives : bool
         Whether to return those by a shift of the scene in x, in y and by `sigma` too.
     """
     n = oversampling
-    margin = int(np.ceil(_REACH * sigma + 1))
+    margin = int(np.ceil(_REACH * sigma + 1 + np.hypot(*motion)))
     x, y = (a - margin + np.arange((s + 2 * margin) * n) / n for a, s in zip(first, size, strict=True))
     bright = scene(*np.meshgrid(x, y), 1.0 / n)
     fx, fy = np.fft.rfftfreq(len(x), 1 / n), np.fft.fftfreq(len(y), 1 / n)[:, None]
     narrow = sigma**2 - 1 / (12 * n**2)
     across, down = (np.exp(-2 * np.pi**2 * narrow * f**2) * np.sinc(aperture * f) for f in (fx, fy))
-    light = scipy.fft.rfft2(bright) * down * across
+    light = scipy.fft.rfft2(bright) * down * across * np.sinc(motion[0] * fx + motion[1] * fy)
     parts = [light]
     if derivatives:
         parts += [-2j * np.pi * fx * light, -2j * np.pi * fy * light]

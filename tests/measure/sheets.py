@@ -82,11 +82,11 @@ class Camera:
         return draw(outline.mapped(self.image).oriented(), _SHAPE, self.blur_px)
 
 
-def exposed(share: Array, seed: int = 0) -> Frame:
+def exposed(share: Array, seed: int = 0, light: float = 190.0) -> Frame:
     """Dark marks on an unevenly lit ground, with noise of 2 grey values."""
     u = np.linspace(-1, 1, share.shape[1])
     noise = np.random.default_rng(seed).normal(0, 2.0, share.shape)
-    grey = 190 * (1 + 0.1 * u) * (1 - 0.85 * share) + noise
+    grey = light * (1 + 0.1 * u) * (1 - 0.85 * share) + noise
     return Frame(grey.round().clip(0, 254).astype(np.uint8), 255.0, "formed")
 
 
@@ -97,6 +97,7 @@ def form(
     rings: bool = True,
     glare: Array | None = None,
     seed: int = 0,
+    light: float = 190.0,
 ) -> Formed:
     """A photograph of the sheet; of the light that a disk takes, `glare` (h, w) gives back a share."""
     assert design.mark.size is not None
@@ -109,7 +110,7 @@ def form(
             share += camera.share(_sector(design.rings, start, end, xy[design.ids.index(name)]))
     if glare is not None:
         share *= 1 - glare
-    return Formed(exposed(share, seed), camera.image(xy)[0])
+    return Formed(exposed(share, seed, light), camera.image(xy)[0])
 
 
 def _sector(rings: Rings, start: float, end: float, centre: Array) -> Outline:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -190,3 +191,26 @@ def test_one_visible_ring_suffices_to_number_a_sheet(kept: tuple[int]) -> None:
     result = measured(formed, design)
     assert result.ok.sum() >= 52
     assert np.abs(result.xy - formed.truth)[result.ok].max() < 0.2
+
+
+def test_grey_values_of_a_curve_are_linearised_with_a_note() -> None:
+    formed = sheets.form(sheets.Camera(10.0, 40.0), light=220)
+    coded = 255 * (formed.frame.pixels / 255.0) ** (1 / 2.2)
+    result = measure_reseau(Frame(coded.round().astype(np.uint8), 255.0), sheets.DESIGN)
+    assert isinstance(result, ReseauResult)
+    assert [note.code for note in result.notes] == [Code.NONLINEAR]
+    found = errors_over_sigmas(result, formed.truth)
+    assert 0.75 < np.sqrt((found**2).mean() / 2) < 1.25
+
+
+def test_smear_by_motion_is_modelled_with_a_note() -> None:
+    formed = sheets.form(sheets.Camera(10.0, 30.0))
+    kernel = np.zeros((5, 5))
+    kernel[range(5), range(5)] = [0.125, 0.25, 0.25, 0.25, 0.125]
+    light = cv2.filter2D(formed.frame.pixels.astype(float), -1, kernel)
+    noise = np.random.default_rng(2).normal(0, 2, light.shape)
+    result = measure_reseau(Frame((light + noise).clip(0, 254).astype(np.uint8), 255.0), sheets.DESIGN)
+    assert isinstance(result, ReseauResult)
+    assert [note.code for note in result.notes] == [Code.FILTERED]
+    found = errors_over_sigmas(result, formed.truth)
+    assert 0.7 < np.sqrt((found**2).mean() / 2) < 1.25

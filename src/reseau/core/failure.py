@@ -42,6 +42,7 @@ class Code(StrEnum):
     DOUBTFUL_CONTROL = "doubtful-control"  # control points or distances contradict the images
     DRAWN = "drawn"  # graphics of the instrument, not part of the image
     EDGE_MISSING = "edge-missing"  # one edge of a frame was not found; the format determines it
+    FILTERED = "filtered"  # moved during the exposure, out of focus, or sharpened by a program
     GROSS_ERRORS = "gross-errors"  # single observations are probably wrong: check or leave them out
     HIDDEN = "hidden"  # covered, saturated or on lost pixels
     INCONSISTENT = "inconsistent"  # the observations contradict the model or each other

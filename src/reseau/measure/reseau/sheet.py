@@ -23,16 +23,18 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign, Rings
 from ...optics import Chain, RationalPolynomial
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, draw
-from ..matching import GrownOutline, Matches, MatchOptions, Window, grey_variance, match
+from ..matching import GrownOutline, Matches, MatchOptions, Shape, Window, grey_variance, match
 from ..points import Reason
+from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
 from ..screening import Screened, screen
 from ..testfield.lattice import refit, second_order
 from ..testfield.targets import merged
+from ..testfield.tone import ToneCurve
 from .disks import Disks, find_disks
 from .marks import ReseauOptions
 from .placement import spacing
@@ -347,8 +349,8 @@ _FORM = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.
 _FORM_SIGMA = np.array([0.1, 0.03, 0.03])
 _CLASS_PX = 4
 """Step of the window sizes."""
-_GROUND_PX = 5
-"""Background shown by a window around its disk, pixels."""
+_GROUND_PX, _GROUND_WIDTHS = 5, 3.0
+"""Background shown by a window around its disk: pixels, and widths of the point-spread function."""
 _RING = 0.05
 """Share of a pixel from which a ring hides it from the matching; the light of fainter tails is subtracted."""
 _FAR_PX = 1e5
@@ -365,6 +367,14 @@ _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """Tolerances of the prediction of a disk by its neighbours: noise, share of the light, and shift."""
 _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
+_ENOUGH_LIKE, _SAMPLE = 6, 30
+"""Least number of reliable disks from which something is learnt, and most that show the camera's response."""
+_FILTERED = 0.85
+"""Ratio of mean square residuals below which a kernel is used."""
+_LINEAR = 0.15
+"""Deviation of an exponent from 1 that does no harm."""
+_ATTEMPTS = 6
+"""Iterations of the exponent of a tone curve."""
 _PSF_LOG_SIGMA, _SIZE_SIGMA = 0.2, 0.03
 """Spread of sharpness (logarithm) and relative size over the disks of one frame."""
 _BLURRED, _GROWN, _BENT = 1.8, 0.2, 0.12
@@ -427,6 +437,12 @@ class _Appearance:
     size: float
     form_sigma: Array
     variance: tuple[float, float] | None
+    kernel: Array | None
+    """Of motion or sharpening, see :mod:`reseau.measure.response`."""
+    blur_px: float
+    """Width of the point-spread function with the kernel."""
+    contrast: Array | None
+    """Contrast (n,) of each disk of the design."""
     light: Array | None
     """Grey values (n,) that full ink adds at each disk of the design; negative for dark ink."""
 
@@ -450,15 +466,19 @@ class _Sheet:
         self.at = design.xy @ placed.frame.T + placed.origin
         self.found = placed.disk >= 0
         self.start = np.where(self.found[:, None], disks.xy[placed.disk], self.mapping(self.at))
-        self.look = _Appearance(options.psf_px, 0.5, design.mark.size, _FORM_SIGMA, None, None)
+        self.look = _Appearance(
+            options.psf_px, 0.5, design.mark.size, _FORM_SIGMA, None, None, options.psf_px, None, None
+        )
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
+        self.notes: tuple[Remark, ...] = ()
 
     def columns(self) -> dict[str, Any]:
         """Columns of the result."""
         rows = np.flatnonzero(self.found)
         first = self._match(rows)
         sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
-        self._learn(first, rows, sure)
+        if sure.sum() >= _ENOUGH_LIKE:
+            self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows = self._in_sight()
         found = self._match(rows)
         why, field = self._judged(rows, found)
@@ -508,6 +528,7 @@ class _Sheet:
                 polarity=self.design.polarity,
                 row_jitter_px=self.options.row_jitter_px,
                 settled=0.05,
+                contrast=None if self.look.contrast is None else self.look.contrast[rows[part]],
                 contrast_slope=_SLOPE,
                 background=2,
                 variance=self.look.variance,
@@ -516,11 +537,10 @@ class _Sheet:
                 match(
                     self.screened.grey,
                     valid,
-                    Outline(outline.xy[part], outline.dxy[part]),
+                    self._shape(outline, part),
                     self.start[rows[part]],
                     options,
                     noise=self.screened.noise,
-                    form=_FORM,
                     form_sigma=self.look.form_sigma,
                     others=self._light_of(ring, rows[part], half),
                 )
@@ -528,13 +548,18 @@ class _Sheet:
             parts.append(part)
         return merged(parts, found)
 
-    @staticmethod
-    def _windows(outline: Outline) -> Iterator[tuple[Rows, tuple[int, int]]]:
+    def _shape(self, outline: Outline, part: Rows) -> Shape:
+        """Images of some of the disks."""
+        plain = GrownOutline(Outline(outline.xy[part], outline.dxy[part]), _FORM)
+        return plain if self.look.kernel is None else FilteredShape(plain, self.look.kernel)
+
+    def _windows(self, outline: Outline) -> Iterator[tuple[Rows, tuple[int, int]]]:
         """Disks with windows of one size, and half their width and height."""
+        ground = max(_GROUND_PX, int(np.ceil(_GROUND_WIDTHS * self.look.blur_px)))
         reach = np.abs(outline.xy).max(axis=1)
         sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
         for k, size in enumerate(sizes):
-            half = size * _CLASS_PX + _GROUND_PX
+            half = size * _CLASS_PX + ground
             yield np.flatnonzero(of.ravel() == k), (int(half[0]), int(half[1]))
 
     def _pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -563,7 +588,8 @@ class _Sheet:
         for one in np.split(corners, len(sheet)):
             outline = Outline.polygon(one, self.look.psf_px).oriented()
             share += draw(Outline(outline.xy[None], outline.dxy[None]), shape, self.look.psf_px)
-        return share
+        kernel = self.look.kernel
+        return share if kernel is None else np.asarray(cv2.filter2D(share, -1, kernel), dtype=np.float64)
 
     def _light_of(self, ring: Array, rows: Rows, half: tuple[int, int]) -> Array | None:
         """Light (k, rows, columns) that the blurred edges of rings take in the windows of disks."""
@@ -573,25 +599,115 @@ class _Sheet:
         x, y = self._pixels(rows, half)
         return np.asarray(ring[y, x] * light[rows, None, None])
 
-    def _learn(self, first: Matches, rows: Rows, sure: Mask) -> None:
-        """Learn mapping, sharpness, size and noise from the reliable disks."""
-        if sure.sum() < 6:
-            return
-        rows = rows[sure]
-        self.mapping = through(self.at[rows], first.xy[sure], self.screened.grey.shape)
-        depth = first.contrast * (-first.level if self.design.polarity == "dark" else 1)
-        light = np.full(len(self.at), np.median(depth[sure]))
-        light[rows] = depth[sure]
+    def _learn(self, first: Matches, rows: Rows) -> Matches:
+        """Learn mapping, sharpness, size and noise from reliable disks; their form refers to the new size."""
+        self.mapping = through(self.at[rows], first.xy, self.screened.grey.shape)
+        variance = grey_variance(self.screened.grey, self.start[rows], first.residuals)
+        first = self._settle(first)
+        width = self.look.psf_px
         self.look = _Appearance(
-            float(np.median(first.psf_px[sure])),
+            width,
             _PSF_LOG_SIGMA,
-            self.look.size * (1 + float(np.median(first.form[sure, 0]))),
+            self.look.size,
             np.array([_SIZE_SIGMA, *_FORM_SIGMA[1:]]),
-            grey_variance(self.screened.grey, self.start[rows], first.residuals[sure]),
-            light,
+            variance,
+            None,
+            width,
+            self._everywhere(first.contrast, rows),
+            self._everywhere(self._depth(first), rows),
         )
         self.start = np.where(self.found[:, None], self.start, self.mapping(self.at))
-        self.start[rows] = first.xy[sure]
+        self.start[rows] = first.xy
+        return first
+
+    def _everywhere(self, values: Array, rows: Rows) -> Array:
+        """Values (k,) of some disks for all disks of the design; the median where there is none."""
+        whole = np.full(len(self.at), np.median(values))
+        whole[rows] = values
+        return whole
+
+    def _depth(self, found: Matches) -> Array:
+        """Grey values (k,) that ink adds."""
+        return np.asarray(found.contrast * (-found.level if self.design.polarity == "dark" else 1))
+
+    def _respond(self, first: Matches, rows: Rows) -> None:
+        """Learn what motion, sharpening and the curve of the camera make of the images."""
+        some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLE).astype(np.intp))
+        first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
+        # The first match began far from the sharpness of these images.
+        first = self._settle(self._match(rows))
+        kernel, sharper, gain = estimate_kernel(self._samples(first, rows)[0])
+        if gain < _FILTERED:
+            self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
+            first = self._settle(self._match(rows))
+            text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
+            self.notes += (Remark(text, Code.FILTERED),)
+        coded, full_scale, gamma = self.screened.grey, self.image.full_scale, 1.0
+        before = self.screened, self.look
+        for attempt in range(_ATTEMPTS):
+            samples, formed = self._samples(first, rows)
+            curve = estimate_gamma(samples, formed, gamma, full_scale)
+            if attempt == 0 and not curve.certain:
+                return
+            step, gamma = abs(curve.gamma - gamma), float(np.clip(curve.gamma, 0.3, 4))
+            if attempt and step < curve.sigma:
+                break
+            light = ToneCurve(gamma).light(coded, full_scale)
+            self.screened = replace(self.screened, grey=light)
+            self.look = replace(
+                self.look, variance=(0.02 * full_scale, 1.0) if gamma > 1 else None, light=None
+            )
+            first = self._settle(self._match(rows))
+            self.screened = replace(self.screened, noise=float(np.median(first.noise)))
+        if not (first.converged.all() and 0.35 < gamma < 3.5 and abs(gamma - 1) > _LINEAR):
+            self.screened, self.look = before
+            return
+        variance = grey_variance(self.screened.grey, self.start[rows], first.residuals)
+        self.look = replace(
+            self.look,
+            variance=variance,
+            contrast=self._everywhere(first.contrast, rows),
+            light=self._everywhere(self._depth(first), rows),
+        )
+        text = (
+            f"grey values are not proportional to the light: they follow its power 1/{gamma:.2f} "
+            f"(± {curve.sigma:.2f}), as estimated from the disks, and were linearised"
+        )
+        self.notes += (Remark(text, Code.NONLINEAR),)
+
+    def _settle(self, first: Matches) -> Matches:
+        """Learn sharpness and size; the form of the matches refers to the new size."""
+        growth = float(np.median(first.form[:, 0]))
+        self.look = replace(
+            self.look, psf_px=float(np.median(first.psf_px)), size=self.look.size * (1 + growth)
+        )
+        return replace(first, form=(first.form - np.array([growth, 0.0, 0.0])) / (1 + growth))
+
+    def _samples(self, first: Matches, rows: Rows) -> tuple[Samples, Array]:
+        """Matched disks in windows of one size, and their adjusted images."""
+        outline = self._outline(rows)
+        high, wide = (n // 2 for n in first.residuals.shape[1:])
+        size = np.max([half for _, half in self._windows(outline)], axis=0)
+        half = int(min(size[0], wide)), int(min(size[1], high))
+        x, y = self._pixels(rows, half)
+        centre = slice(high - half[1], high + half[1] + 1), slice(wide - half[0], wide + half[0] + 1)
+        residuals = first.residuals[:, *centre]
+        grey = self.screened.grey[y, x].astype(np.float64)
+        if (others := self._light_of(self._rings(), rows, half)) is not None:
+            grey -= others
+        window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
+        every = np.arange(len(rows))
+        samples = Samples(
+            self._shape(outline, every),
+            first.xy,
+            first.psf_px,
+            first.form,
+            self._depth(first),
+            window,
+            grey,
+            np.isfinite(residuals),
+        )
+        return samples, grey + np.nan_to_num(residuals)
 
     def _uneasy(self, found: Matches) -> Mask:
         """Disks with larger residuals than the others, or that did not converge."""
@@ -607,9 +723,7 @@ class _Sheet:
         quarter of a pixel makes of them.
         """
         near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
-        dark = self.design.polarity == "dark"
-        depth = found.contrast * (-found.level if dark else 1)
-        level, depth = (np.median(values[good][near], axis=1) for values in (found.level, depth))
+        level, depth = (np.median(values[good][near], axis=1) for values in (found.level, self._depth(found)))
         noise = float(np.median(found.noise[good]))
         uneasy = self._uneasy(found) | ~good
         some = rows[uneasy]
@@ -621,7 +735,7 @@ class _Sheet:
         for part, half in self._windows(outline):
             x, y = self._pixels(some[part], half)
             window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
-            shape = GrownOutline(Outline(outline.xy[part], outline.dxy[part]), _FORM)
+            shape = self._shape(outline, part)
             width, form = np.full(len(part), self.look.psf_px), np.zeros((len(part), len(_FORM)))
             share, slopes = shape.derivatives(xy[part], width, form, np.arange(len(part)), window)
             here, ink = (values[uneasy][part, None, None] for values in (level, depth))
@@ -721,4 +835,5 @@ class _Sheet:
             "why": tuple(reasons),
             "predicted": predicted,
             "deviation": deviation,
+            "notes": self.notes,
         } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
