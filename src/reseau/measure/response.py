@@ -28,12 +28,14 @@ _TAP = 0.1
 """Prior standard deviation of a value of a kernel."""
 _SHARPER = (1.0, 0.75, 0.5)
 """Shares of the width of the point-spread function that are tried beneath a kernel."""
+_FUTILE = 0.95
+"""Ratio of mean square residuals above which no kernel is sought beneath a sharper function."""
 _SMALL = 1e-3
 """Values of a kernel below this are set to zero."""
-_LEAST_GAIN, _STRONG = 0.995, 0.95
+_LEAST_GAIN, _STRONG = 0.995, 0.9
 """Ratios of mean square residuals below which a tone curve matters, and is beyond doubt."""
-_CERTAIN, _CORRELATED = 6.0, 1.65
-"""Least significance of a curve; ratio of standard deviations from which residuals count as correlated."""
+_CERTAIN, _CORRELATED = 6.0, 0.12
+"""Least significance of a tone curve; correlation of residuals from which they have another cause."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +221,8 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
         cost = float(((rest - taps @ values) ** 2).sum() + variance * (values**2).sum() / _TAP**2)
         if cost < best[0]:
             best = cost, sharper, values
+        if cost > _FUTILE * plain:
+            break
     cost, sharper, values = best
     kernel = np.zeros((2 * _REACH + 1,) * 2)
     values = np.where(np.abs(values) < _SMALL, 0.0, values)
@@ -238,27 +242,27 @@ class Exponent:
         The exponent γ.
     sigma : float
         Its standard deviation, from the scatter of the marks.
-    white : float
-        The same if the residuals of a mark were independent.
     gain : float
         Mean square of the residuals with the exponent over that before.
+    correlation : float
+        Largest correlation of the residuals of neighbouring pixels that remains.
 
     Examples
     --------
-    >>> Exponent(2.2, 0.04, 0.03, 0.97).certain, Exponent(2.2, 0.12, 0.04, 0.97).certain
+    >>> Exponent(2.2, 0.04, 0.97, 0.02).certain, Exponent(2.2, 0.04, 0.97, 0.25).certain
     (True, False)
     """
 
     gamma: float
     sigma: float
-    white: float
     gain: float
+    correlation: float
 
     @property
     def certain(self) -> bool:
         """Whether there is a curve; correlated residuals, as of compression, can look like a weak one."""
         significant = self.gain < _LEAST_GAIN and abs(self.gamma - 1) > _CERTAIN * self.sigma
-        return significant and (self.gain < _STRONG or self.sigma < _CORRELATED * self.white)
+        return significant and (self.gain < _STRONG or self.correlation < _CORRELATED)
 
 
 def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: float) -> Exponent:
@@ -314,5 +318,19 @@ def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: fl
     scores = (change * rest).sum(axis=1)
     sigma = np.sqrt(k / max(k - 1, 1) * float((scores**2).sum())) / max(square, 1e-300)
     before, after = float((observed**2).sum()), float((rest**2).sum())
-    white = np.sqrt(after / max(float((weight > 0).sum()), 1) / max(square, 1e-300))
-    return Exponent(gamma + step, float(sigma), float(white), after / max(before, 1e-300))
+    correlation = _correlation(rest.reshape(samples.grey.shape), samples.used)
+    return Exponent(gamma + step, float(sigma), after / max(before, 1e-300), correlation)
+
+
+def _correlation(rest: Array, used: Mask) -> float:
+    """Largest correlation of the residuals (k, r, c) of neighbouring pixels."""
+    before = [
+        (rest[:, :, 1:], rest[:, :, :-1], used[:, :, 1:] & used[:, :, :-1]),
+        (rest[:, 1:], rest[:, :-1], used[:, 1:] & used[:, :-1]),
+        (rest[:, 1:, 1:], rest[:, :-1, :-1], used[:, 1:, 1:] & used[:, :-1, :-1]),
+        (rest[:, 1:, :-1], rest[:, :-1, 1:], used[:, 1:, :-1] & used[:, :-1, 1:]),
+    ]
+    square = float((rest**2).sum()) / max(float(used.sum()), 1)
+    return max(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1) for a, b, both in before) / max(
+        square, 1e-300
+    )

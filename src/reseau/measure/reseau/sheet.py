@@ -27,7 +27,7 @@ from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign, Rings
 from ...optics import Chain, RationalPolynomial
 from ...optics.field import SmoothField
-from ...optics.formation import Outline, PixelResponse, draw
+from ...optics.formation import Outline, PixelResponse, side_rule
 from ..matching import GrownOutline, Matches, MatchOptions, Shape, Window, grey_variance, match
 from ..points import Reason
 from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
@@ -353,6 +353,8 @@ _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its disk: pixels, and widths of the point-spread function."""
 _RING = 0.05
 """Share of a pixel from which a ring hides it from the matching; the light of fainter tails is subtracted."""
+_ALIKE_WIDTH = 0.03
+"""Relative change of the sharpness from which the rings are formed anew."""
 _FAR_PX = 1e5
 """Coordinates from which the mapping is not used: it is extrapolated far beyond the disks."""
 _SLOPE = 0.3
@@ -367,8 +369,10 @@ _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """Tolerances of the prediction of a disk by its neighbours: noise, share of the light, and shift."""
 _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
-_ENOUGH_LIKE, _SAMPLE = 6, 30
+_ENOUGH_LIKE, _SAMPLE = 6, 20
 """Least number of reliable disks from which something is learnt, and most that show the camera's response."""
+_FEW = 3
+"""One in so many of these shows whether a kernel is needed."""
 _FILTERED = 0.85
 """Ratio of mean square residuals below which a kernel is used."""
 _LINEAR = 0.15
@@ -421,13 +425,6 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
 
 
-def _sector(rings: Rings, start: float, end: float) -> Array:
-    """Corners (80, 2) of a sector of a ring around the origin, from one angle to another, degrees."""
-    angle = np.deg2rad(np.linspace(start, end, 40))
-    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.concatenate([rings.outer / 2 * arc, rings.inner / 2 * arc[::-1]])
-
-
 @dataclass(frozen=True, eq=False)
 class _Appearance:
     """Appearance of the disks of this frame."""
@@ -470,6 +467,7 @@ class _Sheet:
             options.psf_px, 0.5, design.mark.size, _FORM_SIGMA, None, None, options.psf_px, None, None
         )
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
+        self.ring: tuple[Array, Chain, float, Array | None] | None = None
         self.notes: tuple[Remark, ...] = ()
 
     def columns(self) -> dict[str, Any]:
@@ -570,26 +568,66 @@ class _Sheet:
         return np.clip(x, 0, w - 1)[:, None, :], np.clip(y, 0, h - 1)[:, :, None]
 
     def _rings(self) -> Array:
-        """Share (h, w) of each pixel that the coded rings take."""
+        """Share (h, w) of each pixel that the coded rings take; formed anew when they have changed."""
+        look = self.look
+        if self.ring is not None:
+            share, mapping, psf_px, kernel = self.ring
+            alike = abs(psf_px / look.psf_px - 1) < _ALIKE_WIDTH
+            if alike and mapping is self.mapping and kernel is look.kernel:
+                return share
+        share = np.zeros(self.screened.grey.shape, dtype=np.float32)
         rings = self.design.rings
         assert rings is not None
-        sheet = []
+        reach = 0 if look.kernel is None else len(look.kernel) // 2
         for name, sectors in rings.sectors.items():
             centre = self.design.xy[self.design.ids.index(name)]
             for start, end in sectors:
-                sheet.append(_sector(rings, start, end) + centre)
-        shape = self.image.height, self.image.width
-        share: Array = np.zeros(shape)
-        if not sheet:
-            return share
-        corners = self.mapping(np.concatenate(sheet) @ self.frame.T + self.origin)
-        if not np.abs(corners).max() < _FAR_PX:  # the mapping is extrapolated far beyond the disks
-            return share
-        for one in np.split(corners, len(sheet)):
-            outline = Outline.polygon(one, self.look.psf_px).oriented()
-            share += draw(Outline(outline.xy[None], outline.dxy[None]), shape, self.look.psf_px)
-        kernel = self.look.kernel
-        return share if kernel is None else np.asarray(cv2.filter2D(share, -1, kernel), dtype=np.float64)
+                outline = self._sector(rings, start, end, centre)
+                if outline is None or not np.abs(outline.xy).max() < _FAR_PX:
+                    continue  # the mapping is extrapolated far beyond the disks
+                margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
+                low = np.maximum(np.floor(outline.xy.min(axis=0)).astype(np.intp) - margin, 0)
+                high = np.ceil(outline.xy.max(axis=0)).astype(np.intp) + margin + 1
+                place = share[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
+                if min(place.shape) <= 2 * reach:
+                    continue
+                x, y = (low[k] + np.arange(place.shape[1 - k], dtype=np.float64)[None] for k in (0, 1))
+                window = Window(x, y, PixelResponse(self.options.fill))
+                nodes = Outline(outline.xy[None], outline.dxy[None]).oriented().single()
+                one = np.zeros(1, dtype=np.intp)
+                width = np.full(1, look.psf_px)
+                taken = GrownOutline(nodes, np.zeros((0, 2, 2))).image(
+                    np.zeros((1, 2)), width, np.zeros((1, 0)), one, window
+                )[0]
+                place += taken if look.kernel is None else cv2.filter2D(taken, -1, look.kernel)
+        self.ring = share, self.mapping, look.psf_px, look.kernel
+        return share
+
+    def _sector(self, rings: Rings, start: float, end: float, centre: Array) -> Outline | None:
+        """Image of a sector of a ring, from one angle to another, degrees."""
+        _, slope, _ = second_order(self.mapping, (centre @ self.frame.T + self.origin)[None])
+        scale = float(np.linalg.norm(slope[0] @ self.frame, ord=2))
+        spacing = _NODES_PX * self.look.psf_px / scale
+        a, b = np.deg2rad([start, end])
+        nodes, tangents = [], []
+        for radius, first, last in ((rings.outer / 2, a, b), (rings.inner / 2, b, a)):
+            along, weight = side_rule(abs(b - a) * radius, spacing)
+            angle = first + along * (last - first)
+            nodes.append(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+            turning = radius * (last - first) * weight[:, None]
+            tangents.append(turning * np.stack([-np.sin(angle), np.cos(angle)], axis=1))
+        for angle, first, last in (
+            (b, rings.outer / 2, rings.inner / 2),
+            (a, rings.inner / 2, rings.outer / 2),
+        ):
+            along, weight = side_rule(abs(last - first), spacing)
+            ray = np.array([np.cos(angle), np.sin(angle)])
+            nodes.append((first + along * (last - first))[:, None] * ray)
+            tangents.append(((last - first) * weight)[:, None] * ray)
+        at = (np.concatenate(nodes) + centre) @ self.frame.T + self.origin
+        xy, slopes, _ = second_order(self.mapping, at)
+        found = Outline(xy, np.einsum("nij,nj->ni", slopes, np.concatenate(tangents) @ self.frame.T))
+        return found if np.isfinite(xy).all() else None
 
     def _light_of(self, ring: Array, rows: Rows, half: tuple[int, int]) -> Array | None:
         """Light (k, rows, columns) that the blurred edges of rings take in the windows of disks."""
@@ -636,13 +674,15 @@ class _Sheet:
         first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
         # The first match began far from the sharpness of these images.
         first = self._settle(self._match(rows))
-        kernel, sharper, gain = estimate_kernel(self._samples(first, rows)[0])
+        few = np.arange(len(rows)) % _FEW == 0
+        kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
         if gain < _FILTERED:
+            kernel, sharper, gain = estimate_kernel(self._samples(first, rows)[0])
             self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
             first = self._settle(self._match(rows))
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             self.notes += (Remark(text, Code.FILTERED),)
-        coded, full_scale, gamma = self.screened.grey, self.image.full_scale, 1.0
+        full_scale, gamma = self.image.full_scale, 1.0
         before = self.screened, self.look
         for attempt in range(_ATTEMPTS):
             samples, formed = self._samples(first, rows)
@@ -652,8 +692,7 @@ class _Sheet:
             step, gamma = abs(curve.gamma - gamma), float(np.clip(curve.gamma, 0.3, 4))
             if attempt and step < curve.sigma:
                 break
-            light = ToneCurve(gamma).light(coded, full_scale)
-            self.screened = replace(self.screened, grey=light)
+            self.screened = replace(self.screened, grey=self._linear(ToneCurve(gamma)))
             self.look = replace(
                 self.look, variance=(0.02 * full_scale, 1.0) if gamma > 1 else None, light=None
             )
@@ -674,6 +713,14 @@ class _Sheet:
             f"(± {curve.sigma:.2f}), as estimated from the disks, and were linearised"
         )
         self.notes += (Remark(text, Code.NONLINEAR),)
+
+    def _linear(self, curve: ToneCurve) -> NDArray[np.float32]:
+        """Grey values of the frame that are proportional to the light."""
+        pixels, full_scale = self.image.pixels, self.image.full_scale
+        if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+            return curve.light(pixels.astype(np.float32), full_scale)
+        levels = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32)
+        return np.asarray(curve.light(levels, full_scale)[pixels])
 
     def _settle(self, first: Matches) -> Matches:
         """Learn sharpness and size; the form of the matches refers to the new size."""
