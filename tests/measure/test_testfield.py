@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 from reseau.core.data import Array, Frame
 from reseau.core.errors import ImageError
@@ -90,6 +91,19 @@ def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
     both = found.ok & first.ok
     error, least = ((each.xy - truth.xy)[both].std() for each in (found, first))
     assert error < 1.15 * least
+
+
+def test_motion_during_the_exposure_is_formed_and_sigmas_stay_right() -> None:
+    still = FieldBench(sensor=Sensor(240, 240, shot_noise=False, read_noise=0.0))
+    frame, truth = still.record(STATION), still.truth(STATION)
+    moved = uniform_filter1d(frame.pixels.astype(np.float64), 5, axis=0)
+    moved += np.random.default_rng(1).normal(0, 1.2, moved.shape)
+    found = measure_testfield(Frame(np.rint(moved).clip(0, 255).astype(np.uint8), 255.0), DESIGN)
+    assert isinstance(found, TestfieldResult)
+    assert found.found > 330
+    error = (found.xy - truth.xy)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt(((error / sigma) ** 2).mean()) == pytest.approx(1.0, abs=0.25)
 
 
 def test_hidden_and_saturated_targets_are_flagged_or_correct() -> None:

@@ -16,11 +16,13 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
-from ..matching import Matches
+from ..matching import Matches, Window
 from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
 from .lattice import LatticeFit, refit, slope_of
+from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
+from .target_images import form_targets
 from .targets import Light, Scene, match_targets, merged
 from .tone import SHRUNK, ToneCurve, best_curve
 
@@ -30,6 +32,9 @@ _LEAST_FIRST, _MOST_FIRST = 8, 36
 """Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets not measured for which another round is made; maximum number of rounds."""
+_BESIDE_PX = 0.025
+"""Distance of targets from their predictions, exceeded by one coordinate in ten, for which another round is
+made: the light of lines and neighbours was formed in wrong places."""
 _FAR = 4.5
 """Largest deviation of a target from the mapping through all targets, in standard deviations."""
 _WIDE = 0.1
@@ -42,6 +47,8 @@ _UNMODELLED_PX = 0.03
 """Scatter of positions about a mapping of third degree beyond their own sigmas."""
 _SEEN = 0.95
 """Minimum share of a target on pixels that carry an image."""
+_MOVES, _SAME_SPREAD = 4, 0.03
+"""Maximum number of rounds in which motion is estimated; change of the covariance (px²) that ends them."""
 _HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
 _UNLIKE = 2.0
@@ -239,6 +246,7 @@ class _Measurement:
     def __init__(self, scene: Scene, lattice: LatticeFit, options: TestfieldOptions) -> None:
         self.scene, self.options = scene, options
         self.growth: float | None = None
+        self.spread = np.zeros(2)
         self.at = scene.lattice(scene.design.xy)
         ends = np.array([(lines.min(), lines.max()) for lines in (lattice.across, lattice.along)])
         self.middle, self.half = ends.mean(axis=1), np.ptp(ends, axis=1) / 2
@@ -279,14 +287,16 @@ class _Measurement:
         why, predicted = self._judged(self.scene, wanted, found)
         for _ in range(_AGAIN):
             good = why == ""
-            if good.mean() > 1 - _FEW or good.sum() < _MOST_FIRST:
+            off = np.abs(found.xy - self.predicted[wanted])[good]
+            settled = good.mean() > 1 - _FEW and np.quantile(off, 0.9) < _BESIDE_PX
+            if settled or good.sum() < _MOST_FIRST:
                 break
             # With many targets known, the mapping and the light of neighbours are known better.
             self._learn_from(found, good, wanted)
             wanted = self.rows[self.inside]
             found = self._matched()
             why, predicted = self._judged(self.scene, wanted, found)
-            if (why == "").sum() < 1.05 * good.sum():
+            if good.mean() < 1 - _FEW and (why == "").sum() < 1.05 * good.sum():
                 break
         n = len(self.at)
         ok, reasons = (
@@ -357,10 +367,12 @@ class _Measurement:
             candidates = candidates[(out <= beyond).all(axis=1)]
             if len(candidates) < _LEAST_FIRST:
                 continue
-            some = np.zeros(len(self.rows), dtype=bool)
-            some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
+            targets = self.rows[candidates[:: max(1, len(candidates) // _MOST_FIRST)]]
             predicted = self.predicted
-            self._learn(some)
+            for _ in range(_MOVES):
+                self._learn(np.isin(self.rows, targets) & self.inside)
+                if not self._shifted():
+                    break
             moved = (self.predicted - predicted)[self.rows[self.inside]]
             if len(moved) and np.abs(moved).max() < _SETTLED_PX:
                 break
@@ -372,7 +384,37 @@ class _Measurement:
             if sure.sum() >= max(_LEAST_FIRST, some.sum() // 2):
                 break
         if sure.sum() >= _LEAST_FIRST:
+            self.spread = self._spread(first, sure, self.rows[some])
             self._learn_from(first, sure, self.rows[some])
+
+    def _spread(self, first: Matches, sure: Mask, rows: Rows) -> Array:
+        """Anisotropy of the point-spread function, from the residuals of matched targets."""
+        scene, rows = self.scene, rows[sure]
+        formed, xy, _ = form_targets(
+            scene.design, rows, scene.mapping, scene.frame, scene.lattice(scene.design.xy[rows]), scene.psf_px
+        )
+        shape = MovedShape(formed, scene.path) if scene.path.any() else formed
+        centre, half = np.rint(xy), [n // 2 for n in first.residuals.shape[1:]]
+        down, right = (np.arange(-n, n + 1.0) for n in half)
+        window = Window(centre[:, :1] + right, centre[:, 1:] + down, scene.response)
+        dark = scene.design.polarity == "dark"
+        amplitude = -first.contrast[sure] * first.level[sure] if dark else first.contrast[sure]
+        left = -first.residuals[sure] / amplitude[:, None, None]
+        found = anisotropy(shape, first.xy[sure], first.psf_px[sure], window, left)
+        return spread_of(scene.path) + found
+
+    def _shifted(self) -> bool:
+        """Adopt the motion during the exposure that was found; whether it is another one than before."""
+        path = path_of(self.spread)
+        before, self.scene = self.scene, replace(self.scene, path=path)
+        change = np.hypot(*(spread_of(path) - spread_of(before.path)))
+        if change > _SAME_SPREAD:
+            # What is now modelled as motion was part of the blur.
+            added = (path @ path - before.path @ before.path) / 24
+            variance = max(self.scene.psf_px**2 - float(added), 0.25 * self.scene.psf_px**2)
+            self.scene = replace(self.scene, psf_px=float(np.sqrt(variance)))
+            self._place()
+        return bool(change > _SAME_SPREAD)
 
     def _learn_from(self, first: Matches, sure: Mask, rows: Rows) -> None:
         """Learn mapping, light and sharpness from matched targets."""

@@ -8,7 +8,7 @@ of the board is modelled by polynomials over the frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,10 @@ from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
-from ..matching import FormedShape, GrownOutline, Matches, MatchOptions, Shape, ShapeSubset, Window, match
+from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
 from .lattice import slope_of
 from .line_profiles import blur_of, crossings, strip
+from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
 __all__ = ["Light", "Scene", "match_targets", "merged"]
@@ -109,6 +110,8 @@ class Scene:
         Response of a pixel.
     row_jitter_px : float
         Standard deviation of the shift of a row.
+    path : ndarray (2,)
+        Path of the images during the exposure, pixels.
     """
 
     grey: NDArray[np.float32]
@@ -122,6 +125,7 @@ class Scene:
     psf_px: float
     response: PixelResponse
     row_jitter_px: float
+    path: Array = field(default_factory=lambda: np.zeros(2))
 
     def lattice(self, xy: Array) -> Array:
         """Lattice coordinates (n, 2) of points of the design (n, 2)."""
@@ -155,7 +159,10 @@ def match_targets(
     if not inside.all():
         rows, inside = _around(scene, rows, inside)
     at = scene.lattice(scene.design.xy[rows])
-    images, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+    formed, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+    images: Shape = formed
+    if scene.path.any():
+        images, reach = MovedShape(formed, scene.path), reach + np.abs(scene.path) / 2
     canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows], inside)
     return merged(*canvas.match(background, searching))
 
@@ -188,7 +195,7 @@ class _Canvas:
     """Light that the marks of a testfield attenuate or add, and matching of each without the others."""
 
     def __init__(
-        self, scene: Scene, images: GrownOutline, xy: Array, reach: Array, large: Mask, wanted: Mask
+        self, scene: Scene, images: Shape, xy: Array, reach: Array, large: Mask, wanted: Mask
     ) -> None:
         self.scene, self.images, self.xy = scene, images, xy
         self.total = _line_light(scene)
@@ -293,6 +300,8 @@ def _line_light(scene: Scene) -> Array:
     lines, free = scene.design.lines, np.ones(h * w)
     x0, y0, x1, y1 = lines.extent
     blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
+    steps = steps_of(scene.path)
+    longest = float(np.hypot(*scene.path)) / 2
     for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
         along = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
         on = np.empty((len(places), 2, count, 2))
@@ -303,15 +312,20 @@ def _line_light(scene: Scene) -> Array:
             line = crossings(middle, np.arange(count, dtype=float), (h, w), 4 * blur)
             if line is None:
                 continue
-            line = line.within(int(5 * blur + 3), (h, w))
+            line = line.within(int(5 * blur + longest + 3), (h, w))
             if not len(line.step):
                 continue
             width = (beside - middle)[np.rint(line.along).astype(np.intp)]
             half = 0.5 * np.abs((width * line.normal).sum(axis=1))
             # A line may run at 45° to the rows or columns along which it is followed.
-            reach = int(np.ceil((3.5 * blur + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min()))
+            reach = int(
+                np.ceil((3.5 * blur + longest + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min())
+            )
             row, column, distance = line.around(reach)
-            share = strip(distance, half[:, None], blur)
+            share = sum(
+                weight * strip(distance - (line.normal @ place)[:, None], half[:, None], blur)
+                for place, weight in zip(*steps, strict=True)
+            )
             # The ends of the line are blurred, too.
             ends = np.sort(middle[[0, -1], line.axis])
             share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
