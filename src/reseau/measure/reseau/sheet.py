@@ -640,29 +640,17 @@ class _Sheet:
     def _learn(self, first: Matches, rows: Rows) -> Matches:
         """Learn mapping, sharpness, size and noise from reliable disks; their form refers to the new size."""
         self.mapping = through(self.at[rows], first.xy, self.screened.grey.shape)
-        variance = grey_variance(self.screened.grey, self.start[rows], first.residuals)
+        self._weigh(first, rows)
         first = self._settle(first)
-        width = self.look.psf_px
-        self.look = _Appearance(
-            width,
-            _PSF_LOG_SIGMA,
-            self.look.size,
-            np.array([_SIZE_SIGMA, *_FORM_SIGMA[1:]]),
-            variance,
-            None,
-            width,
-            self._everywhere(first.contrast, rows),
-            self._everywhere(self._depth(first), rows),
+        self.look = replace(
+            self.look,
+            psf_log_sigma=_PSF_LOG_SIGMA,
+            form_sigma=np.array([_SIZE_SIGMA, *_FORM_SIGMA[1:]]),
+            blur_px=self.look.psf_px,
         )
         self.start = np.where(self.found[:, None], self.start, self.mapping(self.at))
         self.start[rows] = first.xy
         return first
-
-    def _everywhere(self, values: Array, rows: Rows) -> Array:
-        """Values (k,) of some disks for all disks of the design; the median where there is none."""
-        whole = np.full(len(self.at), np.median(values))
-        whole[rows] = values
-        return whole
 
     def _depth(self, found: Matches) -> Array:
         """Grey values (k,) that ink adds."""
@@ -674,12 +662,14 @@ class _Sheet:
         first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
         # The first match began far from the sharpness of these images.
         first = self._settle(self._match(rows))
+        self._weigh(first, rows)
         few = np.arange(len(rows)) % _FEW == 0
         kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
         if gain < _FILTERED:
             kernel, sharper, gain = estimate_kernel(self._samples(first, rows)[0])
             self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
             first = self._settle(self._match(rows))
+            self._weigh(first, rows)
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             self.notes += (Remark(text, Code.FILTERED),)
         full_scale, gamma = self.image.full_scale, 1.0
@@ -701,18 +691,30 @@ class _Sheet:
         if not (first.converged.all() and 0.35 < gamma < 3.5 and abs(gamma - 1) > _LINEAR):
             self.screened, self.look = before
             return
-        variance = grey_variance(self.screened.grey, self.start[rows], first.residuals)
-        self.look = replace(
-            self.look,
-            variance=variance,
-            contrast=self._everywhere(first.contrast, rows),
-            light=self._everywhere(self._depth(first), rows),
-        )
+        self._weigh(first, rows)
         text = (
             f"grey values are not proportional to the light: they follow its power 1/{gamma:.2f} "
             f"(± {curve.sigma:.2f}), as estimated from the disks, and were linearised"
         )
         self.notes += (Remark(text, Code.NONLINEAR),)
+
+    def _weigh(self, first: Matches, rows: Rows) -> None:
+        """Learn noise, contrast and light from some of the disks; those of the others change as much."""
+
+        def renewed(known: Array | None, values: Array) -> Array:
+            whole = np.full(len(self.at), np.median(values))
+            if known is not None:
+                whole = known * np.median(values / known[rows])
+            whole[rows] = values
+            return np.asarray(whole)
+
+        look = self.look
+        self.look = replace(
+            look,
+            variance=grey_variance(self.screened.grey, self.start[rows], first.residuals),
+            contrast=renewed(look.contrast, first.contrast),
+            light=renewed(look.light, self._depth(first)),
+        )
 
     def _linear(self, curve: ToneCurve) -> NDArray[np.float32]:
         """Grey values of the frame that are proportional to the light."""
