@@ -45,14 +45,20 @@ _SETTLED_PX = 0.1
 """Change of the predictions, in pixels, below which learning is not continued further outwards."""
 _UNMODELLED_PX = 0.03
 """Scatter of positions about a mapping of third degree beyond their own sigmas."""
-_SEEN = 0.95
-"""Minimum share of a target on pixels that carry an image."""
+_SEEN = 0.75
+"""Minimum share of a target on pixels that carry an image and are not saturated."""
 _MOVES, _SAME_SPREAD = 4, 0.03
 """Maximum number of rounds in which motion is estimated; change of the covariance (px²) that ends them."""
 _HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
+_VEILED, _CONTRAST_SLOPE = 0.04, 0.3
+"""Deviation of the contrast of a target from the usual one from which it may change across the target, and
+the standard deviation of this change over half a window."""
 _UNLIKE = 2.0
 """Multiple of the usual residuals from which an image is that of another object."""
+_FORMED_PX = 0.002
+"""Standard deviation of a coordinate from what no image shows: edges of prints, unequal pixels, formation of
+images. Other programs for the formation of images agree with ours to this."""
 _BLURRED, _PALE, _GROWN = 1.5, 0.25, 0.15
 """Tolerances of sharpness (factor), contrast and size (shares) of a target relative to the others."""
 
@@ -313,7 +319,7 @@ class _Measurement:
         good = why == ""
         return {
             "xy": spread(found.xy, good),
-            "cov": spread(found.cov, good),
+            "cov": spread(found.cov + _FORMED_PX**2 * np.eye(2), good),
             "ok": ok,
             "why": tuple(reasons),
             "predicted": predicted,
@@ -430,20 +436,32 @@ class _Measurement:
         self._place()
 
     def _matched(self) -> Matches:
-        """Match all targets; on an uneven background with a curved one if that is better."""
+        """Match all targets; on an uneven background with a curved one if that is better.
+
+        Where light is reflected over a target, or lies over it as a veil, its contrast differs from the usual
+        and changes across it.
+        """
         found = match_targets(self.scene, self.rows, self.inside)
-        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
-        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
-        if not uneasy.any():
+        if not found.converged.any():
             return found
-        some = self.inside.copy()
-        some[some] = uneasy
-        curved = match_targets(self.scene, self.rows, some, background=2)
-        better = curved.converged & ~(curved.noise > 0.9 * found.noise[uneasy])
-        keep = ~uneasy
-        keep[uneasy] = ~better
-        rows = [np.flatnonzero(keep), np.flatnonzero(~keep)]
-        return merged(rows, [found.select(keep), curved.select(better)])
+        ordinary = np.median(found.noise[found.converged])
+        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
+        usual = np.median(found.contrast[found.converged])
+        # The contrast itself has a relative standard deviation of 1/t.
+        doubt = 4 / np.maximum(found.t, 1.0)
+        veiled = found.converged & (np.abs(found.contrast / usual - 1) > _VEILED + doubt)
+        for some, slope in ((uneasy & ~veiled, None), (veiled, _CONTRAST_SLOPE)):
+            if not some.any():
+                continue
+            among = self.inside.copy()
+            among[among] = some
+            curved = match_targets(self.scene, self.rows, among, background=2, contrast_slope=slope)
+            better = curved.converged & ~(curved.noise > (0.9 if slope is None else 1.02) * found.noise[some])
+            keep = ~some
+            keep[some] = ~better
+            parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
+            found = merged(parts, [found.select(keep), curved.select(better)])
+        return found
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
         """Reason why each target is rejected, and the positions predicted by the mapping through all."""
@@ -477,9 +495,13 @@ class _Measurement:
                     Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
                 )
             ]
-        width, contrast, noise = (
-            float(np.median(values[sure])) for values in (found.psf_px, found.contrast, found.noise)
+        amplitude = found.contrast * found.level
+        width, contrast, noise, usual = (
+            float(np.median(values[sure]))
+            for values in (found.psf_px, found.contrast, found.noise, amplitude)
         )
+        # Light that is added to that of a target changes its contrast, but not its depth.
+        pale = np.minimum(np.abs(found.contrast / contrast - 1), np.abs(amplitude / usual - 1))
         return [
             (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
@@ -494,7 +516,7 @@ class _Measurement:
                 Reason("sharpness differs from the other targets", Code.BLURRED),
             ),
             (
-                np.abs(found.contrast / contrast - 1) > _PALE,
+                pale > _PALE,
                 Reason("contrast differs from the other targets", Code.UNLIKE),
             ),
             (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the design", Code.UNLIKE)),

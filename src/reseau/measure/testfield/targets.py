@@ -133,7 +133,13 @@ class Scene:
 
 
 def match_targets(
-    scene: Scene, rows: Rows, inside: Mask, background: int = 1, *, searching: bool = True
+    scene: Scene,
+    rows: Rows,
+    inside: Mask,
+    background: int = 1,
+    *,
+    searching: bool = True,
+    contrast_slope: float | None = None,
 ) -> Matches:
     """Match targets of the design.
 
@@ -150,6 +156,8 @@ def match_targets(
     searching : bool
         Whether to search for blunders in windows with large residuals; see
         :func:`reseau.measure.matching.match`.
+    contrast_slope : float, optional
+        Standard deviation of the change of contrast over half a window; by default it is constant.
 
     Returns
     -------
@@ -164,7 +172,7 @@ def match_targets(
     if scene.path.any():
         images, reach = MovedShape(formed, scene.path), reach + np.abs(scene.path) / 2
     canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows], inside)
-    return merged(*canvas.match(background, searching))
+    return merged(*canvas.match(background, searching, contrast_slope))
 
 
 def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
@@ -232,11 +240,13 @@ class _Canvas:
             self.near.reshape(-1)[flat] = True
         return _Part(part, half, own, formed)
 
-    def match(self, background: int, searching: bool) -> tuple[list[Rows], list[Matches]]:
+    def match(
+        self, background: int, searching: bool, contrast_slope: float | None
+    ) -> tuple[list[Rows], list[Matches]]:
         """Match small and large targets in windows of one size each: their indices and matches."""
         noise = self._noise()
         return [part.rows for part in self.parts], [
-            self._match(part, background, noise, searching) for part in self.parts
+            self._match(part, background, noise, searching, contrast_slope) for part in self.parts
         ]
 
     def _noise(self) -> float:
@@ -253,7 +263,14 @@ class _Canvas:
         # The median of normal deviates is 0.6745 of their σ; the variance of such a difference is 3/2 σ².
         return float(np.median(np.abs(bend[flat])) / (0.6745 * np.sqrt(1.5)))
 
-    def _match(self, part: _Part, background: int, noise: float, searching: bool) -> Matches:
+    def _match(
+        self,
+        part: _Part,
+        background: int,
+        noise: float,
+        searching: bool,
+        contrast_slope: float | None,
+    ) -> Matches:
         scene, (h, w), half = self.scene, self.total.shape, part.half
         centre = np.rint(self.xy[part.rows]).astype(np.intp)
         column, row = (
@@ -271,6 +288,7 @@ class _Canvas:
             start_px=0.3,
             settled=0.1,
             background=background,
+            contrast_slope=contrast_slope,
         )
         level, amplitude = scene.light.at(centre.astype(np.float64))
         # Slopes across half a window, in the order of the matcher's monomials: 1, v, u.
