@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from reseau.core.data import Frame
 from reseau.core.errors import ImageError, UsageError
 from reseau.core.failure import Code, Failure
 from reseau.io import DesignPoint, ReseauMeasurement
-from reseau.measure import ReseauOptions, measure_reseau
+from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
 from reseau.optics import sigma_of_snr
 from reseau.optics.formation import Outline, draw, mark_outline
 
@@ -70,6 +71,20 @@ def test_with_known_row_jitter_sigmas_are_not_too_small():
     # Eight marks of a row share its jitter: 60 groups.
     assert s.normalised == pytest.approx([1.0, 1.0], abs=0.25)
     assert s.ratio.max() < 1.15 + 0.25
+
+
+@pytest.mark.parametrize("quality", [60, 10])
+def test_sigmas_contain_the_errors_of_compression(quality):
+    scene = Scene(mark=MARKS["cross"], columns=11, rows=9, width=700, height=600)
+    formed = form(scene, np.random.default_rng(0))
+    pixels = np.clip(np.rint(formed.frame.pixels * (255 / formed.frame.full_scale)), 0, 255).astype(np.uint8)
+    _, coded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    found = measure_reseau(Frame(cv2.imdecode(coded, 0), 255.0, "coded.jpg"), scene.design())
+    assert isinstance(found, ReseauResult)
+    assert found.ok.all()
+    error = (found.xy - formed.xy) / np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    # With independent errors 1.6 and 3.3.
+    assert 0.7 < np.sqrt((error**2).mean()) < 1.25
 
 
 def test_the_bound_agrees_with_an_independent_estimator():

@@ -316,6 +316,20 @@ class Patches:
             formed = plane + contrast * share
         return formed - self.grey, _FORM_ERROR * amplitude * (share > 0.02)
 
+    def influence(self, x: Array, cofactor: Array, used: Mask, scale: Array) -> tuple[Array, Array]:
+        """Influence of each pixel on the position (k, 2, rows, columns), and leverage (k, rows, columns).
+
+        With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W, and the diagonal of
+        A Q Aᵀ W.
+        """
+        _, jacobian = self.form_image(x, np.arange(len(x)))
+        weights = self.weights * self.relative_weights * used / scale[:, None] ** 2
+        gain = np.nan_to_num(jacobian @ cofactor.astype(jacobian.dtype)) * weights[..., None]
+        leverage = (gain * jacobian).sum(axis=2)
+        return np.moveaxis(gain[..., :2], 2, 1).reshape(len(x), 2, *self.shape[1:]), leverage.reshape(
+            self.shape
+        )
+
     def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
         """Include a common error of each row, jitter × slope along x, in the stochastic model.
 
@@ -392,6 +406,10 @@ class Matches:
         Adjusted minus observed, NaN where a pixel was not used.
     form_sigma : ndarray (k, m)
         Standard deviations of `form`.
+    influence : ndarray (k, 2, rows, columns)
+        Change of the position with the grey value of each pixel.
+    leverage : ndarray (k, rows, columns)
+        Share of the error of each pixel that the adjustment takes from its residual.
 
     Examples
     --------
@@ -399,7 +417,7 @@ class Matches:
     >>> xy, cov = np.array([[10.3, 9.6], [40.1, 9.8]]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
     >>> seen = np.array([1.0, 0.4])
     >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
-    ...                 one > 0, np.zeros((2, 17, 17)), none)
+    ...                 one > 0, np.zeros((2, 17, 17)), none, np.zeros((2, 2, 17, 17)), np.zeros((2, 17, 17)))
     >>> len(marks.select(marks.seen > 0.5))
     1
     """
@@ -418,6 +436,8 @@ class Matches:
     converged: Mask
     residuals: Array
     form_sigma: Array
+    influence: Array
+    leverage: Array
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -627,6 +647,7 @@ def _columns(
         expected = -plane * flat if patch.options.polarity == "dark" else flat
         correlation = _correlation(patch.grey - plane, expected, used)
         t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - patch.form_at, 1) / (1 - correlation**2))
+    influence, leverage = patch.influence(x, found.cofactor, used, scale)
     return Matches(
         xy=patch.xy + x[:, :2],
         cov=cov[:, :2, :2],
@@ -642,6 +663,8 @@ def _columns(
         converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
         residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
         form_sigma=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, patch.form_at :]),
+        influence=influence,
+        leverage=leverage,
     )
 
 

@@ -15,7 +15,7 @@ from ...core.failure import Code
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
-from ..matching import SIZE, Matches, MatchOptions, grey_variance, match
+from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
 from .placement import Placement, spacing
 from .wires import grid_wires
@@ -180,7 +180,8 @@ class MarkMeasurement:
             if cleared is found:
                 break
             found, judged = cleared, self._judged(at, cleared)
-        return at, found, judged
+        alike = with_alike_errors(found)
+        return (at, found, judged) if alike is found else (at, alike, self._judged(at, alike))
 
     def _without_intruders(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
         """Match marks with large residuals again, without the pixels of what lies over or beside them.

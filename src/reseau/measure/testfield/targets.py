@@ -354,18 +354,19 @@ def _line_light(scene: Scene) -> Array:
 
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
-    """Matches of several parts in the order of their rows; smaller windows are padded with NaN."""
+    """Matches of several parts in the order of their rows; smaller windows are padded."""
     order = np.argsort(np.concatenate(parts), kind="stable")
     most = np.max([matches.residuals.shape[1:] for matches in found], axis=0)
     columns: dict[str, Any] = {}
     for name in Matches.__dataclass_fields__:
         values = [getattr(matches, name) for matches in found]
-        if name == "residuals":
+        if name in ("residuals", "influence", "leverage"):
             values = [
                 np.pad(
                     v,
-                    [(0, 0), *([(n - m) // 2] * 2 for m, n in zip(v.shape[1:], most, strict=True))],
-                    constant_values=np.nan,
+                    [(0, 0)] * (v.ndim - 2)
+                    + [((n - m) // 2,) * 2 for m, n in zip(v.shape[-2:], most, strict=True)],
+                    constant_values=np.nan if name == "residuals" else 0.0,
                 )
                 for v in values
             ]

@@ -1,0 +1,138 @@
+"""Covariances of matched marks where the errors of neighbouring pixels are alike.
+
+An adjustment takes the errors of pixels as independent and, within a patch, as equally large. Compression,
+sharpening and resampling violate both: their errors extend over several pixels, and they are large at the
+edges of a mark and small in its even surroundings. The residuals of all marks of a frame show how; variances
+and correlations are then propagated to the positions with the influence L of each pixel on a position, L Σ Lᵀ
+(the law of propagation of covariances; Mikhail and Ackermann 1976, chapter 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from ...core.data import Array
+from .matcher import Matches
+
+__all__ = ["with_alike_errors"]
+
+_LAGS = 7
+"""Largest distance of pixels along either axis: errors of a compressed picture end with its blocks of 8."""
+_SIGNIFICANT = 4.0
+"""A correlation must exceed this many of its standard deviations to be used."""
+_LEAST = 0.05
+"""Errors count as alike if pixels next to each other have at least this correlation."""
+_FEWEST = 20
+"""Marks that are needed to learn correlations."""
+_SPREAD = 5
+"""Width in pixels over which errors at the edge of a mark extend."""
+_CLASSES = 5
+"""Classes of pixels, by their influence on the position, whose variances are estimated apart."""
+_TAKEN = 0.7
+"""Correlation of neighbouring pixels in what the adjustment takes from their residuals: parameters describe
+what is smooth, so residuals of independent errors are negatively correlated by this share of the leverage."""
+
+
+def with_alike_errors(found: Matches) -> Matches:
+    """Matches with covariances that contain what errors of neighbouring pixels have in common.
+
+    Where pixels next to each other are not significantly correlated, or too few marks show it, the matches
+    are returned as they are.
+
+    Parameters
+    ----------
+    found : Matches
+        Marks of one frame; their covariances are those of independent errors.
+
+    Returns
+    -------
+    Matches
+    """
+    with np.errstate(invalid="ignore"):
+        sure = found.converged & (found.rejected < 0.1) & (found.seen > 0.9) & (found.noise > 0)
+        sure &= found.noise < 2 * np.median(found.noise[sure]) if sure.any() else False
+    if sure.sum() < _FEWEST:
+        return found
+    used = np.isfinite(found.residuals)
+    unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
+    free = 1 - found.leverage
+    if not _neighbours(unit[sure], used[sure], free[sure]):
+        return found
+    influence = found.influence * found.noise[:, None, None, None]
+    activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
+    activity /= np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-300)
+    shown = used[sure]
+    limits = np.quantile(activity[sure][shown], np.arange(1, _CLASSES) / _CLASSES)
+    kind = np.digitize(activity, limits)
+    variance = np.ones(_CLASSES)
+    for k in range(_CLASSES):
+        those = shown & (kind[sure] == k)
+        if those.any():
+            variance[k] = (unit[sure][those] ** 2).sum() / max(free[sure][those].sum(), 1.0)
+    spread = np.sqrt(variance)[kind]
+    correlation = _correlation((unit / np.maximum(spread, 1e-6))[sure], shown, free[sure])
+    uneven = influence * spread[:, None]
+    extra = np.einsum("kirc,kjrc->kij", uneven, uneven) - np.einsum("kirc,kjrc->kij", influence, influence)
+    for lag, r in correlation.items():
+        here, there = _pair(uneven, *lag)
+        together = r * np.einsum("kirc,kjrc->kij", here, there)
+        extra += together + np.swapaxes(together, 1, 2)
+    # Errors that cancel each other are not relied upon.
+    cov = found.cov + extra
+    shrunk = np.linalg.eigvalsh(np.nan_to_num(extra))[:, 0] < 0
+    cov[shrunk] = _no_less(cov[shrunk], found.cov[shrunk])
+    return replace(found, cov=cov)
+
+
+def _no_less(cov: Array, least: Array) -> Array:
+    """Covariances (k, 2, 2), enlarged where they are less than others in any direction."""
+    root = np.linalg.cholesky(least)
+    back = np.linalg.inv(root)
+    value, vector = np.linalg.eigh(back @ cov @ np.swapaxes(back, 1, 2))
+    axes = root @ vector
+    enlarged: Array = (axes * np.maximum(value, 1.0)[:, None]) @ np.swapaxes(axes, 1, 2)
+    return enlarged
+
+
+def _lags() -> Iterator[tuple[int, int]]:
+    """Distances (down, right) of pairs of pixels, each pair once."""
+    for down in range(_LAGS + 1):
+        for right in range(-_LAGS if down else 1, _LAGS + 1):
+            yield down, right
+
+
+def _pair(values: Array, down: int, right: int) -> tuple[Array, Array]:
+    """Two views of windows (..., rows, columns) displaced against each other."""
+    rows, columns = values.shape[-2:]
+    return (
+        values[..., : rows - down, max(0, -right) : columns - max(0, right)],
+        values[..., down:, max(0, right) : columns + min(0, right)],
+    )
+
+
+def _at(lag: tuple[int, int], unit: Array, used: Array, free: Array) -> tuple[float, float]:
+    """Correlation of residuals in units of their standard deviations, and its standard deviation."""
+    here, there = _pair(unit, *lag)
+    both = np.logical_and(*_pair(used, *lag))
+    count = max(int(both.sum()), 1)
+    # Residuals are smaller than errors by what the adjustment has taken from them.
+    taken = 1 - float(free[used].mean())
+    power = float((unit[used] ** 2).mean()) / (1 - taken)
+    return float((here * there).sum()) / count / power + _TAKEN * taken, 1 / np.sqrt(count)
+
+
+def _neighbours(unit: Array, used: Array, free: Array) -> bool:
+    """Whether pixels next to each other have errors in common."""
+    found = [_at(lag, unit, used, free) for lag in ((0, 1), (1, 0))]
+    return any(r > max(_LEAST, _SIGNIFICANT * sigma) for r, sigma in found)
+
+
+def _correlation(unit: Array, used: Array, free: Array) -> dict[tuple[int, int], float]:
+    """Significant correlations by distance."""
+    rows, columns = unit.shape[1:]
+    found = {lag: _at(lag, unit, used, free) for lag in _lags() if lag[0] < rows and abs(lag[1]) < columns}
+    return {lag: r for lag, (r, sigma) in found.items() if abs(r) > _SIGNIFICANT * sigma}
