@@ -141,6 +141,7 @@ def test_the_source_of_the_frames_is_reported(made: tuple[Path, str]) -> None:
     assert ways[not gige] not in made[1]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_except_clock_times(
     out: Path, reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

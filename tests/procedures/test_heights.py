@@ -60,6 +60,7 @@ def camera_of(found: Calibrated | Failure) -> tuple[np.ndarray, np.ndarray, Resu
     return result.camera_columns(0)[2], np.sqrt(np.diag(result.camera_covariance(0))), result
 
 
+@pytest.mark.slow
 def test_errors_of_the_interior_orientation_are_as_large_as_their_sigmas() -> None:
     ratios, sigma0 = [], []
     for seed in range(150):

@@ -70,6 +70,7 @@ def test_true_coordinates_of_a_body_lie_within_their_sigmas(world, bench):
     assert (np.abs(off) < 4 * third.true.sigma).all()
 
 
+@pytest.mark.slow
 def test_a_missing_row_of_rods_is_reported(bench):
     found = photo_of(at_fault(missing_row="C"), bench)
     assert [str(note) for note in found.notes] == ["the whole row of rods at y = -60 mm is missing"]
@@ -89,7 +90,7 @@ def photo_of(world: World, bench: tuple[PhotoI, PhotoII]) -> PhotoII:
     return photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
 
 
-@pytest.mark.parametrize("pushed", [0.4, 20.0])
+@pytest.mark.parametrize("pushed", [0.4, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_a_displaced_camera_is_detected_and_corrected(pushed: float, bench):
     _, before = bench
     found = photo_of(at_fault(camera_moved_mm=pushed), bench)
@@ -116,6 +117,7 @@ def test_a_gap_between_reseau_and_screen_has_no_effect_from_one_position():
     assert (np.abs(errors(third.true, world)) < 4 * third.true.sigma).all()
 
 
+@pytest.mark.slow
 def test_a_gap_between_reseau_and_screen_is_reported_from_two_positions():
     still = at_fault(parallax_mm=2.0)
     first = photo_i(still.photo_i(), still.design).required()

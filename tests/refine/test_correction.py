@@ -238,12 +238,12 @@ def test_the_covariance_of_coefficients_contains_the_errors_of_o_and_s(lost):
     keep = [name for name in GRID.ids if name not in lost]
     exact = corrected(measured(world=PROJECTIVE))
     squares, alone = 0.0, 0.0
-    for seed in range(60):
+    for seed in range(20):
         camera = corrected(measured(world=PROJECTIVE, seed=seed).select(keep))
         off = camera.model.values - exact.model.values
         squares += off @ np.linalg.solve(camera.coefficient_covariance, off)
         alone += off @ np.linalg.solve(camera.cofactor, off)
-    low, high = chi2.ppf([0.0005, 0.9995], 60 * 13)
+    low, high = chi2.ppf([0.0005, 0.9995], 20 * 13)
     assert low < squares < high
     assert alone > (5 if not lost else 1) * squares
 
@@ -321,6 +321,7 @@ def test_a_local_bend_requires_a_local_model():
     assert fit.local.ratio.min() > 0
 
 
+@pytest.mark.slow
 def test_without_a_bend_the_test_for_a_local_model_keeps_its_level():
     """Half of white fields and more are likeliest without any signal: those have the probability 1."""
     need = np.array([corrected(measured(seed=seed), trials=59).fit.local.need for seed in range(100)]).ravel()

@@ -71,6 +71,7 @@ def test_marks_that_contradict_the_others_do_not_pull_the_photograph():
     assert found.displacement_px < 0.02
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_marks_are_part_of_the_registered_points():
     body = ImagePoints.with_sigma(["p", "q"], [[400.0, 300.0], [1300.0, 900.0]], 1e-6)
     off = []

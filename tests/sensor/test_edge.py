@@ -90,6 +90,7 @@ def test_with_little_noise_there_is_no_bias() -> None:
         assert np.abs(plain_iso(edge.frame, SHOWN) - edge.truth(SHOWN)).max() > 2e-3
 
 
+@pytest.mark.slow
 def test_the_test_of_the_gaussian_keeps_its_level() -> None:
     found = [measured(edge_of("gaussian", np.random.default_rng([k, 99])))[0].gaussian for k in range(30)]
     p = np.array([test.p for test in found if test is not None])

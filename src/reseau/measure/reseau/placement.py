@@ -241,9 +241,15 @@ def _vote(
     """Smoothed two-dimensional histogram, and the centres of its bins."""
     widths = (width, width) if isinstance(width, float) else width
     bins = [max(3, int((high - low) / w)) for (low, high), w in zip(limits, widths, strict=True)]
-    votes, x, y = np.histogram2d(values[:, 0], values[:, 1], bins=bins, range=limits, weights=weight)
-    smooth: Array = gaussian_filter(votes, blur, mode="constant")
-    return smooth, ((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+    index = np.zeros(len(values), dtype=np.intp)
+    centres: list[Array] = []
+    for column, (low, high), count in zip(values.T, limits, bins, strict=True):
+        step = (high - low) / count
+        index = index * count + np.clip(((column - low) / step).astype(np.intp), 0, count - 1)
+        centres.append(np.linspace(low, high, 2 * count + 1)[1::2])
+    votes = np.bincount(index, weight, minlength=bins[0] * bins[1]).reshape(bins)
+    smooth: Array = gaussian_filter(votes, blur, mode="constant", truncate=3.0)
+    return smooth, (centres[0], centres[1])
 
 
 def _densest(start: Array, candidates: Candidates, pitch: float) -> Array:
@@ -427,13 +433,13 @@ def _shifted(plane: Array, similarity: complex, candidates: Candidates) -> list[
     limits = [
         (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
     ]
-    votes, (x, y) = _vote(values, np.ones(len(values)), limits, pitch / 10, 2.0)
+    votes, (x, y) = _vote(values, np.ones(len(values)), limits, pitch / 6, 1.2)
     starts = []
     for _ in range(5):
         i, j = np.unravel_index(votes.argmax(), votes.shape)
         moved = turned + complex(x[i], y[j])
         starts.append(np.stack([moved.real, moved.imag], axis=1))
-        votes[max(0, i - 6) : i + 7, max(0, j - 6) : j + 7] = 0
+        votes[max(0, i - 4) : i + 5, max(0, j - 4) : j + 5] = 0
     return starts
 
 
