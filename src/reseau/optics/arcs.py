@@ -26,9 +26,12 @@ The position is the middle between the two ends, whatever the brightness does be
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar, cast
 
+import numba
 import numpy as np
 from scipy.special import ndtr
 
@@ -44,9 +47,10 @@ _MOST_EXPONENT = 50.0
 """Bound of exponents, for parameters that an iteration tries and refuses."""
 
 
-def _normal(z: Array) -> Array:
-    density: Array = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
-    return density
+_DARK = 9.0
+"""Widths beyond which a Gaussian is 0 as far as digits go: 3e-18."""
+F = TypeVar("F", bound=Callable[..., Any])
+_HALF_ROOT, _DENSITY = math.sqrt(0.5), 1 / math.sqrt(2 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +137,30 @@ class Arcs:
         -------
         ndarray (k, r, c)
         """
-        return self._formed(xy, columns, rows, derivatives=False)[0]
+        # Coordinates along and across the tangent of each arc, (k, r, c).
+        c, s = np.cos(self._of("tilt")), np.sin(self._of("tilt"))
+        x, y = (columns - xy[:, :1])[:, None, :], (rows - xy[:, 1:])[:, :, None]
+        u, v = c * x + s * y, c * y - s * x
+        k, a = self._of("curvature"), self._of("along")
+        late = v - k * u * u / (1 + np.sqrt(1 + (k * u) ** 2))
+        t = u / a
+        late /= self._of("across") * _exponential(self._of("thickening") * t * t)
+        inner = self._of("fading") * t + self._of("tapering") * t * t
+        pulse = np.exp(-0.5 * late * late) * _exponential(inner)
+        f = np.clip(self._of("flatness"), _LEAST_FLATNESS, 1 - _LEAST_FLATNESS)
+        w, soft = a * np.sqrt(3 * f), a * np.sqrt(1 - f)
+        if self.flatness is not None and self.flatness.any():
+            # Symmetric in u; differences of the lower tails lose no digits.
+            far = np.abs(u) / soft
+            line = (ndtr(w / soft - far) - ndtr(-w / soft - far)) / (2 * ndtr(w / soft) - 1)
+        else:
+            line = np.exp(-0.5 * t * t)
+        image: Array = line * pulse
+        if self.saturation is not None and self.saturation.any():
+            q = self._of("saturation")
+            q = np.where(np.abs(q) < _LINEAR, _LINEAR, q)
+            image = np.expm1(-q * image) / np.expm1(-q)
+        return image
 
     def derivatives(self, xy: Array, columns: Array, rows: Array) -> tuple[Array, Array]:
         """Brightness, and its derivatives with respect to position, widths and form.
@@ -145,88 +172,123 @@ class Arcs:
             With respect to x, y, `across`, the logarithm of `along`, `curvature`, `tilt`, the logit
             ln(f/(1 − f)) of `flatness`, `fading`, `tapering`, `thickening` and `saturation`.
         """
-        return self._formed(xy, columns, rows, derivatives=True)
-
-    def _formed(self, xy: Array, columns: Array, rows: Array, *, derivatives: bool) -> tuple[Array, Array]:
-        # Coordinates along and across the tangent of each arc, (k, r, c).
-        c, s = np.cos(self._of("tilt")), np.sin(self._of("tilt"))
-        x, y = (columns - xy[:, :1])[:, None, :], (rows - xy[:, 1:])[:, :, None]
-        u, v = c * x + s * y, c * y - s * x
-        k, a = self._of("curvature"), self._of("along")
-        root = np.sqrt(1 + (k * u) ** 2)
-        late = v - k * u * u / (1 + root)
-        b = self._of("across")
-        t = u / a
-        thick = self._changes("thickening")
-        if thick is not None:
-            b = b * np.exp(np.clip(thick * t * t, -_MOST_EXPONENT, _MOST_EXPONENT))
-        late_b = late / b
-        pulse = np.exp(-0.5 * late_b * late_b)
-        fades = self._changes("fading", "tapering") is not None
-        if fades:
-            g, taper = self._of("fading"), self._of("tapering")
-            pulse *= np.exp(np.clip(g * t + taper * t * t, -_MOST_EXPONENT, _MOST_EXPONENT))
-        f = np.clip(self._of("flatness"), _LEAST_FLATNESS, 1 - _LEAST_FLATNESS)
-        w, soft = a * np.sqrt(3 * f), a * np.sqrt(1 - f)
-        even = self._changes("flatness") is not None
-        if even:
-            whole = 2 * ndtr(w / soft) - 1
-            # Symmetric in u; differences of the lower tails lose no digits.
-            far = np.abs(u) / soft
-            line = (ndtr(w / soft - far) - ndtr(-w / soft - far)) / whole
-        else:
-            line = np.exp(-0.5 * t * t)
-        linear = line * pulse
-        saturates = self._changes("saturation")
-        image: Array = linear
-        if saturates is not None:
-            q = np.where(np.abs(saturates) < _LINEAR, _LINEAR, saturates)
-            scale = -np.expm1(-q)
-            image = -np.expm1(-q * linear) / scale
-        if not derivatives:
-            return image, image
-        parts = np.empty((len(u), 11, *u.shape[1:]))
-        by_v = -linear * late_b / b
-        by_thick = -by_v * late  # with respect to the logarithm of b
-        if even:
-            ahead, behind = _normal((u + w) / soft) / soft, _normal((u - w) / soft) / soft
-            by_u = (ahead - behind) / whole * pulse
-            middle = 2 * _normal(w / soft) / soft
-            by_w = (ahead + behind - line * middle) / whole
-            by_soft = ((u - w) * behind - (u + w) * ahead + line * middle * w) / (soft * whole)
-            parts[:, 3] = pulse * (w * by_w + soft * by_soft)
-            parts[:, 6] = pulse * (by_w * w * (1 - f) - by_soft * soft * f) / 2
-        else:
-            by_u = -linear * t / a
-            parts[:, 3] = linear * t * t
-            parts[:, 6] = 0.0  # of first order in f
-        by_u = by_u - by_v * k * u / root
-        if fades or thick is not None:
-            inner = self._of("fading") + 2 * self._of("tapering") * t
-            by_t = linear * inner + 2 * self._of("thickening") * t * by_thick
-            by_u += by_t / a
-            parts[:, 3] -= t * by_t
-        parts[:, 0] = s * by_v - c * by_u
-        parts[:, 1] = -s * by_u - c * by_v
-        parts[:, 2] = by_thick / self._of("across")
-        parts[:, 4] = -by_v * u * u / (root * (1 + root))
-        parts[:, 5] = by_u * v - by_v * u
-        parts[:, 7] = linear * t
-        parts[:, 8] = parts[:, 7] * t
-        parts[:, 9] = by_thick * t * t
-        if saturates is not None:
-            parts[:, :10] *= (q * np.exp(-q * linear) / scale)[:, None]
-            parts[:, 10] = (linear * np.exp(-q * linear) - image * np.exp(-q)) / scale
-        else:
-            parts[:, 10] = 0.5 * linear * (1 - linear)
+        image = np.empty((len(self), rows.shape[1], columns.shape[1]))
+        parts = np.empty((len(self), 11, *image.shape[1:]))
+        values = [self._of(f.name)[:, 0, 0] for f in fields(self)]
+        # A Gaussian is formed as one, if all are.
+        even = self.flatness is not None and bool(self.flatness.any())
+        _differentiated(
+            np.stack(values, axis=1),
+            even,
+            np.asarray(xy, dtype=np.float64),
+            np.ascontiguousarray(columns, dtype=np.float64),
+            np.ascontiguousarray(rows, dtype=np.float64),
+            image,
+            parts,
+        )
         return image, parts
-
-    def _changes(self, *names: str) -> Array | None:
-        """The last of some columns as (k, 1, 1), if any value of them is not 0."""
-        given = [getattr(self, name) for name in names]
-        return self._of(names[-1]) if any(one is not None and one.any() for one in given) else None
 
     def _of(self, name: str) -> Array:
         """A column as (k, 1, 1); zeros where it was not given."""
         values = getattr(self, name)
         return np.zeros((len(self), 1, 1)) if values is None else values[:, None, None]
+
+
+def _exponential(exponent: Array) -> Array:
+    bounded: Array = np.exp(np.clip(exponent, -_MOST_EXPONENT, _MOST_EXPONENT))
+    return bounded
+
+
+def _compiled(function: F) -> F:
+    """Compile with Numba, cached on disk, releasing the GIL."""
+    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+@_compiled
+def _tail(z: float) -> float:
+    """Normal distribution."""
+    return 0.5 * math.erfc(-z * _HALF_ROOT)
+
+
+@_compiled
+def _bell(z: float) -> float:
+    """Density of the normal distribution."""
+    return math.exp(-0.5 * z * z) * _DENSITY
+
+
+@_compiled
+def _differentiated(
+    arcs: Array, even: bool, xy: Array, columns: Array, rows: Array, image: Array, parts: Array
+) -> None:
+    """Images and derivatives pixel by pixel; columns of `arcs` in the order of the fields of :class:`Arcs`."""
+    for n in range(len(arcs)):
+        a, b0, k, tilt = arcs[n, 0], arcs[n, 1], arcs[n, 2], arcs[n, 3]
+        fading, tapering, thickening, saturation = arcs[n, 5], arcs[n, 6], arcs[n, 7], arcs[n, 8]
+        f = min(max(arcs[n, 4], _LEAST_FLATNESS), 1 - _LEAST_FLATNESS)
+        c, s = math.cos(tilt), math.sin(tilt)
+        w, soft = a * math.sqrt(3 * f), a * math.sqrt(1 - f)
+        whole, middle = 2 * _tail(w / soft) - 1, 2 * _bell(w / soft) / soft
+        fades, saturates = fading != 0 or tapering != 0, saturation != 0
+        q = saturation if abs(saturation) >= _LINEAR else _LINEAR
+        scale = -math.expm1(-q)
+        for i in range(rows.shape[1]):
+            y = rows[n, i] - xy[n, 1]
+            for j in range(columns.shape[1]):
+                x = columns[n, j] - xy[n, 0]
+                u, v = c * x + s * y, c * y - s * x
+                root = math.sqrt(1 + (k * u) ** 2)
+                late = v - k * u * u / (1 + root)
+                t = u / a
+                b = b0
+                if thickening != 0:
+                    b *= math.exp(min(max(thickening * t * t, -_MOST_EXPONENT), _MOST_EXPONENT))
+                late_b = late / b
+                if abs(late_b) > _DARK or (even and abs(u) > w + _DARK * soft):
+                    image[n, i, j] = 0.0
+                    parts[n, :, i, j] = 0.0
+                    continue
+                pulse = math.exp(-0.5 * late_b * late_b)
+                if fades:
+                    inner = fading * t + tapering * t * t
+                    pulse *= math.exp(min(max(inner, -_MOST_EXPONENT), _MOST_EXPONENT))
+                if even:
+                    far = abs(u) / soft
+                    linear = (_tail(w / soft - far) - _tail(-w / soft - far)) / whole * pulse
+                    ahead, behind = _bell((u + w) / soft) / soft, _bell((u - w) / soft) / soft
+                    by_u = (ahead - behind) / whole * pulse
+                    by_w = ((ahead + behind) * pulse - linear * middle) / whole
+                    by_soft = ((u - w) * behind - (u + w) * ahead) * pulse + linear * middle * w
+                    by_soft /= soft * whole
+                    by_along = w * by_w + soft * by_soft
+                    by_flatness = 0.5 * (by_w * w * (1 - f) - by_soft * soft * f)
+                else:
+                    linear = math.exp(-0.5 * t * t) * pulse
+                    by_u = -linear * t / a
+                    by_along = linear * t * t
+                    by_flatness = 0.0  # of first order in f
+                by_v = -linear * late_b / b
+                by_thick = -by_v * late  # with respect to the logarithm of b
+                by_u -= by_v * k * u / root
+                by_t = linear * (fading + 2 * tapering * t) + 2 * thickening * t * by_thick
+                by_u += by_t / a
+                by_along -= t * by_t
+                image[n, i, j] = linear
+                part = parts[n, :, i, j]
+                part[0] = s * by_v - c * by_u
+                part[1] = -s * by_u - c * by_v
+                part[2] = by_thick / b0
+                part[3] = by_along
+                part[4] = -by_v * u * u / (root * (1 + root))
+                part[5] = by_u * v - by_v * u
+                part[6] = by_flatness
+                part[7] = linear * t
+                part[8] = part[7] * t
+                part[9] = by_thick * t * t
+                part[10] = 0.5 * linear * (1 - linear)
+                if saturates:
+                    left = math.exp(-q * linear)
+                    seen = -math.expm1(-q * linear) / scale
+                    image[n, i, j] = seen
+                    for p in range(10):
+                        part[p] *= q * left / scale
+                    part[10] = (linear * left - seen * (1 - scale)) / scale

@@ -51,10 +51,12 @@ _HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
 _END_HIDDEN = 0.15
 """Hidden share of an end of a line from which its place is integrated over."""
-_BEYOND_PX, _PLACES = 24.0, 33
+_BEYOND_PX, _PLACES = 24.0, 25
 """Largest displacement of a hidden end, and number of its places; as many again among the likely ones."""
 _SCALES_PX = 0.1, 6.0
 """Bounds of the displacement up to which the places are equidistant, not in a ratio."""
+_LINEAR = 0.15
+"""Standard deviation of an end over its softness up to which its likelihood is normal."""
 _UNLIKELY = 25.0
 """Costs over the least of places that are left out."""
 
@@ -144,24 +146,24 @@ def _correct_for_details(
 
 def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
     """The form of the frame's echoes, all of them matched with it, and the means of its priors."""
-    form, start = BEAM, work.start
-    found = work.matched(work.every, form, start, work.echoes.xy[work.at])
-    clear = _clear(found)
-    if not len(clear):
+    form, start, xy = BEAM, work.start, work.echoes.xy[work.at]
+    # The brightest ones are enough to choose the form, as a rule.
+    some = work.every[: 2 * _FEW]
+    found = work.matched(some, form, start.select(some), xy[some])
+    if len(_clear(found)) < _FEW and len(some) < len(work.at):
+        some = work.every
+        found = work.matched(some, form, start, xy)
+    sample = _clear(found)[:_FEW]
+    if len(sample):
+        form = _line_or_beam(work, found, sample)
+    if form is BEAM and len(some) < len(work.at):
+        found = work.matched(work.every, form, start, xy)
+    if not len(sample):
         return form, found, start
-    sample = clear[:_FEW]
-    first, xy = work.start_of_lines.select(sample), work.echoes.xy[work.at[sample]]
-    best = 0.0
-    # An uneven line may be as unlike an even one as it is unlike a beam.
-    for candidate in (LINE, *(LINE.with_(**{name: sigma}) for name, sigma in FURTHER.items())):
-        line = work.matched(sample, candidate, first, xy)
-        ratio, _, _ = _compared(found, line, sample, work.noise)
-        if ratio > 2 * best and _better(found, line, sample, work.noise) and _plausible(line):
-            best, form = ratio, candidate
     if form is not BEAM:
         start = work.start_of_lines
         work.resized(start)
-        found = work.matched(work.every, form, start, work.echoes.xy[work.at])
+        found = work.matched(work.every, form, start, xy)
     if "fading" in form.sigma:
         # The brightness need not decrease exponentially.
         form = form.with_(tapering=FURTHER["tapering"])
@@ -173,6 +175,26 @@ def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
     if shared is not form:
         form, found = shared, work.matched(work.every, shared, start, found.xy)
     return form, found, start
+
+
+def _line_or_beam(work: Windows, found: ArcMatches, sample: Rows) -> Form:
+    """The form that explains the clear echoes `sample` of others, matched as beams, best."""
+    first, xy = work.start_of_lines.select(sample), work.echoes.xy[work.at[sample]]
+    form, best = BEAM, 0.0
+    # An uneven line may be as unlike an even one as it is unlike a beam.
+    for candidate in (LINE, *(LINE.with_(**{name: sigma}) for name, sigma in FURTHER.items())):
+        line = work.matched(sample, candidate, first, xy)
+        ratio, _, _ = _compared(found, line, sample, work.noise)
+        if ratio > 2 * best and _better(found, line, sample, work.noise) and _plausible(line):
+            best, form = ratio, candidate
+            if _is_white(line):
+                break
+    return form
+
+
+def _is_white(found: ArcMatches) -> bool:
+    """Whether what a form leaves of the echoes is as good as white noise."""
+    return float(np.median(found.inflation)) < _WHITE
 
 
 def _clear(found: ArcMatches) -> Rows:
@@ -208,8 +230,7 @@ def _better(before: ArcMatches, after: ArcMatches, rows: Rows, noise: float) -> 
     ratio, explained, improved = _compared(before, after, rows, noise)
     # What is left of real echoes beside a beam is mostly speckle, in which other forms fit by chance. Noise
     # is white; its size is that of the frame only where the light falls off little.
-    white = float(np.median(after.inflation)) < _WHITE
-    enough = white or explained > _EXPLAINED or "length" in before.sigma
+    enough = _is_white(after) or explained > _EXPLAINED or "length" in before.sigma
     return ratio > _EVIDENCE and enough and improved >= _IMPROVED
 
 
@@ -306,6 +327,7 @@ def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, st
     then. With the weights w of the likelihoods, mean and covariance are Σwm and Σw(C + (m − Σwm)(m − Σwm)ᵀ).
     """
     hidden = work.hidden_ends(found) > _END_HIDDEN
+    soft = ends_of(found.arcs)[1]
     for row in np.flatnonzero(found.converged & hidden.any(axis=1)).tolist():
         tilt = found.arcs.tilt[row]
         along = np.array([np.cos(tilt), np.sin(tilt)])
@@ -313,7 +335,10 @@ def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, st
             found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
             continue
         side = 1.0 if hidden[row, 1] else -1.0
-        scale = float(np.clip(2 * np.sqrt(along @ found.cov[row] @ along), *_SCALES_PX))
+        end = 2 * float(np.sqrt(along @ found.cov[row] @ along))
+        if end < _LINEAR * soft[row]:
+            continue
+        scale = float(np.clip(end, *_SCALES_PX))
         most = np.arcsinh(_BEYOND_PX / scale)
         steps = scale * np.sinh(np.linspace(-most, most, _PLACES))
         cost, _, _ = work.with_end_at(found, row, side, steps, form, start)
