@@ -220,7 +220,7 @@ def _bell(z: float) -> float:
 def _differentiated(
     arcs: Array, even: bool, xy: Array, columns: Array, rows: Array, image: Array, parts: Array
 ) -> None:
-    """Images and derivatives pixel by pixel; columns of `arcs` in the order of the fields of :class:`Arcs`."""
+    """Images and derivatives, pixel by pixel, of `arcs` with columns in the order of :class:`Arcs`."""
     for n in range(len(arcs)):
         a, b0, k, tilt = arcs[n, 0], arcs[n, 1], arcs[n, 2], arcs[n, 3]
         fading, tapering, thickening, saturation = arcs[n, 5], arcs[n, 6], arcs[n, 7], arcs[n, 8]

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import scipy.stats
+from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
@@ -45,6 +46,8 @@ _BY_CHANCE = 1e-5
 """Largest probability that as many marks are found where there are none; many positions were tried."""
 _DISTORTED = 0.03
 """Largest rms deviation of marks from their prediction, as a share of their spacing."""
+_BLURRED, _PIXEL = 2.6, 12**-0.5
+"""Margin of a shadow over the width of the blur; width (one sigma) of a pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,7 +85,7 @@ class ReseauResult(Measured):
         f = self.field
         return SmoothField.fit(f.source, f.target, sigma=f.sigma, trials=trials, seed=seed).need
 
-    def shadow(self, design: ReseauDesign, shape: tuple[int, int], margin_px: float = 2.0) -> Mask:
+    def shadow(self, design: ReseauDesign, shape: tuple[int, int], margin_px: float | None = None) -> Mask:
         """Mask of the pixels that the reseau hides from what lies behind it.
 
         Parameters
@@ -91,8 +94,9 @@ class ReseauResult(Measured):
             The reseau that was measured.
         shape : tuple
             Height and width of the frame.
-        margin_px : float
-            Margin on either side of a wire or around a mark, for the blur.
+        margin_px : float, optional
+            Margin on either side of a wire or around a mark, for the blur; by default 2.6 times its width
+            (one sigma) in the image of the marks, beyond which half a per cent of an edge remains.
 
         Returns
         -------
@@ -103,12 +107,15 @@ class ReseauResult(Measured):
         scale = np.sqrt(np.abs(np.linalg.det(self.field.jacobian(xy)))).max()
         mark = design.mark
         size = (mark.line_width if mark.shape == "line-grid" else mark.size) or 0.0
-        width = max(1, round(scale * size + 2 * margin_px))
+        if margin_px is None:
+            blur = np.nanmedian(self.psf_px) if np.isfinite(self.psf_px).any() else 0.0
+            margin_px = _BLURRED * float(np.hypot(blur, _PIXEL))
         if mark.shape != "line-grid":
+            width = max(1, round(scale * size + 2 * margin_px))
             for centre in self.field(xy):
                 cv2.circle(hidden, tuple(int(c) for c in np.rint(centre)), (width + 1) // 2, 1, -1)
             return hidden > 0
-        wires = grid_wires(xy)
+        wires, reach = grid_wires(xy), scale * size / 2 + margin_px
         for family, chains in enumerate(wires.marks):
             for chain in chains:
                 ends = xy[chain[[0, -1]]]
@@ -120,10 +127,27 @@ class ReseauResult(Measured):
                 outer = (self.field.jacobian(ends) @ beyond) * [[-1.0], [1.0]]
                 line = self.field(inner)
                 line = np.concatenate([line[:1] + outer[:1], line, line[-1:] + outer[1:]])
-                # Coordinates with four binary digits after the point make a smooth line.
-                bent = np.rint(line * 16).astype(np.int32)
-                cv2.polylines(hidden, [bent], False, 1, width, cv2.LINE_8, 4)
+                _cover(hidden, line, reach)
         return hidden > 0
+
+
+def _cover(hidden: NDArray[np.uint8], line: Array, reach: float) -> None:
+    """Set the pixels (h, w) whose centres are nearer to a line (n, 2) than `reach`."""
+    across = int(np.ptp(line[:, 0]) > np.ptp(line[:, 1]))
+    image = hidden.T if across else hidden  # a view: what is set there is set in `hidden`
+    x, y = line[:, across], line[:, 1 - across]
+    x, y = (x, y) if y[-1] > y[0] else (x[::-1], y[::-1])
+    rows = np.arange(max(int(np.ceil(y[0])), 0), min(int(np.floor(y[-1])) + 1, len(image)))
+    if not len(rows):
+        return
+    middle = np.interp(rows, y, x)
+    half = reach * np.hypot(1, np.interp(rows, y, np.gradient(x, y)))
+    offsets = np.arange(-int(np.ceil(half.max())) - 1, int(np.ceil(half.max())) + 2)
+    columns = np.rint(middle).astype(np.intp)[:, None] + offsets
+    near = np.abs(columns - middle[:, None]) < half[:, None]
+    near &= (columns >= 0) & (columns < image.shape[1])
+    row, at = np.nonzero(near)
+    image[rows[row], columns[row, at]] = 1
 
 
 def measure_reseau(
