@@ -23,8 +23,8 @@ _STEP = 20
 """Distance of the places at which the glow is sampled, pixels."""
 _INSIDE = 0.08
 """Margin of the reseau's extent that is not sampled, as a share: the screen may end there."""
-_LEAST = 10.0
-"""Minimum glow of a lit raster over the noise."""
+_LEAST = 4.0
+"""Minimum glow of a lit raster over the noise; a dark level in it makes the correction too small only."""
 _ROUGH = 0.1
 """Largest scatter of the glow about a parabola, as a share of it; a larger one belongs to an image."""
 _LIMITS = (0.25, 2.0)
