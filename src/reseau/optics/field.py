@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from ..core.data import Array
 from ..core.errors import UsageError
 
-__all__ = ["SmoothField", "trend_degree"]
+__all__ = ["SmoothField", "monomials", "trend_degree"]
 
 _LENGTHS = 0.12 * 2.0 ** np.arange(6)
 """Correlation lengths that are tried, in half extents of the field."""
@@ -224,8 +224,26 @@ def _design(source: Array, xy: Array, degree: int) -> tuple[Array, float]:
     """Monomials of the trend at `xy`, scaled to the extent of the source."""
     centre, extent = _extent(source)
     x, y = ((xy - centre) / extent).T
-    columns = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
-    return np.stack(columns, axis=1), extent
+    return monomials(x, y, degree), extent
+
+
+def monomials(x: Array, y: Array, degree: int) -> Array:
+    """Monomials xⁱ yʲ up to a degree, (n, terms).
+
+    Examples
+    --------
+    >>> monomials(np.array([2.0]), np.array([3.0]), 2).tolist()
+    [[1.0, 3.0, 9.0, 2.0, 6.0, 4.0]]
+    """
+    columns = np.empty(((degree + 1) * (degree + 2) // 2, len(x)))
+    row, left = 0, np.ones(len(x))
+    for i in range(degree + 1):
+        columns[row] = left
+        for j in range(1, degree + 1 - i):
+            np.multiply(columns[row + j - 1], y, out=columns[row + j])
+        row += degree + 1 - i
+        left = left * x
+    return columns.T
 
 
 def _correlation(z: Array) -> Array:

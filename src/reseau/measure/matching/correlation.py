@@ -51,6 +51,19 @@ def with_alike_errors(found: Matches) -> Matches:
     Returns
     -------
     Matches
+
+    Examples
+    --------
+    Errors that extend over three pixels along both axes, and pixels that influence a position together:
+
+    >>> rng = np.random.default_rng(0)
+    >>> one, none, window = np.ones(30), np.zeros((30, 0)), np.ones((30, 17, 17))
+    >>> alike = 3 * uniform_filter(rng.standard_normal(window.shape), (0, 3, 3))
+    >>> cov, influence = np.tile(np.eye(2), (30, 1, 1)), np.stack([window, window], axis=1) / 17
+    >>> found = Matches(np.zeros((30, 2)), cov, one, one, one, one, none, one, one, one, 0 * one, one > 0,
+    ...                 alike, none, influence, 0 * window)
+    >>> bool(with_alike_errors(found).cov[0, 0, 0] > 5)
+    True
     """
     with np.errstate(invalid="ignore"):
         sure = found.converged & (found.rejected < 0.1) & (found.seen > 0.9) & (found.noise > 0)

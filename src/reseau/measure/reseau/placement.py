@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
-from ...optics.field import SmoothField, trend_degree
+from ...optics.field import SmoothField, monomials, trend_degree
 from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
 from .candidates import Candidates, find_candidates
@@ -286,17 +286,22 @@ def _robust_field(
     if len(has) < least:
         return None
     image, kept = candidates.xy[rows[has]], np.ones(len(has), dtype=bool)
+    off = source[has] - source[has].mean(axis=0)
+    x, y = off.T / np.abs(off).max()
+    design = monomials(x, y, degree)
     for _ in range(6):
-        try:
-            field = SmoothField.fit(source[has[kept]], image[kept], degree=degree, local=False)
-        except np.linalg.LinAlgError:  # marks of a single row
-            return None
-        distance = np.hypot(*(field(source[has]) - image).T)
-        scatter = max(float(np.median(distance[kept])) / 1.18, 0.15)
+        used = kept
+        trend = np.linalg.lstsq(design[used], image[used], rcond=None)[0]
+        distance = np.hypot(*(design @ trend - image).T)
+        scatter = max(float(np.median(distance[used])) / 1.18, 0.15)
         closer = distance < 3 * scatter
-        if closer.sum() < least or (closer == kept).all():
+        if closer.sum() < least or (closer == used).all():
             break
         kept = closer
+    try:
+        field = SmoothField.fit(source[has[used]], image[used], degree=degree, local=False)
+    except np.linalg.LinAlgError:  # marks of a single row
+        return None
     return field, scatter
 
 
