@@ -361,6 +361,10 @@ _SLOPE = 0.3
 """Standard deviation of the change of contrast from the centre of a disk to the edge of its window, caused by
 reflected light."""
 _SEEN = 0.6
+"""Least share of a disk on pixels that can be used."""
+_RIM, _LEAST_RIM = 1.5, 0.25
+"""Half the width of the edge of a disk, in widths of the point-spread function; share of it below which the
+level of the paper is hardly seen, and has no slope."""
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a disk."""
 _DISTURBED = 1.6
@@ -478,14 +482,14 @@ class _Sheet:
         if sure.sum() >= _ENOUGH_LIKE:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows = self._in_sight()
-        found = self._match(rows)
+        found = self._match_all(rows)
         why, field = self._judged(rows, found)
         doubtful = (why != "") | self._uneasy(found)
         if doubtful.any() and (~doubtful).sum() >= _NEIGHBOURS and field is not None:
             # Look again where their neighbours predict them, without what lies in front of them.
             self._uncover(rows, found, ~doubtful, field)
             parts = [np.flatnonzero(~doubtful), np.flatnonzero(doubtful)]
-            found = merged(parts, [found.select(~doubtful), self._match(rows[doubtful])])
+            found = merged(parts, [found.select(~doubtful), self._match_all(rows[doubtful])])
             why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
 
@@ -512,7 +516,16 @@ class _Sheet:
         )
         return Outline(nodes, tangents).oriented().single()
 
-    def _match(self, rows: Rows) -> Matches:
+    def _match_all(self, rows: Rows) -> Matches:
+        """Match disks; on even paper where paper is saturated all around."""
+        found = self._match(rows)
+        dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
+        if not dim.any():
+            return found
+        parts = [np.flatnonzero(~dim), np.flatnonzero(dim)]
+        return merged(parts, [found.select(~dim), self._match(rows[dim], background=0)])
+
+    def _match(self, rows: Rows, background: int = 2) -> Matches:
         """Match disks, grouped by window size."""
         outline, ring = self._outline(rows), self._rings()
         valid = self.screened.valid & (ring < _RING) & ~self.hidden
@@ -528,7 +541,7 @@ class _Sheet:
                 settled=0.05,
                 contrast=None if self.look.contrast is None else self.look.contrast[rows[part]],
                 contrast_slope=_SLOPE,
-                background=2,
+                background=background,
                 variance=self.look.variance,
             )
             found.append(
@@ -797,6 +810,19 @@ class _Sheet:
         reach = int(np.ceil(2 * self.look.psf_px)) + 1
         foreign = cv2.dilate(foreign, np.ones((2 * reach + 1,) * 2, np.uint8))
         self.hidden |= (foreign > 0) & seen
+
+    def _edge_seen(self, rows: Rows, found: Matches) -> Array:
+        """Share (k,) of the pixels on the blurred edge of each disk that were used."""
+        used = np.isfinite(found.residuals)
+        high, wide = (n // 2 for n in used.shape[1:])
+        x, y = self._pixels(rows, (wide, high))
+        radii = second_order(self.mapping, self.at[rows])[1] @ self.frame * (self.look.size / 2)
+        off = np.stack(np.broadcast_arrays(x, y), axis=-1) - found.xy[:, None, None]
+        # The unit circle is the edge.
+        distance = np.linalg.norm(np.einsum("kij,krcj->krci", np.linalg.inv(radii), off), axis=-1)
+        width = _RIM * self.look.blur_px / np.sqrt(np.abs(np.linalg.det(radii)))
+        rim = np.abs(distance - 1) < width[:, None, None]
+        return np.asarray((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
 
     def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to disks from their own images, the most serious first."""
