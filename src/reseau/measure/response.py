@@ -215,10 +215,12 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
             wider = samples.basis(middle, slopes[:, :, *inner])
             plain = float((_left(observed, wider, weight) ** 2).sum())
         rest, taps = left[..., 0].ravel(), left[..., 1:].reshape(-1, len(offsets))
-        variance = plain / max(weight.sum(), 1)
-        normal = taps.T @ taps + np.eye(len(offsets)) * variance / _TAP**2
-        values = np.linalg.solve(normal, taps.T @ rest)
-        cost = float(((rest - taps @ values) ** 2).sum() + variance * (values**2).sum() / _TAP**2)
+        square, across, cost = taps.T @ taps, taps.T @ rest, plain
+        for _ in range(3):
+            # The prior is weighed by what is left with the kernel: noise, not misfit.
+            weight_of_prior = cost / max(weight.sum(), 1) / _TAP**2
+            values = np.linalg.solve(square + weight_of_prior * np.eye(len(offsets)), across)
+            cost = float(((rest - taps @ values) ** 2).sum())
         if cost < best[0]:
             best = cost, sharper, values
         if cost > _FUTILE * plain:

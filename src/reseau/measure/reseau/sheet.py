@@ -28,7 +28,16 @@ from ...io import ReseauDesign, Rings
 from ...optics import Chain, RationalPolynomial
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, side_rule
-from ..matching import GrownOutline, Matches, MatchOptions, Shape, Window, grey_variance, match
+from ..matching import (
+    GrownOutline,
+    Matches,
+    MatchOptions,
+    Shape,
+    Window,
+    grey_variance,
+    match,
+    with_alike_errors,
+)
 from ..points import Reason
 from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
 from ..screening import Screened, screen
@@ -377,6 +386,8 @@ _ENOUGH_LIKE, _SAMPLE = 6, 20
 """Least number of reliable disks from which something is learnt, and most that show the camera's response."""
 _FEW = 3
 """One in so many of these shows whether a kernel is needed."""
+_KERNELS = 2
+"""Number of times a kernel is estimated."""
 _FILTERED = 0.85
 """Ratio of mean square residuals below which a kernel is used."""
 _LINEAR = 0.15
@@ -471,6 +482,7 @@ class _Sheet:
             options.psf_px, 0.5, design.mark.size, _FORM_SIGMA, None, None, options.psf_px, None, None
         )
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
+        self.dazzled = np.zeros(len(self.at), dtype=bool)
         self.ring: tuple[Array, Chain, float, Array | None] | None = None
         self.notes: tuple[Remark, ...] = ()
 
@@ -483,14 +495,16 @@ class _Sheet:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows = self._in_sight()
         found = self._match_all(rows)
-        why, field = self._judged(rows, found)
-        doubtful = (why != "") | self._uneasy(found)
+        why, field = self._judged(rows, with_alike_errors(found))
+        # Where paper is saturated, neighbours do not predict the light.
+        doubtful = (why != "") | (self._uneasy(found) & ~self.dazzled[rows])
         if doubtful.any() and (~doubtful).sum() >= _NEIGHBOURS and field is not None:
             # Look again where their neighbours predict them, without what lies in front of them.
             self._uncover(rows, found, ~doubtful, field)
             parts = [np.flatnonzero(~doubtful), np.flatnonzero(doubtful)]
             found = merged(parts, [found.select(~doubtful), self._match_all(rows[doubtful])])
-            why, field = self._judged(rows, found)
+        found = with_alike_errors(found)
+        why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
 
     def _straight(self, rows: Rows) -> Array:
@@ -520,6 +534,7 @@ class _Sheet:
         """Match disks; on even paper where paper is saturated all around."""
         found = self._match(rows)
         dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
+        self.dazzled[rows] |= dim
         if not dim.any():
             return found
         parts = [np.flatnonzero(~dim), np.flatnonzero(dim)]
@@ -679,10 +694,13 @@ class _Sheet:
         few = np.arange(len(rows)) % _FEW == 0
         kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
         if gain < _FILTERED:
-            kernel, sharper, gain = estimate_kernel(self._samples(first, rows)[0])
-            self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
-            first = self._settle(self._match(rows))
-            self._weigh(first, rows)
+            for _ in range(_KERNELS):
+                # Position and form were those of images without the kernel, or with the one before.
+                self.look = replace(self.look, kernel=None)
+                kernel, sharper, _ = estimate_kernel(self._samples(first, rows)[0])
+                self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
+                first = self._settle(self._match(rows))
+                self._weigh(first, rows)
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             self.notes += (Remark(text, Code.FILTERED),)
         full_scale, gamma = self.image.full_scale, 1.0
