@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.measure.reseau.wires import grid_wires
+from reseau.measure.reseau.wires import cover, grid_wires
 
 
 def crossings(columns, rows, slopes, turn, seed=0):
@@ -49,3 +49,13 @@ def test_missing_crossings_do_not_interrupt_a_wire():
     for chain in wires.marks[1]:
         assert len(set(place[chain] % 9)) == 1
     assert sum(map(len, wires.marks[0])) >= there.sum() - 1
+
+
+@pytest.mark.parametrize("angle", np.deg2rad([0.0, 3.0, 40.0, 50.0, 91.0, 183.0, 270.0]))
+def test_a_wire_covers_the_pixels_whose_centres_are_within_its_reach(angle):
+    hidden = np.zeros((80, 100), np.uint8)
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    cover(hidden, np.array([50.3, 41.7]) + np.linspace(-150, 150, 30)[:, None] * along, 4.21)
+    y, x = np.indices(hidden.shape)
+    away = np.abs((x - 50.3) * across[0] + (y - 41.7) * across[1])
+    assert ((away < 4.21) == (hidden > 0)).all()

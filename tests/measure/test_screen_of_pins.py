@@ -69,7 +69,7 @@ def test_light_falloff_known_from_the_raster_does_not_shift_echoes():
     assert abs(outward[1]) < 0.04
 
 
-@pytest.mark.parametrize("glow", [0.0, 45.0])
+@pytest.mark.parametrize("glow", [0.0, 6 * NOISE, 45.0])
 def test_without_a_lit_raster_no_light_falloff_is_estimated(glow: float):
     ground = np.full(_SIZE, glow, dtype=np.float32)
     ground += np.linspace(0, 0.2 * glow, _SIZE[1], dtype=np.float32)

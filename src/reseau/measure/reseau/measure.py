@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
@@ -30,7 +29,7 @@ from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .orientation import misfit, rival_orientations
 from .placement import GridOptions, Placement, PlacingOptions, place, spacing
 from .sheet import measure_sheet
-from .wires import grid_wires
+from .wires import cover, grid_wires
 
 __all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
 
@@ -127,27 +126,8 @@ class ReseauResult(Measured):
                 outer = (self.field.jacobian(ends) @ beyond) * [[-1.0], [1.0]]
                 line = self.field(inner)
                 line = np.concatenate([line[:1] + outer[:1], line, line[-1:] + outer[1:]])
-                _cover(hidden, line, reach)
+                cover(hidden, line, reach)
         return hidden > 0
-
-
-def _cover(hidden: NDArray[np.uint8], line: Array, reach: float) -> None:
-    """Set the pixels (h, w) whose centres are nearer to a line (n, 2) than `reach`."""
-    across = int(np.ptp(line[:, 0]) > np.ptp(line[:, 1]))
-    image = hidden.T if across else hidden  # a view: what is set there is set in `hidden`
-    x, y = line[:, across], line[:, 1 - across]
-    x, y = (x, y) if y[-1] > y[0] else (x[::-1], y[::-1])
-    rows = np.arange(max(int(np.ceil(y[0])), 0), min(int(np.floor(y[-1])) + 1, len(image)))
-    if not len(rows):
-        return
-    middle = np.interp(rows, y, x)
-    half = reach * np.hypot(1, np.interp(rows, y, np.gradient(x, y)))
-    offsets = np.arange(-int(np.ceil(half.max())) - 1, int(np.ceil(half.max())) + 2)
-    columns = np.rint(middle).astype(np.intp)[:, None] + offsets
-    near = np.abs(columns - middle[:, None]) < half[:, None]
-    near &= (columns >= 0) & (columns < image.shape[1])
-    row, at = np.nonzero(near)
-    image[rows[row], columns[row, at]] = 1
 
 
 def measure_reseau(

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Rows
 
-__all__ = ["GridWires", "grid_wires"]
+__all__ = ["GridWires", "cover", "grid_wires"]
 
 _NEIGHBOURS = 24
 """Neighbours of a mark that may be the next on its wire; crossings in between may be missing."""
@@ -141,3 +141,32 @@ def _direction(xy: Array, towards: Array) -> Array:
     """Unit vector along the line through points, by total least squares."""
     vector = np.asarray(np.linalg.svd(xy - xy.mean(axis=0), full_matrices=False)[2][0], dtype=np.float64)
     return vector if vector @ towards > 0 else -vector
+
+
+def cover(hidden: NDArray[np.uint8], line: Array, reach: float) -> None:
+    """Set the pixels whose centres are nearer to a line than a given distance.
+
+    Parameters
+    ----------
+    hidden : ndarray (h, w)
+        The mask; changed.
+    line : ndarray (n, 2)
+        Points of a line without sharp bends, pixels.
+    reach : float
+        The distance, pixels.
+    """
+    across = int(np.ptp(line[:, 0]) > np.ptp(line[:, 1]))
+    image = hidden.T if across else hidden  # a view: what is set there is set in `hidden`
+    x, y = line[:, across], line[:, 1 - across]
+    x, y = (x, y) if y[-1] > y[0] else (x[::-1], y[::-1])
+    rows = np.arange(max(int(np.ceil(y[0])), 0), min(int(np.floor(y[-1])) + 1, len(image)))
+    if not len(rows):
+        return
+    middle = np.interp(rows, y, x)
+    half = reach * np.hypot(1, np.interp(rows, y, np.gradient(x, y)))
+    offsets = np.arange(-int(np.ceil(half.max())) - 1, int(np.ceil(half.max())) + 2)
+    columns = np.rint(middle).astype(np.intp)[:, None] + offsets
+    near = np.abs(columns - middle[:, None]) < half[:, None]
+    near &= (columns >= 0) & (columns < image.shape[1])
+    row, at = np.nonzero(near)
+    image[rows[row], columns[row, at]] = 1
