@@ -402,6 +402,8 @@ _BULGED = 0.3
 """Largest deviation of a disk from its neighbours' prediction, in radii: paper bulges."""
 _UNMODELLED_PX = 0.05
 """Scatter of positions beyond their own sigmas: the sheet is not plane."""
+_FORMED_PX = 0.002
+"""Standard deviation of what no formed image contains: edges of prints, unequal pixels."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
 
@@ -438,6 +440,12 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
     valid = screened.valid & (clipped == 0)
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
+
+
+def _with_all_errors(found: Matches) -> Matches:
+    """Matches with covariances that contain what errors of pixels have in common, and errors of forming."""
+    found = with_alike_errors(found)
+    return replace(found, cov=found.cov + _FORMED_PX**2 * np.eye(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -495,15 +503,15 @@ class _Sheet:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows = self._in_sight()
         found = self._match_all(rows)
-        why, field = self._judged(rows, with_alike_errors(found))
+        why, field = self._judged(rows, _with_all_errors(found))
         # Where paper is saturated, neighbours do not predict the light.
-        doubtful = (why != "") | (self._uneasy(found) & ~self.dazzled[rows])
-        if doubtful.any() and (~doubtful).sum() >= _NEIGHBOURS and field is not None:
+        doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
+        if doubtful.any() and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS and field is not None:
             # Look again where their neighbours predict them, without what lies in front of them.
-            self._uncover(rows, found, ~doubtful, field)
+            self._uncover(rows, found, doubtful, field)
             parts = [np.flatnonzero(~doubtful), np.flatnonzero(doubtful)]
             found = merged(parts, [found.select(~doubtful), self._match_all(rows[doubtful])])
-        found = with_alike_errors(found)
+        found = _with_all_errors(found)
         why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
 
@@ -796,16 +804,16 @@ class _Sheet:
         spread = 1.4826 * np.median(np.abs(known / ordinary - 1)) if len(known) else 0.0
         return ~found.converged | (found.noise > max(_HIGH_RESIDUALS, 1 + 4 * spread) * ordinary)
 
-    def _uncover(self, rows: Rows, found: Matches, good: Mask, field: SmoothField) -> None:
+    def _uncover(self, rows: Rows, found: Matches, uneasy: Mask, field: SmoothField) -> None:
         """Mask the pixels of windows that show neither paper nor ink, but something in front of them.
 
         The images of disks are predicted from their neighbours. The tolerance contains what a shift of a
         quarter of a pixel makes of them.
         """
+        good = ~uneasy & ~self.dazzled[rows]
         near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
         level, depth = (np.median(values[good][near], axis=1) for values in (found.level, self._depth(found)))
         noise = float(np.median(found.noise[good]))
-        uneasy = self._uneasy(found) | ~good
         some = rows[uneasy]
         xy = field(self._straight(some))
         self.start[some] = xy
@@ -842,7 +850,7 @@ class _Sheet:
         rim = np.abs(distance - 1) < width[:, None, None]
         return np.asarray((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
 
-    def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to disks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
@@ -862,7 +870,11 @@ class _Sheet:
                 np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT,
                 Reason("the outline is not that of a disk", Code.UNLIKE),
             ),
-            (found.correlation < 0.8, Reason("the image is not that of a disk", Code.UNLIKE)),
+            # Without paper, the reflection in a disk is all that is left to compare.
+            (
+                (found.correlation < 0.8) & ~self.dazzled[rows],
+                Reason("the image is not that of a disk", Code.UNLIKE),
+            ),
             (
                 (found.rejected > 0.25) | (found.noise > _DISTURBED * usual),
                 Reason("partly hidden or disturbed", Code.DISTURBED),
@@ -873,7 +885,7 @@ class _Sheet:
     def _judged(self, rows: Rows, found: Matches) -> tuple[Array, SmoothField | None]:
         """Reason why each disk is rejected, and the field through the others."""
         why = np.full(len(rows), "", dtype=object)
-        for mask, reason in self._objections(found):
+        for mask, reason in self._objections(rows, found):
             why[mask & (why == "")] = reason
         source, field = self._straight(rows), None
         variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
