@@ -1,11 +1,12 @@
 """Marks in frames of other programs: errors compared with the Cramér–Rao bound and with their sigmas.
 
-Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py [--part data|worlds]
+Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py [--part data|worlds|compressed]
 [--kind K] [--count N]``. `data` measures the frames in ``independent/marks`` and the crossings of
 ``independent/oscilloscope``; `worlds` draws N sheets of each kind with ``benchmarks/worlds/marks.py``, which
 shares no formation of images with the project: crosses, disks and short crossings of three contrasts in one
 frame, and wires at any rotation with slopes to 0.1. The bound is that of position, contrast, background and
-blur.
+blur. `compressed` measures JPEG copies of such sheets, one for each quality: their errors compared with their
+sigmas.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from worlds.marks import Sheet, write
 
@@ -28,6 +30,7 @@ from reseau.io import ReseauDesign
 from reseau.io.images import read_image
 from reseau.measure import measure_reseau
 
+QUALITIES = (90, 60, 30, 10, 3)
 KINDS = ("cross", "disk", "line-grid", "wires")
 MOST_RATIO, NORMALISED = 1.05, (0.85, 1.15)
 
@@ -106,9 +109,25 @@ def table(title: str, frames: Iterator[tuple[str, Any]], each: bool = True) -> b
     return (line(title, parts) if parts else False) and good
 
 
+def compressed(folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
+    """Results of the frames of a folder after compression with JPEG; the bound no longer holds."""
+    with tempfile.TemporaryDirectory() as name:
+        copies = Path(name)
+        for path in folder.iterdir():
+            if path.suffix == ".png":
+                frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+                cv2.imwrite(str(copies / path.stem) + ".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
+                coded = cv2.imread(str(copies / path.stem) + ".jpg", cv2.IMREAD_GRAYSCALE)
+                cv2.imwrite(str(copies / path.name), coded)
+            elif path.suffix == ".json":
+                (copies / path.name).write_bytes(path.read_bytes())
+        for name, found in marks_of(copies):
+            yield name, found if isinstance(found, str) else (*found[:2], None, found[3])
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--part", choices=("data", "worlds"))
+    parser.add_argument("--part", choices=("data", "worlds", "compressed"))
     parser.add_argument("--kind", choices=KINDS)
     parser.add_argument("--count", type=int, default=11, help="sheets of each kind")
     options = parser.parse_args()
@@ -131,6 +150,13 @@ def main() -> int:
                         folder, f"{kind}-{seed:02}", Sheet.drawn_from(kind, np.random.default_rng(seed)), seed
                     )
                 good &= table(f"{kind}, own worlds", marks_of(folder), each=False)
+    if options.part in (None, "compressed"):
+        for kind in KINDS if options.kind is None else (options.kind,):
+            with tempfile.TemporaryDirectory() as name:
+                folder = Path(name)
+                write(folder, kind, Sheet.drawn_from(kind, np.random.default_rng(0)), 0)
+                for quality in QUALITIES:
+                    table(f"{kind}, quality {quality}", compressed(folder, quality), each=False)
     return 0 if good else 1
 
 
