@@ -163,6 +163,8 @@ def draw_overlay(
     factor = _enlargement(layers, radius, zoom)
     if factor is not None:
         layers = [_stated(layer, factor, radius / (zoom * factor)) for layer in layers]
+    if zoom < 1:
+        notes = (*notes, f"reduced: one of {round(1 / zoom)} × {round(1 / zoom)} pixels is shown")
     columns = max(24, int(width / (0.56 * text)))
     legend = _legend(layers, title, notes, columns)
     foot = round((len(legend) + 0.8) * 1.5 * text)
