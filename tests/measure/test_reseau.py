@@ -279,6 +279,13 @@ def test_a_design_with_too_few_coordinates_is_refused():
         measure_reseau(form(SMALL, rng()).frame, design.model_copy(update={"points": points}))
 
 
+def test_a_design_on_one_line_is_refused():
+    design = SMALL.design()
+    points = tuple(p for p in design.points if p.y == design.points[0].y)
+    with pytest.raises(UsageError, match="all its points on one line"):
+        measure_reseau(form(SMALL, rng()).frame, design.model_copy(update={"points": points}))
+
+
 def test_the_document_contains_the_measurement_and_is_read_back_unchanged():
     scene = small(missing=frozenset({5}))
     result = measured(scene, form(scene, rng(13)))

@@ -23,6 +23,7 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
+from ..fitting import on_one_line
 from ..matching import Matches
 from ..points import Measured, Reason, deviating
 from .marks import MarkMeasurement, ReseauOptions, Verdict
@@ -155,7 +156,7 @@ def measure_reseau(
     ImageError
         When the frame is all black, saturated, or of one grey.
     UsageError
-        When the design has neither coordinates nor nominal positions.
+        When the design has neither coordinates nor nominal positions, or all its points lie on one line.
 
     Examples
     --------
@@ -180,6 +181,10 @@ def measure_reseau(
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
     if len(known) < 4:
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
+    if on_one_line(source[known]):
+        raise UsageError(
+            "has all its points on one line: at least one beside it is needed", where=f"design {design.name}"
+        )
     nominal = design.nominal_px[known]
     use_nominal = options.nominal and bool(np.isfinite(nominal).all())
     if design.rings is not None and not use_nominal:
