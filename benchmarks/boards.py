@@ -1,9 +1,10 @@
 """Testfield and sheet in pictures of another program: what is found, errors, sigmas and processor time.
 
 Run from the checkout: ``RESEAU_DATA=… python benchmarks/boards.py [--target tf|sheet] [--data FOLDER]
-[--condition C …] [--each] [--others]``. The pictures of ``independent/boards`` share neither the camera nor
-the formation of pixels with the project. Poses are pooled; with ``--each`` every picture has its own row.
-``--others`` also measures the pictures of all other targets with the design: they must be declined.
+[--condition C …] [--each] [--others] [--worlds N]``. The pictures of ``independent/boards`` share neither the
+camera nor the formation of pixels with the project. Poses are pooled; with ``--each`` every picture has its
+own row. ``--others`` also measures the pictures of all other targets with the design: they must be declined.
+``--worlds`` draws and measures N sets of views, near and wide, with ``benchmarks/worlds/boards.py``.
 
 A target counts as inside where its whole image, and two pixels more, lies in the picture and nothing hides
 it. Wrong is a position in error by more than 0.15 px and 5 sigma.
@@ -18,13 +19,14 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from worlds.boards import OPENCV, picture, poses
 
 from reseau.core.data import Array, Frame, Mask
 from reseau.core.failure import Failure
@@ -167,6 +169,28 @@ def others(folder: Path, target: str, design: Any) -> bool:
     return wrong == 0
 
 
+def worlds(design_path: Path, count: int) -> bool:
+    """Measure views of the testfield drawn by ``benchmarks/worlds/boards.py``, from near and wide."""
+    contents = json.loads(design_path.read_text())
+    measure, _ = measurers("tf", parse_design(design_path.read_text(), design_path))
+    parts, good = [], True
+    for seed in range(count):
+        for k1, tilt in ((0.0, 65.0), (-0.15, 30.0), (-0.3, 60.0), (-0.3, 65.0)):
+            camera = replace(OPENCV, k1=k1, k2=0.06 if k1 else 0.0)
+            pose = poses(4, seed, 500.0, (tilt - 1, tilt))[seed % 4]
+            pixels, xy = picture(contents, camera, pose, seed=seed)
+            whole = ((xy > 10) & (xy < [camera.width - 11, camera.height - 11])).all(axis=1)
+            found = measured(Frame(pixels.astype(np.uint8), 255.0), measure, xy, whole)
+            name = f"k1 {k1:g}, {tilt:g}°, seed {seed}"
+            if isinstance(found, str):
+                print(f"{name:26} {found}  MISSED", flush=True)
+                good = False
+                continue
+            line(name, [found], rough=False)
+            parts.append(found)
+    return (line("own worlds", parts, rough=False) if parts else False) and good
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--target", choices=tuple(DESIGNS))
@@ -174,6 +198,7 @@ def main() -> int:
     parser.add_argument("--condition", nargs="+", default=[], help="only these conditions")
     parser.add_argument("--each", action="store_true", help="a row for every picture")
     parser.add_argument("--others", action="store_true", help="pictures of other targets, too")
+    parser.add_argument("--worlds", type=int, default=0, help="sets of own views, drawn at 10 s each")
     options = parser.parse_args()
     root = os.environ.get("RESEAU_DATA")
     folder = options.data or (Path(root) / "independent" / "boards" if root else None)
@@ -187,6 +212,8 @@ def main() -> int:
         good &= table(folder, target, design, options.condition, options.each)
         if options.others:
             good &= others(folder, target, design)
+        if target == "tf" and options.worlds:
+            good &= worlds(path, options.worlds)
     return 0 if good else 1
 
 

@@ -193,11 +193,12 @@ def find_lattices(ridges: Ridges) -> list[Lattice] | Failure:
     lines = _candidates(ridges)
     if len(lines) < 4:
         return Failure("no straight lines were found", Code.NOT_FOUND)
-    first = _family(lines, np.ones(len(lines), dtype=bool))
+    first = _family(lines, np.ones(len(lines), dtype=bool), np.ones(len(lines)))
     numbered = [_numbered(lines, first)]
     of_first = np.isin(np.arange(len(lines)), numbered[0][0].rows)
     main = lines.turn_from(int(first[0]))
-    second = _family(lines, ~of_first & (main > np.sin(_CROSSING)))
+    # The second family crosses the first; its own lines may lie at all angles, too.
+    second = _family(lines, ~of_first & (main > np.sin(_CROSSING)), main**2)
     numbered.append(_numbered(lines, second) if len(second) else [])
     most = [max((len(one.rows) for one in each), default=0) for each in numbered]
     if min(most) < 2:
@@ -344,12 +345,14 @@ def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Arra
     )
 
 
-def _family(lines: _Lines, among: Mask) -> Rows:
+def _family(lines: _Lines, among: Mask, preference: Array) -> Rows:
     """Lines that may belong to one family: the strongest one, first, and those less than 40° from it."""
     rows = np.flatnonzero(among)
     if not len(rows):
         return rows
-    return np.asarray(rows[lines.turn_from(int(rows[0]))[rows] < np.sin(_FAMILY)])
+    main = int(rows[np.argmax((lines.weight * preference)[rows])])
+    near = rows[lines.turn_from(main)[rows] < np.sin(_FAMILY)]
+    return np.concatenate([[main], near[near != main]])
 
 
 def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
@@ -487,6 +490,8 @@ _DISTORTED, _MOST_DISTORTED = 0.1, 0.3
 """Prior standard deviation and largest value of the radial distortion at the edge of the frame."""
 _LONGEST = 0.5
 """Longest step, in lattice coordinates, of the inversion of a mapping."""
+_ABOUT = 0.02
+"""Distance from its predicted place, in steps, within which a line is looked for."""
 _BESIDE = 0.07
 """Distance from a line, in steps, at which both sides are compared with it; no targets are so near."""
 _SUPPORT = 0.25
@@ -894,16 +899,29 @@ def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, lines: Array, oth
     return [np.asarray(dark[keep], dtype=np.float64) for dark, keep in zip(seen, inside, strict=True)]
 
 
+def _darkest_of(samples: tuple[Array, ...]) -> Array:
+    """The largest of samples at corresponding places of lines side by side, of different lengths."""
+    count = min(map(len, samples))
+    return np.asarray(np.max([each[:count] for each in samples], axis=0))
+
+
 def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows, others: Rows) -> Rows:
     """Those of some lines that exist: dark between the other lines, and with ridge points at `number`."""
     found = []
     whole = np.rint(number)
-    left, middle, right = (
+    left, low, centre, high, right = (
         _darkness_along(mapping, ridges, axis, lines.astype(np.float64) + shift, others)
-        for shift in (-_BESIDE, 0.0, _BESIDE)
+        for shift in (-_BESIDE, -_ABOUT, 0.0, _ABOUT, _BESIDE)
     )
+    # The mapping may still be a pixel or two wrong.
+    middle = [_darkest_of(each) for each in zip(low, centre, high, strict=True)]
+    ends = np.empty((2, len(lines), 2))
+    ends[..., axis], ends[..., 1 - axis] = lines, np.array([[others.min()], [others.max()]])
+    first, last = mapping(ends.reshape(-1, 2)).reshape(ends.shape)
+    # Samples are as many for all lines; ridge points are one for each pixel of their length.
+    each = np.hypot(*(last - first).T).clip(0, max(ridges.darkness.shape)) / max(ridges.darkness.shape)
     for k, (line, dark) in enumerate(zip(lines, middle, strict=True)):
-        enough = (whole == line).sum() > _SUPPORT * len(dark)
+        enough = (whole == line).sum() > _SUPPORT * len(dark) * each[k]
         if len(dark) <= _SHORTEST or not enough:
             continue
         usual = float(np.median(dark))

@@ -456,7 +456,7 @@ class _Measurement:
             among = self.inside.copy()
             among[among] = some
             curved = match_targets(self.scene, self.rows, among, background=2, contrast_slope=slope)
-            better = curved.converged & ~(curved.noise > (0.9 if slope is None else 1.02) * found.noise[some])
+            better = curved.converged & ~(curved.noise > (0.9 if slope is None else 0.97) * found.noise[some])
             keep = ~some
             keep[some] = ~better
             parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
