@@ -503,7 +503,7 @@ class _Sheet:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows = self._in_sight()
         found = self._match_all(rows)
-        why, field = self._judged(rows, _with_all_errors(found))
+        why, field = self._judged(rows, found)
         # Where paper is saturated, neighbours do not predict the light.
         doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
         if doubtful.any() and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS and field is not None:
