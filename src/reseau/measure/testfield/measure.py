@@ -54,8 +54,9 @@ _HIGH_RESIDUALS = 1.4
 _VEILED, _CONTRAST_SLOPE = 0.04, 0.3
 """Deviation of the contrast of a target from the usual one from which it may change across the target, and
 the standard deviation of this change over half a window."""
-_UNLIKE = 2.0
-"""Multiple of the usual residuals from which an image is that of another object."""
+_UNLIKE, _UNLIKE_BESIDE, _ALIKE = 2.0, 3.5, 0.08
+"""Multiple of the usual residuals from which an image is that of another object; the same for targets whose
+sharpness, contrast and size differ from the usual by less than this share."""
 _FORMED_PX = 0.002
 """Standard deviation of a coordinate from what no image shows: edges of prints, unequal pixels, formation of
 images. Other programs for the formation of images agree with ours to this."""
@@ -502,6 +503,9 @@ class _Measurement:
         )
         # Light that is added to that of a target changes its contrast, but not its depth.
         pale = np.minimum(np.abs(found.contrast / contrast - 1), np.abs(amplitude / usual - 1))
+        # Something beside a target raises its residuals, but changes neither sharpness nor contrast nor size.
+        alike = (np.abs(np.log(found.psf_px / width)) < _ALIKE) & (np.abs(found.form[:, 0]) < _ALIKE)
+        alike &= np.abs(found.contrast / contrast - 1) < _ALIKE
         return [
             (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
             (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
@@ -510,7 +514,10 @@ class _Measurement:
                 Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
             ),
             (found.rejected > 0.1, Reason("partly hidden", Code.HIDDEN)),
-            (found.noise > _UNLIKE * noise, Reason("the image is not that of the target", Code.UNLIKE)),
+            (
+                found.noise > np.where(alike, _UNLIKE_BESIDE, _UNLIKE) * noise,
+                Reason("the image is not that of the target", Code.UNLIKE),
+            ),
             (
                 np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED),
                 Reason("sharpness differs from the other targets", Code.BLURRED),
