@@ -10,7 +10,7 @@ from reseau.core.failure import Code
 from reseau.measure import ReseauOptions, measure_reseau
 from reseau.measure.reseau.orientation import misfit
 
-from .formed import Scene, form
+from .formed import MARKS, Scene, form
 
 SCENE = Scene(columns=11, rows=9, width=700, height=600)
 
@@ -42,6 +42,15 @@ def test_nothing_is_ambiguous_where_handedness_and_turn_are_known(pixels):
 def test_a_grid_of_which_columns_and_rows_are_cropped_is_found(pixels):
     found = measure_reseau(shown(pixels[110:, 165:]), SCENE.design()).required()
     assert found.found == 72
+
+
+def test_a_cropped_grid_of_wires_is_not_laid_over_what_lies_along_them():
+    scene = Scene(mark=MARKS["line-grid"], columns=11, rows=9, width=700, height=600)
+    formed = form(scene, np.random.default_rng(0))
+    known = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    found = measure_reseau(shown(formed.frame.pixels[110:, 165:]), scene.design(), known).required()
+    assert found.found == 72
+    assert np.abs(found.xy - (formed.xy - [165, 110]))[found.ok].max() < 0.05
 
 
 def test_nominal_positions_wrong_by_one_pitch_are_noticed():

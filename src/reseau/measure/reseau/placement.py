@@ -330,7 +330,7 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
     # Many places along a wire look somewhat like a crossing: with all candidates voting, they may outvote the
     # crossings; with the strongest only, a scene behind the marks may. Therefore first one, then the other.
     # A frame that shows only part of the design has fewer crossings than expected, all about as strong.
-    usual = np.median(strong.t[: max(4, len(source) // 2)])
+    usual = float(np.median(strong.t[: max(4, len(source) // 2)]))
     alike = int((strong.t > _AS_STRONG * usual).sum())
     electorates = [_strongest(candidates, 3 * len(source) // 2), strong]
     if 8 <= alike < len(source):
@@ -341,7 +341,7 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
         for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
             plane = source * [1, -1 if mirrored else 1]
             starts = (_starts(plane, voters, turned, options.hypotheses) for voters in electorates)
-            for start in _supported(list(chain.from_iterable(starts)), strong, _TRIED):
+            for start in _supported(list(chain.from_iterable(starts)), strong, usual, _TRIED):
                 found = assign(source, start, strong, valid, shifts=1)
                 if found is None:
                     continue
@@ -357,11 +357,14 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
     return best
 
 
-def _supported(starts: list[Array], candidates: Candidates, count: int) -> list[Array]:
-    """The start positions near which most marks have a candidate."""
-    tree = KDTree(candidates.xy)
-    near = [int((tree.query(start)[0] < 0.25 * spacing(start)).sum()) for start in starts]
-    return [starts[k] for k in np.argsort(-np.array(near, dtype=int), kind="stable")[:count]]
+def _supported(starts: list[Array], candidates: Candidates, usual: float, count: int) -> list[Array]:
+    """The start positions near which most marks have a candidate that is as strong as marks usually are."""
+    tree, likeness = KDTree(candidates.xy), np.minimum(candidates.t / usual, 1.0)
+    support = []
+    for start in starts:
+        distance, row = tree.query(start)
+        support.append(float(likeness[row[distance < 0.25 * spacing(start)]].sum()))
+    return [starts[k] for k in np.argsort(-np.array(support, dtype=float), kind="stable")[:count]]
 
 
 def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
