@@ -73,12 +73,15 @@ def with_alike_errors(found: Matches) -> Matches:
     used = np.isfinite(found.residuals)
     unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
     free = 1 - found.leverage
-    if not _neighbours(unit[sure], used[sure], free[sure]):
-        return found
     influence = found.influence * found.noise[:, None, None, None]
     activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
     activity /= np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-300)
     shown = used[sure]
+    # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
+    # formed image lacks, which is alike in all marks and symmetric.
+    beside = shown & (activity[sure] < np.median(activity[sure][shown]))
+    if not _neighbours(unit[sure], beside, free[sure]):
+        return found
     limits = np.quantile(activity[sure][shown], np.arange(1, _CLASSES) / _CLASSES)
     kind = np.digitize(activity, limits)
     variance = np.ones(_CLASSES)
@@ -129,7 +132,7 @@ def _pair(values: Array, down: int, right: int) -> tuple[Array, Array]:
 
 def _at(lag: tuple[int, int], unit: Array, used: Array, free: Array) -> tuple[float, float]:
     """Correlation of residuals in units of their standard deviations, and its standard deviation."""
-    here, there = _pair(unit, *lag)
+    here, there = _pair(np.where(used, unit, 0.0), *lag)
     both = np.logical_and(*_pair(used, *lag))
     count = max(int(both.sum()), 1)
     # Residuals are smaller than errors by what the adjustment has taken from them.
