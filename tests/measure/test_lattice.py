@@ -8,14 +8,8 @@ import pytest
 from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.measure.screening import quiet_noise
-from reseau.measure.testfield.lattice import (
-    LatticeFit,
-    find_lattices,
-    lattices,
-    refit,
-    ridge_points,
-    second_order,
-)
+from reseau.measure.testfield.lattice import find_lattices, ridge_points
+from reseau.measure.testfield.lattice_fit import LatticeFit, lattices, refit, second_order
 from reseau.measure.testfield.line_profiles import blur_of
 from reseau_sims import FieldBench, Station
 

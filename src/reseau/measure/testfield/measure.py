@@ -19,7 +19,7 @@ from ...optics.formation import PixelResponse
 from ..matching import Matches, Window
 from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
-from .lattice import LatticeFit, refit, slope_of
+from .lattice_fit import LatticeFit, refit, slope_of
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets

@@ -29,7 +29,8 @@ from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
-from .lattice import LatticeFit, Ridges, find_lattices, lattices, ridge_points, straightened
+from .lattice import Ridges, find_lattices, ridge_points
+from .lattice_fit import LatticeFit, lattices, straightened
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 

@@ -20,7 +20,7 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
-from .lattice import slope_of
+from .lattice_fit import slope_of
 from .line_profiles import blur_of, crossings, strip
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
