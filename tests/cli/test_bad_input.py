@@ -51,7 +51,9 @@ def make(case: str, photo: Any, folder: Path) -> tuple[Path, Path]:
         case "a corner of the image":
             write_image(image, np.ascontiguousarray(pixels[:40, :40]))
         case "nominal positions of a larger frame":
-            moved = [p | {"nominal_px": [3000.0 + 100 * i, 2000.0]} for i, p in enumerate(points)]
+            moved = [
+                p | {"nominal_px": [3000.0 + 100 * i, 2000.0 + 100 * (i % 3)]} for i, p in enumerate(points)
+            ]
             design = changed(design, folder / "bad.json", points=moved)
             image = good
         case "wrong key":

@@ -222,10 +222,22 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     assert again[1] == (tmp_path / "K.json").read_text()
 
 
-def test_an_error_in_a_worker_process_is_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
+def test_photographs_without_an_image_are_named_in_one_line(reseau: Run, tmp_path: Path) -> None:
     FieldBench(seed=4).design.write(tmp_path / "field.json")
     for name in "abc":
         write_image(tmp_path / f"{name}.png", np.full((240, 240), 80, dtype=np.uint8))
+    images = sorted(tmp_path.glob("*.png"))
+    status, out, err = reseau("calibrate", *images, "-d", tmp_path / "field.json", "--jobs", 2)
+    assert (status, out) == (1, "")
+    assert err.count("\n") == 1
+    for name in "abc":
+        assert f"{name}.png: is all of one grey" in err
+
+
+def test_an_error_in_a_worker_process_is_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
+    FieldBench(seed=4).design.write(tmp_path / "field.json")
+    for name in "abc":
+        (tmp_path / f"{name}.png").write_text("no image")
     images = sorted(tmp_path.glob("*.png"))
     status, out, err = reseau("calibrate", *images, "-d", tmp_path / "field.json", "--jobs", 2)
     assert (status, out) == (2, "")

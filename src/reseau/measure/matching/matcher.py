@@ -89,6 +89,8 @@ class MatchOptions:
     variance : (float, float), optional
         Coefficients of the variance a + b·g of a grey value g. Only ratios matter; see
         :func:`reseau.measure.matching.grey_variance`. By default all grey values have the same variance.
+    influence : bool
+        Whether the influence of every pixel is wanted; see :func:`reseau.measure.matching.with_alike_errors`.
 
     Examples
     --------
@@ -111,6 +113,7 @@ class MatchOptions:
     held: tuple[float, float] | None = None
     settled: float = 0.01
     variance: tuple[float, float] | None = None
+    influence: bool = False
 
     @property
     def half(self) -> tuple[int, int]:
@@ -407,7 +410,7 @@ class Matches:
     form_sigma : ndarray (k, m)
         Standard deviations of `form`.
     influence : ndarray (k, 2, rows, columns)
-        Change of the position with the grey value of each pixel.
+        Change of the position with the grey value of each pixel, if it was wanted.
     leverage : ndarray (k, rows, columns)
         Share of the error of each pixel that the adjustment takes from its residual.
 
@@ -647,7 +650,9 @@ def _columns(
         expected = -plane * flat if patch.options.polarity == "dark" else flat
         correlation = _correlation(patch.grey - plane, expected, used)
         t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - patch.form_at, 1) / (1 - correlation**2))
-    influence, leverage = patch.influence(x, found.cofactor, used, scale)
+    influence, leverage = np.zeros((k, 2, *patch.shape[1:])), np.zeros(patch.shape)
+    if patch.options.influence:
+        influence, leverage = patch.influence(x, found.cofactor, used, scale)
     return Matches(
         xy=patch.xy + x[:, :2],
         cov=cov[:, :2, :2],

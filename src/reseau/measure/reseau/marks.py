@@ -388,6 +388,7 @@ class MarkMeasurement:
             row_jitter_px=self.options.row_jitter_px,
             start_px=1.0,
             variance=self.variance,
+            influence=True,
         )
 
     def _match_all(self, at: Rows, start: Array) -> Matches:

@@ -247,7 +247,8 @@ def _vote(
         step = (high - low) / count
         index = index * count + np.clip(((column - low) / step).astype(np.intp), 0, count - 1)
         centres.append(np.linspace(low, high, 2 * count + 1)[1::2])
-    votes = np.bincount(index, weight, minlength=bins[0] * bins[1]).reshape(bins)
+    # Without values `bincount` counts in integers.
+    votes = np.bincount(index, weight, minlength=bins[0] * bins[1]).astype(np.float64).reshape(bins)
     smooth: Array = gaussian_filter(votes, blur, mode="constant", truncate=3.0)
     return smooth, (centres[0], centres[1])
 

@@ -250,6 +250,7 @@ class _Sheet:
                 polarity=self.design.polarity,
                 row_jitter_px=self.options.row_jitter_px,
                 settled=0.05,
+                influence=True,
                 contrast=None if self.look.contrast is None else self.look.contrast[rows[part]],
                 contrast_slope=_SLOPE,
                 background=background,
