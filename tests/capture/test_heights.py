@@ -38,7 +38,8 @@ def test_frontal_frames_at_several_heights_give_the_principal_distance(tmp_path:
     assert isinstance(found, Calibrated)
     result = found.result
     assert len(np.unique(result.fit.values.rotation, axis=0)) == 1  # one orientation
-    assert 0.9 < result.sigma0 < 1.1
+    # Sigmas contain what formed images lack of real ones (0.002 px); the simulated ones lack nothing.
+    assert 0.85 < result.sigma0 < 1.1
     c = json.loads(session.content(session.results()[-1]))["parameters"]["c"]
     assert abs(c["value"] - 57.5) < 3 * c["sigma"] < 0.15
     assert all(again.same for again in rerun(session, rig.procedure(sigmas=SIGMAS)))
