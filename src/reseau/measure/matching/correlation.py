@@ -79,7 +79,7 @@ def with_alike_errors(found: Matches) -> Matches:
     shown = used[sure]
     # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
     # formed image lacks, which is alike in all marks and symmetric.
-    beside = shown & (activity[sure] < np.median(activity[sure][shown]))
+    beside = shown & (activity[sure] <= np.median(activity[sure][shown]))
     if not _neighbours(unit[sure], beside, free[sure]):
         return found
     limits = np.quantile(activity[sure][shown], np.arange(1, _CLASSES) / _CLASSES)
