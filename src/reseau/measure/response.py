@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from ..core.data import Array, Mask, Rows
-from .matching import Shape, Window
+from .matching import Shape, Window, displaced
 
 __all__ = ["Exponent", "FilteredShape", "Samples", "estimate_gamma", "estimate_kernel"]
 
@@ -326,13 +326,9 @@ def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: fl
 
 def _correlation(rest: Array, used: Mask) -> float:
     """Largest correlation of the residuals (k, r, c) of neighbouring pixels."""
-    before = [
-        (rest[:, :, 1:], rest[:, :, :-1], used[:, :, 1:] & used[:, :, :-1]),
-        (rest[:, 1:], rest[:, :-1], used[:, 1:] & used[:, :-1]),
-        (rest[:, 1:, 1:], rest[:, :-1, :-1], used[:, 1:, 1:] & used[:, :-1, :-1]),
-        (rest[:, 1:, :-1], rest[:, :-1, 1:], used[:, 1:, :-1] & used[:, :-1, 1:]),
-    ]
     square = float((rest**2).sum()) / max(float(used.sum()), 1)
-    return max(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1) for a, b, both in before) / max(
-        square, 1e-300
-    )
+    found = []
+    for lag in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        (a, b), both = displaced(rest, *lag), np.logical_and(*displaced(used, *lag))
+        found.append(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1))
+    return max(found) / max(square, 1e-300)

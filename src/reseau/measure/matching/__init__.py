@@ -1,6 +1,6 @@
 """Least-squares matching: windows of a frame are adjusted to formed images of marks."""
 
-from .correlation import with_alike_errors
+from .correlation import displaced, with_alike_errors
 from .matcher import SIZE, Matches, MatchOptions, match
 from .noise import grey_variance
 from .shapes import FormedShape, GrownOutline, Shape, ShapeSubset, Window
@@ -14,6 +14,7 @@ __all__ = [
     "Shape",
     "ShapeSubset",
     "Window",
+    "displaced",
     "grey_variance",
     "match",
     "with_alike_errors",

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from ...core.data import Array
+from ...core.data import Array, Mask
 from .matcher import Matches
 
-__all__ = ["with_alike_errors"]
+__all__ = ["displaced", "with_alike_errors"]
 
 _LAGS = 7
 """Largest distance of pixels along either axis: errors of a compressed picture end with its blocks of 8."""
@@ -94,7 +96,7 @@ def with_alike_errors(found: Matches) -> Matches:
     uneven = influence * spread[:, None]
     extra = np.einsum("kirc,kjrc->kij", uneven, uneven) - np.einsum("kirc,kjrc->kij", influence, influence)
     for lag, r in correlation.items():
-        here, there = _pair(uneven, *lag)
+        here, there = displaced(uneven, *lag)
         together = r * np.einsum("kirc,kjrc->kij", here, there)
         extra += together + np.swapaxes(together, 1, 2)
     # Errors that cancel each other are not relied upon.
@@ -121,8 +123,15 @@ def _lags() -> Iterator[tuple[int, int]]:
             yield down, right
 
 
-def _pair(values: Array, down: int, right: int) -> tuple[Array, Array]:
-    """Two views of windows (..., rows, columns) displaced against each other."""
+def displaced(values: NDArray[Any], down: int, right: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Two views of windows (..., rows, columns), the second displaced against the first.
+
+    Examples
+    --------
+    >>> here, there = displaced(np.arange(6).reshape(2, 3), 1, -1)
+    >>> here.tolist(), there.tolist()
+    ([[1, 2]], [[3, 4]])
+    """
     rows, columns = values.shape[-2:]
     return (
         values[..., : rows - down, max(0, -right) : columns - max(0, right)],
@@ -130,10 +139,10 @@ def _pair(values: Array, down: int, right: int) -> tuple[Array, Array]:
     )
 
 
-def _at(lag: tuple[int, int], unit: Array, used: Array, free: Array) -> tuple[float, float]:
+def _at(lag: tuple[int, int], unit: Array, used: Mask, free: Array) -> tuple[float, float]:
     """Correlation of residuals in units of their standard deviations, and its standard deviation."""
-    here, there = _pair(np.where(used, unit, 0.0), *lag)
-    both = np.logical_and(*_pair(used, *lag))
+    here, there = displaced(np.where(used, unit, 0.0), *lag)
+    both = np.logical_and(*displaced(used, *lag))
     count = max(int(both.sum()), 1)
     # Residuals are smaller than errors by what the adjustment has taken from them.
     taken = 1 - float(free[used].mean())
@@ -141,13 +150,13 @@ def _at(lag: tuple[int, int], unit: Array, used: Array, free: Array) -> tuple[fl
     return float((here * there).sum()) / count / power + _TAKEN * taken, 1 / np.sqrt(count)
 
 
-def _neighbours(unit: Array, used: Array, free: Array) -> bool:
+def _neighbours(unit: Array, used: Mask, free: Array) -> bool:
     """Whether pixels next to each other have errors in common."""
     found = [_at(lag, unit, used, free) for lag in ((0, 1), (1, 0))]
     return any(r > max(_LEAST, _SIGNIFICANT * sigma) for r, sigma in found)
 
 
-def _correlation(unit: Array, used: Array, free: Array) -> dict[tuple[int, int], float]:
+def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], float]:
     """Significant correlations by distance."""
     rows, columns = unit.shape[1:]
     found = {lag: _at(lag, unit, used, free) for lag in _lags() if lag[0] < rows and abs(lag[1]) < columns}

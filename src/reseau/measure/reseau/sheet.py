@@ -228,15 +228,15 @@ class _Sheet:
 
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
-        found = self._match(rows)
+        found = self._match(rows, influence=True)
         dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
         self.dazzled[rows] |= dim
         if not dim.any():
             return found
         parts = [np.flatnonzero(~dim), np.flatnonzero(dim)]
-        return merged(parts, [found.select(~dim), self._match(rows[dim], background=0)])
+        return merged(parts, [found.select(~dim), self._match(rows[dim], background=0, influence=True)])
 
-    def _match(self, rows: Rows, background: int = 2) -> Matches:
+    def _match(self, rows: Rows, background: int = 2, influence: bool = False) -> Matches:
         """Match disks, grouped by window size."""
         outline, ring = self._outline(rows), self._rings()
         valid = self.screened.valid & (ring < _RING) & ~self.hidden
@@ -250,7 +250,7 @@ class _Sheet:
                 polarity=self.design.polarity,
                 row_jitter_px=self.options.row_jitter_px,
                 settled=0.05,
-                influence=True,
+                influence=influence,
                 contrast=None if self.look.contrast is None else self.look.contrast[rows[part]],
                 contrast_slope=_SLOPE,
                 background=background,
