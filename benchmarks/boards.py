@@ -5,6 +5,9 @@ Run from the checkout: ``RESEAU_DATA=… python benchmarks/boards.py [--target t
 camera nor the formation of pixels with the project. Poses are pooled; with ``--each`` every picture has its
 own row. ``--others`` also measures the pictures of all other targets with the design: they must be declined.
 ``--worlds`` draws and measures N sets of views, near and wide, with ``benchmarks/worlds/boards.py``.
+``--calibrate`` draws 12 views of the testfield for each of ``--seeds`` 20, calibrates the camera as
+``reseau calibrate`` does with its defaults, and compares the errors of its parameters with their sigmas.
+``--keep FOLDER`` keeps the pictures of the calibrations for the next run.
 
 A target counts as inside where its whole image, and two pixels more, lies in the picture and nothing hides
 it. Wrong is a position in error by more than 0.15 px and 5 sigma.
@@ -28,11 +31,12 @@ import cv2
 import numpy as np
 from worlds.boards import OPENCV, picture, poses
 
-from reseau.core.data import Array, Frame, Mask
+from reseau.core.data import Array, Frame, ImagePoints, Mask
 from reseau.core.failure import Failure
 from reseau.io import parse_design
 from reseau.io.images import read_image
 from reseau.measure import ReseauOptions, measure_reseau, measure_testfield
+from reseau.procedures.calibration import calibrate_camera, measurer_of
 
 DESIGNS = {"tf": "testfield.design.json", "sheet": "sheet.design.json"}
 DECLINED = {"defoc3", "mirror"}
@@ -41,6 +45,10 @@ ROUGH = {"jpeg60", "sharpened", "motion3", "motion6", "specular"}
 MARGIN_PX, LEAST_FOUND, WRONG_PX, WRONG_SIGMA = 2.0, 0.95, 0.15, 5.0
 NORMALISED, NORMALISED_ROUGH = (0.85, 1.2), (0.7, 1.25)
 LABELS = {"tn": "near", "td": "near, distorted"}
+
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+VIEWS, CALIBRATED = 12, (0.9, 1.15)
+"""Number of pictures of a calibration, and limits of the normalised errors of all parameters together."""
 
 Measure = Callable[[Frame], Any]
 
@@ -191,6 +199,78 @@ def worlds(design_path: Path, count: int) -> bool:
     return (line("own worlds", parts, rough=False) if parts else False) and good
 
 
+def views(contents: dict[str, Any], seed: int, keep: Path | None) -> Iterator[tuple[Frame, Array]]:
+    """Pictures of the testfield for a calibration, with the images of its targets."""
+    for k, pose in enumerate(poses(VIEWS, seed, 500.0)):
+        name = f"view-{seed:03}-{k:02}.png"
+        kept = keep is not None and (keep / name).is_file()
+        pixels = cv2.imread(str(keep / name), cv2.IMREAD_GRAYSCALE) if keep and kept else None
+        board = np.column_stack([contents["targets"]["x"], contents["targets"]["y"]])
+        xy = OPENCV.image(np.column_stack([board, 0 * board[:, 0]]) @ pose.rotation.T + pose.translation)
+        if pixels is None:
+            pixels = picture(contents, OPENCV, pose, seed=VIEWS * seed + k)[0].astype(np.uint8)
+            if keep is not None:
+                keep.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(keep / name), pixels)
+        yield Frame(np.asarray(pixels), 255.0, name), xy
+
+
+def normalised(measured: dict[str, ImagePoints], truth: dict[str, Array], ids: tuple[str, ...]) -> Array:
+    """Errors (n, 2) of image points of all pictures over their sigmas."""
+    row = {name: k for k, name in enumerate(ids)}
+    parts = []
+    for name, points in measured.items():
+        error = points.xy - truth[name][[row[target] for target in points.names]]
+        parts.append(error / np.sqrt(np.diagonal(points.cov, axis1=1, axis2=2)))
+    return np.concatenate(parts)
+
+
+def calibrations(design_path: Path, seeds: range, keep: Path | None) -> bool:
+    """Calibrate the camera from own views, and print the errors of its parameters over their sigmas."""
+    contents = json.loads(design_path.read_text())
+    design = parse_design(design_path.read_text(), design_path)
+    true = np.array([getattr(OPENCV, name) for name in PARAMETERS])
+    scaled, white, good = [], [], True
+    print(
+        f"calibration {'points':>7} {'error/sigma':>11} {'sigma0':>6}  "
+        + " ".join(f"{p:>6}" for p in PARAMETERS)
+    )
+    for seed in seeds:
+        pictured = list(views(contents, seed, keep))
+        start = time.process_time()
+        done = calibrate_camera([frame for frame, _ in pictured], design, measurer_of(design))
+        seconds = time.process_time() - start
+        if isinstance(done, Failure):
+            print(f"seed {seed:<6} {done.reason} [{done.code}]  MISSED", flush=True)
+            good = False
+            continue
+        camera = done.cameras["camera"]
+        at = [camera.parameters.index(name) for name in PARAMETERS]
+        error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
+        scaled.append(error / np.sqrt(np.diag(cov)))
+        white.append(np.linalg.solve(np.linalg.cholesky(cov), error))
+        points = normalised(done.measured, {frame.name: xy for frame, xy in pictured}, design.ids)
+        print(
+            f"seed {seed:<6} {len(points):>7} {np.sqrt((points**2).mean()):>11.3f} {done.sigma0:>6.3f}  "
+            + " ".join(f"{value:>6.2f}" for value in scaled[-1])
+            + f"  {seconds:.1f} s"
+            + "".join(f"  {name}: {why}" for name, why in done.declined.items()),
+            flush=True,
+        )
+    if not scaled:
+        return False
+    each = np.sqrt((np.array(scaled) ** 2).mean(axis=0))
+    ratio, doubt = float(np.sqrt((np.array(scaled) ** 2).mean())), 1 / np.sqrt(2 * np.size(white))
+    low, high = CALIBRATED
+    good &= low <= ratio <= high
+    print(f"{'error/sigma':34}  " + " ".join(f"{value:>6.2f}" for value in each))
+    print(
+        f"all parameters {ratio:.3f} ± {doubt * ratio:.3f}, free of correlations "
+        f"{np.sqrt((np.array(white) ** 2).mean()):.3f}  {'ok' if good else 'MISSED'}"
+    )
+    return good
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--target", choices=tuple(DESIGNS))
@@ -198,7 +278,11 @@ def main() -> int:
     parser.add_argument("--condition", nargs="+", default=[], help="only these conditions")
     parser.add_argument("--each", action="store_true", help="a row for every picture")
     parser.add_argument("--others", action="store_true", help="pictures of other targets, too")
-    parser.add_argument("--worlds", type=int, default=0, help="sets of own views, drawn at 10 s each")
+    parser.add_argument("--worlds", type=int, default=0, help="sets of own views, drawn at 2 s each")
+    parser.add_argument("--calibrate", action="store_true", help="calibrate from own views, and nothing else")
+    parser.add_argument("--seeds", type=int, default=20, help="number of calibrations")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first calibration")
+    parser.add_argument("--keep", type=Path, help="folder of the pictures of calibrations")
     options = parser.parse_args()
     root = os.environ.get("RESEAU_DATA")
     folder = options.data or (Path(root) / "independent" / "boards" if root else None)
@@ -206,6 +290,9 @@ def main() -> int:
         print("RESEAU_DATA is not set, and --data not given: nothing to measure")
         return 1
     good = True
+    if options.calibrate:
+        seeds = range(options.first, options.first + options.seeds)
+        return 0 if calibrations(folder / DESIGNS["tf"], seeds, options.keep) else 1
     for target in DESIGNS if options.target is None else (options.target,):
         path = folder / DESIGNS[target]
         design = parse_design(path.read_text(), path)

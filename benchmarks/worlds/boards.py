@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 
-from .pixels import Array, edge, form
+from .pixels import Array, form, interpolated
 
 __all__ = ["OPENCV", "Camera", "Pose", "picture", "poses"]
 
@@ -99,17 +100,89 @@ def poses(
     ]
 
 
-def _inside(shape: str, size: float, x: Array, y: Array) -> Array:
+_SHAPES = {"square": 0, "triangle": 1, "cross": 2, "circle": 3}
+
+
+@numba.njit(cache=True)
+def _inside(shape: int, size: float, x: float, y: float) -> float:
     """Signed distance inside an outline, about its centroid."""
-    if shape == "circle":
+    if shape == 3:
         return size / 2 - np.hypot(x, y)
-    if shape == "square":
-        return size / 2 - np.maximum(np.abs(x), np.abs(y))
-    if shape == "cross":
-        arms = [np.maximum(np.abs(p) - size / 2, np.abs(q) - size / 6) for p, q in ((x, y), (y, x))]
-        return np.asarray(-np.minimum(*arms))
-    slanted = np.abs(x) * np.sqrt(3) / 2 + y / 2
-    return np.asarray(size / np.sqrt(12) - np.maximum(slanted, -y))
+    a, b = max(abs(x), abs(y)), min(abs(x), abs(y))
+    if shape == 0:
+        return size / 2 - a
+    if shape == 2:
+        return -max(a - size / 2, b - size / 6)
+    return size / np.sqrt(12) - max(abs(x) * np.sqrt(3) / 2 + y / 2, -y)
+
+
+@numba.njit(cache=True)
+def _nearest(places: Array, x: float) -> int:
+    """Index of the nearest of ascending places."""
+    low, high = 0, len(places) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if x > (places[middle] + places[middle + 1]) / 2:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@numba.njit(cache=True)
+def _share(inside: float, change: float) -> float:
+    """Share of a sample inside an edge, from the signed distance and its change from sample to sample."""
+    return min(1.0, max(0.0, 0.5 + inside / max(change, 1e-9)))
+
+
+@numba.njit(cache=True)
+def _drawn(
+    x: Array, y: Array, columns: Array, rows: Array, table: Array, targets: Array, lines: Array,
+    vertical: Array, horizontal: Array, border: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Shares (h, w) of board and of ink in samples at places of the board.
+
+    Targets (n, 6) are x, y, shape, size, and cosine and sine of the angle; lines their width and extent.
+    """
+    h, w = x.shape
+    board, ink = np.zeros((h, w)), np.zeros((h, w))
+    for i in range(h):
+        up, down = max(i - 1, 0), min(i + 1, h - 1)
+        for j in range(w):
+            left, right = max(j - 1, 0), min(j + 1, w - 1)
+            xu, yu = (x[i, right] - x[i, left]) / (right - left), (y[i, right] - y[i, left]) / (right - left)
+            xv, yv = (x[down, j] - x[up, j]) / (down - up), (y[down, j] - y[up, j]) / (down - up)
+            a, b = x[i, j], y[i, j]
+            across, along = np.hypot(xu, xv), np.hypot(yu, yv)
+            in_x, in_y = border - abs(a), border - abs(b)
+            if not min(in_x, in_y) > -1e3 * border:
+                continue
+            board[i, j] = _share(min(in_x, in_y), across if in_x < in_y else along)
+            if board[i, j] == 0:
+                continue
+            dark = 0.0
+            k = table[_nearest(columns, a), _nearest(rows, b)]
+            if k >= 0:
+                shape, size, cosine, sine = int(targets[k, 2]), targets[k, 3], targets[k, 4], targets[k, 5]
+                dx, dy = a - targets[k, 0], b - targets[k, 1]
+                if max(abs(dx), abs(dy)) < size + across + along:
+                    p, q = cosine * dx + sine * dy, cosine * dy - sine * dx
+                    s = 1e-3 * size
+                    inside = _inside(shape, size, p, q)
+                    by_p = (_inside(shape, size, p + s, q) - _inside(shape, size, p - s, q)) / (2 * s)
+                    by_q = (_inside(shape, size, p, q + s) - _inside(shape, size, p, q - s)) / (2 * s)
+                    by_x, by_y = cosine * by_p - sine * by_q, sine * by_p + cosine * by_q
+                    dark = _share(inside, np.hypot(by_x * xu + by_y * yu, by_x * xv + by_y * yv))
+            for m in range(2):
+                # The width of a line is along x or y, and its ends are along the other.
+                place, other = (a, b) if m == 0 else (b, a)
+                centres = vertical if m == 0 else horizontal
+                beside = lines[0] / 2 - abs(place - centres[_nearest(centres, place)])
+                ends = min(other - lines[2 - m], lines[4 - m] - other)
+                change = across if (beside < ends) == (m == 0) else along
+                dark = max(dark, _share(min(beside, ends), change))
+            ink[i, j] = dark
+    return board, ink
 
 
 def picture(
@@ -138,54 +211,24 @@ def picture(
     table = np.full((len(columns), len(rows)), -1)
     at = [np.argmin(np.abs(place[:, None] - grid), axis=1) for place, grid in ((tx, columns), (ty, rows))]
     table[at[0], at[1]] = np.arange(len(tx))
-    kinds = list(dict.fromkeys(zip(targets["shape"], targets["size"], targets["angle"], strict=True)))
-    kind = np.array(
-        [kinds.index(k) for k in zip(targets["shape"], targets["size"], targets["angle"], strict=True)]
-    )
-    x0, y0, x1, y1 = lines["extent"]
+    shape = [_SHAPES[name] for name in targets["shape"]]
+    angle = np.deg2rad(targets["angle"])
+    kinds = np.column_stack([tx, ty, shape, targets["size"], np.cos(angle), np.sin(angle)])
+    bars = np.array([lines["width"], *lines["extent"]])
     vertical, horizontal = (np.array(lines[name]) for name in ("vertical_x", "horizontal_y"))
-    border = max(x1, y1) + 0.6 * pitch
+    border = max(lines["extent"][2:]) + 0.6 * pitch
     r, t = pose.rotation, pose.translation
     back = np.linalg.inv(np.column_stack([r[:, :2], t]))
 
-    def scene(u: Array, v: Array, spacing: float) -> Array:
+    def place(u: Array, v: Array) -> Array:
         p, q = camera.directions(u, v)
-        a, b, c = (back[k, 0] * p + back[k, 1] * q + back[k, 2] for k in range(3))
-        x, y = a / c, b / c
+        return np.asarray(back @ np.stack([p, q, np.ones_like(p)]))
 
-        def drawn(inside: Array) -> Array:
-            down, across = np.gradient(inside, spacing)
-            return edge(inside / np.maximum(np.hypot(down, across), 1e-9), spacing)
-
-        column, row = (
-            np.searchsorted((grid[1:] + grid[:-1]) / 2, place) for place, grid in ((x, columns), (y, rows))
-        )
-        nearest = table[column, row]
-        # Derivatives of the board's coordinates; the nearest target changes suddenly, its distance may not.
-        (x_down, x_across), (y_down, y_across) = (np.gradient(place, spacing) for place in (x, y))
-        dark = np.zeros(x.shape)
-        for number, (shape, size, angle) in enumerate(kinds):
-            of = (nearest >= 0) & (kind[nearest] == number)
-            if of.any():
-                dx, dy = x[of] - tx[nearest[of]], y[of] - ty[nearest[of]]
-                cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-                dx, dy = cosine * dx + sine * dy, cosine * dy - sine * dx
-                inside = _inside(shape, size, dx, dy)
-                by_x, by_y = (
-                    (_inside(shape, size, dx + h, dy + k) - _inside(shape, size, dx - h, dy - k)) / 2e-3
-                    for h, k in ((1e-3 * cosine, -1e-3 * sine), (1e-3 * sine, 1e-3 * cosine))
-                )
-                change = np.hypot(
-                    by_x * x_across[of] + by_y * y_across[of], by_x * x_down[of] + by_y * y_down[of]
-                )
-                dark[of] = edge(inside / np.maximum(change, 1e-9), spacing)
-        half = lines["width"] / 2
-        for place, centres, other, ends in ((x, vertical, y, (y0, y1)), (y, horizontal, x, (x0, x1))):
-            near = centres[np.searchsorted((centres[1:] + centres[:-1]) / 2, place)]
-            along = np.minimum(other - ends[0], ends[1] - other)
-            dark = np.maximum(dark, drawn(np.minimum(half - np.abs(place - near), along)))
-        board = drawn(border - np.maximum(np.abs(x), np.abs(y)))
-        return np.where(c > 0, 30 + board * (180 - 170 * dark), 30.0)
+    def scene(u: Array, v: Array, spacing: float) -> Array:
+        x, y, z = interpolated(place, u[0], v[:, 0])
+        z[z <= 0] = np.nan  # above the horizon
+        board, ink = _drawn(x / z, y / z, columns, rows, table, kinds, bars, vertical, horizontal, border)
+        return np.asarray(30 + board * (180 - 170 * ink))
 
     light = form(scene, camera.width, camera.height, sigma, oversampling=oversampling)
     light += np.random.default_rng(seed).normal(0, noise, light.shape)

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Scene", "edge", "form", "form_at"]
+__all__ = ["Array", "Scene", "edge", "form", "form_at", "interpolated"]
 
 Array = NDArray[np.float64]
 Scene = Callable[[Array, Array, float], Array]
@@ -22,11 +22,30 @@ Scene = Callable[[Array, Array, float], Array]
 
 _TILE = 96
 _REACH = 6.0
+_NODES = 14
+"""Nodes of an interpolation along an axis of a tile; 1e-9 px for the distortions of lenses."""
 
 
 def edge(inside: Array, spacing: float) -> Array:
     """Share of a sample inside, from the signed distance to an edge (positive inside)."""
     return np.clip(0.5 + inside / spacing, 0.0, 1.0)
+
+
+def interpolated(function: Callable[[Array, Array], Array], x: Array, y: Array) -> Array:
+    """Values (k, h, w) of a smooth function of positions on the grid of columns x (w,) and rows y (h,).
+
+    The function (k, n) is evaluated at Chebyshev's nodes only, and interpolated by polynomials.
+    """
+    node = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    by, at = [], []
+    for place in (x, y):
+        middle, half = (place[0] + place[-1]) / 2, (place[-1] - place[0]) / 2
+        at.append(middle + half * node)
+        values = np.polynomial.chebyshev.chebvander((place - middle) / half, _NODES - 1)
+        by.append(values @ np.linalg.inv(np.polynomial.chebyshev.chebvander(node, _NODES - 1)))
+    u, v = np.meshgrid(*at)
+    known = function(u.ravel(), v.ravel()).reshape(-1, _NODES, _NODES)
+    return np.asarray(by[1] @ known @ by[0].T)
 
 
 def form(
@@ -103,5 +122,12 @@ def form_at(
     if derivatives:
         parts += [-2j * np.pi * fx * light, -2j * np.pi * fy * light]
         parts += [-4 * np.pi**2 * sigma * (fx**2 + fy**2) * light]
-    inner = slice(margin * n, -margin * n, n)
-    return np.stack([scipy.fft.irfft2(part, bright.shape)[inner, inner] for part in parts])
+    inner = slice(margin, -margin)
+    return np.stack([_every(part, n, bright.shape)[inner, inner] for part in parts])
+
+
+def _every(spectrum: Array, n: int, shape: tuple[int, int]) -> Array:
+    """Every n-th row and column of the signal (h, w) with this half of a spectrum."""
+    # The spectrum of every n-th value is the sum of n parts of a spectrum; along x only half of it is given.
+    rows = scipy.fft.ifft(spectrum.reshape(n, shape[0] // n, -1).sum(axis=0) / n, axis=0)
+    return np.asarray(scipy.fft.irfft(rows, shape[1], axis=1)[:, ::n])
