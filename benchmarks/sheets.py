@@ -1,7 +1,8 @@
 """Photographs of sheets of independent formation: what is found, errors and sigmas.
 
-Run from the checkout: ``python benchmarks/sheets.py [--count 3] [--condition C …]``; see
-:mod:`worlds.sheets` for the conditions. A disk counts as inside if its centre is more than 8 px from the
+Run from the checkout: ``python benchmarks/sheets.py [--count 3] [--condition C …] [--large]``; see
+:mod:`worlds.sheets` for the conditions. ``--large`` measures one photograph of 20 megapixels, and prints
+processor time and memory. A disk counts as inside if its centre is more than 8 px from the
 border and nothing in front of the sheet comes nearer than 12 px.
 """
 
@@ -9,10 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import time
 
+import cv2
 import numpy as np
-from worlds.sheets import CONDITIONS, View, views
+from worlds.sheets import CONDITIONS, View, coded, views
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
@@ -41,11 +44,54 @@ def measured(view: View) -> tuple[np.ndarray, np.ndarray, int, int, float] | Fai
     return error, scaled, int((found.ok & inside).sum()), int(inside.sum()), seconds
 
 
+def large() -> None:
+    """Measure a sheet of 13 × 17 disks in a picture of 5184 × 3888 pixels, seen obliquely."""
+    sheet, (h, w) = coded(13, 17), (3888, 5184)
+    (left, bottom), (right, top) = sheet.xy.min(axis=0) - 20, sheet.xy.max(axis=0) + 20
+    corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], np.float32)
+    on_image = np.array([[500, 300], [4700, 500], [4400, 3500], [300, 3300]], np.float32)
+    to_image = cv2.getPerspectiveTransform(corners, on_image).astype(float)
+    back, grey = np.linalg.inv(to_image), np.empty((h, w), np.float32)
+    for top_row in range(0, h, 216):  # 216 rows at a time
+        x, y = np.meshgrid(np.arange(w), np.arange(top_row, top_row + 216))
+        plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ back.T
+        share = np.clip(0.5 + 12 * sheet.inside(*np.moveaxis(plane[..., :2] / plane[..., 2:], 2, 0)), 0, 1)
+        grey[top_row : top_row + 216] = 200 - 150 * share
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    grey += np.random.default_rng(0).standard_normal(grey.shape, np.float32) * 2
+    frame = Frame(np.clip(np.rint(grey), 0, 255).astype(np.uint8), 255.0)
+    truth = np.column_stack([sheet.xy, np.ones(len(sheet.xy))]) @ to_image.T
+    del grey, plane, share
+    design = ReseauDesign.parse(json.dumps(sheet.design()), where="sheet")
+    before = _resident_mb()
+    start = time.process_time()
+    found = measure_reseau(frame, design)
+    seconds = time.process_time() - start
+    if isinstance(found, Failure):
+        print(f"declined: {found.reason}")
+        return
+    error = (found.xy - truth[:, :2] / truth[:, 2:])[found.ok]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{w} x {h} pixels: {found.found} of {len(sheet.xy)} disks, rms {np.sqrt((error**2).mean()):.4f} px, "
+        f"processor time {seconds:.2f} s, memory {before:.0f} MB before, at most {peak:.0f} MB"
+    )
+
+
+def _resident_mb() -> float:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=3)
     parser.add_argument("--condition", nargs="*", default=list(CONDITIONS))
+    parser.add_argument("--large", action="store_true", help="only time and memory for 20 megapixels")
     arguments = parser.parse_args()
+    if arguments.large:
+        large()
+        return
     print(f"{'condition':12} {'measured':>14}  rms     worst px, sigma  wrong  error/sigma  processor time")
     for condition in arguments.condition:
         parts = []

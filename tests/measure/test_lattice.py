@@ -18,7 +18,7 @@ def fitted(bench: FieldBench, station: Station) -> LatticeFit:
     grey = bench.record(station).pixels.astype(np.float32)
     ridges = ridge_points(grey, quiet_noise(grey))
     found = find_lattices(ridges)
-    assert isinstance(found, list), found.reason
+    assert not isinstance(found, Failure), found.reason
     return next(lattices(grey, ridges, found, 2 / 125, blur_of(0.8, bench.response)))
 
 

@@ -41,6 +41,16 @@ def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll:
     assert 0.8 < np.sqrt((error**2).sum() / np.trace(result.cov, axis1=1, axis2=2).sum()) < 1.25
 
 
+def test_a_sheet_found_at_half_the_size_of_a_large_frame_is_measured_at_its_full_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("reseau.measure.reseau.sheet._LARGE_PX", 1000)
+    formed = sheets.form(sheets.Camera(100.0, 30.0))
+    result = measured(formed)
+    assert result.ok.all(), result.why
+    assert np.sqrt(((result.xy - formed.truth) ** 2).mean()) < 0.02
+
+
 def test_disks_outside_the_frame_are_declined_and_the_others_keep_their_numbers() -> None:
     formed = sheets.form(sheets.Camera(20.0, 30.0, (330.0, 0.0)))
     result = measured(formed)

@@ -329,7 +329,7 @@ class Patches:
         weights = self.weights * self.relative_weights * used / scale[:, None] ** 2
         gain = np.nan_to_num(jacobian @ cofactor.astype(jacobian.dtype)) * weights[..., None]
         leverage = (gain * jacobian).sum(axis=2)
-        on_position = np.moveaxis(gain[..., :2], 2, 1)
+        on_position = np.moveaxis(gain[..., :2], 2, 1).copy()  # a view would keep all of `gain`
         return on_position.reshape(len(x), 2, *self.shape[1:]), leverage.reshape(self.shape)
 
     def whiten(self, x: Array, sigma: Array, jitter: float) -> None:

@@ -48,6 +48,13 @@ _CLASS_PX = 4
 """Step of the window sizes."""
 _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its disk: pixels, and widths of the point-spread function."""
+_LARGE_PX, _MANY = 4_000_000, 64
+"""Size of a frame from which disks are searched at half its size first; largest grey value from which grey
+values may be rounded for it."""
+_LEARNT_FROM = 120
+"""Most disks from which mapping and appearance are learnt first."""
+_AT_ONCE_PX = 60_000
+"""Number of pixels of windows matched together; what is formed in them fits into the cache of a processor."""
 _RING = 0.05
 """Share of a pixel from which a ring hides it from the matching; the light of fainter tails is subtracted."""
 _ALIKE_WIDTH = 0.03
@@ -115,8 +122,7 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     """
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
-    disks = find_disks(grey, screened.valid, screened.noise)
-    placed = lay_sheet(grey, disks, design, options.mirrored)
+    placed, disks = _placed(grey, screened, design, options.mirrored)
     if isinstance(placed, Failure):
         return Failure(
             f"design {design.name!r} was not found in the frame: {placed.reason}",
@@ -128,6 +134,29 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
     valid = screened.valid & (clipped == 0)
     return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
+
+
+def _placed(
+    grey: NDArray[np.float32], screened: Screened, design: ReseauDesign, mirrored: bool | None
+) -> tuple[SheetPlacement | Failure, Disks]:
+    """Position of the sheet, and the disks of the frame; a large frame is first tried at half its size."""
+    h, w = grey.shape
+    if h * w > _LARGE_PX:
+        half: Any = cv2.resize(
+            grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA
+        )
+        half = np.rint(half) if float(np.abs(half).max()) > _MANY else half
+        valid = screened.valid[: h // 2 * 2 : 2, : w // 2 * 2 : 2]
+        disks = find_disks(half, valid, screened.noise / 2)
+        placed = lay_sheet(half, disks, design, mirrored)
+        if not isinstance(placed, Failure):
+            # Pixel 0 at half the size covers pixels 0 and 1.
+            disks = Disks(2 * disks.xy + 0.5, 2 * disks.form, disks.t)
+            at, found = design.xy @ placed.frame.T + placed.origin, placed.disk >= 0
+            mapping = through(at[found], disks.xy[placed.disk[found]], (h, w))
+            return replace(placed, mapping=mapping), disks
+    disks = find_disks(grey, screened.valid, screened.noise)
+    return lay_sheet(grey, disks, design, mirrored), disks
 
 
 def _with_all_errors(found: Matches) -> Matches:
@@ -185,6 +214,8 @@ class _Sheet:
     def columns(self) -> dict[str, Any]:
         """Columns of the result."""
         rows = np.flatnonzero(self.found)
+        if len(rows) > _LEARNT_FROM:
+            rows = rows[np.linspace(0, len(rows) - 1, _LEARNT_FROM).astype(np.intp)]
         first = self._match(rows)
         sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
         if sure.sum() >= _ENOUGH_LIKE:
@@ -277,13 +308,16 @@ class _Sheet:
         return plain if self.look.kernel is None else FilteredShape(plain, self.look.kernel)
 
     def _windows(self, outline: Outline) -> Iterator[tuple[Rows, tuple[int, int]]]:
-        """Disks with windows of one size, and half their width and height."""
+        """Disks with windows of one size, not too many, and half their width and height."""
         ground = max(_GROUND_PX, int(np.ceil(_GROUND_WIDTHS * self.look.blur_px)))
         reach = np.abs(outline.xy).max(axis=1)
         sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
         for k, size in enumerate(sizes):
             half = size * _CLASS_PX + ground
-            yield np.flatnonzero(of.ravel() == k), (int(half[0]), int(half[1]))
+            part = np.flatnonzero(of.ravel() == k)
+            some = max(1, int(_AT_ONCE_PX // (2 * half + 1).prod()))
+            for piece in np.array_split(part, -(-len(part) // some)):
+                yield piece, (int(half[0]), int(half[1]))
 
     def _pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns (k, 1, c) and rows (k, r, 1) of the windows of disks, within the frame."""

@@ -8,8 +8,10 @@ numbers. :mod:`reseau.measure.testfield.lattice_fit` adjusts them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
+from heapq import heappop, heappush
+from itertools import chain, islice, product
 from typing import Any
 
 import cv2
@@ -159,13 +161,14 @@ def _darkness(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     return lack
 
 
-def find_lattices(ridges: Ridges) -> list[Lattice] | Failure:
+def find_lattices(ridges: Ridges) -> Iterator[Lattice] | Failure:
     """Find two families of straight lines and number them.
 
     Returns
     -------
-    list of Lattice, or Failure
-        Possible numberings, the likeliest first. A failure if either family has fewer than two lines.
+    iterator of Lattice, or Failure
+        Possible numberings, the likeliest first, computed as they are asked for; at least one. A failure if
+        either family has fewer than two lines.
     """
     lines = _candidates(ridges)
     if len(lines) < 4:
@@ -183,16 +186,30 @@ def find_lattices(ridges: Ridges) -> list[Lattice] | Failure:
             f"{most[0]} and {most[1]} equally spaced straight lines were found; two and two are needed",
             Code.NOT_FOUND,
         )
-    found = []
-    for one, other in product(*numbered):
-        lattice = _lattice(lines, one, other, ridges.darkness.shape)
+    ranked = _ranked(lines, *numbered, ridges.darkness.shape)
+    likeliest = next(ranked, None)
+    if likeliest is None:
+        return Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
+    return chain([likeliest], islice(ranked, _MOST_PAIRS - 1))
+
+
+def _ranked(
+    lines: _Lines, first: list[_Numbering], second: list[_Numbering], shape: tuple[int, ...]
+) -> Iterator[Lattice]:
+    """Lattices of pairs of numberings, in the order of their worth."""
+    # The deviation from a common lattice only lowers the worth: what is less by the numberings alone waits.
+    pairs = sorted(product(first, second), key=lambda pair: -pair[0].worth * pair[1].worth)
+    ready: list[tuple[float, int, Lattice]] = []
+    for k, (one, other) in enumerate(pairs):
+        bound = one.worth * other.worth
+        while ready and -ready[0][0] >= bound:
+            yield heappop(ready)[2]
+        lattice = _lattice(lines, one, other, shape)
         if lattice is not None:
             off = _off_lattice(lattice, lines, one, other)
-            found.append((one.worth * other.worth / (1 + (off / _CONSISTENT) ** 2), lattice))
-    if not found:
-        return Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
-    found.sort(key=lambda each: -each[0])
-    return [lattice for _, lattice in found[:_MOST_PAIRS]]
+            heappush(ready, (-bound / (1 + (off / _CONSISTENT) ** 2), k, lattice))
+    while ready:
+        yield heappop(ready)[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,19 +324,29 @@ def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Arra
     ]
     dark = np.max(across[1:-1], axis=0)
     inside[:, 0] |= ~inside.any(axis=1)  # a median needs at least one value
-    middle = np.nanmedian(np.where(inside, dark, np.nan), axis=1, keepdims=True)
+    middle = _quantile(dark, inside, 0.5)[:, None]
     section = (min(_SECTION, int(0.6 * min(h, w))), 1)
     seen, dark_part = (
         cv2.blur(mask.astype(np.float32), section) for mask in (inside, (dark > 0.5 * middle) & inside)
     )
     # The edge of the board is dark on one side only; a line is darker than both sides.
-    rises = [np.where(inside, dark - beside, np.nan) for beside in (across[0], across[-1])]
-    least = np.min([np.nanquantile(rise, BETWEEN_SIDES, axis=1) for rise in rises], axis=0)
+    rises = [dark - beside for beside in (across[0], across[-1])]
+    least = np.min([_quantile(rise, inside, BETWEEN_SIDES) for rise in rises], axis=0)
     between = least > 0.1 * middle[:, 0]
     # A small part of a section is not sufficient.
     return np.asarray(
         np.where(seen > 0.8, dark_part / np.maximum(seen, 0.1), 0).max(axis=1) * between, dtype=np.float64
     )
+
+
+def _quantile(values: NDArray[np.float32], inside: Mask, share: float) -> Array:
+    """Quantile (n,) of the values inside in each row; at least one is."""
+    ordered = np.sort(np.where(inside, values, np.inf), axis=1)
+    place = share * (inside.sum(axis=1) - 1)
+    low = place.astype(np.intp)
+    rows = np.arange(len(values))
+    below, above = ordered[rows, low], ordered[rows, np.ceil(place).astype(np.intp)]
+    return np.asarray(below + (place - low) * (above - below), dtype=np.float64)
 
 
 def _family(lines: _Lines, among: Mask, preference: Array) -> Rows:

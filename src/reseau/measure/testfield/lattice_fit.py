@@ -8,7 +8,7 @@ normal n, where s is the nearest point of its line.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -120,7 +120,7 @@ def second_order(mapping: PlaneMapping, at: Array) -> tuple[Array, Array, Array]
 
 
 def lattices(
-    grey: NDArray[np.float32], ridges: Ridges, found: list[Lattice], width: float, blur: float
+    grey: NDArray[np.float32], ridges: Ridges, found: Iterable[Lattice], width: float, blur: float
 ) -> Iterator[LatticeFit]:
     """Lattices adjusted to the lines of a frame, the likeliest first.
 
@@ -133,19 +133,14 @@ def lattices(
         Grey values with dark lines.
     ridges : Ridges
         Ridge points of the frame.
-    found : list of Lattice
-        Possible numberings of the lines found, the likeliest first.
+    found : iterable of Lattice
+        Possible numberings of the lines found, the likeliest first; at least one.
     width : float
         Width of the lines, in lattice steps.
     blur : float
         Approximate width (one sigma) of a blurred edge in pixels.
     """
-    likely = [(_parts(ridges, one, 0), _parts(ridges, one, 1)) for one in found]
-    tried = list(zip(found, likely, strict=True))
-    tried += [
-        (found[0], pair) for pair in sorted(product(_PARTS, _PARTS), key=sum) if pair != tuple(likely[0])
-    ]
-    for one, pair in tried:
+    for one, pair in _divided(ridges, found):
         scale = np.array([1 / pair[0], 1 / pair[1], 1.0])
         lattice = Lattice(one.homography * scale, one.across * pair[0], one.along * pair[1])
         fit = fit_lattice(ridges, lattice)
@@ -156,6 +151,19 @@ def lattices(
                 if fit.points < 1.02 * before.points or _moved(before, fit) < _STILL_PX:
                     break
             yield fit
+
+
+def _divided(ridges: Ridges, found: Iterable[Lattice]) -> Iterator[tuple[Lattice, tuple[int, int]]]:
+    """Lattices with the numbers of parts of their steps: the likeliest of each, then all of the first."""
+    first: tuple[Lattice, tuple[int, int]] | None = None
+    for one in found:
+        likely = _parts(ridges, one, 0), _parts(ridges, one, 1)
+        first = first or (one, likely)
+        yield one, likely
+    assert first is not None
+    for pair in sorted(product(_PARTS, _PARTS), key=sum):
+        if pair != first[1]:
+            yield first[0], pair
 
 
 def _moved(before: LatticeFit, after: LatticeFit) -> float:
