@@ -186,7 +186,7 @@ def find_lattices(ridges: Ridges) -> Iterator[Lattice] | Failure:
             f"{most[0]} and {most[1]} equally spaced straight lines were found; two and two are needed",
             Code.NOT_FOUND,
         )
-    ranked = _ranked(lines, *numbered, ridges.darkness.shape)
+    ranked = _ranked(lines, numbered[0], numbered[1], ridges.darkness.shape)
     likeliest = next(ranked, None)
     if likeliest is None:
         return Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
