@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
@@ -23,7 +24,7 @@ from .lattice_fit import LatticeFit, refit, slope_of
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
-from .targets import Light, Scene, match_targets, merged
+from .targets import Light, Scene, match_targets, merged, pixels_of_targets
 from .tone import SHRUNK, ToneCurve, best_curve
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
@@ -35,6 +36,9 @@ _FEW, _AGAIN = 0.05, 4
 _BESIDE_PX = 0.025
 """Distance of targets from their predictions, exceeded by one coordinate in ten, for which another round is
 made: the light of lines and neighbours was formed in wrong places."""
+_RESHAPED_PX, _REACH, _REPEATED = 0.015, 0.6, 1.05
+"""Displacement of an outline by the mapping through all targets from which a target is matched again; reach
+of targets relative to their size; multiple of the residuals that may remain then."""
 _FAR = 4.5
 """Largest deviation of a target from the mapping through all targets, in standard deviations."""
 _WIDE = 0.1
@@ -45,12 +49,15 @@ _SETTLED_PX = 0.1
 """Change of the predictions, in pixels, below which learning is not continued further outwards."""
 _UNMODELLED_PX = 0.03
 """Scatter of positions about a mapping of third degree beyond their own sigmas."""
-_SEEN = 0.75
+_SEEN = 0.6
 """Minimum share of a target on pixels that carry an image and are not saturated."""
 _MOVES, _SAME_SPREAD = 4, 0.03
 """Maximum number of rounds in which motion is estimated; change of the covariance (px²) that ends them."""
 _HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
+_CLEARED, _NEIGHBOURS, _LIKE = 0.9, 6, 0.8
+"""The residuals must fall below this multiple without the pixels that show something else; number of
+neighbours that give the light of the background there; correlation of a window that is like its target."""
 _VEILED, _CONTRAST_SLOPE = 0.04, 0.3
 """Deviation of the contrast of a target from the usual one from which it may change across the target, and
 the standard deviation of this change over half a window."""
@@ -247,6 +254,11 @@ def _curved(curve: ToneCurve) -> Remark:
     return Remark(text, Code.NONLINEAR)
 
 
+def _replaced(found: Matches, keep: Mask, others: Matches) -> Matches:
+    """The matches to keep, and others in the places of the remaining ones."""
+    return merged([np.flatnonzero(keep), np.flatnonzero(~keep)], [found.select(keep), others])
+
+
 class _Measurement:
     """The two rounds of matching, and the tests of every target."""
 
@@ -305,6 +317,7 @@ class _Measurement:
             why, predicted = self._judged(self.scene, wanted, found)
             if good.mean() < 1 - _FEW and (why == "").sum() < 1.05 * good.sum():
                 break
+        found, why, predicted = self._reshaped(wanted, found, why, predicted)
         n = len(self.at)
         ok, reasons = (
             np.zeros(n, dtype=bool),
@@ -326,6 +339,33 @@ class _Measurement:
             "predicted": predicted,
             "deviation": spread(found.xy - predicted[wanted], good),
         } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+
+    def _reshaped(
+        self, wanted: Rows, found: Matches, why: Array, predicted: Array
+    ) -> tuple[Matches, Array, Array]:
+        """Match targets again whose form the mapping through all targets changes; see `_judged`.
+
+        An outline of wrong form displaces the image of a target that is not symmetric.
+        """
+        good = why == ""
+        if good.sum() < _MOST_FIRST:
+            return found, why, predicted
+        scene, at = self.scene, self.at[wanted]
+        mapping = refit(scene.mapping, at[good], found.xy[good], _UNMODELLED_PX)
+        change = (slope_of(mapping, at) - slope_of(scene.mapping, at)) @ scene.frame
+        size = np.array(scene.design.targets.size)[wanted]
+        displaced = np.linalg.norm(change, ord=2, axis=(1, 2)) * _REACH * size > _RESHAPED_PX
+        if not displaced.any():
+            return found, why, predicted
+        self._learn_from(found, good, wanted)
+        among = self.inside & np.isin(self.rows, wanted[displaced])
+        some = np.flatnonzero(np.isin(wanted, self.rows[among]))
+        again = match_targets(self.scene, self.rows, among)
+        better = again.converged & ~(again.noise > _REPEATED * found.noise[some])
+        keep = np.ones(len(found), dtype=bool)
+        keep[some] = ~better
+        found = _replaced(found, keep, again.select(better))
+        return found, *self._judged(self.scene, wanted, found)
 
     def curve(self, full_scale: float) -> ToneCurve | None:
         """The curve between light and grey values, if the size of the targets suggests that there is one."""
@@ -437,32 +477,75 @@ class _Measurement:
         self._place()
 
     def _matched(self) -> Matches:
-        """Match all targets; on an uneven background with a curved one if that is better.
+        """Match all targets, without what hides them; on an uneven background with a curved one if better.
 
         Where light is reflected over a target, or lies over it as a veil, its contrast differs from the usual
         and changes across it.
         """
-        found = match_targets(self.scene, self.rows, self.inside)
+        found = match_targets(self.scene, self.rows, self.inside, searching=False)
+        found, covered = self._uncovered(found)
+        amiss = ~found.converged & ~covered
+        if amiss.any():
+            found = _replaced(found, ~amiss, match_targets(self.scene, self.rows, self._among(amiss)))
         if not found.converged.any():
             return found
-        ordinary = np.median(found.noise[found.converged])
-        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
         usual = np.median(found.contrast[found.converged])
         # The contrast itself has a relative standard deviation of 1/t.
         doubt = 4 / np.maximum(found.t, 1.0)
         veiled = found.converged & (np.abs(found.contrast / usual - 1) > _VEILED + doubt)
-        for some, slope in ((uneasy & ~veiled, None), (veiled, _CONTRAST_SLOPE)):
+        for some, slope in ((self._uneasy(found) & ~veiled, None), (veiled, _CONTRAST_SLOPE)):
+            some &= ~covered
             if not some.any():
                 continue
-            among = self.inside.copy()
-            among[among] = some
+            among = self._among(some)
             curved = match_targets(self.scene, self.rows, among, background=2, contrast_slope=slope)
             better = curved.converged & ~(curved.noise > (0.9 if slope is None else 0.97) * found.noise[some])
             keep = ~some
             keep[some] = ~better
-            parts = [np.flatnonzero(keep), np.flatnonzero(~keep)]
-            found = merged(parts, [found.select(keep), curved.select(better)])
+            found = _replaced(found, keep, curved.select(better))
         return found
+
+    def _among(self, some: Mask) -> Mask:
+        """Which of all targets are some of those inside the frame."""
+        among: Mask = self.inside.copy()
+        among[among] = some
+        return among
+
+    @staticmethod
+    def _uneasy(found: Matches) -> Mask:
+        """Targets with larger residuals than the others, or that did not converge."""
+        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
+        uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
+        return np.asarray(uneasy)
+
+    def _uncovered(self, found: Matches) -> tuple[Matches, Mask]:
+        """Match targets with large residuals without the pixels that show something in front of them.
+
+        Returns
+        -------
+        Matches
+            Those of targets that are seen well enough replaced.
+        ndarray of bool (n,)
+            Targets that are hidden: they are seen in part at most, and their windows do not look like them.
+        """
+        uneasy = self._uneasy(found)
+        easy = np.flatnonzero(~uneasy & (found.t > self.options.least_t))
+        covered = np.zeros(len(found), dtype=bool)
+        if not uneasy.any() or len(easy) < _LEAST_FIRST:
+            return found, covered
+        xy = self.predicted[self.rows[self.inside]]
+        near = KDTree(xy[easy]).query(xy[uneasy], k=_NEIGHBOURS)[1]
+        level = np.median(found.level[easy][near], axis=1)
+        valid, seen = pixels_of_targets(self.scene, self.rows, self._among(uneasy), level)
+        some = np.flatnonzero(uneasy)[seen >= _SEEN]
+        covered[uneasy] = (seen < _SEEN) & ~(found.correlation[uneasy] > _LIKE)
+        found.seen[covered] = seen[covered[uneasy]]
+        among = self._among(np.isin(np.arange(len(found)), some))
+        again = match_targets(replace(self.scene, valid=valid), self.rows, among, searching=False)
+        better = again.converged & (again.seen >= _SEEN) & ~(again.noise > _CLEARED * found.noise[some])
+        keep = np.ones(len(found), dtype=bool)
+        keep[some] = ~better
+        return _replaced(found, keep, again.select(better)), covered
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
         """Reason why each target is rejected, and the positions predicted by the mapping through all."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -25,7 +26,7 @@ from .line_profiles import blur_of, crossings, strip
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
-__all__ = ["Light", "Scene", "match_targets", "merged"]
+__all__ = ["Light", "Scene", "match_targets", "merged", "pixels_of_targets"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,9 @@ def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
 
 _AT_ONCE = 100
 """Number of targets matched together; their images fit into the cache of a processor."""
+_FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
+"""A pixel shows something else if it differs from the predicted image by more than this multiple of the
+noise, this share of the light, and the effect of a shift by this distance."""
 _FLAT, _LEAST_FLAT = 0.2, 500
 """A pixel is flat if the jitter of rows is at most this share of the noise; minimum number of flat pixels."""
 
@@ -164,15 +168,28 @@ def match_targets(
     Matches
         The n measured targets, in their order; residuals have the size of the largest window.
     """
-    if not inside.all():
-        rows, inside = _around(scene, rows, inside)
-    at = scene.lattice(scene.design.xy[rows])
-    formed, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
-    images: Shape = formed
-    if scene.path.any():
-        images, reach = MovedShape(formed, scene.path), reach + np.abs(scene.path) / 2
-    canvas = _Canvas(scene, images, xy, reach, scene.design.large[rows], inside)
-    return merged(*canvas.match(background, searching, contrast_slope))
+    return merged(*_Canvas.of(scene, rows, inside).match(background, searching, contrast_slope))
+
+
+def pixels_of_targets(scene: Scene, rows: Rows, inside: Mask, level: Array) -> tuple[Mask, Array]:
+    """Pixels (h, w) to be used in the windows of targets, and the share (n,) of each target on such pixels.
+
+    Pixels that show something in front of the targets are not used.
+
+    Parameters
+    ----------
+    scene, rows, inside
+        As for :func:`match_targets`.
+    level : ndarray (n,)
+        Grey value of the background at each of the n targets.
+    """
+    canvas = _Canvas.of(scene, rows, inside)
+    differing, seen = canvas.differing(level)
+    foreign = cv2.morphologyEx(differing, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    reach = int(np.ceil(2 * scene.psf_px + np.hypot(*scene.path) / 2))
+    foreign = cv2.dilate(foreign, np.ones((2 * reach + 1,) * 2, np.uint8))
+    valid = np.asarray(scene.valid & ~((foreign > 0) & seen))
+    return valid, canvas.shares(valid)
 
 
 def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
@@ -217,6 +234,52 @@ class _Canvas:
                 mine = np.flatnonzero(of & wanted)
                 for some in np.array_split(mine, -(-len(mine) // _AT_ONCE)) if len(mine) else []:
                     self.parts.append(self._lay(some, half, wanted=True))
+
+    @classmethod
+    def of(cls, scene: Scene, rows: Rows, inside: Mask) -> _Canvas:
+        """The canvas of some targets and of all whose light falls into their windows."""
+        if not inside.all():
+            rows, inside = _around(scene, rows, inside)
+        at = scene.lattice(scene.design.xy[rows])
+        formed, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+        images: Shape = formed
+        if scene.path.any():
+            images, reach = MovedShape(formed, scene.path), reach + np.abs(scene.path) / 2
+        return cls(scene, images, xy, reach, scene.design.large[rows], inside)
+
+    def differing(self, level: Array) -> tuple[NDArray[np.uint8], Mask]:
+        """Pixels (h, w) of windows that differ from the predicted image, and all pixels of windows."""
+        scene, sign = self.scene, -1.0 if self.scene.design.polarity == "dark" else 1.0
+        differ, seen = np.zeros(self.total.shape, np.uint8), np.zeros(self.total.shape, dtype=bool)
+        order = np.sort(np.concatenate([part.rows for part in self.parts]))
+        for part in self.parts:
+            column, row = self._pixels(part)
+            y, x = row[:, :, None], column[:, None, :]
+            light = level[np.searchsorted(order, part.rows), None, None]
+            ink = self.total[y, x]
+            tolerance = _FOREIGN * scene.noise + _SHADE * np.abs(light)
+            tolerance = tolerance + _SHIFT_PX * np.hypot(*np.gradient(ink, axis=(1, 2)))
+            np.maximum.at(differ, (y, x), np.abs(scene.grey[y, x] - light - sign * ink) > tolerance)
+            seen[y, x] = True
+        return differ, seen
+
+    def shares(self, valid: Mask) -> Array:
+        """Share (n,) of each measured target on valid pixels."""
+        found: list[Array] = []
+        for part in self.parts:
+            column, row = self._pixels(part)
+            used = part.own * valid[row[:, :, None], column[:, None, :]]
+            found.append(used.sum(axis=(1, 2)) / part.own.sum(axis=(1, 2)))
+        return np.concatenate(found)[np.argsort(np.concatenate([part.rows for part in self.parts]))]
+
+    def _pixels(self, part: _Part) -> tuple[Rows, Rows]:
+        """Columns (k, c) and rows (k, r) of the windows of targets, in the frame."""
+        (h, w), half, centre = self.total.shape, part.half, np.rint(self.xy[part.rows]).astype(np.intp)
+        column, row = (
+            (centre[:, k, None] + np.arange(-half[k], half[k] + 1)).clip(0, size - 1)
+            for k, size in ((0, w), (1, h))
+        )
+        return column, row
 
     def _lay(self, part: Rows, half: Rows, *, wanted: bool = False) -> _Part:
         """Add the light of some targets to the sum; derivatives are formed for those to be measured."""
@@ -271,12 +334,9 @@ class _Canvas:
         searching: bool,
         contrast_slope: float | None,
     ) -> Matches:
-        scene, (h, w), half = self.scene, self.total.shape, part.half
+        scene, half = self.scene, part.half
         centre = np.rint(self.xy[part.rows]).astype(np.intp)
-        column, row = (
-            (centre[:, k, None] + np.arange(-half[k], half[k] + 1)).clip(0, size - 1)
-            for k, size in ((0, w), (1, h))
-        )
+        column, row = self._pixels(part)
         others = self.total[row[:, :, None], column[:, None, :]] - part.own
         options = MatchOptions(
             half_px=(int(half[0]), int(half[1])),
