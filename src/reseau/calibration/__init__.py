@@ -3,6 +3,7 @@
 from .camera import CameraMapping, ProjectionField, projection_field
 from .compare import FieldDifference, calibration_difference
 from .document import Calibration, Covariance, Quantity
+from .fiducials import FiducialMapping, calibration_of_fiducials, film_axes, scan_coordinates
 from .film import FilmFrameMapping, calibration_of_frame
 from .mapping import CalibratedMapping
 from .oscilloscope import CameraCorrection, Datum, InstrumentCorrection, LocalModel, ObjectPlane
@@ -18,6 +19,7 @@ __all__ = [
     "CorrectedImage",
     "Covariance",
     "Datum",
+    "FiducialMapping",
     "FieldDifference",
     "Fields",
     "FilmFrameMapping",
@@ -28,10 +30,13 @@ __all__ = [
     "Quantity",
     "SensorCorrection",
     "calibration_difference",
+    "calibration_of_fiducials",
     "calibration_of_frame",
+    "film_axes",
     "parse_calibration",
     "projection_field",
     "read_calibration",
+    "scan_coordinates",
     "undistorted_camera",
     "write_corrected",
 ]

@@ -24,6 +24,7 @@ __all__ = [
     "Calibration",
     "CameraModel",
     "Covariance",
+    "FiducialModel",
     "FilmFrameModel",
     "Kind",
     "OscilloscopeModel",
@@ -32,7 +33,7 @@ __all__ = [
     "readable_as",
 ]
 
-Kind = Literal["oscilloscope", "camera", "film_frame", "sensor"]
+Kind = Literal["oscilloscope", "camera", "film_frame", "fiducials", "sensor"]
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
@@ -102,6 +103,19 @@ class FilmFrameModel(TypedDict):
 
 
 @with_config(_STRICT)
+class FiducialModel(TypedDict):
+    """A photograph oriented by fiducial marks; its parameters are those of the transformation."""
+
+    type: Literal["fiducials"]
+    image: str
+    camera: str
+    transform: str
+    px_per_mm: float
+    rotation_deg: int
+    mirrored: bool
+
+
+@with_config(_STRICT)
 class SensorModel(TypedDict):
     """Fields and linearity of a sensor."""
 
@@ -132,6 +146,7 @@ Model = Annotated[
     Annotated[OscilloscopeModel, Tag("oscilloscope")]
     | Annotated[CameraModel, Tag("camera")]
     | Annotated[FilmFrameModel, Tag("film_frame")]
+    | Annotated[FiducialModel, Tag("fiducials")]
     | Annotated[SensorModel, Tag("sensor")],
     Discriminator(
         _tag,

@@ -19,6 +19,7 @@ from ..io.scans import Scan
 from ..optics.resampling import resample
 from .camera import CameraMapping
 from .document import Calibration, CameraModel, Covariance, Quantity
+from .fiducials import FiducialMapping
 from .film import FilmFrameMapping
 from .mapping import BEYOND, CalibratedMapping
 from .oscilloscope import CameraCorrection
@@ -147,12 +148,14 @@ class CorrectedImage:
         return cls(camera, (x, y), (float(focal[0]), float(focal[1])), width, height, False)
 
     @classmethod
-    def of_frame(cls, frame: FilmFrameMapping, scale: float | None = None) -> CorrectedImage:
-        """The raster of a film frame in photo-coordinates.
+    def of_frame(
+        cls, frame: FilmFrameMapping | FiducialMapping, scale: float | None = None
+    ) -> CorrectedImage:
+        """The raster of a film frame, or of a photograph with fiducial marks, in photo-coordinates.
 
         Parameters
         ----------
-        frame : FilmFrameMapping
+        frame : FilmFrameMapping or FiducialMapping
             The orientation of the frame.
         scale : float, optional
             Pixels per millimetre; by default that of the scan.

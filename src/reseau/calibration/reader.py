@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 from ..core.errors import FormatError
-from ..io import FrameOrientation
+from ..io import FiducialOrientation, FrameOrientation
 from ..io.document import read_text
 from .document import Calibration
+from .fiducials import calibration_of_fiducials
 from .film import calibration_of_frame
 
 __all__ = ["parse_calibration", "read_calibration"]
@@ -21,7 +22,7 @@ def read_calibration(path: Path | str) -> Calibration:
     ----------
     path : path
         ``reseau-calibration/1`` of any kind and age, or the orientation of a film frame
-        (``reseau-orientation/1``).
+        (``reseau-orientation/1``) or of a photograph with fiducial marks (``reseau-fiducials/1``).
 
     Returns
     -------
@@ -74,4 +75,6 @@ def parse_calibration(text: str, *, where: object) -> Calibration:
         raise FormatError(f"is not JSON ({error})", where=where) from None
     if isinstance(content, dict) and content.get("schema") == FrameOrientation.SCHEMA:
         return calibration_of_frame(FrameOrientation.parse(text, where=where))
+    if isinstance(content, dict) and content.get("schema") == FiducialOrientation.SCHEMA:
+        return calibration_of_fiducials(FiducialOrientation.parse(text, where=where))
     return Calibration.parse(text, where=where)

@@ -26,6 +26,7 @@ from . import (
     capture_sensor,
     demo,
     design,
+    fiducials,
     measure,
     orient,
     perforations,
@@ -46,6 +47,7 @@ app.command()(demo.demo)
 app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
 measure.app.command()(perforations.perforations)
+measure.app.command()(fiducials.fiducials)
 app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)

@@ -29,6 +29,7 @@ _OF = {
     "camera": "a camera",
     "oscilloscope": "an oscilloscope",
     "film_frame": "a film frame",
+    "fiducials": "a photograph with fiducial marks",
     "sensor": "a sensor",
 }
 
@@ -37,7 +38,10 @@ View = Literal["keep", "all"] | float
 
 def apply(
     calibration: Annotated[
-        Path, typer.Argument(help="Calibration of a camera, an oscilloscope, a film frame or a sensor.")
+        Path,
+        typer.Argument(
+            help="Calibration of a camera, an oscilloscope, a film frame, fiducial marks or a sensor."
+        ),
     ],
     source: Annotated[
         Path, typer.Argument(metavar="IMAGE|POINTS", help="Image, or image coordinates (JSON, CSV).")
@@ -77,7 +81,7 @@ def apply(
 
     Corrected points have covariances that include those of the points and of the calibration. Images are
     resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
-    the frame (film frame). With the calibration of a sensor, the grey values are corrected.
+    the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
     from ..calibration import SensorCorrection, read_calibration
     from ..io import is_points
@@ -156,11 +160,17 @@ def _raster(
     mapping: CalibratedMapping, size: tuple[int, int], view: View, scale: float | None
 ) -> CorrectedImage:
     """Return the raster of the corrected image."""
-    from ..calibration import CameraCorrection, CameraMapping, CorrectedImage, FilmFrameMapping
+    from ..calibration import (
+        CameraCorrection,
+        CameraMapping,
+        CorrectedImage,
+        FiducialMapping,
+        FilmFrameMapping,
+    )
 
     if isinstance(mapping, CameraMapping):
         return CorrectedImage.undistorted(mapping, view, 1.0 if scale is None else scale)
-    if isinstance(mapping, FilmFrameMapping):
+    if isinstance(mapping, FilmFrameMapping | FiducialMapping):
         return CorrectedImage.of_frame(mapping, scale)
     assert isinstance(mapping, CameraCorrection)
     return CorrectedImage.plan(mapping, size, scale)
@@ -248,7 +258,9 @@ def _image(
     from ..calibration import undistorted_camera, write_corrected
     from ..core.provenance import Provenance, canonical_json, sha256_of
 
-    suffix = {"camera": "undistorted", "film_frame": "frame"}.get(stored.kind, "corrected")
+    suffix = {"camera": "undistorted", "film_frame": "frame", "fiducials": "frame"}.get(
+        stored.kind, "corrected"
+    )
     out = out or source.with_name(f"{source.stem}-{suffix}{source.suffix}")
     suffix_of(writable(out), _IMAGES)
     planes = _planes(source, colours=stored.kind != "oscilloscope")

@@ -87,7 +87,7 @@ def _from_file(
 ) -> Camera:
     """Read a camera from a calibration file; `entry` has the principal distance for a film frame."""
     calibration = read_calibration(file)
-    if calibration.kind != "film_frame":
+    if calibration.kind not in ("film_frame", "fiducials"):
         if film and calibration.kind == "camera":
             raise UsageError(
                 f"{file.name} is a calibration of a camera, not of a film frame",

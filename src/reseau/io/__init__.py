@@ -6,6 +6,14 @@ written completely or not at all.
 
 from .design import DesignPoint, Mark, ReseauDesign, Rings
 from .document import Document, Strict, read_text, write_whole
+from .fiducials import (
+    FiducialDesign,
+    FiducialMark,
+    FiducialOrientation,
+    FiducialPoint,
+    MarkPart,
+    MeasuredFiducial,
+)
 from .frame import (
     CORNERS,
     EDGES,
@@ -25,14 +33,20 @@ __all__ = [
     "SHAPES",
     "DesignPoint",
     "Document",
+    "FiducialDesign",
+    "FiducialMark",
+    "FiducialOrientation",
+    "FiducialPoint",
     "FieldLines",
     "FieldTargets",
     "FrameCorners",
     "FrameOrientation",
     "FrameTransform",
     "Mark",
+    "MarkPart",
     "MeasuredCorner",
     "MeasuredEdge",
+    "MeasuredFiducial",
     "MeasuredPoint",
     "ReseauDesign",
     "ReseauMeasurement",

@@ -7,7 +7,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...calibration import Calibration, CameraMapping, FilmFrameMapping, calibration_of_frame
+from ...calibration import (
+    Calibration,
+    CameraMapping,
+    FiducialMapping,
+    FilmFrameMapping,
+    calibration_of_frame,
+)
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...io import FrameOrientation
@@ -119,7 +125,7 @@ def film_camera(camera: Camera, frame: Calibration | FrameOrientation, *, held: 
     """
     calibration = calibration_of_frame(frame) if isinstance(frame, FrameOrientation) else frame
     mapping, model, where = calibration.mapping(), camera.registered, f"camera {camera.id}"
-    if not isinstance(mapping, FilmFrameMapping):
+    if not isinstance(mapping, FilmFrameMapping | FiducialMapping):
         kind = calibration.kind.replace("_", " ")
         raise UsageError(f"is a calibration of a {kind}, not of a film frame", where=where)
     centre = () if model is None else model.of_role("centre")

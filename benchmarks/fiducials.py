@@ -1,0 +1,115 @@
+"""Fiducial marks in photographs that another renderer drew: errors compared with their sigmas.
+
+Run from the checkout: ``python benchmarks/fiducials.py [--count N] [--kind K] [--keep FOLDER]``. The
+photographs of ``benchmarks/worlds/fiducials.py`` share no formation of images with the project. Reported for
+each kind: photographs declined, marks measured, rms of the errors in pixels, errors over their sigmas (1 is
+right), wrong marks (beyond 5 sigma and 0.15 px), and orientations that are wrong without a remark.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from worlds.fiducials import KINDS, photograph, write
+
+from reseau.core.failure import Code, Failure
+from reseau.io import FiducialDesign
+from reseau.io.images import open_scan
+from reseau.measure.fiducials import FiducialOptions, measure_fiducials
+
+WRONG_PX, WRONG_SIGMA = 0.15, 5.0
+
+
+def assessed(image: Path, verbose: bool) -> dict[str, object]:
+    """Errors and sigmas (m, 2) of one photograph, or why it was declined."""
+    name = image.name.split(".")[0]
+    design = FiducialDesign.read(image.with_name(f"{name}.design.json"))
+    truth = json.loads(image.with_name(f"{name}.truth.json").read_text())
+    start = time.process_time()
+    found = measure_fiducials(open_scan(image), design, FiducialOptions())
+    seconds = time.process_time() - start
+    if isinstance(found, Failure):
+        return {"declined": found.reason, "seconds": seconds, "marks": len(truth["ids"])}
+    right = (found.attitude.rotation, found.attitude.mirrored) == (truth["rotation_deg"], truth["mirrored"])
+    ambiguous = any(note.code is Code.AMBIGUOUS for note in found.notes)
+    places = np.array(truth["xy"])
+    if not right:  # which mark is which is another question: compare places
+        nearest = np.hypot(*(found.xy[:, None] - places[None]).transpose(2, 0, 1))
+        nearest = np.where(np.isfinite(nearest), nearest, np.inf).argmin(axis=1)
+        places = places[nearest]
+    error = (found.xy - places)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
+    if verbose:
+        for i, (e, s) in enumerate(zip(error, sigma, strict=True)):
+            print(
+                f"      {found.points.names[i]}: {e.round(3)} sigma {s.round(3)}",
+                found.likeness[found.ok][i].round(2),
+            )
+        print("     ", found.attitude, [str(n) for n in found.notes], [w for w in found.why if w])
+    return {
+        "error": error,
+        "sigma": sigma,
+        "right": right,
+        "ambiguous": ambiguous,
+        "seconds": seconds,
+        "marks": len(truth["ids"]),
+    }
+
+
+def main() -> None:
+    """Measure photographs of every kind and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--count", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--kind", choices=KINDS, action="append")
+    parser.add_argument("--keep", type=Path, help="folder with photographs; missing ones are drawn")
+    parser.add_argument("--verbose", action="store_true")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.keep or Path(scratch)
+        print("kind      photos declined  marks  rms px  err/sigma  wrong  silent turns   s")
+        every: list[dict[str, object]] = []
+        for kind in given.kind or KINDS:
+            done = []
+            for seed in range(given.first, given.first + given.count):
+                name = f"{kind}_{seed}"
+                there = [p for p in folder.glob(f"{name}.*") if p.suffix in (".tif", ".jpg")]
+                image = there[0] if there else write(folder, name, photograph(kind, seed))
+                if given.verbose:
+                    print("   ", image.name)
+                done.append(assessed(image, given.verbose))
+                if "declined" in done[-1]:
+                    print(f"  {image.name}: {done[-1]['declined']}")
+                if not given.keep:
+                    image.unlink()
+            print(line(kind, done))
+            every += done
+        print(line("all", every))
+
+
+def line(name: str, done: list[dict[str, object]]) -> str:
+    """One line of the table."""
+    good = [d for d in done if "error" in d]
+    marks = sum(int(d["marks"]) for d in done)  # type: ignore[call-overload]
+    seconds = float(np.mean([d["seconds"] for d in done]))  # type: ignore[arg-type]
+    if not good:
+        return f"{name:10}{len(done):6}{len(done):9}{'0/' + str(marks):>9}{'':40}{seconds:5.1f}"
+    e, s = (np.concatenate([d[key] for d in good]) for key in ("error", "sigma"))  # type: ignore[misc]
+    wrong = int(((np.abs(e) > WRONG_PX) & (np.abs(e) > WRONG_SIGMA * s)).any(axis=1).sum())
+    silent = sum(not d["right"] and not d["ambiguous"] for d in good)
+    rms, ratio = np.sqrt((e**2).mean()), np.sqrt(((e / s) ** 2).mean())
+    return (
+        f"{name:10}{len(done):6}{len(done) - len(good):9}{f'{len(e)}/{marks}':>9}{rms:8.3f}{ratio:10.2f}"
+        f"{wrong:8}{silent:9}{seconds:9.1f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,788 @@
+"""Fiducial marks of a scanned photograph, and the transformation to the camera's coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjust import Adjustment
+from ...calibration import scan_coordinates
+from ...core.data import Array, ImagePoints, Mask, Rows
+from ...core.display import Display
+from ...core.failure import Code, Failure, Remark
+from ...io import FiducialDesign, FiducialOrientation, FrameTransform, MeasuredCorner, MeasuredFiducial
+from ...io.scans import Scan
+from ...optics import RationalPolynomial
+from ..film import Kind
+from ..fitting import fit_mapping
+from ..points import Reason
+from .forms import margin_of, reach_of
+from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
+from .windows import match_marks, tracked
+
+if TYPE_CHECKING:
+    from ...core.overlay import Layer
+
+__all__ = ["FiducialOptions", "FiducialResult", "measure_fiducials"]
+
+_MODELS = {
+    "similarity": RationalPolynomial.similarity,
+    "affine": RationalPolynomial.affine,
+    "projective": RationalPolynomial.projective,
+    "bilinear": RationalPolynomial.bilinear,
+}
+_MARK_PX, _LONGEST = 24.0, 3000
+"""Size of the smallest mark with its surroundings in the overview, and largest longer side of that."""
+_STATED, _UNKNOWN = 0.03, 0.08
+"""Relative uncertainty of the scale that a file states, and of one step of those that are tried."""
+_NO_TAG = (72.0, 96.0)
+"""Resolutions that programs write which do not know it."""
+_TRIED = 2
+"""Patterns that are examined at full resolution."""
+_MISSING = 2
+"""Most marks that may be missing."""
+_LEAST_T = 6.0
+"""Least contrast of a mark over its standard deviation."""
+_ALIKE = 0.55
+"""Least correlation of a mark with its formed image."""
+_SURE = 0.85
+"""Median of these correlations from which no other pattern is examined."""
+_ALIKE_ALL = 0.7
+"""Least median of these correlations."""
+_MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.5, 0.015
+"""Largest standard deviation of a coordinate; the larger of the two applies."""
+_FILM_MM = 0.005
+"""Irregular deformation of film and scanner between marks, one sigma: the least weight of their distances."""
+_UNLIKE_MM = 0.02
+"""Least rms of the residuals of a contradicted transformation, per 100 mm of the pattern's radius."""
+_AFFINE = 0.006
+"""Largest shear or difference of scales that film and scanners have."""
+_OFF_MM = 0.15
+"""Residual of a mark from which it is not the mark, if the others agree without it."""
+
+
+@dataclass(frozen=True)
+class FiducialOptions:
+    """What is known of a scan.
+
+    Parameters
+    ----------
+    dpi : float, optional
+        Resolution of the scan, if it is missing or wrong in the file.
+    rotation : {0, 90, 180, 270}, optional
+        Rotation of the camera's x-axis in the scan, degrees counter-clockwise.
+    mirrored : bool, optional
+        Whether the scan shows the film from behind.
+    transform : {"similarity", "affine", "projective", "bilinear"}
+        Kind of the transformation to the calibrated coordinates.
+    max_tilt_deg : float
+        Largest rotation of the film besides quarter turns.
+
+    Examples
+    --------
+    >>> FiducialOptions(dpi=1270, mirrored=False).transform
+    'affine'
+    """
+
+    dpi: float | None = None
+    rotation: int | None = None
+    mirrored: bool | None = None
+    transform: Kind = "affine"
+    max_tilt_deg: float = 8.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FiducialResult(Display):
+    """Fiducial marks of one photograph, and its inner orientation.
+
+    Parameters
+    ----------
+    image, sha256 : str
+        The scan.
+    design : FiducialDesign
+        The camera.
+    size : (int, int)
+        Width and height of the scan.
+    attitude : Attitude
+        How the film lies in the scan.
+    px_per_mm : float
+        Scale.
+    xy, cov : ndarray (n, 2), (n, 2, 2)
+        Marks in pixels of the scan; NaN where not measured.
+    ok : ndarray of bool (n,)
+        Which marks were measured.
+    why : tuple of str (n,)
+        Why not.
+    predicted : ndarray (n, 2)
+        Positions by the transformation.
+    likeness, psf_px : ndarray (n,)
+        Correlation with the formed mark, and width of the point-spread function in pixels of the scan.
+    kind : str
+        Of the transformation.
+    fit : Adjustment
+        The transformation from scan coordinates to the calibrated ones.
+    residuals : ndarray (n, 2)
+        Transformed minus calibrated coordinates, mm.
+    notes : tuple of Remark
+        What to know about the result.
+    """
+
+    image: str
+    sha256: str
+    design: FiducialDesign
+    size: tuple[int, int]
+    attitude: Attitude
+    px_per_mm: float
+    xy: Array
+    cov: Array
+    ok: Mask
+    why: tuple[str, ...]
+    predicted: Array
+    likeness: Array
+    psf_px: Array
+    kind: Kind
+    fit: Adjustment
+    residuals: Array
+    notes: tuple[Remark, ...]
+
+    @property
+    def sigma_mm(self) -> tuple[float, float] | None:
+        """Standard deviation of a coordinate in X and Y by the residuals; None without redundancy."""
+        free = 2 * int(self.ok.sum()) - len(self.fit.values)
+        if free <= 0:
+            return None
+        sx, sy = np.sqrt((self.residuals[self.ok] ** 2).sum(axis=0) / (free / 2))
+        return float(sx), float(sy)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance matrix of the transformation's parameters; enlarged where residuals ask for it."""
+        return self.fit.covariance
+
+    def _facts(self) -> list[tuple[str, str]]:
+        sigma = self.sigma_mm
+        return [
+            ("image", self.image),
+            ("measured", f"{int(self.ok.sum())} of {len(self.ok)}"),
+            ("film", str(self.attitude)),
+            (
+                self.kind,
+                "no residuals" if sigma is None else f"residuals {sigma[0]:.2g}, {sigma[1]:.2g} mm",
+            ),
+        ]
+
+    @property
+    def points(self) -> ImagePoints:
+        """The marks that were measured."""
+        names = tuple(name for name, ok in zip(self.design.ids, self.ok, strict=True) if ok)
+        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
+
+    def document(self) -> FiducialOrientation:
+        """The result as a document."""
+        marks = tuple(
+            MeasuredFiducial(
+                id=name,
+                at=MeasuredCorner.from_columns(self.xy[k], self.cov[k]) if self.ok[k] else None,
+                ok=bool(self.ok[k]),
+                why=str(self.why[k]),
+            )
+            for k, name in enumerate(self.design.ids)
+        )
+        spread = [None] * len(self.fit.values) if self.sigma_mm is None else np.sqrt(np.diag(self.covariance))
+        transform = FrameTransform(
+            kind=self.kind,
+            parameters={
+                name: {"value": float(v), "sigma": None if s is None else float(s)}
+                for name, v, s in zip(_MODELS[self.kind]().names, self.fit.values, spread, strict=True)
+            },
+            residuals_mm={
+                name: (float(x), float(y))
+                for name, (x, y), ok in zip(self.design.ids, self.residuals, self.ok, strict=True)
+                if ok
+            },
+            sigma_mm=self.sigma_mm,
+        )
+        return FiducialOrientation(
+            image=self.image,
+            sha256=self.sha256,
+            camera=self.design.name,
+            status="oriented",
+            why="",
+            size=self.size,
+            px_per_mm=self.px_per_mm,
+            rotation_deg=self.attitude.rotation,  # type: ignore[arg-type]
+            mirrored=self.attitude.mirrored,
+            marks=marks,
+            transform=transform,
+            covariance=tuple(tuple(map(float, row)) for row in self.covariance),
+            extent=_extent(self.design),
+            notes=tuple(str(note) for note in self.notes),
+            note_codes=tuple(note.code.value for note in self.notes),
+        )
+
+    def layers(self) -> list[Layer]:
+        """What is drawn over the scan: measured marks, and those that were not measured."""
+        from ...core.overlay import Layer, declined_layers
+
+        ids, rest = self.design.ids, np.flatnonzero(~self.ok)
+        measured = Layer(
+            f"measured, {int(self.ok.sum())}", self.points.xy, self.points.names, self.points.cov
+        )
+        codes = [_code(self.why[i]).value for i in rest]
+        declined = declined_layers(
+            [ids[i] for i in rest], self.predicted[rest], [str(self.why[i]) for i in rest], codes
+        )
+        return [measured, *declined]
+
+    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
+        """Draw what was measured and what was declined, and why, over the scan.
+
+        Parameters
+        ----------
+        pixels : ndarray (h, w) or (h, w, 3)
+            Grey or RGB values of the scan.
+        path : str or Path, optional
+            PNG file to write.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        from ...core.overlay import draw_overlay
+
+        title = f"{self.image}: {int(self.ok.sum())} of {len(self.ok)} fiducial marks, {self.attitude}"
+        return draw_overlay(pixels, self.layers(), title, [str(note) for note in self.notes], path=path)
+
+
+def _code(why: str) -> Code:
+    return why.code if isinstance(why, Reason) else Code.DECLINED
+
+
+def _extent(design: FiducialDesign) -> tuple[float, float, float, float]:
+    if design.extent is not None:
+        return design.extent
+    low, high = design.xy.min(axis=0), design.xy.max(axis=0)
+    room = 0.02 * (high - low)
+    (left, bottom), (right, top) = (low - room).tolist(), (high + room).tolist()
+    return left, bottom, right, top
+
+
+def measure_fiducials(
+    scan: Scan, design: FiducialDesign, options: FiducialOptions | None = None, sha256: str = ""
+) -> FiducialResult | Failure:
+    """Find and measure the fiducial marks of a scanned photograph.
+
+    Parameters
+    ----------
+    scan : Scan
+        The open scan; only an overview and windows around the marks are read.
+    design : FiducialDesign
+        The camera.
+    options : FiducialOptions, optional
+        What is known of the scan.
+    sha256 : str
+        Hash of the file, for the result.
+
+    Returns
+    -------
+    FiducialResult or Failure
+        A failure if the marks are not in the scan, or too few of them.
+
+    Examples
+    --------
+    Four crosses of a camera of 40 mm x 30 mm, scanned at 10 px/mm:
+
+    >>> from reseau.io import FiducialMark, FiducialPoint, MarkPart
+    >>> from reseau.io.scans import scan_of
+    >>> from reseau.optics.formation import Outline, draw
+    >>> cross = FiducialMark(polarity="bright", parts=(MarkPart(shape="cross", size=3.0, line_width=0.3),))
+    >>> camera = {"1": (20, 15), "2": (-20, 15), "3": (-20, -15), "4": (20, -15)}
+    >>> points = tuple(FiducialPoint(id=k, x=x, y=y, mark="cross") for k, (x, y) in camera.items())
+    >>> design = FiducialDesign(name="camera", marks={"cross": cross}, points=points)
+    >>> from reseau.optics.formation import mark_outline
+    >>> places = design.xy * [10, -10] + [235.3, 190.6]
+    >>> crosses = mark_outline("cross", 30.0, 3.0, 0.5)
+    >>> light = draw(Outline(crosses.xy + places[:, None], np.tile(crosses.dxy, (4, 1, 1))), (380, 470), 1.0)
+    >>> grey = 40 + 160 * light + np.random.default_rng(0).normal(0, 2, light.shape)
+    >>> found = measure_fiducials(scan_of(grey.astype(np.uint8)), design)
+    >>> bool(abs(found.xy - places).max() < 0.05), found.notes[0].code
+    (True, <Code.AMBIGUOUS: 'ambiguous'>)
+    """
+    options = options or FiducialOptions()
+    placed, notes = _found(scan, design, options)
+    if isinstance(placed, Failure):
+        return placed
+    best: FiducialResult | None = None
+    failure: Failure | None = None
+    for pattern, reduction in placed[:_TRIED]:
+        result = _measured(scan, design, options, pattern, reduction, sha256)
+        if isinstance(result, Failure):
+            failure = failure or result
+        elif best is None or _quality(result) > _quality(best):
+            best = result
+        if best is not None and np.median(best.likeness[best.ok]) > _SURE:
+            break
+    if best is None:
+        assert failure is not None
+        return failure
+    best = _oriented(best, options)
+    return replace(best, notes=(*best.notes, *notes, *_remarks(best)))
+
+
+def _quality(result: FiducialResult) -> tuple[int, float]:
+    return int(result.ok.sum()), float(np.median(result.likeness[result.ok]))
+
+
+def _scales(
+    scan: Scan, design: FiducialDesign, options: FiducialOptions
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Scales (px/mm) with relative uncertainties: the stated one, and those at which marks fill the scan."""
+    low, high = least_scales(design, (scan.width, scan.height))
+    if options.dpi is not None:
+        return [(options.dpi / 25.4, _STATED)], []
+    steps = int(np.ceil(np.log(high / low) / np.log(1 + 2 * _UNKNOWN)))
+    grid = np.geomspace(high, low, steps + 1)
+    tried = [(float(k), _UNKNOWN + 0.01) for k in (grid[1:] + grid[:-1]) / 2]
+    stated: list[tuple[float, float]] = []
+    if scan.dpi is not None and not any(abs(scan.dpi - no) < 1 for no in _NO_TAG):
+        k = scan.dpi / 25.4
+        if 0.5 * low < k < high:
+            stated = [(k, _STATED)]
+    return stated, tried
+
+
+def _found(
+    scan: Scan, design: FiducialDesign, options: FiducialOptions
+) -> tuple[list[tuple[Pattern, float]] | Failure, tuple[Remark, ...]]:
+    """Patterns in an overview with its reduction, the best first, and remarks on the scale."""
+    stated, tried = _scales(scan, design, options)
+    notes: tuple[Remark, ...] = ()
+    for scales in (stated, tried):
+        found: list[tuple[Pattern, float]] = []
+        for scale, within in scales:
+            found += _at_scale(scan, design, options, scale, within)
+        found.sort(key=lambda each: -each[0].score)
+        found = [each for each in found if _enough(each[0], design)]
+        if found:
+            if stated and scales is tried:
+                k = np.sqrt(abs(np.linalg.det(found[0][0].linear))) * found[0][1]
+                text = f"the file states {scan.dpi:.0f} dpi; the marks show about {25.4 * k:.0f} dpi"
+                notes = (Remark(text, Code.INCONSISTENT),)
+            return found, notes
+    n = len(design.points)
+    hint = "" if options.dpi is None else ", and that the resolution is right"
+    return Failure(
+        f"the pattern of the {n} marks of {design.name!r} is not in the image; check that it is a photograph "
+        f"of this camera with all of its borders{hint}",
+        Code.NOT_FOUND,
+    ), ()
+
+
+def _enough(pattern: Pattern, design: FiducialDesign) -> bool:
+    seen = int((pattern.likeness > 0).sum())
+    return seen >= max(3, len(design.points) - _MISSING)
+
+
+def _at_scale(
+    scan: Scan, design: FiducialDesign, options: FiducialOptions, scale: float, within: float
+) -> list[tuple[Pattern, float]]:
+    """Patterns at one scale: those of the best attitude, and of others as good."""
+    smallest = min(2 * (reach_of(mark) + margin_of(mark)) for mark in design.marks.values())
+    r = max(1.0, smallest * scale / _MARK_PX, max(scan.width, scan.height) / _LONGEST)
+    overview, reduction = scan.overview(int(np.ceil(max(scan.width, scan.height) / r)))
+    grey = np.ascontiguousarray(overview.mean(axis=2))
+    patterns = find_patterns(
+        grey,
+        design,
+        scale / reduction,
+        within,
+        attitudes(options.rotation, options.mirrored),
+        options.max_tilt_deg,
+        scan.full_scale / 255 * 0.6,
+    )
+    if not patterns:
+        return []
+    # Attitudes that use the same candidates are compared after the measurement.
+    distinct: list[Pattern] = []
+    for pattern in patterns:
+        if not any(_same_places(pattern, other) for other in distinct):
+            distinct.append(pattern)
+    return [(pattern, reduction) for pattern in distinct]
+
+
+def _same_places(one: Pattern, other: Pattern) -> bool:
+    a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
+    near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
+    return bool(near.all())
+
+
+def _measured(
+    scan: Scan,
+    design: FiducialDesign,
+    options: FiducialOptions,
+    pattern: Pattern,
+    reduction: float,
+    sha256: str,
+) -> FiducialResult | Failure:
+    """Measure the marks of a pattern at full resolution, and fit the transformation."""
+    n = len(design.points)
+    linear = reduction * pattern.linear
+    shift = (pattern.shift + 0.5) * reduction - 0.5
+    start = (pattern.xy + 0.5) * reduction - 0.5
+    expected = design.xy @ linear.T + shift
+    seen: Mask = np.asarray(np.isfinite(start).all(axis=1))
+    columns = _Columns.empty(n)
+    _look(scan, design, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
+    scale = float(np.sqrt(abs(np.linalg.det(linear))))
+    for _ in range(2):
+        _drop(design, pattern.attitude, scan, scale, columns)
+        if columns.ok.sum() < 3:
+            break
+        fitted = _fitted(
+            design, columns, pattern.attitude, scan, scale, "affine" if columns.ok.sum() > 3 else "similarity"
+        )
+        if isinstance(fitted, Failure):
+            return fitted
+        fit, _ = fitted
+        near = _predicted(design, fit[1], pattern.attitude, scan, scale)
+        linear = _linear_of(design, near, linear)
+        again = np.flatnonzero(~columns.ok)
+        if not len(again):
+            break
+        columns.predicted = near
+        _look(scan, design, linear, near, 0.1 * scale, columns, again)
+    if columns.ok.sum() < max(3, n - _MISSING):
+        ids = design.ids
+        lost = [f"{ids[k]}: {columns.why[k]}" for k in np.flatnonzero(~columns.ok)]
+        return Failure(
+            f"{int(columns.ok.sum())} of {n} fiducial marks of {design.name!r} were found "
+            f"({'; '.join(lost[:3])})",
+            Code.NOT_FOUND,
+            places=expected,
+        )
+    return _result(scan, design, options, pattern.attitude, scale, columns, sha256)
+
+
+@dataclass
+class _Columns:
+    """Results of the marks while they are measured."""
+
+    xy: Array
+    cov: Array
+    ok: Mask
+    why: list[str]
+    likeness: Array
+    psf_px: Array
+    predicted: Array
+
+    @classmethod
+    def empty(cls, n: int) -> _Columns:
+        none = np.full((n, 2), np.nan)
+        return cls(
+            none.copy(),
+            np.full((n, 2, 2), np.nan),
+            np.zeros(n, dtype=bool),
+            [""] * n,
+            np.zeros(n),
+            np.full(n, np.nan),
+            none.copy(),
+        )
+
+
+def _look(
+    scan: Scan,
+    design: FiducialDesign,
+    linear: Array,
+    at: Array,
+    error: float,
+    columns: _Columns,
+    rows: Any,
+) -> None:
+    """Track marks to full resolution, match them, and judge each."""
+    rows = [int(k) for k in rows]
+    started = np.array([tracked(scan, design, k, linear, at[k], error)[0] for k in rows])
+    found = match_marks(scan, design, rows, linear, started)
+    scale = float(np.sqrt(abs(np.linalg.det(linear))))
+    for i, k in enumerate(rows):
+        one, level = found.matches[i], found.reduction[i]
+        sigma = (
+            float(np.sqrt(np.nanmax(np.diag(found.cov[i])))) if np.isfinite(found.cov[i]).all() else np.inf
+        )
+        limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale)
+        why: str = ""
+        moved = float(np.hypot(*(found.xy[i] - at[k])))
+        if one.seen[0] < 0.5:
+            why = Reason("outside the scan", Code.OUTSIDE)
+        elif not one.converged[0] or one.contrast[0] <= 0 or moved > 3 * error + 6 * level + 0.1 * scale:
+            why = Reason("no such mark where the others expect it", Code.NOT_FOUND)
+        elif one.t[0] < _LEAST_T or one.correlation[0] < _ALIKE:
+            why = Reason(f"does not look like its mark (correlation {one.correlation[0]:.2f})", Code.UNLIKE)
+        elif one.rejected[0] > 0.4:
+            why = Reason(f"{one.rejected[0]:.0%} of it is covered or damaged", Code.DISTURBED)
+        elif sigma > limit:
+            why = Reason(f"its standard deviation would be {sigma:.2g} px", Code.UNCERTAIN)
+        columns.ok[k], columns.why[k] = why == "", why
+        columns.xy[k], columns.cov[k] = found.xy[i], found.cov[i]
+        columns.likeness[k], columns.psf_px[k] = one.correlation[0], level * one.psf_px[0]
+        columns.predicted[k] = at[k]
+
+
+def _scan_points(
+    columns: _Columns, keep: Mask, attitude: Attitude, scan: Scan, scale: float, ids: tuple[str, ...]
+) -> ImagePoints:
+    """Marks in scan coordinates; their covariances contain the irregular deformation of film."""
+    size = (scan.width, scan.height)
+    turn = attitude.matrix / scale
+    uv = scan_coordinates(columns.xy[keep], size, scale, attitude.rotation, attitude.mirrored)
+    cov = turn.T @ columns.cov[keep] @ turn + _FILM_MM**2 * np.eye(2)
+    return ImagePoints(tuple(np.array(ids)[keep].tolist()), uv, cov)
+
+
+def _fitted(
+    design: FiducialDesign,
+    columns: _Columns,
+    attitude: Attitude,
+    scan: Scan,
+    scale: float,
+    kind: Kind,
+    keep: Mask | None = None,
+) -> tuple[tuple[Adjustment, RationalPolynomial], Array] | Failure:
+    """Transformation from scan coordinates to the calibrated ones, and its residuals (m, 2)."""
+    keep = columns.ok if keep is None else keep
+    points = _scan_points(columns, keep, attitude, scan, scale, design.ids)
+    target, sigma = design.xy[keep], np.repeat(design.sigma[keep][:, None], 2, axis=1)
+    fit = fit_mapping(_MODELS[kind](), points, target, sigma)
+    if isinstance(fit, Failure):
+        return fit
+    model = _MODELS[kind]().with_values(fit.values)
+    return (fit, model), model(points.xy) - target
+
+
+def _predicted(
+    design: FiducialDesign, model: RationalPolynomial, attitude: Attitude, scan: Scan, scale: float
+) -> Array:
+    """Pixels (n, 2) of all marks of the design."""
+    uv = np.asarray(model.inverse(design.xy))
+    centre = (np.array([scan.width, scan.height]) - 1) / 2
+    return np.asarray(uv @ (scale * attitude.matrix).T + centre)
+
+
+def _linear_of(design: FiducialDesign, pixels: Array, start: Array) -> Array:
+    """Linear mapping (2, 2) from camera coordinates to pixels by all marks; `start` if undetermined."""
+    a, b = design.xy - design.xy.mean(axis=0), pixels - pixels.mean(axis=0)
+    if not np.isfinite(b).all():
+        return start
+    return np.asarray(np.linalg.lstsq(a, b, rcond=None)[0].T)
+
+
+def _drop(design: FiducialDesign, attitude: Attitude, scan: Scan, scale: float, columns: _Columns) -> None:
+    """Reject marks that contradict the others: without them the residuals fall, with them they are large."""
+    while columns.ok.sum() > 3:
+        kind: Kind = "affine" if columns.ok.sum() > 4 else "similarity"
+        whole = _fitted(design, columns, attitude, scan, scale, kind)
+        if isinstance(whole, Failure):
+            return
+        limit = _OFF_MM + (0.0 if kind == "affine" else _AFFINE / 2 * float(np.ptp(design.xy)))
+        if np.abs(whole[1]).max() < limit:
+            return
+        rms = []
+        for k in np.flatnonzero(columns.ok):
+            keep = columns.ok.copy()
+            keep[k] = False
+            fewer: Kind = "affine" if keep.sum() > 3 and kind == "affine" else "similarity"
+            part = _fitted(design, columns, attitude, scan, scale, fewer, keep)
+            rms.append(np.inf if isinstance(part, Failure) else float(np.sqrt((part[1] ** 2).mean())))
+        worst = np.flatnonzero(columns.ok)[int(np.argmin(rms))]
+        columns.ok[worst] = False
+        columns.why[worst] = Reason("contradicts the other marks", Code.DEVIATES)
+
+
+def _result(
+    scan: Scan,
+    design: FiducialDesign,
+    options: FiducialOptions,
+    attitude: Attitude,
+    scale: float,
+    columns: _Columns,
+    sha256: str,
+) -> FiducialResult | Failure:
+    """The transformation of the kind that was asked for, after tests of all marks together."""
+    ok = columns.ok
+    alike = float(np.median(columns.likeness[ok]))
+    if alike < _ALIKE_ALL:
+        return Failure(
+            f"what lies in the pattern of {design.name!r} does not look like its marks (median correlation "
+            f"{alike:.2f}); check the kinds of marks in the design",
+            Code.UNLIKE,
+            places=columns.xy[ok],
+        )
+    kind = options.transform
+    needed = {"similarity": 2, "affine": 3, "projective": 4, "bilinear": 4}[kind]
+    if ok.sum() < needed:
+        return Failure(
+            f"{int(ok.sum())} marks were found, and a transformation of the kind {kind} needs {needed}",
+            Code.TOO_FEW_POINTS,
+            places=columns.xy[ok],
+        )
+    affine = _fitted(design, columns, attitude, scan, scale, "affine")
+    if isinstance(affine, Failure):
+        return affine
+    values = affine[0][1].derivatives(np.zeros((1, 2))).d_xy[0]
+    s = np.linalg.svd(values, compute_uv=False)
+    off = np.abs(affine[1]).max()
+    if s[0] / s[1] - 1 > _AFFINE or off > 2 * _OFF_MM:
+        return Failure(
+            f"the marks found do not form the pattern of {design.name!r}: scales differ by "
+            f"{100 * (s[0] / s[1] - 1):.2f} %, residuals of {1000 * off:.0f} µm",
+            Code.INCONSISTENT,
+            places=columns.xy[ok],
+        )
+    fitted = _fitted(design, columns, attitude, scan, scale, kind)
+    if isinstance(fitted, Failure):
+        return fitted
+    (fit, model), left = fitted
+    residuals = np.full((len(ok), 2), np.nan)
+    residuals[ok] = left
+    columns.xy[~ok], columns.cov[~ok] = np.nan, np.nan
+    return FiducialResult(
+        image=scan.name,
+        sha256=sha256,
+        design=design,
+        size=(scan.width, scan.height),
+        attitude=attitude,
+        px_per_mm=scale,
+        xy=columns.xy,
+        cov=columns.cov,
+        ok=ok,
+        why=tuple(columns.why),
+        predicted=_predicted(design, model, attitude, scan, scale),
+        likeness=columns.likeness,
+        psf_px=columns.psf_px,
+        kind=kind,
+        fit=fit,
+        residuals=residuals,
+        notes=(),
+    )
+
+
+def _oriented(result: FiducialResult, options: FiducialOptions) -> FiducialResult:
+    """Compare the other attitudes in which the same marks fit: the coordinates may tell, or nothing does."""
+    own = _misfit(result, result.attitude, np.arange(len(result.ok)))
+    rivals = []
+    for attitude in attitudes(options.rotation, options.mirrored):
+        if attitude == result.attitude:
+            continue
+        order = _exchanged(result, attitude)
+        if order is not None:
+            rivals.append((_misfit(result, attitude, order), attitude, order))
+    if not rivals:
+        return result
+    every = [(own, result.attitude, np.arange(len(result.ok))), *rivals]
+    best = min(every, key=lambda each: each[0])
+    others = [each for each in every if each[1] != best[1]]
+    radius = float(np.hypot(*(result.design.xy - result.design.xy.mean(axis=0)).T).max())
+    clear = _UNLIKE_MM * radius / 100
+    if all(o[0] > max(3 * best[0], clear) for o in others):
+        return result if best[1] == result.attitude else _renamed(result, best[1], best[2])
+    # Nothing distinguishes them: upright and not mirrored, if that is one of them.
+    alike = [each for each in every if each[0] <= max(3 * best[0], clear)]
+    rank = {attitude: k for k, attitude in enumerate(attitudes(None, None))}
+    taken = min(alike, key=lambda each: rank[each[1]])
+    names = ", ".join(str(each[1]) for each in alike if each[1] != taken[1])
+    text = (
+        f"the marks fit in {len(alike)} orientations: taken as {taken[1]}, but also {names}; "
+        "give --rotation and --mirrored or --not-mirrored"
+    )
+    settled = result if taken[1] == result.attitude else _renamed(result, taken[1], taken[2])
+    return replace(settled, notes=(*settled.notes, Remark(text, Code.AMBIGUOUS)))
+
+
+def _exchanged(result: FiducialResult, attitude: Attitude) -> Rows | None:
+    """For each mark the measured one that it is in another attitude; None if the marks do not fit."""
+    design = result.design
+    change = np.linalg.inv(result.attitude.matrix) @ attitude.matrix
+    middle = design.xy.mean(axis=0)
+    moved = (design.xy - middle) @ change.T
+    away = np.hypot(*(moved[:, None] - (design.xy - middle)[None]).transpose(2, 0, 1))
+    order = away.argmin(axis=1)
+    extent = float(np.ptp(design.xy))
+    if len(set(order.tolist())) < len(order) or away.min(axis=1).max() > 0.01 * extent:
+        return None
+    for k, j in enumerate(order.tolist()):
+        one = formed_mark(design, k, 8.0 / reach_of(design.marks[design.points[k].mark]) * attitude.matrix)
+        other = formed_mark(
+            design, j, 8.0 / reach_of(design.marks[design.points[j].mark]) * result.attitude.matrix
+        )
+        if one.shape != other.shape or np.corrcoef(one.ravel(), other.ravel())[0, 1] < 0.9:
+            return None
+    return np.asarray(order, dtype=np.intp)
+
+
+def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> FiducialResult:
+    """The result with its marks named as in another attitude."""
+    scan_size, design = result.size, result.design
+    ok = result.ok[order]
+    renamed = replace(
+        result,
+        attitude=attitude,
+        xy=result.xy[order],
+        cov=result.cov[order],
+        ok=ok,
+        why=tuple(result.why[i] for i in order),
+        likeness=result.likeness[order],
+        psf_px=result.psf_px[order],
+    )
+    columns = _Columns(
+        renamed.xy, renamed.cov, ok, list(renamed.why), renamed.likeness, renamed.psf_px, renamed.xy
+    )
+    scan = _SizeOnly(*scan_size)
+    fitted = _fitted(design, columns, attitude, scan, result.px_per_mm, result.kind)  # type: ignore[arg-type]
+    if isinstance(fitted, Failure):
+        return result
+    (fit, model), left = fitted
+    residuals = np.full((len(ok), 2), np.nan)
+    residuals[ok] = left
+    predicted = _predicted(design, model, attitude, scan, result.px_per_mm)  # type: ignore[arg-type]
+    return replace(renamed, fit=fit, residuals=residuals, predicted=predicted)
+
+
+@dataclass(frozen=True)
+class _SizeOnly:
+    width: int
+    height: int
+
+
+def _misfit(result: FiducialResult, attitude: Attitude, order: Rows) -> float:
+    """Rms of the residuals (mm) of an affine transformation in another attitude, of a similarity of three."""
+    ok = result.ok[order]
+    uv = scan_coordinates(
+        result.xy[order][ok], result.size, result.px_per_mm, attitude.rotation, attitude.mirrored
+    )
+    target = result.design.xy[ok]
+    if ok.sum() > 3:
+        a = np.column_stack([uv, np.ones(len(uv))])
+        left = a @ np.linalg.lstsq(a, target, rcond=None)[0] - target
+        return float(np.sqrt((left**2).sum() / (2 * len(uv) - 6)))
+    z, w = (v[:, 0] + 1j * v[:, 1] for v in (uv - uv.mean(axis=0), target - target.mean(axis=0)))
+    return float(np.sqrt((np.abs(z * ((z.conj() @ w) / (z.conj() @ z)) - w) ** 2).sum() / 2))
+
+
+def _remarks(result: FiducialResult) -> tuple[Remark, ...]:
+    """Marks that are missing, and residuals that film does not explain."""
+    notes = []
+    lost = [name for name, ok in zip(result.design.ids, result.ok, strict=True) if not ok]
+    if lost:
+        notes.append(Remark(f"not measured: {', '.join(lost)}", Code.NOT_FOUND))
+    sigma = result.sigma_mm
+    if sigma is None:
+        text = f"no redundancy: {int(result.ok.sum())} marks and a transformation of the kind {result.kind}"
+        notes.append(Remark(text, Code.NO_REDUNDANCY))
+    elif max(sigma) > 0.05:
+        text = f"residuals of {1000 * max(sigma):.0f} µm are large for film; check the calibrated coordinates"
+        notes.append(Remark(text, Code.INCONSISTENT))
+    return tuple(notes)

@@ -1,0 +1,262 @@
+"""Least-squares matching of single fiducial marks in windows of a scan, with correlated noise of the film."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ...core.data import Array, Mask
+from ...io import FiducialDesign
+from ...io.scans import Scan
+from ..matching import Matches, MatchOptions, match
+from .forms import contours_of, margin_of, outlined, reach_of
+from .search import BEYOND_MM, formed_mark, turned
+
+__all__ = ["MatchedMarks", "grey_window", "match_marks", "tracked"]
+
+_HALF = 48
+"""Half side of a window in pixels after reduction, to which larger marks are reduced."""
+_WIDTHS = (1.2, 0.6, 2.5)
+"""Widths of the point-spread function with which the matching starts, in pixels; others if one fails."""
+_GOOD = 0.9
+"""Correlation of a match from which other widths need not be tried."""
+_SIZE, _TURN = 0.03, 0.012
+"""Standard deviations of the size (relative) and rotation (rad) of a mark."""
+_SPREAD_MM, _SPREAD = 0.008, 0.15
+"""Standard deviation of the displacement of edges: in mm, and in units of the thinnest line."""
+_AROUND = 5
+"""Pixels around the expected position in which a mark is tracked from level to level."""
+_LAGS = 24
+"""Largest distance of pixels whose errors count as correlated."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedMarks:
+    """Matched marks in pixels of the scan, in columns.
+
+    Parameters
+    ----------
+    xy, cov : ndarray (k, 2), (k, 2, 2)
+        Positions and covariances.
+    matches : list of Matches
+        The match of each mark in its window; one row each.
+    reduction : ndarray (k,)
+        Reduction of each window.
+    """
+
+    xy: Array
+    cov: Array
+    matches: list[Matches]
+    reduction: Array
+
+
+def grey_window(
+    scan: Scan, centre: Array, half: int, reduction: int
+) -> tuple[NDArray[np.float32], Mask, Array]:
+    """Grey values around a place, reduced by averaging.
+
+    Parameters
+    ----------
+    scan : Scan
+        The scan.
+    centre : ndarray (2,)
+        Its centre, pixels of the scan.
+    half : int
+        Half its side, pixels after reduction.
+    reduction : int
+        Pixels of the scan per pixel along either axis.
+
+    Returns
+    -------
+    grey : ndarray (2·half + 1, 2·half + 1)
+        Mean of the channels.
+    inside : ndarray of bool
+        Pixels within the scan.
+    first : ndarray (2,)
+        Place in the scan of the first pixel's centre.
+    """
+    side = (2 * half + 1) * reduction
+    left, top = (int(np.rint(c - (side - 1) / 2)) for c in centre)
+    x0, x1 = np.clip([left, left + side], 0, scan.width)
+    y0, y1 = np.clip([top, top + side], 0, scan.height)
+    whole = np.zeros((side, side), np.float32)
+    there = np.zeros((side, side), np.float32)
+    if x1 > x0 and y1 > y0:
+        part = scan.window(int(y0), int(y1), int(x0), int(x1)).astype(np.float32).mean(axis=2)
+        whole[y0 - top : y1 - top, x0 - left : x1 - left] = part
+        there[y0 - top : y1 - top, x0 - left : x1 - left] = 1.0
+    if reduction > 1:
+        size = (2 * half + 1, 2 * half + 1)
+        whole = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        there = np.asarray(cv2.resize(there, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    first = np.array([left, top]) + (reduction - 1) / 2
+    return whole, there > 0.999, first
+
+
+def tracked(
+    scan: Scan, design: FiducialDesign, k: int, linear: Array, at: Array, error: float
+) -> tuple[Array, float]:
+    """Position of a mark, from the coarsest to the finest level, and its correlation with the formed mark.
+
+    Parameters
+    ----------
+    scan, design, k, linear
+        The scan, the camera, the mark, and the mapping from camera coordinates to pixels of the scan.
+    at : ndarray (2,)
+        Expected position, pixels of the scan.
+    error : float
+        Its error, pixels of the scan.
+    """
+    finest = _reduction(design, k, linear)
+    level = max(finest, int(np.ceil(error / _AROUND)))
+    likeness = 0.0
+    while True:
+        template = formed_mark(design, k, linear / level)
+        half = len(template) // 2 + _AROUND
+        grey, inside, first = grey_window(scan, at, half, level)
+        if inside.mean() < 0.5 or np.ptp(grey) == 0:
+            return at, 0.0
+        r = cv2.matchTemplate(np.where(inside, grey, grey[inside].mean()), template, cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(np.nanargmax(r)), r.shape)
+        likeness = float(r[row, column])
+        at = first + level * (np.array([column, row], dtype=np.float64) + len(template) // 2)
+        if level == finest:
+            return at, likeness
+        level = max(finest, level // 2)
+
+
+def _reduction(design: FiducialDesign, k: int, linear: Array) -> int:
+    """Reduction of the window of a mark for matching."""
+    mark = design.marks[design.points[k].mark]
+    scale = np.sqrt(abs(np.linalg.det(linear)))
+    return max(1, int(np.rint((reach_of(mark) + margin_of(mark)) * scale / _HALF)))
+
+
+def match_marks(
+    scan: Scan, design: FiducialDesign, rows: list[int], linear: Array, at: Array
+) -> MatchedMarks:
+    """Match marks with their formed images.
+
+    Parameters
+    ----------
+    scan : Scan
+        The scan.
+    design : FiducialDesign
+        The camera.
+    rows : list of int
+        Indices of the marks.
+    linear : ndarray (2, 2)
+        From camera coordinates to pixels of the scan.
+    at : ndarray (k, 2)
+        Approximate positions, pixels of the scan.
+    """
+    xy, cov = np.full((len(rows), 2), np.nan), np.full((len(rows), 2, 2), np.nan)
+    found, reduction = [], np.ones(len(rows))
+    for i, k in enumerate(rows):
+        level = _reduction(design, k, linear)
+        matched, first = _matched(scan, design, k, linear / level, at[i], level)
+        xy[i] = first + level * matched.xy[0]
+        cov[i] = level**2 * _correlated(matched)
+        found.append(matched)
+        reduction[i] = level
+    return MatchedMarks(xy, cov, found, reduction)
+
+
+def _matched(
+    scan: Scan, design: FiducialDesign, k: int, linear: Array, at: Array, level: int
+) -> tuple[Matches, Array]:
+    """The best of several matches of one mark, and the place of its window's first pixel."""
+    point = design.points[k]
+    mark = design.marks[point.mark]
+    scale = float(np.sqrt(abs(np.linalg.det(linear))))
+    half = int(np.ceil((reach_of(mark) + margin_of(mark)) * scale)) + 2
+    grey, inside, first = grey_window(scan, at, half, level)
+    thinnest = min(part.line_width or part.width or part.size for part in mark.parts)
+    spread = max(_SPREAD_MM, _SPREAD * thinnest if thinnest < 0.5 else 0.0) * scale
+    shape = outlined(
+        [contours_of(mark, BEYOND_MM)],
+        (linear @ turned(point.turn_deg))[None],
+        0.5,
+        np.array([_SIZE, _TURN, spread]),
+    )
+    noise = max(_quiet(grey, inside), scan.full_scale / 255 * 0.3 / level)
+    start = np.array([[half, half]], dtype=np.float64) + (at - first) / level - half
+    options = MatchOptions(
+        half_px=half,
+        psf_log_sigma=0.5,
+        polarity=mark.polarity,
+        start_px=1.0,
+        influence=True,
+        background=1,
+    )
+    best: Matches | None = None
+    for psf in _WIDTHS:
+        found = match(
+            grey,
+            inside,
+            shape,
+            start,
+            replace(options, psf_px=psf),
+            noise=noise,
+            form_sigma=np.ones(3),
+        )
+        if best is None or _better(found, best):
+            best = found
+        if best.converged[0] and best.correlation[0] > _GOOD:
+            break
+    assert best is not None
+    return best, first
+
+
+def _better(one: Matches, other: Matches) -> bool:
+    """Whether a match is better than another: it converged, and leaves less."""
+    if one.converged[0] != other.converged[0]:
+        return bool(one.converged[0])
+    return bool(one.noise[0] * (1 + one.rejected[0]) < 0.999 * other.noise[0] * (1 + other.rejected[0]))
+
+
+def _quiet(grey: NDArray[np.float32], inside: Mask) -> float:
+    """Standard deviation of independent noise, from second differences."""
+    bend = grey[1:-1, 1:-1] - 0.25 * (grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:])
+    used = bend[inside[1:-1, 1:-1]]
+    return float(1.4826 * np.median(np.abs(used)) / np.sqrt(1.25)) if used.size else 0.0
+
+
+def _correlated(found: Matches) -> Array:
+    """Covariance (2, 2) of a position with the variances and correlations that the residuals show.
+
+    With the influence L of each pixel, the local standard deviation s and the autocorrelation ρ of the
+    residuals, the covariance is Σ Σ (L s)(p) ρ(p - q) (L s)(q). :mod:`reseau.measure.matching.correlation`
+    needs many marks. Here a window has thousands of pixels beside its mark.
+    """
+    cov = np.asarray(found.cov[0])
+    residuals = found.residuals[0]
+    used = np.isfinite(residuals)
+    if not found.converged[0] or used.sum() < 100 or not np.isfinite(cov).all():
+        return cov
+    v = np.where(used, residuals, 0.0)
+    weight = gaussian_filter(used.astype(np.float64), 4.0)
+    local = np.sqrt(gaussian_filter(v * v, 4.0) / np.maximum(weight, 1e-3))
+    local = np.maximum(local, 0.3 * float(np.sqrt((v * v).sum() / used.sum())))
+    unit = v / local
+    size = [2 * n for n in v.shape]
+    power = np.abs(np.fft.rfft2(unit, size)) ** 2
+    pairs = np.abs(np.fft.rfft2(used.astype(np.float64), size)) ** 2
+    auto = np.fft.irfft2(power, size) / np.maximum(np.fft.irfft2(pairs, size), 1.0)
+    auto /= auto[0, 0]
+    lag = np.hypot(*np.meshgrid(*(np.minimum(np.arange(n), n - np.arange(n)) for n in size), indexing="ij"))
+    auto = np.where(lag <= _LAGS, auto * np.cos(np.pi / 2 * np.minimum(lag / _LAGS, 1.0)) ** 2, 0.0)
+    kernel = np.fft.rfft2(auto)
+    gain = np.where(used, found.influence[0] * local, 0.0)
+    spread = np.fft.irfft2(np.fft.rfft2(gain, size) * kernel.real, size)[:, : v.shape[0], : v.shape[1]]
+    uneven = np.einsum("irc,jrc->ij", gain, spread)
+    uneven = (uneven + uneven.T) / 2
+    # What the prior knowledge of size and spread leaves is in the covariance of independent errors.
+    even = np.einsum("irc,jrc->ij", found.influence[0], found.influence[0]) * float(found.noise[0]) ** 2
+    value, vector = np.linalg.eigh(cov + uneven - even)
+    least = np.linalg.eigvalsh(cov)[0]
+    return np.asarray((vector * np.maximum(value, least)) @ vector.T)

@@ -1,0 +1,77 @@
+"""`reseau measure fiducials`: from a scan to its orientation, and to a picture in millimetres."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.io.images import read_image, write_image
+from ..measure.photographs import UNEVEN, camera, photograph
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A scan and its camera."""
+    folder = tmp_path_factory.mktemp("photo")
+    write_image(folder / "photo.tif", photograph(UNEVEN, rotation=90)[0])
+    camera(UNEVEN).write(folder / "camera.json")
+    return folder / "photo.tif", folder / "camera.json"
+
+
+def test_a_scan_is_oriented_and_resampled_to_millimetres(files, tmp_path: Path, reseau: Run) -> None:
+    photo, design = files
+    status, out, _ = reseau(
+        "measure",
+        "fiducials",
+        photo,
+        "-d",
+        design,
+        "-o",
+        tmp_path / "photo.json",
+        "--overlay",
+        tmp_path / "o.png",
+    )
+    assert status == 0
+    assert "4 of 4 fiducial marks, rotated by 90°" in out
+    assert (tmp_path / "o.png").exists()
+    status, out, _ = reseau(
+        "apply", tmp_path / "photo.json", photo, "--scale", 8, "-o", tmp_path / "frame.tif", "--json"
+    )
+    assert status == 0
+    left, top = json.loads(out)["first_pixel"]
+    frame = read_image(tmp_path / "frame.tif").pixels.astype(float)
+    for x, y in UNEVEN.values():
+        column, row = int(np.rint((x - left) * 8)), int(np.rint((top - y) * 8))
+        assert frame[row, column] > 120  # the dot of the mark
+        assert frame[row + 3, column + 3] < 80  # beside it
+
+
+def test_a_foreign_picture_is_declined_in_one_line(files, tmp_path: Path, reseau: Run) -> None:
+    rng = np.random.default_rng(0)
+    write_image(tmp_path / "other.png", rng.integers(0, 255, (400, 400)).astype(np.uint8))
+    status, _, err = reseau("measure", "fiducials", tmp_path / "other.png", "-d", files[1])
+    assert status == 1
+    assert len(err.splitlines()) == 1
+    assert "test camera" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"unit": "m"}, "unit"),
+        ({"points": []}, "points"),
+        ({"marks": {}}, "marks"),
+    ],
+)
+def test_a_damaged_design_is_named(files, tmp_path: Path, reseau: Run, change, message: str) -> None:
+    content = json.loads(files[1].read_text()) | change
+    (tmp_path / "bad.json").write_text(json.dumps(content))
+    status, _, err = reseau("measure", "fiducials", files[0], "-d", tmp_path / "bad.json")
+    assert status == 2
+    assert message in err

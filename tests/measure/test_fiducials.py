@@ -1,0 +1,108 @@
+"""Fiducial marks: forms, orientation of the film, missing marks, foreign pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reseau.calibration import read_calibration
+from reseau.core.data import ImagePoints
+from reseau.core.failure import Code, Failure
+from reseau.io import FiducialDesign, FiducialMark, FiducialOrientation, MarkPart
+from reseau.io.scans import scan_of
+from reseau.measure.fiducials import FiducialOptions, FiducialResult, measure_fiducials
+from reseau.measure.fiducials.forms import contours_of
+
+from .photographs import PLACES, UNEVEN, camera, photograph
+
+
+def measured(image, design: FiducialDesign, **options) -> FiducialResult:
+    found = measure_fiducials(scan_of(image, "photo.tif"), design, FiducialOptions(**options))
+    assert not isinstance(found, Failure), found
+    return found
+
+
+def area(contours) -> float:
+    return sum(
+        0.5 * float(np.sum(c[:, 0] * np.roll(c[:, 1], -1) - c[:, 1] * np.roll(c[:, 0], -1))) for c in contours
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ((MarkPart(shape="disk", size=2.0),), np.pi),
+        ((MarkPart(shape="ring", size=2.0, line_width=0.5),), np.pi * 0.75),
+        ((MarkPart(shape="cross", size=2.0, line_width=0.2),), 0.76),
+        ((MarkPart(shape="cross", size=2.0, line_width=0.2, gap=1.0),), 0.4),
+        ((MarkPart(shape="arc", size=2.0, line_width=0.5, from_deg=0, to_deg=90),), np.pi * 0.75 / 4),
+        ((MarkPart(shape="wedge", size=2.0, width=1.0),), 1.0),
+        ((MarkPart(shape="square", size=1.0), MarkPart(shape="square", size=1.0, at=(0.5, 0.5))), 1.75),
+        (
+            (MarkPart(shape="cross", size=2.0, line_width=0.2), MarkPart(shape="disk", size=1.0)),
+            0.4 + np.pi / 4,
+        ),
+    ],
+)
+def test_a_mark_covers_the_area_of_the_union_of_its_parts(parts, expected) -> None:
+    # The arms end inside the disk on a chord of its circle: 0.004 mm² are less than the eye sees.
+    assert area(contours_of(FiducialMark(polarity="dark", parts=parts), 5.0)) == pytest.approx(
+        expected, abs=5e-3
+    )
+
+
+def test_marks_are_measured_within_their_sigmas() -> None:
+    image, places = photograph(UNEVEN)
+    found = measured(image, camera(UNEVEN))
+    error = found.xy - places
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.abs(error).max() < 0.05  # px
+    assert np.abs(error / sigma).max() < 4.0
+
+
+@pytest.mark.parametrize(("rotation", "mirrored"), [(90, False), (180, True), (270, False), (0, True)])
+def test_uneven_marks_tell_how_the_film_lies(rotation: int, mirrored: bool) -> None:
+    image, places = photograph(UNEVEN, rotation, mirrored)
+    found = measured(image, camera(UNEVEN))
+    assert (found.attitude.rotation, found.attitude.mirrored) == (rotation, mirrored)
+    assert Code.AMBIGUOUS not in [note.code for note in found.notes]
+    assert np.abs(found.xy - places).max() < 0.05  # px
+
+
+def test_symmetric_marks_are_said_to_fit_in_several_orientations() -> None:
+    image, places = photograph(rotation=180)
+    found = measured(image, camera())
+    assert found.attitude.rotation == 0
+    assert [note.code for note in found.notes] == [Code.AMBIGUOUS]
+    told = measured(image, camera(), rotation=180, mirrored=False)
+    assert told.notes == ()
+    assert np.abs(told.xy - places).max() < 0.05  # px
+
+
+def test_a_missing_mark_is_said_and_predicted() -> None:
+    image, places = photograph(UNEVEN, without=("2",))
+    found = measured(image, camera(UNEVEN), transform="similarity")
+    assert found.ok.tolist() == [True, False, True, True]
+    assert Code.NOT_FOUND in [note.code for note in found.notes]
+    assert np.abs(found.predicted[1] - places[1]).max() < 1.5  # px, by a similarity of uneven film
+
+
+def test_a_foreign_picture_is_declined() -> None:
+    image, _ = photograph(without=tuple(PLACES))
+    found = measure_fiducials(scan_of(image), camera())
+    assert isinstance(found, Failure)
+    assert found.code in (Code.NOT_FOUND, Code.UNLIKE, Code.INCONSISTENT)
+
+
+def test_the_orientation_maps_marks_to_their_calibrated_coordinates(tmp_path) -> None:
+    image, places = photograph(UNEVEN, rotation=90)
+    design = camera(UNEVEN)
+    found = measured(image, design)
+    path = tmp_path / "photo.json"
+    found.document().write(path)
+    assert FiducialOrientation.read(path) == found.document()
+    mapping = read_calibration(path).mapping()
+    mm = mapping.apply(ImagePoints.with_sigma(design.ids, places, 0.0))
+    assert np.abs(mm.xy - design.xy).max() < 0.01  # mm
+    assert np.abs(mapping.to_pixels(mm.xy) - places).max() < 1e-6
+    assert 0 < mm.sigma.max() < 0.02
