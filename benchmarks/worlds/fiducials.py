@@ -7,8 +7,8 @@ The film is a function of position (mm): a picture of fields, roads and texture 
 its dark border, and marks given by distances to lines and circles. It is sampled six times per pixel around
 the marks, blurred by a Gaussian, a disk, a Gaussian with a wide halo, or motion, and turned into grey values
 by a gamma; grain is correlated and depends on the density. Film shrinks unevenly and is turned, shifted,
-mirrored; scratches and dust lie on it; the scan may be a JPEG. What the design states of the marks (sizes, line widths)
-differs from what is drawn by some percent, as a drawing differs from a camera.
+mirrored; scratches and dust lie on it; the scan may be a JPEG. What the design states of the marks differs
+from what is drawn by some percent, as a drawing differs from a camera.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.io.images import read_image, write_image
+
 from ..measure.photographs import UNEVEN, camera, photograph
 
 Run = Callable[..., tuple[int, str, str]]
