@@ -137,11 +137,11 @@ class FiducialResult(Display):
     >>> places = {"1": (100, 0), "2": (-100, 0), "3": (0, 100)}
     >>> points = tuple(FiducialPoint(id=k, x=x, y=y, mark="dot") for k, (x, y) in places.items())
     >>> design = FiducialDesign(name="camera", marks={"dot": dot}, points=points)
-    >>> uv, none = design.xy, np.zeros((3, 2))
+    >>> uv, none, one = design.xy, np.zeros((3, 2)), np.ones(3)
     >>> fit = fit_mapping(RationalPolynomial.similarity(), ImagePoints.with_sigma("123", uv, 0.01), uv)
     >>> found = FiducialResult(
     ...     "7.tif", "", design, (2300, 2300), Attitude(0, False), 10.0, 1149.5 + uv * [10, -10],
-    ...     np.tile(0.01 * np.eye(2), (3, 1, 1)), np.ones(3, bool), ("", "", ""), none, np.ones(3), np.ones(3),
+    ...     np.tile(0.01 * np.eye(2), (3, 1, 1)), one > 0, ("", "", ""), none, one, one,
     ...     "similarity", fit, none, ())
     >>> found.document().marks[0].at.x, found.sigma_mm
     (2149.5, (0.0, 0.0))
