@@ -91,6 +91,9 @@ class MatchOptions:
         :func:`reseau.measure.matching.grey_variance`. By default all grey values have the same variance.
     influence : bool
         Whether the influence of every pixel is wanted; see :func:`reseau.measure.matching.with_alike_errors`.
+    within_px : float
+        Pixels farther from the approximate position are not used, for instance where the arms of a crossing
+        end within the window.
 
     Examples
     --------
@@ -114,6 +117,7 @@ class MatchOptions:
     settled: float = 0.01
     variance: tuple[float, float] | None = None
     influence: bool = False
+    within_px: float = np.inf
 
     @property
     def half(self) -> tuple[int, int]:
@@ -158,7 +162,10 @@ class Patches:
         self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
         if others is not None:
             self.grey -= others.reshape(k, -1)
-        usable = inside & valid[r, c]
+        x_off, y_off = columns - xy[:, :1], rows - xy[:, 1:]
+        near = np.hypot(x_off[:, None, :], y_off[:, :, None]) <= options.within_px
+        self.near = near.reshape(k, -1)
+        usable = inside & valid[r, c] & near
         if claims is not None:
             owner, mine = claims
             usable &= (owner[r, c] < 0) | (owner[r, c] == mine[:, None, None])
@@ -642,7 +649,7 @@ def _columns(
     """Columns of results from the adjusted batch; `share` as formed last, if it is known."""
     x, k = found.estimates, len(patch.xy)
     flat = (patch.share(x) if share is None else share).reshape(k, -1)
-    sight = np.maximum(flat.sum(axis=1), 1e-12)
+    sight = np.maximum((flat * patch.near).sum(axis=1), 1e-12)
     plane = patch.background(x).reshape(k, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         cov = found.covariance

@@ -64,6 +64,11 @@ _FLANK = 2.5
 """Margin around an intruder in widths of the point-spread function."""
 _MOVED = 0.5
 """Shift against the start, in widths of the mark's image, from which a mark is matched again."""
+_ARM_ENDS, _END = 0.85, 1.55
+"""Share of the contrast of an arm below which it has ended; margin from there in sigmas of blur: 2.6 from the
+end itself, where half a per cent of the contrast is missing."""
+_NEAR_PX = 2.5
+"""Length of an arm beside a crossing that is used while it is not known where arms end."""
 _TURN, _TURNED = 0.12, 0.02
 """Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
@@ -151,6 +156,8 @@ class MarkMeasurement:
             else np.broadcast_to(np.eye(2), (len(source), 2, 2))
         )
 
+        # Until it is known whether arms end, crossings are matched by what lies near them.
+        self.reach_px = self.extent_px / 2 + _NEAR_PX if mark.shape == "line-grid" else np.inf
         self.covered = np.zeros(len(source), dtype=bool)
 
     def result(self) -> tuple[Rows, Matches, Verdict]:
@@ -165,7 +172,7 @@ class MarkMeasurement:
         first = self._match(
             shown, placed.at[shown], self._first_options(), 0.3 if self.free_size else 0.1, _TURN
         )
-        self._learn(first, placed.at[shown])
+        self._learn(shown, first, placed.at[shown])
         at = np.flatnonzero(self._near_frame(self.predicted))
         found = self._match_all(at, np.where(has[at, None], placed.at[at], self.predicted[at]))
         self._refit(at, found)
@@ -275,6 +282,7 @@ class MarkMeasurement:
             polarity=self.design.polarity,
             response=PixelResponse(self.options.fill),
             start_px=2.0,
+            within_px=self.reach_px,
         )
 
     def _outline(self, at: Rows, options: MatchOptions) -> Outline:
@@ -347,7 +355,7 @@ class MarkMeasurement:
             self.field = SmoothField.fit(self.source[at[sure]], found.xy[sure], sigma=relative)
             self.predicted = self.field(self.source)
 
-    def _learn(self, first: Matches, start: Array) -> None:
+    def _learn(self, at: Rows, first: Matches, start: Array) -> None:
         """Learn width, contrast, size and noise of the marks of this frame."""
         sure = _sure(first)
         # The strongest marks show this best; the others are added for their contrasts only.
@@ -370,6 +378,32 @@ class MarkMeasurement:
         self.extent_px *= 1 + growth
         if self.design.mark.shape in _ARMS:
             self.arms = self._turned(first.form[sure, 1:])
+        if self.design.mark.shape == "line-grid":
+            self.reach_px = self._reach(at[strongest], first.select(strongest))
+
+    def _reach(self, at: Rows, first: Matches) -> float:
+        """Distance from a crossing up to which its arms are continuous wires; infinite in a whole grid.
+
+        Crossings of short bars end within the window, and where they end is no property of the crossing.
+        """
+        half = max(self._first_options().half)
+        distance = np.arange(0.0, 1.5 * half, 0.5)
+        along = self._axes(at)
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        along = np.swapaxes(np.concatenate([along, -along], axis=2), 1, 2)
+        points = first.xy[:, None, None] + along[:, :, None] * distance[:, None]
+        x, y = np.moveaxis(points.astype(np.float32), -1, 0).reshape(2, len(at), -1)
+        grey = self.screened.grey.astype(np.float32)
+        seen = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(
+            points.shape[:3]
+        )
+        profile = np.median(seen - first.level[:, None, None], axis=(0, 1))
+        profile = profile / np.median(profile[distance <= 0.7 * half])
+        ended = np.flatnonzero(profile < _ARM_ENDS)
+        if not len(ended):
+            return np.inf
+        blur = float(np.hypot(np.median(first.psf_px), 12**-0.5))  # of the optics and of a pixel
+        return float(distance[ended[0]] - _END * blur)
 
     def _turned(self, turns: Array) -> Array:
         """The arms, turned by what the marks of the frame have in common."""
