@@ -10,7 +10,7 @@ from reseau.adjust import Adjustment, Elimination, Options, adjust, check_jacobi
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
-from reseau.measure.fitting import fit_mapping, mapping_problem, reduce_mapping
+from reseau.measure.fitting import fit_mapping, mapping_problem, reduce_mapping, residual_field
 from reseau.optics import Chain, PlaneMapping, RationalPolynomial, Similarity
 
 X, Y = np.meshgrid(np.linspace(-60.0, 60.0, 9), np.linspace(-50.0, 50.0, 8))
@@ -227,3 +227,20 @@ def test_a_projectivity_needs_no_approximate_values():
     np.testing.assert_allclose(fit.values, model.values, rtol=1e-9)
     near = fit_mapping(model, points(XY), model(XY)).required()
     np.testing.assert_allclose(near.values, model.values, rtol=1e-9)
+
+
+def test_one_uncertain_point_needs_no_local_model():
+    sigma = np.full(XY.shape, 0.01)
+    sigma[-1] = 0.2
+    needs, hills = [], []
+    for seed in range(8):
+        error = np.random.default_rng(seed).normal(0, 1, XY.shape) * sigma
+        error[-1] = 0.6, -0.6
+        model = RationalPolynomial.affine()
+        seen = ImagePoints.with_sigma(NAMES, XY + error, sigma)
+        fitted = model.with_values(fit_mapping(model, seen, XY).values)
+        field = residual_field(fitted, seen, XY, fitted(seen.xy) - XY, trials=99)
+        needs.append(field.need)
+        hills.append(np.abs(field(XY[-1:])).max())
+    assert np.median(needs) > 0.1
+    assert np.median(hills) < 0.1

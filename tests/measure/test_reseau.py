@@ -11,10 +11,11 @@ import pytest
 from reseau.core.data import Frame
 from reseau.core.errors import ImageError, UsageError
 from reseau.core.failure import Code, Failure
-from reseau.io import DesignPoint, ReseauMeasurement
+from reseau.designs import regular_reseau
+from reseau.io import DesignPoint, Mark, ReseauMeasurement
 from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
 from reseau.optics import sigma_of_snr
-from reseau.optics.formation import Outline, draw, mark_outline
+from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives, draw, mark_outline
 
 from .formed import MARKS, Scene, bounds, form, measure_many, measured
 
@@ -302,3 +303,28 @@ def test_the_same_frame_gives_the_same_bytes():
     formed = form(SMALL, rng(14))
     first, second = (measured(SMALL, formed).measurement().to_json() for _ in range(2))
     assert first == second
+
+
+@pytest.mark.parametrize("arm_px", [7.5, 8.5, 10.0])
+def test_crossings_of_short_arms_reach_the_bound_of_what_lies_near_them(arm_px):
+    """Two bars of 2.2 px; the bound of their crossing within 5 px, whatever the ends of the arms are."""
+    generator, angle, sigma, psf = rng(5), np.deg2rad(12.0), 1.0, 0.9
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    design = regular_reseau(7, 6, 28.0, Mark(shape="line-grid", line_width=2.2))
+    centres = (design.xy * [1, -1]) @ turn.T + [140, 125] + generator.uniform(-0.5, 0.5, design.xy.shape)
+    bars = mark_outline("cross", 2 * arm_px, 2.2, 0.5).affine(turn)
+    outlines = Outline(centres[:, None] + bars.xy, np.broadcast_to(bars.dxy, (len(centres), *bars.dxy.shape)))
+    grey = 180 * (1 - 0.6 * draw(outlines, (250, 280), psf))
+    found = measure_reseau(Frame(grey + generator.normal(0, sigma, grey.shape), 255.0), design)
+    assert found.ok.all()
+
+    window = np.arange(-7.0, 8.0)[None]
+    _, slopes = coverage_derivatives(
+        Outline(bars.xy[None] + 0.0, bars.dxy[None]), window, window, np.full(1, psf), PixelResponse()
+    )
+    near = np.hypot(*np.meshgrid(window[0], window[0])) < 5
+    cov = np.linalg.inv(np.einsum("ihw,jhw->ij", *(2 * [np.where(near, 180 * 0.6 * slopes[0, :2], 0)])))
+    error = found.xy - centres
+    assert np.sqrt((error**2).mean()) < 1.1 * sigma * np.sqrt(np.trace(cov) / 2)
+    variance = np.diagonal(found.cov, axis1=1, axis2=2)
+    assert np.sqrt((error**2 / variance).mean()) == pytest.approx(1, abs=0.25)

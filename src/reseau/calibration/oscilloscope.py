@@ -395,6 +395,7 @@ class LocalModel:
         return {
             "at": self.field.source.tolist(),
             "left": self.field.target.tolist(),
+            "sigma": self.field.sigma.tolist(),
             "degree": self.field.degree,
             "needed": list(self.needed),
         }
@@ -403,8 +404,9 @@ class LocalModel:
     def from_dict(cls, content: dict[str, Any]) -> Self:
         """Read back; KeyError, TypeError or ValueError where something is missing or wrong."""
         at, left = (np.array(content[key], dtype=np.float64).reshape(-1, 2) for key in ("at", "left"))
+        sigma = np.array(content.get("sigma", np.ones(len(at))), dtype=np.float64)  # earlier files have none
         x, y = (bool(axis) for axis in content["needed"])
-        return cls(SmoothField.fit(at, left, degree=int(content["degree"])), (x, y))
+        return cls(SmoothField.fit(at, left, sigma=sigma, degree=int(content["degree"])), (x, y))
 
 
 @dataclass(frozen=True, eq=False)

@@ -224,7 +224,10 @@ def residual_field(
     white = np.random.default_rng(0).standard_normal((trials, 2 * len(points)))
     white -= (white @ taken) @ taken.T
     null = np.einsum("nij,tnj->tni", root, white.reshape(trials, len(points), 2))
-    return SmoothField.fit(target, residuals, degree=0, null=null)
+    variance = np.diagonal(cov, axis1=1, axis2=2)
+    # Without weights a single uncertain point would raise a hill of its own.
+    relative = np.sqrt((variance / np.median(variance, axis=0)).mean(axis=1))
+    return SmoothField.fit(target, residuals, sigma=relative, degree=0, null=null)
 
 
 def is_mirrored(first: Array, second: Array) -> bool:
