@@ -120,9 +120,7 @@ def of_hard(folder: Path, only: list[str]) -> Iterator[Answer]:
         if only and not any(part in name for part in only):
             continue
         width, height = (float(side) for side in item["fmt"].split("x"))
-        results = orient_scan(
-            open_scan(folder / item["image"]), FrameOptions(formats=((width, height),))
-        )
+        results = orient_scan(open_scan(folder / item["image"]), FrameOptions(formats=((width, height),)))
         for i, q in enumerate(item["q"] or [[[np.nan] * 2] * 4]):
             truth = np.array(q, dtype=float)
             result = _nearest(results, truth)
@@ -154,7 +152,9 @@ def table(title: str, answers: list[Answer], each: bool) -> tuple[int, int]:
             figures = f"{np.sqrt(np.mean(error**2)):8.3f} {np.sqrt(np.mean(ratio**2)):6.2f}"
             figures += f" {np.abs(error).max():10.2f} {np.abs(ratio).max():6.1f}"
         counts = len(asked), sum(a.answered for a in asked), sum(a.right for a in group)
-        print(f"{name:22} {counts[0]:5} {counts[1]:8} {counts[2]:5} {sum(_false(a) for a in group):5} {figures}")
+        print(
+            f"{name:22} {counts[0]:5} {counts[1]:8} {counts[2]:5} {sum(_false(a) for a in group):5} {figures}"
+        )
     for a in answers:
         if each or not a.right:
             error = ""

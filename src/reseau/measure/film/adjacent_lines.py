@@ -30,12 +30,13 @@ from ...adjust import BatchOptions, adjust_batch
 from ...core.data import Array, Rows
 from .border import Band, binned
 from .edges import NEIGHBOURS, EdgeProfiles
+from .steps import StepForm
 
 __all__ = [
     "FEW_DISPLACED",
     "AdjacentEdge",
     "SharpSteps",
-    "common_widths",
+    "common_forms",
     "displaced_by_lines",
     "edge_beside_line",
     "ends_with_line",
@@ -84,14 +85,19 @@ class SharpSteps(NamedTuple):
         return bool(np.median(found.blur[0][found.good]) < self.log_width - _TOO_SHARP)
 
 
-def common_widths(profiles: Sequence[EdgeProfiles | None]) -> list[float | None]:
-    """Width of the blurred step for each edge: common to all, unless their sharpness differs."""
-    measured = sorted(p.width for p in profiles if p is not None and p.good.sum() > 20)
+def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
+    """Form of the blurred step for each edge: common to all, unless their sharpness differs."""
+    measured = sorted(
+        (p.form for p in profiles if p is not None and p.good.sum() > 20), key=lambda f: f.width
+    )
     if not measured:
         return [None] * len(profiles)
-    if _uneven(measured):
-        return [None if p is None else p.width for p in profiles]
-    return [measured[(len(measured) - 1) // 2]] * len(profiles)
+    if _uneven([form.width for form in measured]):
+        return [None if p is None else p.form for p in profiles]
+    width = measured[(len(measured) - 1) // 2].width
+    weight = sum(form.weight for form in measured)
+    lobes = sum(form.weight * form.lobes for form in measured) / max(weight, 1e-12)
+    return [None if p is None else StepForm(width, lobes, p.form.half, weight) for p in profiles]
 
 
 def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:

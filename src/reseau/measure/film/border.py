@@ -75,6 +75,11 @@ class Band:
         along = self.stop - self.start
         return np.asarray(np.array([-along[1], along[0]]) / np.hypot(*along))
 
+    @property
+    def half(self) -> float:
+        """Half the side of a pixel across the edge."""
+        return float(0.5 * np.abs(self.normal).max())
+
 
 def read_band(
     scan: Scan, start: Array, stop: Array, outward: float, inward: float, *, wide: bool = False

@@ -14,7 +14,7 @@ from .adjacent_lines import (
     FEW_DISPLACED,
     AdjacentEdge,
     SharpSteps,
-    common_widths,
+    common_forms,
     displaced_by_lines,
     edge_beside_line,
     sharp_steps,
@@ -22,6 +22,7 @@ from .adjacent_lines import (
 from .border import Band, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
+from .steps import StepForm
 
 __all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
 
@@ -49,10 +50,13 @@ _LEAST_AGREE = 0.45
 _BOWED, _OUTWARDS = 0.6, 0.1
 """Inward bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
 outwards of a straight edge."""
+_PARTS, _MOST_PARTS = 20, 0.5
+"""Parts of an edge, and share of them in which undisturbed profiles determine it."""
 _CHORD = 30
 """Number of points that represent an edge known by its two ends."""
-_OTHER_WIDTH = 0.12
-"""Largest difference in the logarithm of the width at which an edge is measured with the common width."""
+_OTHER_WIDTH, _OTHER_LOBES = 0.12, 0.01
+"""Differences in the logarithm of the width, and in the lobes, from which an edge is measured again with the
+form of step common to the edges."""
 _MOST_GOOD = 0.85
 """Share of profiles that show a step, from which wide profiles are not needed."""
 
@@ -97,11 +101,11 @@ def measure_channel(
     far: list[bool] = [False] * 4
     films: list[Film | None] = [None] * 4
 
-    def measured(k: int, wide: bool, width: float | None = None) -> EdgeProfiles | None:
+    def measured(k: int, wide: bool, form: StepForm | None = None) -> EdgeProfiles | None:
         pixels, reached = band(k, wide, far[k]), WIDER_SEARCH * reach if far[k] else reach
         if pixels is None:
             return None
-        return measure_profiles(pixels, channel, polarity, reached, gap, width, films[k])
+        return measure_profiles(pixels, channel, polarity, reached, gap, form, films[k])
 
     profiles = [measured(k, False) for k in range(4)]
     for k, found in enumerate(profiles):
@@ -117,13 +121,14 @@ def measure_channel(
         if film is not None:
             films[k] = film
             profiles[k] = measured(k, False)
-    for k, (found, width) in enumerate(zip(profiles, common_widths(profiles), strict=True)):
-        if found is None or width is None:
+    for k, (found, form) in enumerate(zip(profiles, common_forms(profiles), strict=True)):
+        if found is None or form is None:
             continue
-        if abs(np.log(found.width / width)) > _OTHER_WIDTH:
-            found = measured(k, False, width) or found
+        other = abs(np.log(found.width / form.width)) > _OTHER_WIDTH
+        if other or abs(found.form.lobes - form.lobes) > _OTHER_LOBES:
+            found = measured(k, False, form) or found
         if found.good.mean() < _MOST_GOOD:
-            more = measured(k, True, width)
+            more = measured(k, True, form)
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
@@ -170,8 +175,11 @@ def _edge(
     # An error of the film's tone moves a step by √(2π) of its width, times the error relative to the
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
-    hidden = False
-    if part > (FEW_DISPLACED if found.good.mean() > _CLEAR else FEW_DISPLACED / 5):
+    hidden, untouched = False, place[drawn[found.good] == 0]
+    if _spans(untouched):
+        # The edge is seen by itself beside the structures that displace some of its steps.
+        agree &= drawn[found.good] == 0
+    elif part > (FEW_DISPLACED if found.good.mean() > _CLEAR else FEW_DISPLACED / 5):
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
         # A line displaces an edge by at most its width; a larger bow is real.
         own = bow if abs(bow) > 2 * found.width else 0.0
@@ -188,6 +196,13 @@ def _edge(
     ends = _ENDS * sharp.width * part if hidden else 0.0
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
+
+
+def _spans(place: Array) -> bool:
+    """Whether profiles at these positions are seen along most of an edge, and towards both of its ends."""
+    seen = np.bincount(((place + 1) / 2 * _PARTS).astype(np.intp).clip(0, _PARTS - 1), minlength=_PARTS) > 2
+    third = _PARTS // 3
+    return bool(seen.mean() > _MOST_PARTS and seen[:third].any() and seen[-third:].any())
 
 
 def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:

@@ -12,26 +12,27 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.special import ndtr
 
 from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
 from .border import Band, Border, Film, binned, border_of, row_median
+from .steps import SHIFTS, StepForm, profile_function
 
-__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged", "profile_function"]
+__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged"]
 
-_SHIFTS, _CHANGE = (3.0,), 0.15
-"""Distance behind the edge, in widths of the step, at which the tone of the picture may change, and the
-standard deviation of this change relative to the contrast."""
-_INWARD, _OUTWARD = 2.0, 4.0
-"""Extent of the profile behind the edge and beyond it, in widths of the step."""
+_CHANGE = 0.15
+"""Standard deviation of a change of the picture's tone behind the edge, relative to the contrast."""
+_INWARD, _OUTWARD, _LEAST_INWARD = 2.0, 4.0, 2.0
+"""Extent of the profile behind the edge and beyond it, in widths of the step; the former at least in pixels:
+behind a sharp step the tone of the picture is seen only by pixels that lie behind it entirely."""
 NEIGHBOURS = 15
 """Number of neighbouring profiles used to estimate how well a step is determined."""
 _BATCH = BatchOptions(max_iterations=7, share=0.05, reweight=weight_function("danish", 2.5))
+_SECTIONS = BatchOptions(max_iterations=25, share=0.05, reweight=weight_function("danish", 2.5))
 _FREE, _TIGHTENED = 0.5, (0.02, 0.12)
 """Standard deviation of the logarithm of the width: at first; then for a width from other edges, and for one
 from this edge."""
@@ -40,6 +41,11 @@ _MODEL = 0.012, 0.05
 latter, so that model errors are not treated as blunders."""
 _ROUNDS, _LEAST_PIXELS = 2, 100
 """Rounds of estimating the common width, and minimum number of pixels of a section used for it."""
+_FORMING, _HELD, _WIDTHS = 3, 0.005, (0.4, 6.0)
+"""Iterations of the common form of sharp steps; standard deviation of a logarithm of a width that is held; and
+the range of widths."""
+_LOBES, _MOST_LOBES = 0.1, (-0.12, 0.2)
+"""Prior standard deviation of the lobes of a step, and their range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +62,8 @@ class EdgeProfiles:
         Which profiles show a step that can be located.
     blur : ndarray (2, n)
         Logarithm of the width estimated from a profile and its neighbours alone, and its variance.
-    width : float
-        Width of the blurred step, one sigma, pixels.
+    form : StepForm
+        Form of the blurred step.
     border : Border
         Film and picture along the edge.
     """
@@ -67,8 +73,13 @@ class EdgeProfiles:
     sigma: Array
     good: Mask
     blur: Array
-    width: float
+    form: StepForm
     border: Border
+
+    @property
+    def width(self) -> float:
+        """Width of the blurred step, one sigma, pixels."""
+        return self.form.width
 
 
 def measure_profiles(
@@ -77,7 +88,7 @@ def measure_profiles(
     polarity: int,
     reach: float,
     gap: float,
-    width: float | None = None,
+    known: StepForm | None = None,
     film: Film | None = None,
 ) -> EdgeProfiles | None:
     """Locate the step from film to picture in every profile of one channel.
@@ -94,9 +105,8 @@ def measure_profiles(
         Largest distance of the edge from the approximate one, pixels.
     gap : float
         Width of film in pixels beyond which structures do not belong to the frame.
-    width : float, optional
-        Width of the blurred step, one sigma, if known from other edges; then the model allows a second step
-        of the picture near the edge.
+    known : StepForm, optional
+        Form of the blurred step, if known from other edges.
     film : Film, optional
         Film as shown by other edges, if little film lies beyond this one.
 
@@ -109,12 +119,12 @@ def measure_profiles(
     border = border_of(grey, band, reach, gap, film)
     if border is None:
         return None
-    found = _fitted(grey, band, border, width)
+    found = _fitted(grey, band, border, known)
     if found is None:
         return None
-    steps, width = found
+    steps, form = found
     place, sigma = np.where(steps.good, steps.place, 0.0), np.where(steps.good, steps.sigma, 1.0)
-    return EdgeProfiles(band.place, place, sigma, steps.good, steps.blur, width, border)
+    return EdgeProfiles(band.place, place, sigma, steps.good, steps.blur, form, border)
 
 
 def _width(grey: Array, band: Band, border: Border) -> float:
@@ -151,32 +161,41 @@ class _Steps(NamedTuple):
     blur: Array
 
 
-def _fitted(grey: Array, band: Band, border: Border, known: float | None) -> tuple[_Steps, float] | None:
-    """Step of every profile, and the common width."""
-    width = _width(grey, band, border) if known is None else known
+def _fitted(
+    grey: Array, band: Band, border: Border, known: StepForm | None
+) -> tuple[_Steps, StepForm] | None:
+    """Step of every profile, and their common form."""
+    form = StepForm(_width(grey, band, border), 0.0, band.half) if known is None else known
     # The border is accurate to one or two pixels, not enough for a narrow window.
-    first = _one_by_one(grey, band, border, border.start, width, _FREE)
+    first = _one_by_one(grey, band, border, border.start, form, _FREE)
     if first is None:
         return None
     start = _smoothed(first.place, first.good)
     if known is None:
-        width = float(np.clip(np.exp(np.median(first.blur[0][first.good])), 0.4, 6.0))
+        width = float(np.clip(np.exp(np.median(first.blur[0][first.good])), *_WIDTHS))
+        form = form._replace(width=width)
         for _ in range(_ROUNDS):
-            width = _common_width(grey, band, border, start, first, width)
-    steps = _one_by_one(grey, band, border, start, width, _TIGHTENED[known is None])
-    return None if steps is None else (steps, width)
+            form = _common_form(grey, band, border, start, first, form)
+    steps = _one_by_one(grey, band, border, start, form, _TIGHTENED[known is None])
+    return None if steps is None else (steps, form)
+
+
+def _inward(width: float) -> float:
+    """Extent of the profile behind a step of known position, pixels."""
+    return max(_INWARD * width, _LEAST_INWARD)
 
 
 def _one_by_one(
-    grey: Array, band: Band, border: Border, start: Array, width: float, spread: float
+    grey: Array, band: Band, border: Border, start: Array, form: StepForm, spread: float
 ) -> _Steps | None:
     """Step of every profile, with a prior on the common width; None if none is good."""
-    near = _OUTWARD * width + 2.0 if spread == _FREE else _INWARD * width
+    width = form.width
+    near = _OUTWARD * width + 2.0 if spread == _FREE else _inward(width)
     window = _window(grey, band, border, start, width, near)
     if window is None:
         return None
     value, distance, weight = window
-    fit = _fit(value, distance, weight, border, start, border.level, width, spread)
+    fit = _fit(value, distance, weight, border, start, border.level, form, spread)
     p, step = fit.estimates[:, 0], fit.estimates[:, 3]
     scale = np.maximum(np.nan_to_num(fit.sigma0, nan=1.0), 1.0)
     own, own_step = (np.sqrt(fit.cofactor[:, k, k]) * scale for k in (0, 3))
@@ -200,23 +219,24 @@ def _fit(
     border: Border,
     start: Array,
     level: Array,
-    width: float,
+    form: StepForm,
     spread: float,
+    options: BatchOptions = _BATCH,
 ) -> BatchAdjustment:
     """Adjust profiles, starting from expected parameters."""
-    one = np.ones(len(value))
-    none = [0 * one] * len(_SHIFTS)
+    one, width = np.ones(len(value)), form.width
+    none = [0 * one] * len(SHIFTS)
     initial = np.stack([start, level, np.log(width) * one, border.contrast * one, *none], axis=1)
     # Film is known from its surroundings; an immediate change of tone in the picture is an exception.
-    changes = [_CHANGE * border.contrast] * len(_SHIFTS)
+    changes = [_CHANGE * border.contrast] * len(SHIFTS)
     prior = np.array([10 * width, 0.5 * border.noise, spread, 4 * border.contrast, *changes])
     return adjust_batch(
-        profile_function(distance),
+        profile_function(distance, form),
         initial,
         value,
         weights=weight / (border.noise**2 + (_MODEL[spread == _FREE] * border.contrast) ** 2),
         prior=(initial, prior),
-        options=_BATCH,
+        options=options,
     )
 
 
@@ -226,19 +246,21 @@ def _smoothed(place: Array, good: Mask) -> Array:
     return _along(np.interp(index, index[good], place[good]))
 
 
-def _common_width(
-    grey: Array, band: Band, border: Border, start: Array, steps: _Steps, width: float
-) -> float:
-    """Width of the step: median over sections of neighbouring profiles, each fitted as one profile.
+def _common_form(
+    grey: Array, band: Band, border: Border, start: Array, steps: _Steps, form: StepForm
+) -> StepForm:
+    """Form of the step from sections of neighbouring profiles, each fitted as one profile.
 
-    From single noisy profiles it would be too small, as each has unknowns of its own (Neyman and Scott 1948),
-    and with a wrong width all positions are biased to one side.
+    From single noisy profiles the width would be too small, as each has unknowns of its own (Neyman and Scott
+    1948), and with a wrong width all positions are biased to one side. The width is the median of those of
+    the sections; where the pixels are seen in the step, width and lobes are common to all sections, because a
+    section in which the edge lies on the grid in one way cannot tell one from the other.
     """
     contrast = _along(np.where(steps.good, steps.contrast, np.inf))
     lit = steps.good & np.isfinite(contrast) & (contrast > 0)
-    window = _window(grey, band, border, start, width, _INWARD * width)
+    window = _window(grey, band, border, start, form.width, _inward(form.width))
     if window is None:
-        return width
+        return form
     value, distance, weight = window
     part = np.where(lit, contrast, border.contrast)[:, None] / border.contrast
     value, distance = (value - border.level[:, None]) / part, distance - start[:, None]
@@ -250,12 +272,61 @@ def _common_width(
     )
     measured = (weight > 0).sum(axis=1) > _LEAST_PIXELS
     if not measured.any():
-        return width
-    none = np.zeros(int(measured.sum()))
-    fit = _fit(value[measured], distance[measured], weight[measured], border, none, none, width, _FREE)
+        return form
+    value, distance, weight = value[measured], distance[measured], weight[measured]
+    none = np.zeros(len(value))
+    fit = _fit(value, distance, weight, border, none, none, form, _FREE, _SECTIONS)
     found = fit.estimates[fit.converged, 2]
     # If another structure runs along the edge, few sections converge.
-    return float(np.clip(np.exp(np.median(found)), 0.4, 6.0)) if len(found) > 0.5 * sections else width
+    if len(found) <= 0.5 * len(value):
+        return form
+    form = form._replace(width=float(np.clip(np.exp(np.median(found)), *_WIDTHS)))
+    for _ in range(0 if form.gaussian else _FORMING):
+        fit = _fit(value, distance, weight, border, none, none, form, _HELD, _SECTIONS)
+        form = _formed(form, fit, value, distance, weight, border)
+    return form
+
+
+def _formed(
+    form: StepForm,
+    fit: BatchAdjustment,
+    value: Array,
+    distance: Array,
+    weight: Array,
+    border: Border,
+) -> StepForm:
+    """Width and lobes common to sections, a step of Newton's method from the given ones."""
+    rows = np.flatnonzero(fit.converged)
+    if len(rows) < 2:
+        return form
+    x = np.concatenate([fit.estimates[rows], np.full((len(rows), 1), form.lobes)], axis=1)
+    computed, jacobian = profile_function(distance, form)(x, rows)
+    root = np.sqrt(weight[rows] * fit.factors[rows])
+    rest, slope = root * (value[rows] - computed), root[..., None] * jacobian
+    # The prior of the tone of film and of a change behind the edge, as in the adjustment of the sections.
+    own = slope[..., [0, 1, 3, 4]]
+    inner = np.einsum("kni,knj->kij", own, own)
+    strength = (_MODEL[0] * border.contrast) ** 2 + border.noise**2
+    inner += strength * np.diag([0.0, (2 / border.noise) ** 2, 0.0, (_CHANGE * border.contrast) ** -2])
+    inner += 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(4)
+    common = slope[..., [2, 5]]
+    mixed = np.einsum("kni,knj->kij", own, common)
+    solved = np.linalg.solve(inner, mixed)
+    normal = np.einsum("kni,knj->kij", common, common) - np.einsum("kin,kij->knj", mixed, solved)
+    right = np.einsum("kni,kn->ki", common, rest)
+    right -= np.einsum("kij,ki->kj", solved, np.einsum("kni,kn->ki", own, rest))
+    variance = (rest**2).sum(axis=1) / np.maximum((root > 0).sum(axis=1) - 6, 1)
+    # Sections with other structures have larger residuals.
+    sure = variance < 4 * np.median(variance)
+    normal = (normal[sure] / variance[sure, None, None]).sum(axis=0)
+    right = (right[sure] / variance[sure, None]).sum(axis=0)
+    weight = float(normal[1, 1] - normal[0, 1] ** 2 / max(normal[0, 0], 1e-9))
+    normal += np.diag([1 / _FREE**2, 1 / _LOBES**2])
+    right[1] -= form.lobes / _LOBES**2
+    by_width, by_lobes = np.linalg.solve(normal, right)
+    width = float(np.clip(form.width * np.exp(np.clip(by_width, -0.3, 0.3)), *_WIDTHS))
+    lobes = float(np.clip(form.lobes + by_lobes, *_MOST_LOBES))
+    return form._replace(width=width, lobes=lobes, weight=max(weight, 0.0))
 
 
 def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
@@ -312,22 +383,3 @@ def _window(
         np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used.astype(np.float64))
     )
     return np.where(weight > 0, value, 0.0), place, weight
-
-
-def profile_function(distance: Array) -> Any:
-    """Model of a profile and its derivatives by p, b, log w, A and the c, for :func:`adjust_batch`."""
-    shifts = np.array([0.0, *_SHIFTS])
-
-    def function(x: Array, rows: Rows) -> tuple[Array, Array]:
-        p, b, w, steps = x[:, 0, None], x[:, 1, None], np.exp(x[:, 2, None]), x[:, None, 3:]
-        u = ((distance[rows] - p) / w)[:, :, None] - shifts
-        phi, bell = ndtr(u), np.exp(-0.5 * u * u) / np.sqrt(2 * np.pi)
-        jacobian = np.empty((*u.shape[:2], 3 + len(shifts)))
-        jacobian[..., 0] = -(steps * bell).sum(axis=2) / w
-        jacobian[..., 1] = 1.0
-        # The further steps move with the width; u + shift is their position without it.
-        jacobian[..., 2] = -(steps * bell * (u + shifts)).sum(axis=2)
-        jacobian[..., 3:] = phi
-        return b + (steps * phi).sum(axis=2), jacobian
-
-    return function

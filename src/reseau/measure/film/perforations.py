@@ -21,8 +21,9 @@ from ...core.data import Array
 from ...core.failure import Code, Failure
 from ...io.scans import Scan
 from .border import binned, read_band
-from .edges import measure_profiles, profile_function
+from .edges import measure_profiles
 from .lines import robust_line
+from .steps import profile_function
 
 __all__ = ["PITCH_MM", "FilmPlane", "edge_of", "film_plane"]
 
