@@ -53,7 +53,7 @@ class Answer:
 
     @property
     def answered(self) -> bool:
-        """Whether an asked frame is answered, with three edges instead of four only if its corners are right."""
+        """Whether it is answered; with three edges instead of four only if its corners are right."""
         if self.status == "decline":
             return False
         close = (np.abs(self.error) <= MOST_PX) | (np.abs(self.error) <= MOST_SIGMAS * self.sigma)

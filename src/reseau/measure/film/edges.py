@@ -42,8 +42,8 @@ latter, so that model errors are not treated as blunders."""
 _ROUNDS, _LEAST_PIXELS = 2, 100
 """Rounds of estimating the common width, and minimum number of pixels of a section used for it."""
 _FORMING, _HELD, _WIDTHS = 3, 0.005, (0.4, 6.0)
-"""Iterations of the common form of sharp steps; standard deviation of a logarithm of a width that is held; and
-the range of widths."""
+"""Iterations of the common form of sharp steps; standard deviation of a logarithm of a width that is held;
+and the range of widths."""
 _LOBES, _MOST_LOBES = 0.1, (-0.12, 0.2)
 """Prior standard deviation of the lobes of a step, and their range."""
 
