@@ -320,13 +320,13 @@ def _formed(
     sure = variance < 4 * np.median(variance)
     normal = (normal[sure] / variance[sure, None, None]).sum(axis=0)
     right = (right[sure] / variance[sure, None]).sum(axis=0)
-    weight = float(normal[1, 1] - normal[0, 1] ** 2 / max(normal[0, 0], 1e-9))
+    information = float(normal[1, 1] - normal[0, 1] ** 2 / max(float(normal[0, 0]), 1e-9))
     normal += np.diag([1 / _FREE**2, 1 / _LOBES**2])
     right[1] -= form.lobes / _LOBES**2
     by_width, by_lobes = np.linalg.solve(normal, right)
     width = float(np.clip(form.width * np.exp(np.clip(by_width, -0.3, 0.3)), *_WIDTHS))
     lobes = float(np.clip(form.lobes + by_lobes, *_MOST_LOBES))
-    return form._replace(width=width, lobes=lobes, weight=max(weight, 0.0))
+    return form._replace(width=width, lobes=lobes, weight=max(information, 0.0))
 
 
 def _own_width(found: Array, cofactor: Array, known: float, spread: float, good: Mask) -> Array:
