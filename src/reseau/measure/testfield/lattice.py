@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 
-__all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "ridge_points", "rms"]
+__all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "quantile", "ridge_points", "rms"]
 
 _TURN = np.deg2rad(1.5)
 """Step of the Hough transform in angle; the step in distance is one pixel."""
@@ -33,6 +33,8 @@ _LEAST_SHARE = 0.85
 """Minimum dark share of the length of a line; rows of targets reach three quarters."""
 _BESIDE_PX, BETWEEN_SIDES = 2.5, 0.8
 """Distance from a line at which either side is compared with it, and the quantile that must be brighter."""
+_STEP_PX, _DENSE = 8.0, 0.5
+"""Steps along a line, and number of ridge points per pixel from which it is supported."""
 _SECTION = 90
 """Length in pixels of the sections in which a line is tested; short enough for distorted lines."""
 _OFF_STEP = 0.15
@@ -51,6 +53,8 @@ _OWN = 0.5
 """Minimum share of ridge points of a line that are not those of a stronger one."""
 _PARALLEL = float(np.cos(np.deg2rad(12.0)))
 _FEW_POINTS, _ENOUGH_FOR_LINES = 10, 15000
+_BEYOND_ALL = np.float32(1e30)
+"""Larger than all grey values."""
 _ALIKE = 0.7
 """Share of lines with the same numbers from which two numberings are the same."""
 _MOST_TRIED, _NUMBERINGS, _MOST_PAIRS, _CONSISTENT = 300, 5, 6, 0.04
@@ -234,12 +238,12 @@ def _candidates(ridges: Ridges) -> _Lines:
     """Straight lines that are dark along their length between bright surroundings, the strongest first."""
     votes, reach = _hough(ridges)
     peak = votes == cv2.dilate(votes, np.ones((3, 3), np.uint8))
-    least = max(20.0, 0.12 * min(ridges.darkness.shape))
+    least = max(20.0, 0.05 * min(ridges.darkness.shape))
     turn, distance = np.nonzero(peak & (votes > least))
     strongest = np.argsort(-votes[turn, distance], kind="stable")[:_MOST_PEAKS]
     turn, distance = turn[strongest], distance[strongest]
     angle, rho = turn * _TURN, (distance - reach).astype(np.float64)
-    share = _dark_share(ridges.darkness, angle, rho) if len(turn) else rho
+    share = _dark_share(ridges, angle, rho) if len(turn) else rho
     weight = votes[turn, distance] * share
     order = np.argsort(-weight, kind="stable")
     order = order[share[order] > _LEAST_SHARE]
@@ -308,14 +312,27 @@ def _hough(ridges: Ridges) -> tuple[NDArray[np.float32], int]:
     return votes.reshape(turns, width).astype(np.float32), reach
 
 
-def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Array:
-    """Share of the best sections of straight lines (n,) with at least half of the usual darkness."""
+def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
+    """Share of the best sections of straight lines (n,) with at least half of the usual darkness.
+
+    Only the part of a line with dense ridge points counts: a testfield may be small in the frame.
+    """
+    from .compiled import supported  # takes half a second to import; not every command needs it
+
+    darkness = ridges.darkness
     h, w = darkness.shape
     along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    each = max(1, len(ridges.xy) // _ENOUGH_FOR_LINES)
+    points = (ridges.xy - _centre(darkness.shape))[::each]
+    step = _STEP_PX * each
+    ends = supported(
+        points, ridges.normal[::each], normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each
+    )
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
     y = _centre(darkness.shape)[1] + rho[:, None] * normal[:, 1:] + along * normal[:, :1]
     inside = (x > 0) & (x < w - 1) & (y > 0) & (y < h - 1)
+    inside &= (along >= ends[:, :1]) & (along <= ends[:, 1:])
     # Search a pixel on either side: the position of the line is approximate.
     across = [
         cv2.remap(darkness, (x + d * c).astype(np.float32), (y + d * s).astype(np.float32), cv2.INTER_LINEAR)
@@ -324,14 +341,14 @@ def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Arra
     ]
     dark = np.max(across[1:-1], axis=0)
     inside[:, 0] |= ~inside.any(axis=1)  # a median needs at least one value
-    middle = _quantile(dark, inside, 0.5)[:, None]
+    middle = quantile(dark, inside, 0.5)[:, None]
     section = (min(_SECTION, int(0.6 * min(h, w))), 1)
     seen, dark_part = (
         cv2.blur(mask.astype(np.float32), section) for mask in (inside, (dark > 0.5 * middle) & inside)
     )
     # The edge of the board is dark on one side only; a line is darker than both sides.
     rises = [dark - beside for beside in (across[0], across[-1])]
-    least = np.min([_quantile(rise, inside, BETWEEN_SIDES) for rise in rises], axis=0)
+    least = np.min([quantile(rise, inside, BETWEEN_SIDES) for rise in rises], axis=0)
     between = least > 0.1 * middle[:, 0]
     # A small part of a section is not sufficient.
     return np.asarray(
@@ -339,14 +356,14 @@ def _dark_share(darkness: NDArray[np.float32], angle: Array, rho: Array) -> Arra
     )
 
 
-def _quantile(values: NDArray[np.float32], inside: Mask, share: float) -> Array:
-    """Quantile (n,) of the values inside in each row; at least one is."""
-    ordered = np.sort(np.where(inside, values, np.inf), axis=1)
-    place = share * (inside.sum(axis=1) - 1)
+def quantile(values: NDArray[np.float32], inside: Mask, share: float) -> Array:
+    """Quantile (n,) of the values inside in each row; very large where none is."""
+    ordered = np.sort(np.where(inside, values, _BEYOND_ALL), axis=1)
+    place = share * np.maximum(inside.sum(axis=1) - 1, 0)
     low = place.astype(np.intp)
     rows = np.arange(len(values))
     below, above = ordered[rows, low], ordered[rows, np.ceil(place).astype(np.intp)]
-    return np.asarray(below + (place - low) * (above - below), dtype=np.float64)
+    return np.asarray((1 - place + low) * below + (place - low) * above, dtype=np.float64)
 
 
 def _family(lines: _Lines, among: Mask, preference: Array) -> Rows:

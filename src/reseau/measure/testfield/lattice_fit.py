@@ -10,18 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...adjust import BatchOptions, adjust_batch, weight_function
-from ...core.data import Array, Rows
+from ...core.data import Array, Mask, Rows
 from ...optics import Chain, PlaneMapping, RationalPolynomial
 from ...optics.field import trend_degree
 from ...optics.newton import solve_2x2
-from .lattice import BETWEEN_SIDES, Lattice, Ridges, rms
+from .lattice import BETWEEN_SIDES, Lattice, Ridges, quantile, rms
 from .line_profiles import crossings, located
 
 __all__ = [
@@ -70,7 +70,9 @@ _LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
 of the frame (most not on lines) among which they are selected."""
 """Central part of the frame, relative to half its size, that determines the projectivity."""
 _SHORTEST = 20
-"""Minimum number of samples of a line within the frame."""
+"""Minimum part of a line within the frame, relative to its length; times the size of the frame."""
+_EACH_PX, _LEAST_SAMPLES = 3, 120
+"""Distance of samples along a line that extends over the frame; least number of samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,12 @@ def second_order(mapping: PlaneMapping, at: Array) -> tuple[Array, Array, Array]
 
 
 def lattices(
-    grey: NDArray[np.float32], ridges: Ridges, found: Iterable[Lattice], width: float, blur: float
+    grey: NDArray[np.float32],
+    ridges: Ridges,
+    found: Iterable[Lattice],
+    width: float,
+    blur: float,
+    most: int = 100,
 ) -> Iterator[LatticeFit]:
     """Lattices adjusted to the lines of a frame, the likeliest first.
 
@@ -139,8 +146,10 @@ def lattices(
         Width of the lines, in lattice steps.
     blur : float
         Approximate width (one sigma) of a blurred edge in pixels.
+    most : int
+        Maximum number of lattices that are tried.
     """
-    for one, pair in _divided(ridges, found):
+    for one, pair in islice(_divided(ridges, found), most):
         scale = np.array([1 / pair[0], 1 / pair[1], 1.0])
         lattice = Lattice(one.homography * scale, one.across * pair[0], one.along * pair[1])
         fit = fit_lattice(ridges, lattice)
@@ -174,20 +183,20 @@ def _moved(before: LatticeFit, after: LatticeFit) -> float:
 
 def _parts(ridges: Ridges, found: Lattice, axis: int) -> int:
     """The greatest number of parts into which lines divide the distance between those found."""
-    return max(_PARTS, key=lambda n: n * _between(ridges, found, axis, n))
-
-
-def _between(ridges: Ridges, found: Lattice, axis: int, parts: int) -> bool:
-    """Whether there are lines at these fractions of the distance between those found."""
-    if parts == 1:
-        return True
     numbers = (found.across, found.along)
     mapping = _start(found, ridges.darkness.shape)
-    dark = _darkness_along(mapping, ridges, axis, numbers[axis].astype(float), numbers[1 - axis])
-    level = 0.5 * np.median([np.median(each) for each in dark if each.size])
-    steps = np.arange(numbers[axis].min() * parts, numbers[axis].max() * parts + 1)
-    dark = _darkness_along(mapping, ridges, axis, steps[steps % parts != 0] / parts, numbers[1 - axis])
-    return bool(np.median([(each > level).mean() if each.size else 0.0 for each in dark]) > _BETWEEN)
+    dark, inside = _darkness_along(mapping, ridges, axis, numbers[axis].astype(float), numbers[1 - axis])
+    if not inside.any():
+        return 1
+    level = 0.5 * np.median(quantile(dark, inside, 0.5)[inside.any(axis=1)])
+    for parts in sorted(_PARTS[1:], reverse=True):
+        steps = np.arange(numbers[axis].min() * parts, numbers[axis].max() * parts + 1)
+        between = steps[steps % parts != 0] / parts
+        dark, inside = _darkness_along(mapping, ridges, axis, between, numbers[1 - axis])
+        share = ((dark > level) & inside).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
+        if np.median(share) > _BETWEEN:
+            return parts
+    return 1
 
 
 def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
@@ -449,47 +458,49 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
     return Chain(mapping.first, curved), fit.residuals
 
 
-def _darkness_along(mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows) -> list[Array]:
-    """Darkness along lattice lines, sampled between the outermost crossing lines."""
+def _darkness_along(
+    mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows
+) -> tuple[NDArray[np.float32], Mask]:
+    """Darkness (l, n) along lattice lines between the outermost crossing lines; mask of samples in the frame."""
     h, w = ridges.darkness.shape
-    along = np.linspace(others.min(), others.max(), max(h, w))
+    along = np.linspace(others.min(), others.max(), max(_LEAST_SAMPLES, max(h, w) // _EACH_PX))
     at = np.empty((len(lines), len(along), 2))
     at[..., 1 - axis], at[..., axis] = along, lines[:, None]
     xy = mapping(at.reshape(-1, 2)).reshape(at.shape)
-    inside = np.asarray(((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=2))
+    inside: Mask = np.asarray(((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=2))
     x, y = np.moveaxis(xy.astype(np.float32), 2, 0)
-    seen = cv2.remap(ridges.darkness, x, y, cv2.INTER_LINEAR) if x.size else x
-    return [np.asarray(dark[keep], dtype=np.float64) for dark, keep in zip(seen, inside, strict=True)]
-
-
-def _darkest_of(samples: tuple[Array, ...]) -> Array:
-    """The largest of samples at corresponding places of lines side by side, of different lengths."""
-    count = min(map(len, samples))
-    return np.asarray(np.max([each[:count] for each in samples], axis=0))
+    dark = cv2.remap(ridges.darkness, x, y, cv2.INTER_LINEAR) if x.size else x
+    return np.asarray(dark), inside
 
 
 def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows, others: Rows) -> Rows:
     """Those of some lines that exist: dark between the other lines, and with ridge points at `number`."""
-    found = []
-    whole = np.rint(number)
-    left, low, centre, high, right = (
-        _darkness_along(mapping, ridges, axis, lines.astype(np.float64) + shift, others)
-        for shift in (-_BESIDE, -_ABOUT, 0.0, _ABOUT, _BESIDE)
+    shifts = np.array([-_BESIDE, _BESIDE, -_ABOUT, 0.0, _ABOUT])
+    places = (shifts[:, None] + lines).ravel()
+    seen, inside = (
+        values.reshape(len(shifts), len(lines), -1)
+        for values in _darkness_along(mapping, ridges, axis, places, others)
     )
     # The mapping may still be a pixel or two wrong.
-    middle = [_darkest_of(each) for each in zip(low, centre, high, strict=True)]
+    dark, there = seen[2:].max(axis=0), inside[2:].all(axis=0)
     ends = np.empty((2, len(lines), 2))
     ends[..., axis], ends[..., 1 - axis] = lines, np.array([[others.min()], [others.max()]])
     first, last = mapping(ends.reshape(-1, 2)).reshape(ends.shape)
+    size, count = max(ridges.darkness.shape), there.shape[1]
     # Samples are as many for all lines; ridge points are one for each pixel of their length.
-    each = np.hypot(*(last - first).T).clip(0, max(ridges.darkness.shape)) / max(ridges.darkness.shape)
-    for k, (line, dark) in enumerate(zip(lines, middle, strict=True)):
-        enough = (whole == line).sum() > _SUPPORT * len(dark) * each[k]
-        if len(dark) <= _SHORTEST or not enough:
-            continue
-        usual = float(np.median(dark))
-        # The edge of the board is dark on one side only.
-        rise = [np.quantile(usual - side[k], BETWEEN_SIDES) for side in (left, right) if len(side[k])]
-        if (dark > 0.5 * usual).mean() > _LEAST_DARK and min(rise, default=1.0) > 0.05 * usual:
-            found.append(int(line))
-    return np.array(found, dtype=np.intp)
+    part = there.sum(axis=1) / count
+    length = part * np.hypot(*(last - first).T).clip(0, size)
+    support = (np.rint(number)[:, None] == lines).sum(axis=0)
+    found = (part > _SHORTEST / size) & (support > _SUPPORT * length)
+    if not found.any():
+        return np.array([], dtype=np.intp)
+    usual = quantile(dark, there, 0.5)
+    along = ((dark > 0.5 * usual[:, None]) & there).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+    # The edge of the board is dark on one side only.
+    rises = [
+        np.where(side.any(axis=1), quantile(usual[:, None] - values, side, BETWEEN_SIDES), np.inf)
+        for values, side in zip(seen[:2], inside[:2], strict=True)
+    ]
+    rise = np.where(np.isinf(np.min(rises, axis=0)), 1.0, np.min(rises, axis=0))
+    found &= (along > _LEAST_DARK) & (rise > 0.05 * usual)
+    return lines[found]

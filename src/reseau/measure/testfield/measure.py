@@ -199,13 +199,15 @@ def measure_testfield(
     noise = quiet_noise(grey)
     seen = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     read = seen.read()
-    if isinstance(read, Failure):
+    if isinstance(read, Failure) and read.code != Code.MIRRORED:
         # Lines of one pixel width may be recovered from a blurred frame by sharpening.
         failure, sharp = replace(read, where=frame.name), seen.sharpened(noise)
         read = sharp.read()
         if isinstance(read, Failure):
             return failure
         seen = sharp
+    if isinstance(read, Failure):
+        return replace(read, where=frame.name)
     if seen.shows_second(read):
         return Failure(
             f"shows two testfields {design.name!r}; crop the image to one of them",

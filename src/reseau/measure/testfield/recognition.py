@@ -352,6 +352,9 @@ _BLURRED_PX, _SHARP_PX = 1.8, 0.7
 """Width of the point-spread function removed from a blurred frame, and of the one that replaces it."""
 _LEAST_POWER = 2e-3
 """Minimum power of the noise relative to that of the image in sharpening."""
+_MOST_LATTICES, _MOST_SHARPENED = 14, 3
+"""Most lattices that are tried in a frame, and in a frame that was sharpened: if it shows a testfield, its
+lines are now the strongest."""
 _ELSEWHERE = 0.2
 """Share of ridge points beyond a testfield from which a second testfield is searched."""
 
@@ -415,7 +418,8 @@ class SearchedFrame:
             return found
         design, failure = self.design, None
         width, blur = design.lines.width / design.pitch, blur_of(self.psf_px, self.response)
-        for lattice in lattices(self.dark, ridges, found, width, blur):
+        most = _MOST_SHARPENED if self.taken_px2 else _MOST_LATTICES
+        for lattice in lattices(self.dark, ridges, found, width, blur, most):
             reading = read_clusters(self.grey, lattice, design, self.psf_px, self.response)
             placed = reading if isinstance(reading, Failure) else locate(reading, design)
             if isinstance(placed, Placement) and isinstance(reading, Reading):
