@@ -315,7 +315,7 @@ def _hough(ridges: Ridges) -> tuple[NDArray[np.float32], int]:
 def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
     """Share of the best sections of straight lines (n,) with at least half of the usual darkness.
 
-    Only the part of a line with dense ridge points counts: a testfield may be small in the frame.
+    Of the whole line, or of the part of it with dense ridge points: a testfield may be small in the frame.
     """
     from .compiled import supported  # takes half a second to import; not every command needs it
 
@@ -332,7 +332,6 @@ def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
     y = _centre(darkness.shape)[1] + rho[:, None] * normal[:, 1:] + along * normal[:, :1]
     inside = (x > 0) & (x < w - 1) & (y > 0) & (y < h - 1)
-    inside &= (along >= ends[:, :1]) & (along <= ends[:, 1:])
     # Search a pixel on either side: the position of the line is approximate.
     across = [
         cv2.remap(darkness, (x + d * c).astype(np.float32), (y + d * s).astype(np.float32), cv2.INTER_LINEAR)
@@ -340,14 +339,21 @@ def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
         for c, s in ((normal[:, :1], normal[:, 1:]),)
     ]
     dark = np.max(across[1:-1], axis=0)
+    dense = inside & (along >= ends[:, :1]) & (along <= ends[:, 1:])
+    rises = [dark - beside for beside in (across[0], across[-1])]
+    section = min(_SECTION, int(0.6 * min(h, w)))
+    return np.maximum(_share(dark, rises, inside, section), _share(dark, rises, dense, section))
+
+
+def _share(dark: NDArray[np.float32], rises: list[NDArray[np.float32]], inside: Mask, length: int) -> Array:
+    """Share of the best sections (n,) with at least half of the usual darkness of the samples inside."""
+    inside = inside.copy()
     inside[:, 0] |= ~inside.any(axis=1)  # a median needs at least one value
     middle = quantile(dark, inside, 0.5)[:, None]
-    section = (min(_SECTION, int(0.6 * min(h, w))), 1)
     seen, dark_part = (
-        cv2.blur(mask.astype(np.float32), section) for mask in (inside, (dark > 0.5 * middle) & inside)
+        cv2.blur(mask.astype(np.float32), (length, 1)) for mask in (inside, (dark > 0.5 * middle) & inside)
     )
     # The edge of the board is dark on one side only; a line is darker than both sides.
-    rises = [dark - beside for beside in (across[0], across[-1])]
     least = np.min([quantile(rise, inside, BETWEEN_SIDES) for rise in rises], axis=0)
     between = least > 0.1 * middle[:, 0]
     # A small part of a section is not sufficient.

@@ -461,7 +461,7 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
 def _darkness_along(
     mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Darkness (l, n) along lattice lines between the outermost crossing lines; mask of samples in the frame."""
+    """Darkness (l, n) along lattice lines between the outermost crossing lines; mask of those in the frame."""
     h, w = ridges.darkness.shape
     along = np.linspace(others.min(), others.max(), max(_LEAST_SAMPLES, max(h, w) // _EACH_PX))
     at = np.empty((len(lines), len(along), 2))
