@@ -17,7 +17,7 @@ from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
 from reseau.optics import Brown, PixelGrid, Sensor
 from reseau_sims import FieldBench, Stain, Station
-from reseau_sims.testfield import JITTER_PX
+from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
 from .fields import bounds
 
@@ -91,6 +91,15 @@ def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
     both = found.ok & first.ok
     error, least = ((each.xy - truth.xy)[both].std() for each in (found, first))
     assert error < 1.15 * least
+
+
+def test_a_field_of_160_by_190_pixels_is_read_in_its_enlarged_part_and_measured_in_the_frame() -> None:
+    result, error = measured(FieldBench(seed=3, distance_mm=2.2 * DISTANCE_MM), Station(30))
+    assert result.ok.sum() > 1000
+    assert np.abs(error[result.ok]).max() < 0.15
+    normalised = error[result.ok] ** 2 / np.diagonal(result.cov[result.ok], axis1=1, axis2=2)
+    assert 0.8 < np.sqrt(normalised.mean()) < 1.15
+    assert np.abs(result.reading.xy - 120).max() < 130
 
 
 def test_motion_during_the_exposure_is_formed_and_sigmas_stay_right() -> None:

@@ -428,7 +428,8 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
     fits = (np.abs(number - whole) < _OFF_STEP) & (depth > _NEAREST) & smooth[:, None]
     # Of two lines with one number the stronger one counts.
     same = fits[:, 1:] & fits[:, :-1] & (whole[:, 1:] == whole[:, :-1])
-    value = np.where(fits, weight * (1 - (np.nan_to_num(number - whole) / _OFF_STEP) ** 2), 0.0)
+    off = np.where(fits, number - whole, 0.0)
+    value = np.where(fits, weight * (1 - (off / _OFF_STEP) ** 2), 0.0)
     worth = value.sum(axis=1) - (same * np.minimum(value[:, 1:], value[:, :-1])).sum(axis=1)
     count = fits.sum(axis=1) - same.sum(axis=1)
     span = np.where(fits, whole, -np.inf).max(axis=1) - np.where(fits, whole, np.inf).min(axis=1) + 1

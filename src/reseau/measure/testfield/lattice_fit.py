@@ -28,6 +28,7 @@ __all__ = [
     "LatticeFit",
     "fit_lattice",
     "lattices",
+    "reduced",
     "refit",
     "second_order",
     "slope_of",
@@ -323,6 +324,21 @@ def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: f
     return replace(fit, mapping=mapping, rms_px=rms(residuals), points=len(residuals))
 
 
+def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:
+    """A mapping to an enlarged image as one to the original; the point x is at factor · x + shift there."""
+    assert isinstance(mapping.second, RationalPolynomial)
+    matrix = np.append(mapping.first.values, 1.0).reshape(3, 3)
+    matrix[:2] = (matrix[:2] - np.outer(shift, matrix[2])) / factor
+    curved = mapping.second
+    values = dict(zip(curved.names, curved.values.tolist(), strict=True))
+    values |= {name: values[name] - float(by) for name, by in zip(("X_00", "Y_00"), shift, strict=True)}
+    offset = (np.array(curved.offset) - shift) / factor
+    moved = replace(
+        curved, offset=(float(offset[0]), float(offset[1])), scale=curved.scale / factor
+    ).with_values({name: value / factor for name, value in values.items()})
+    return Chain(mapping.first.with_values(matrix.ravel()[:8]), moved)
+
+
 def _start(lattice: Lattice, shape: tuple[int, ...]) -> Chain:
     """The projectivity of a lattice, followed by a polynomial that is still zero."""
     h, w = shape
@@ -461,7 +477,7 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
 def _darkness_along(
     mapping: Chain, ridges: Ridges, axis: int, lines: Array, others: Rows
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Darkness (l, n) along lattice lines between the outermost crossing lines; mask of those in the frame."""
+    """Darkness (l, n) along lattice lines between the outermost crossing lines; which are in the frame."""
     h, w = ridges.darkness.shape
     along = np.linspace(others.min(), others.max(), max(_LEAST_SAMPLES, max(h, w) // _EACH_PX))
     at = np.empty((len(lines), len(along), 2))
@@ -476,13 +492,13 @@ def _darkness_along(
 def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows, others: Rows) -> Rows:
     """Those of some lines that exist: dark between the other lines, and with ridge points at `number`."""
     shifts = np.array([-_BESIDE, _BESIDE, -_ABOUT, 0.0, _ABOUT])
-    places = (shifts[:, None] + lines).ravel()
+    places = (shifts[:, None] + lines.astype(np.float64)).ravel()
     seen, inside = (
         values.reshape(len(shifts), len(lines), -1)
         for values in _darkness_along(mapping, ridges, axis, places, others)
     )
     # The mapping may still be a pixel or two wrong.
-    dark, there = seen[2:].max(axis=0), inside[2:].all(axis=0)
+    dark, there = seen[2:].max(axis=0), np.asarray(inside[2:].all(axis=0))
     ends = np.empty((2, len(lines), 2))
     ends[..., axis], ends[..., 1 - axis] = lines, np.array([[others.min()], [others.max()]])
     first, last = mapping(ends.reshape(-1, 2)).reshape(ends.shape)
@@ -503,4 +519,4 @@ def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows
     ]
     rise = np.where(np.isinf(np.min(rises, axis=0)), 1.0, np.min(rises, axis=0))
     found &= (along > _LEAST_DARK) & (rise > 0.05 * usual)
-    return lines[found]
+    return np.asarray(lines[found])

@@ -200,12 +200,13 @@ def measure_testfield(
     seen = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     read = seen.read()
     if isinstance(read, Failure) and read.code != Code.MIRRORED:
-        # Lines of one pixel width may be recovered from a blurred frame by sharpening.
-        failure, sharp = replace(read, where=frame.name), seen.sharpened(noise)
-        read = sharp.read()
-        if isinstance(read, Failure):
-            return failure
-        seen = sharp
+        # Lines of one pixel width may be recovered from a blurred frame by sharpening, lines and targets of a
+        # few pixels in a small part of it by interpolation.
+        for other in (seen.sharpened(noise), seen.enlarged()):
+            again = read if other is None else other.read()
+            if other is not None and (not isinstance(again, Failure) or again.code == Code.MIRRORED):
+                seen, read = other, again
+                break
     if isinstance(read, Failure):
         return replace(read, where=frame.name)
     if seen.shows_second(read):
@@ -214,6 +215,7 @@ def measure_testfield(
             Code.SEVERAL_TARGETS,
             where=frame.name,
         )
+    read = seen.original(read)
     lattice, reading, placed = read.lattice, read.reading, read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)
     size = (float(frame.width), float(frame.height))

@@ -30,7 +30,7 @@ from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
 from .lattice import Ridges, find_lattices, ridge_points
-from .lattice_fit import LatticeFit, lattices, straightened
+from .lattice_fit import LatticeFit, lattices, reduced, straightened
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 
@@ -355,6 +355,12 @@ _LEAST_POWER = 2e-3
 _MOST_LATTICES, _MOST_SHARPENED = 14, 3
 """Most lattices that are tried in a frame, and in a frame that was sharpened: if it shows a testfield, its
 lines are now the strongest."""
+_BLOCK_PX, _DENSE = 8, 0.1
+"""Side of the blocks in which ridge points are counted, and the share of pixels from which they are dense."""
+_LEAST_FIELD_PX, _SMALL_FIELD_PX, _ENLARGED_PX = 100, 420, 960
+"""Sizes of a part of the frame that is enlarged to be read, and its size then."""
+_LEAST_PSF = 0.5
+"""Least width of the point-spread function, relative to the expected one, taken from an enlarged part."""
 _ELSEWHERE = 0.2
 """Share of ridge points beyond a testfield from which a second testfield is searched."""
 
@@ -385,6 +391,10 @@ class SearchedFrame:
         Response of a pixel.
     taken_px2 : float
         Variance of the point-spread function that was removed by sharpening.
+    factor : int
+        Number of pixels along one of the original frame, of which this is a part enlarged.
+    corner : (int, int)
+        Column and row of the original frame at which that part begins.
     """
 
     grey: NDArray[np.float32]
@@ -393,6 +403,62 @@ class SearchedFrame:
     psf_px: float
     response: PixelResponse
     taken_px2: float = 0.0
+    factor: int = 1
+    corner: tuple[int, int] = (0, 0)
+
+    def enlarged(self) -> SearchedFrame | None:
+        """The part of the frame with the most lines and edges, enlarged; None if it is large already."""
+        points = ridge_points(self.dark, quiet_noise(self.dark)).xy
+        h, w = self.dark.shape
+        blocks = np.zeros((h // _BLOCK_PX + 1, w // _BLOCK_PX + 1), np.float32)
+        column, row = ((points + 0.5) / _BLOCK_PX).astype(np.intp).clip(0).T
+        np.add.at(blocks, (row.clip(max=blocks.shape[0] - 1), column.clip(max=blocks.shape[1] - 1)), 1)
+        dense = cv2.blur(blocks, (3, 3)) > _DENSE * _BLOCK_PX**2
+        _, _, parts, _ = cv2.connectedComponentsWithStats(dense.astype(np.uint8), connectivity=4)
+        if len(parts) < 2:
+            return None
+        left, top, wide, high, _ = (_BLOCK_PX * parts[1:][np.argmax(parts[1:, cv2.CC_STAT_AREA])]).tolist()
+        if not _LEAST_FIELD_PX < max(wide, high) < _SMALL_FIELD_PX:
+            return None
+        margin = 2 * _BLOCK_PX
+        left, right = max(left - margin, 0), min(left + wide + margin, w)
+        top, bottom = max(top - margin, 0), min(top + high + margin, h)
+        factor = int(np.clip(round(_ENLARGED_PX / max(wide, high)), 2, 4))
+        grey, dark = (
+            np.asarray(
+                cv2.resize(
+                    image[top:bottom, left:right], None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC
+                ),
+                dtype=np.float32,
+            )
+            for image in (self.grey, self.dark)
+        )
+        psf_px = float(np.sqrt((factor * self.psf_px) ** 2 + (factor**2 - 1) / 12))
+        return replace(self, grey=grey, dark=dark, psf_px=psf_px, factor=factor, corner=(left, top))
+
+    def original(self, read: Read) -> Read:
+        """What was read in this frame, in pixels of the original one."""
+        if self.factor == 1:
+            return read
+        shift = (self.factor - 1) / 2 - self.factor * np.array(self.corner)
+
+        def xy(points: Array) -> Array:
+            return np.asarray((points - shift) / self.factor)
+
+        psf_px = np.sqrt(max(read.reading.psf_px**2 - (self.factor**2 - 1) / 12, 0.0)) / self.factor
+        reading = replace(
+            read.reading,
+            xy=xy(read.reading.xy),
+            psf_px=max(float(psf_px), _LEAST_PSF * self.psf_px / self.factor),
+        )
+        lattice = replace(
+            read.lattice,
+            mapping=reduced(read.lattice.mapping, self.factor, shift),
+            rms_px=read.lattice.rms_px / self.factor,
+        )
+        return replace(
+            read, ridges=replace(read.ridges, xy=xy(read.ridges.xy)), lattice=lattice, reading=reading
+        )
 
     def sharpened(self, noise: float) -> SearchedFrame:
         """The frame sharpened by removing most of an assumed blur; `noise` is its noise."""
