@@ -1,9 +1,9 @@
-"""Photographs of sheets of independent formation: what is found, errors and sigmas.
+"""Photographs of sheets and testfields of independent formation: what is found, errors and sigmas.
 
-Run from the checkout: ``python benchmarks/sheets.py [--count 3] [--condition C …] [--large]``; see
-:mod:`worlds.sheets` for the conditions. ``--large`` measures one photograph of 20 megapixels, and prints
-processor time and memory. A disk counts as inside if its centre is more than 8 px from the
-border and nothing in front of the sheet comes nearer than 12 px.
+Run from the checkout: ``python benchmarks/sheets.py [--target sheet|field] [--count 3] [--condition C …]
+[--large]``; see :mod:`worlds.sheets` for the conditions. ``--large`` measures one photograph of 20 megapixels
+of a sheet, and prints processor time and memory. A target counts as inside if its image is more than 2 px
+from the border and nothing in front of the sheet comes nearer than 2 px (to disks: 12 px from the centre).
 """
 
 from __future__ import annotations
@@ -12,32 +12,38 @@ import argparse
 import json
 import resource
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
+from boards import reaches
+from worlds.boards import Field
 from worlds.sheets import CONDITIONS, View, coded, views
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
-from reseau.io import ReseauDesign
+from reseau.designs import coded_testfield
+from reseau.io import ReseauDesign, parse_design
 from reseau.measure import measure_reseau
+from reseau.procedures.target_measurement import measurer_of
 
-_BORDER_PX, _CLEAR_PX = 8.0, 12.0
+_MARGIN_PX, _CLEAR_PX = 2.0, 12.0
 _WRONG_PX, _WRONG_SIGMA = 0.15, 5.0
 
 
-def measured(view: View) -> tuple[np.ndarray, np.ndarray, int, int, float] | Failure:
+def measured(view: View, target: str) -> tuple[np.ndarray, np.ndarray, int, int, float] | Failure:
     """Errors (n, 2) and the same in units of sigmas, numbers found and inside, and processor time."""
-    design = ReseauDesign.parse(json.dumps(view.sheet.design()), where="sheet")
+    design = parse_design(json.dumps(view.sheet.design()), Path(target))
     pixels = view.picture()
     start = time.process_time()
-    found = measure_reseau(Frame(pixels, 255.0), design)
+    found = measurer_of(design)(Frame(pixels, 255.0))
     seconds = time.process_time() - start
     if isinstance(found, Failure):
         return found
     size = np.array(pixels.shape[::-1])
-    inside = ((view.truth > _BORDER_PX) & (view.truth < size - 1 - _BORDER_PX)).all(axis=1)
-    inside &= view.hidden > _CLEAR_PX
+    edge = reaches("tf" if target == "field" else "sheet", design, view.truth) + _MARGIN_PX
+    inside = ((view.truth > edge - 0.5) & (view.truth < size - 0.5 - edge)).all(axis=1)
+    inside &= view.hidden > (np.hypot(*edge.T) if target == "field" else _CLEAR_PX)
     error = (found.xy - view.truth)[found.ok]
     root = np.linalg.cholesky(found.cov[found.ok])
     scaled = np.linalg.solve(root, error[..., None])[..., 0]
@@ -85,18 +91,20 @@ def _resident_mb() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--target", choices=("sheet", "field"), default="sheet")
     parser.add_argument("--count", type=int, default=3)
     parser.add_argument("--condition", nargs="*", default=list(CONDITIONS))
     parser.add_argument("--large", action="store_true", help="only time and memory for 20 megapixels")
     arguments = parser.parse_args()
+    sheet = coded() if arguments.target == "sheet" else Field(json.loads(coded_testfield().to_json()))
     if arguments.large:
         large()
         return
     print(f"{'condition':12} {'measured':>14}  rms     worst px, sigma  wrong  error/sigma  processor time")
     for condition in arguments.condition:
         parts = []
-        for view in views(condition, arguments.count):
-            found = measured(view)
+        for view in views(condition, arguments.count, sheet):
+            found = measured(view, arguments.target)
             if isinstance(found, Failure):
                 print(f"{condition:12} declined: {found.reason}")
             else:

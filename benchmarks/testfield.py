@@ -1,10 +1,11 @@
 """The coded testfield: lines, recognition and precision in the paper's recordings, compared with known truth.
 
-Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--workers N]``. The 36 recordings of
-Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured. In the
-Cramér–Rao bound, position, sharpness, contrast, background (level and slopes) and size are unknown, and all
-simulated noise is included, also row jitter. The figures refer to the 256 targets of the central 4 × 4
-squares.
+Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--workers N] [--freed]``. The 36
+recordings of Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured.
+In the Cramér–Rao bound, position, sharpness, contrast, background (level and slopes) and size are unknown,
+and all simulated noise is included, also row jitter. The figures refer to the 256 targets of the central
+4 × 4 squares. ``--freed`` measures photographs whose blur, light, print, board and processing the measurement
+does not model as they are, instead; see :class:`reseau_sims.Photograph`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -26,12 +27,30 @@ from reseau.core.data import Array, Frame
 from reseau.designs import HIDDEN, coded_testfield
 from reseau.io import SHAPES
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
-from reseau_sims import FieldBench, Station, paper_stations
+from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations
 from reseau_sims.testfield import JITTER_PX
 
 DESIGN = coded_testfield()
 OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
 CENTRAL = np.abs(DESIGN.xy).max(axis=1) < 250
+FINGERS = tuple(
+    Stain(60 + 45 * k, 95 + 8 * k, 14, 90.0, end=(20 + 45 * k, 250), texture=12.0) for k in range(4)
+)
+FREED: dict[str, dict[str, Any]] = {
+    "disk out of focus, 2 px": {"photograph": Photograph(defocus_px=2.0)},
+    "motion to and fro, 4 px": {"photograph": Photograph(motion_px=4.0, motion_bend=0.2, motion_speed=0.4)},
+    "curve of 2.2": {"photograph": Photograph(gamma=2.2)},
+    "sharpened": {"photograph": Photograph(sharpening=1.2)},
+    "JPEG of quality 60": {"photograph": Photograph(jpeg=60)},
+    "curve, sharpened, JPEG 85": {"photograph": Photograph(gamma=2.2, sharpening=0.6, jpeg=85)},
+    "uneven light": {"gradient": (0.25, -0.15), "photograph": Photograph(curvature=(-0.15, 0.1, -0.1))},
+    "ink 0.4 mm wider": {"ink_mm": 0.4},
+    "waves of 1 mm": {"waves_mm": 1.0},
+    "fingers": {"stains": FINGERS},
+    "glare to saturation": {"stains": (Stain(150, 100, 25, 120.0, opaque=False),)},
+}
+"""Benches by condition."""
+ROUGH = {"motion to and fro, 4 px", "sharpened", "JPEG of quality 60", "glare to saturation"}
 PAPER = {
     ("square", False): 0.040,
     ("triangle", False): 0.056,
@@ -245,12 +264,59 @@ def speed(done: list[Recording], workers: int) -> None:
     print(f"{len(frames)} images on {workers} cores: processor {cpu.sum():.2f} s, wall {total:.2f} s")
 
 
+def freed(seeds: int, conditions: list[str]) -> bool:
+    """Print what is found, errors and sigmas for each of the conditions `FREED`."""
+    print(f"{'condition':28} {'measured':>13}  rms     worst px, sigma  wrong  error/sigma")
+    kept = True
+    for name in conditions:
+        changes = FREED[name]
+        parts, found, inside = [], 0, 0
+        for seed in range(seeds):
+            sensor = replace(FieldBench().sensor, row_jitter_px=0.0)
+            bench = FieldBench(seed=seed, sensor=sensor, **changes)
+            for station in (Station(0.0), Station(30.0, 90.0, 90.0), Station(45.0, 180.0, 270.0)):
+                truth = bench.truth(station)
+                result = measure_testfield(bench.record(station), DESIGN, TestfieldOptions(fill=0.8))
+                clear = bench.inside(truth, 8.0)
+                for stain in bench.stains if name == "fingers" else ():
+                    a, b = np.array([stain.x, stain.y]), np.array(stain.end)
+                    part = np.clip((truth.xy - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+                    clear &= np.hypot(*(truth.xy - a - part[:, None] * (b - a)).T) > stain.radius + 8
+                inside += int(clear.sum())
+                if not result:
+                    print(f"{name:28} {station.name}: {result.reason}")
+                    continue
+                sigma = np.sqrt(np.diagonal(result.cov, axis1=1, axis2=2))[result.ok]
+                parts.append(np.stack([(result.xy - truth.xy)[result.ok], sigma]))
+                found += int((result.ok & clear).sum())
+        if not parts:
+            kept = False
+            continue
+        error, sigma = np.concatenate(parts, axis=1)
+        off, scaled = np.hypot(*error.T), np.abs(error / sigma).max(axis=1)
+        wrong = int(((off > 0.15) & (scaled > 5)).sum())
+        ratio = float(np.sqrt(((error / sigma) ** 2).mean()))
+        low, high = (0.7, 1.25) if name in ROUGH else (0.85, 1.2)
+        good = found >= 0.95 * inside and wrong == 0 and low <= ratio <= high
+        kept &= good
+        print(
+            f"{name:28} {found:5} of {inside:4}  {np.sqrt((error**2).mean()):.4f}  {off.max():.3f}  "
+            f"{scaled.max():5.1f}      {wrong:5}  {ratio:11.2f}  {'ok' if good else 'MISSED'}",
+            flush=True,
+        )
+    return kept
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=1, help="sets of recordings")
     parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--condition", nargs="+", default=list(FREED), help="only these, with --freed")
+    parser.add_argument("--freed", action="store_true", help="only photographs of freer formation")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    if arguments.freed:
+        return 0 if freed(arguments.seeds, arguments.condition) else 1
     fields = of_the_tests("measure/fields.py")
     paper = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (0.0, 30.0, 45.0))]
     steep = [r for seed in range(arguments.seeds) for r in recordings(fields, seed, (60.0,))]

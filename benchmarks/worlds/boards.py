@@ -15,7 +15,7 @@ import numpy as np
 
 from .pixels import Array, form, interpolated
 
-__all__ = ["OPENCV", "Camera", "Pose", "picture", "poses"]
+__all__ = ["OPENCV", "Camera", "Field", "Pose", "picture", "poses"]
 
 
 @dataclass(frozen=True)
@@ -185,6 +185,41 @@ def _drawn(
     return board, ink
 
 
+class Field:
+    """A printed testfield: its targets, lines and border, as functions of the position on the board.
+
+    Parameters
+    ----------
+    design : dict
+        Contents of a file of the schema ``testfield-design/1``.
+    """
+
+    def __init__(self, design: dict[str, Any]) -> None:
+        targets, lines = design["targets"], design["lines"]
+        self.contents = design
+        self.ids = tuple(targets["id"])
+        self.xy = np.column_stack([targets["x"], targets["y"]])
+        grid = [np.unique(np.round(place, 6)) for place in self.xy.T]
+        table = np.full([len(places) for places in grid], -1)
+        at = [np.argmin(np.abs(self.xy[:, k, None] - grid[k]), axis=1) for k in range(2)]
+        table[at[0], at[1]] = np.arange(len(self.xy))
+        shape, angle = [_SHAPES[name] for name in targets["shape"]], np.deg2rad(targets["angle"])
+        kinds = np.column_stack([self.xy, shape, targets["size"], np.cos(angle), np.sin(angle)])
+        bars = np.array([lines["width"], *lines["extent"]])
+        lined = [np.array(lines[name]) for name in ("vertical_x", "horizontal_y")]
+        border = max(lines["extent"][2:]) + 0.6 * design["pitch"]
+        self._drawn = (*grid, table, kinds, bars, *lined, border)
+
+    def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Shares (h, w) of board and of ink in samples at positions, which follow each other closely."""
+        board, ink = _drawn(x, y, *self._drawn)
+        return board, ink
+
+    def design(self) -> dict[str, Any]:
+        """The design as a document."""
+        return self.contents
+
+
 def picture(
     design: dict[str, Any],
     camera: Camera,
@@ -205,18 +240,7 @@ def picture(
     noise : float
         Standard deviation of the grey values before they are rounded.
     """
-    targets, lines, pitch = design["targets"], design["lines"], design["pitch"]
-    tx, ty = np.array(targets["x"]), np.array(targets["y"])
-    columns, rows = (np.unique(np.round(place, 6)) for place in (tx, ty))
-    table = np.full((len(columns), len(rows)), -1)
-    at = [np.argmin(np.abs(place[:, None] - grid), axis=1) for place, grid in ((tx, columns), (ty, rows))]
-    table[at[0], at[1]] = np.arange(len(tx))
-    shape = [_SHAPES[name] for name in targets["shape"]]
-    angle = np.deg2rad(targets["angle"])
-    kinds = np.column_stack([tx, ty, shape, targets["size"], np.cos(angle), np.sin(angle)])
-    bars = np.array([lines["width"], *lines["extent"]])
-    vertical, horizontal = (np.array(lines[name]) for name in ("vertical_x", "horizontal_y"))
-    border = max(lines["extent"][2:]) + 0.6 * pitch
+    field = Field(design)
     r, t = pose.rotation, pose.translation
     back = np.linalg.inv(np.column_stack([r[:, :2], t]))
 
@@ -227,10 +251,9 @@ def picture(
     def scene(u: Array, v: Array, spacing: float) -> Array:
         x, y, z = interpolated(place, u[0], v[:, 0])
         z[z <= 0] = np.nan  # above the horizon
-        board, ink = _drawn(x / z, y / z, columns, rows, table, kinds, bars, vertical, horizontal, border)
+        board, ink = field.printed(x / z, y / z)
         return np.asarray(30 + board * (180 - 170 * ink))
 
     light = form(scene, camera.width, camera.height, sigma, oversampling=oversampling)
     light += np.random.default_rng(seed).normal(0, noise, light.shape)
-    board = np.column_stack([tx, ty, np.zeros(len(tx))])
-    return np.clip(np.rint(light), 0, 255), camera.image(board @ r.T + t)
+    return np.clip(np.rint(light), 0, 255), camera.image(np.pad(field.xy, ((0, 0), (0, 1))) @ r.T + t)

@@ -1,9 +1,9 @@
-"""Photographs of sheets of disks with coded rings, with truth, by a camera with distortion.
+"""Photographs of sheets of disks with coded rings and of testfields, with truth, by a camera with distortion.
 
 Run from the checkout: ``python benchmarks/worlds/sheets.py FOLDER [--count 3] [--condition C …]`` writes
 ``NAME.png`` and ``NAME.truth.json`` per photograph, and the design beside them.
 
-The sheet is a function of the position in its plane; every sample of the image is undistorted and projected
+The print is a function of the position in its plane; every sample of the image is undistorted and projected
 back to it. Positions of the truth are the images of the centres of the disks. Light is linear up to the
 sensor: reflections are added, a hand hides, noise and the limit of the sensor follow, then the camera's
 curve, sharpening and compression.
@@ -17,18 +17,38 @@ import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from worlds.pixels import Array, edge, form
+from worlds.pixels import Array, edge, form, interpolated
 
-__all__ = ["CONDITIONS", "Sheet", "View", "coded", "pose", "views"]
+__all__ = ["CONDITIONS", "Printed", "Sheet", "View", "coded", "pose", "views"]
 
 _WIDTH, _HEIGHT = 960, 720
 _OVERSAMPLING = 4
+_AROUND = 0.14
+"""Light of what is around the paper, relative to it."""
+
+
+class Printed(Protocol):
+    """What is printed on a plane."""
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the targets (n)."""
+
+    @property
+    def xy(self) -> Array:
+        """Their places (n, 2), y up."""
+
+    def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Shares (h, w) of paper, and of ink on it, at places that follow each other closely."""
+
+    def design(self) -> dict[str, Any]:
+        """The design as a document."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +103,12 @@ class Sheet:
                 )
         return found
 
+    def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Shares (h, w) of paper, which is everywhere, and of ink."""
+        inside = self.inside(x, y)
+        # From millimetres to samples, by the slope of the distance itself.
+        return np.ones(x.shape), edge(inside / np.maximum(np.hypot(*np.gradient(inside)), 1e-9), 1.0)
+
     def design(self) -> dict[str, Any]:
         """The design as a document."""
         points = [
@@ -116,7 +142,7 @@ class View:
 
     Parameters
     ----------
-    sheet : Sheet
+    sheet : Printed
         What is photographed.
     rotation, position : ndarray (3, 3), (3,)
         From the sheet to the camera: x_c = R X + t.
@@ -146,7 +172,7 @@ class View:
         Weight of an unsharp mask of 1 px; 0 without.
     """
 
-    sheet: Sheet
+    sheet: Printed
     rotation: Array
     position: Array
     seed: int = 0
@@ -198,17 +224,19 @@ class View:
 
     def _scene(self, x: Array, y: Array, spacing: float) -> Array:
         """Light at positions of the image."""
-        at = self._undistorted((np.stack([x, y], axis=-1) - self._centre) / self._focal)
         back = np.linalg.inv(np.column_stack([self.rotation[:, :2], self.position]))
-        plane = np.concatenate([at, np.ones((*x.shape, 1))], axis=-1) @ back.T
-        inside = self.sheet.inside(plane[..., 0] / plane[..., 2], plane[..., 1] / plane[..., 2])
-        # From millimetres to samples, by the slope of the distance itself.
-        slope = np.hypot(*np.gradient(inside))
-        ink = edge(inside / np.maximum(slope, 1e-9), 1.0)
+
+        def plane(u: Array, v: Array) -> Array:
+            at = self._undistorted((np.stack([u, v], axis=-1) - self._centre) / self._focal)
+            return np.asarray(back @ np.column_stack([at, np.ones(len(at))]).T)
+
+        a, b, c = interpolated(plane, x[0], y[:, 0])
+        paper, ink = self.sheet.printed(a / c, b / c)
         rng = np.random.default_rng(self.seed + 1)
         to = rng.uniform(0, 2 * np.pi)
         u, v = (x - _WIDTH / 2) / _WIDTH, (y - _HEIGHT / 2) / _WIDTH
-        grey = self.light * (1 + self.fall * (u * np.cos(to) + v * np.sin(to))) * (1 - self.contrast * ink)
+        grey = self.light * (1 + self.fall * (u * np.cos(to) + v * np.sin(to)))
+        grey = grey * (_AROUND + paper * (1 - _AROUND - self.contrast * ink))
         if self.gloss:
             middle, wide = rng.uniform([300, 220], [660, 500]), rng.uniform(60, 120)
             grey += self.gloss * np.exp(-0.5 * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / wide**2)
@@ -250,8 +278,8 @@ class View:
         return found
 
 
-def pose(seed: int, sheet: Sheet, most_tilt_deg: float = 50.0) -> tuple[Array, Array]:
-    """Rotation and position of a sheet that fills most of a picture, seen from the front."""
+def pose(seed: int, sheet: Printed, most_tilt_deg: float = 50.0, nearer: float = 1.0) -> tuple[Array, Array]:
+    """Rotation and position of a sheet seen from the front; it fills most of a picture, or more if nearer."""
     rng = np.random.default_rng(1000 + seed)
     roll, rho = rng.uniform(0, 2 * np.pi, 2)
     tilt = np.deg2rad(rng.uniform(5, most_tilt_deg))
@@ -260,7 +288,7 @@ def pose(seed: int, sheet: Sheet, most_tilt_deg: float = 50.0) -> tuple[Array, A
         cv2.Rodrigues(tilt * axis)[0] @ cv2.Rodrigues(np.array([0, 0, roll]))[0] @ np.diag([1.0, -1.0, -1.0])
     )
     extent = np.hypot(*np.ptp(sheet.xy, axis=0)) / 2
-    away = rng.uniform(1.05, 1.4) * extent * 1050 / (_HEIGHT / 2) * np.cos(tilt / 2)
+    away = rng.uniform(1.05, 1.4) / nearer * extent * 1050 / (_HEIGHT / 2) * np.cos(tilt / 2)
     return np.asarray(turn), np.array(
         [rng.uniform(-0.05, 0.05) * away, rng.uniform(-0.05, 0.05) * away, away]
     )
@@ -280,14 +308,18 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "gamma": {"gamma": 2.2},
     "jpeg60": {"jpeg": 60},
     "sharpened": {"sharpening": 1.2},
+    "cropped": {"nearer": 2.0},
+    "small": {"nearer": 0.5},
 }
 
 
-def views(condition: str, count: int, sheet: Sheet | None = None) -> list[View]:
+def views(condition: str, count: int, sheet: Printed | None = None) -> list[View]:
     """Photographs of one condition, each of another pose."""
     sheet = sheet or coded()
-    plain = [View(sheet, *pose(seed, sheet), seed=10 * seed) for seed in range(count)]
-    return [replace(view, **CONDITIONS[condition]) for view in plain]
+    changed = CONDITIONS[condition]
+    nearer = changed.get("nearer", 1.0)
+    plain = [View(sheet, *pose(seed, sheet, nearer=nearer), seed=10 * seed) for seed in range(count)]
+    return [replace(view, **{k: v for k, v in changed.items() if k != "nearer"}) for view in plain]
 
 
 def main() -> None:

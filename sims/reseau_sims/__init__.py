@@ -3,6 +3,7 @@
 from .camera import FilmCamera, film
 from .display import Bending, Display, Instrument
 from .faults import Faults, swapped
+from .photograph import Photograph
 from .plate import Plate
 from .reflectors import Reflectors
 from .scanner import Scanner, Video
@@ -18,6 +19,7 @@ __all__ = [
     "FieldTruth",
     "FilmCamera",
     "Instrument",
+    "Photograph",
     "Plate",
     "Reflectors",
     "Scanner",

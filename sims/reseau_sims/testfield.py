@@ -32,6 +32,7 @@ from reseau.optics.formation import Outline, PixelResponse, draw
 from reseau.optics.grids import line_grid
 from reseau.optics.targets import target_outline
 
+from .photograph import Photograph
 from .streams import stream
 
 __all__ = ["FieldBench", "FieldTruth", "Stain", "Station", "paper_stations"]
@@ -87,8 +88,9 @@ def paper_stations(tilts: tuple[float, ...] = (0.0, 30.0, 45.0)) -> tuple[Statio
 class Stain(NamedTuple):
     """A round spot in the image: centre and radius in pixels, and the grey value seen there.
 
-    An opaque one hides the image behind it; otherwise it is glare, whose light is added and decreases as a
-    Gaussian of this width.
+    An opaque one hides the image behind it; its grey values vary by its texture, and with an end it is long
+    and round like a finger. Otherwise it is glare, whose light is added and decreases as a Gaussian of this
+    width.
 
     Examples
     --------
@@ -101,6 +103,8 @@ class Stain(NamedTuple):
     radius: float
     grey: float
     opaque: bool = True
+    end: tuple[float, float] | None = None
+    texture: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +172,12 @@ class FieldBench:
         Missing targets.
     mirrored : bool
         Whether the frame is seen in a mirror, left to right.
+    photograph : Photograph
+        Blur of other forms, unevenness of the light, tone curve, sharpening and compression.
+    ink_mm : float
+        Growth of everything printed, on every side.
+    waves_mm : float
+        Height of waves of the board, two squares long along both axes.
     stage_tilt : (float, float)
         Tilt of the axis of the stage that lifts the board: x and y in the system of the board (rad).
     stage_sigma_mm : float
@@ -210,6 +220,9 @@ class FieldBench:
     stains: tuple[Stain, ...] = ()
     missing: frozenset[str] = frozenset()
     mirrored: bool = False
+    photograph: Photograph = field(default_factory=Photograph)
+    ink_mm: float = 0.0
+    waves_mm: float = 0.0
     stage_tilt: tuple[float, float] = (0.0, 0.0)
     stage_sigma_mm: float = 0.0
 
@@ -268,7 +281,8 @@ class FieldBench:
         """Record the testfield; the same seed and station give the same frame to the bit."""
         rng = stream(self.seed, "exposure", *(station if station.height_mm else station[:3]))
         shifts = self.sensor.row_shifts(rng) if self.sensor.row_jitter_px else None
-        pixels = self.sensor.expose(self.light(station, shifts), rng)
+        exposed = self.sensor.expose(self.light(station, shifts), rng)
+        pixels = self.photograph.processed(exposed, self.sensor.full_scale)
         return Frame(pixels, self.sensor.full_scale, station.name, sha256(pixels.tobytes()).hexdigest())
 
     def light(self, station: Station, row_shifts: Array | None = None) -> Array:
@@ -278,10 +292,17 @@ class FieldBench:
         share = np.zeros(shape)
         for outline in self._outlines():
             image = outline.mapped(view).oriented()
-            share += draw(image, shape, self.psf_px, self.response, row_shifts)
+            for place, weight in zip(*self.photograph.kernel(), strict=True):
+                moved = Outline(image.xy + place, image.dxy)
+                share += weight * draw(moved, shape, self.psf_px, self.response, row_shifts)
         if self.design.polarity == "bright":
             share = 1 - share
-        even = illumination(self.sensor.width, self.sensor.height, gradient=self.gradient)
+        even = illumination(
+            self.sensor.width,
+            self.sensor.height,
+            gradient=self.gradient,
+            curvature=self.photograph.curvature,
+        )
         light: Array = self.level * even * (1 - self.contrast * share)
         for stain in self.stains:
             light = self._stained(light, stain)
@@ -304,6 +325,11 @@ class FieldBench:
             points = np.column_stack([xy, -sag * along**2])
             slope = np.tile(np.eye(3)[:, :2], (len(xy), 1, 1))
             slope[:, 2] = -2 * sag * along[:, None] * way / reach
+            if self.waves_mm:
+                (x, y), k = xy.T, np.pi / self.design.pitch
+                points[:, 2] += self.waves_mm * np.sin(k * x) * np.cos(k * y)
+                slope[:, 2, 0] += self.waves_mm * k * np.cos(k * x) * np.cos(k * y)
+                slope[:, 2, 1] -= self.waves_mm * k * np.sin(k * x) * np.sin(k * y)
             return points, slope
 
         return surface
@@ -317,7 +343,9 @@ class FieldBench:
         for k in np.flatnonzero(there):
             kinds.setdefault((targets.shape[k], targets.size[k], targets.angle[k]), []).append(int(k))
         outlines = [
-            target_outline(*kind, spacing).affine(np.tile(np.eye(2), (len(rows), 1, 1)), xy[rows])
+            target_outline(kind[0], kind[1] + 2 * self.ink_mm, kind[2], spacing).affine(
+                np.tile(np.eye(2), (len(rows), 1, 1)), xy[rows]
+            )
             for kind, rows in kinds.items()
         ]
         lines = self.design.lines
@@ -326,7 +354,9 @@ class FieldBench:
         )
         return [
             *outlines,
-            *line_grid(lines.vertical_x, lines.horizontal_y, lines.width, spacing, beyond=beyond),
+            *line_grid(
+                lines.vertical_x, lines.horizontal_y, lines.width + 2 * self.ink_mm, spacing, beyond=beyond
+            ),
         ]
 
     def _mm_per_px(self) -> float:
@@ -336,10 +366,14 @@ class FieldBench:
 
     def _stained(self, light: Array, stain: Stain) -> Array:
         rows, columns = np.indices(light.shape)
-        distance = np.hypot(columns - stain.x, rows - stain.y)
+        along = np.zeros(2) if stain.end is None else np.subtract(stain.end, (stain.x, stain.y))
+        way = np.stack([columns - stain.x, rows - stain.y], axis=-1)
+        part = np.clip(way @ along / max(float(along @ along), 1e-9), 0, 1)
+        distance = np.hypot(*np.moveaxis(way - part[..., None] * along, 2, 0))
         if stain.opaque:
             over = 0.5 - 0.5 * np.tanh((distance - stain.radius) / self.psf_px)
-            stained: Array = light * (1 - over) + stain.grey * over
+            grey = stain.grey + stain.texture * np.sin(columns / 2.3) * np.cos(rows / 1.9)
+            stained: Array = light * (1 - over) + grey * over
         else:
             stained = light + stain.grey * np.exp(-0.5 * (distance / stain.radius) ** 2)
         return stained

@@ -10,7 +10,7 @@ import pytest
 from reseau.core.data import Array
 from reseau.designs import coded_testfield
 from reseau.optics import Sensor, project, rotation_matrix
-from reseau_sims import FieldBench, Stain, Station, paper_stations
+from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations
 
 QUIET = Sensor(240, 240, shot_noise=False, quantise=False)
 
@@ -117,3 +117,34 @@ def test_stains_hide_or_saturate_targets_and_a_mirror_reflects_the_field() -> No
     )
     turned = replace(plain, design=coded_testfield(polarity="bright")).light(Station(0))
     np.testing.assert_allclose(turned + plain.light(Station(0)), 200 * (2 - 0.85), rtol=0, atol=1e-6)
+
+
+def test_blur_of_other_forms_does_not_move_the_centroid_of_a_target() -> None:
+    field = coded_testfield()
+    only = "28.06"
+    shaken = Photograph(defocus_px=1.5, motion_px=3.0, motion_bend=0.2, motion_speed=0.4)
+    bench = FieldBench(
+        design=field, missing=frozenset(field.ids) - {only}, sensor=QUIET, photograph=shaken, waves_mm=1.0
+    )
+    at = bench.truth(Station(30.0)).xy[field.ids.index(only)]
+    found = darkness_centroid(bench.light(Station(30.0)), bench.level, at, 11)
+    np.testing.assert_allclose(found, at, rtol=0, atol=2e-3)
+
+
+def test_a_finger_hides_what_is_beside_its_axis() -> None:
+    bench = FieldBench(stains=(Stain(60.0, 60.0, 10.0, 90.0, end=(60.0, 180.0), texture=5.0),), sensor=QUIET)
+    light = bench.light(Station(0.0))
+    assert np.abs(light[60:180, 53:68] - 90).max() <= 5.5
+    np.testing.assert_allclose(light[:, 100:], FieldBench(sensor=QUIET).light(Station(0.0))[:, 100:])
+
+
+def test_curve_sharpening_and_compression_change_grey_values_as_they_say() -> None:
+    grey = np.tile(np.array([64, 255], dtype=np.uint8), (16, 8))
+    assert Photograph(gamma=2.0).processed(grey, 255.0)[0, :2].tolist() == [128, 255]
+    edge = np.where(np.arange(16) < 8, 100, 150).astype(np.uint8)[None].repeat(16, axis=0)
+    sharp = Photograph(sharpening=1.0).processed(edge, 255.0)
+    assert sharp[0, 7] < 100
+    assert sharp[0, 8] > 150
+    coded = Photograph(jpeg=60).processed(edge, 255.0)
+    assert (coded != edge).any()
+    assert np.abs(coded.astype(int) - edge).max() < 20
