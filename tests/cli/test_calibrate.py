@@ -217,9 +217,11 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     # Two processes find the same to the byte, whichever is first.
     again = reseau(
         "calibrate", *images, "-d", tmp_path / "field.json", "--free", "fx,fy,cx,cy", "--fill", 0.8, "--json",
-        "--jobs", 2,
+        "--jobs", 2, "--overlay", tmp_path / "seen",
     )  # fmt: skip
     assert again[1] == (tmp_path / "K.json").read_text()
+    drawn = {file.name for file in (tmp_path / "seen").iterdir()}
+    assert drawn == {f"{image.stem}-overlay.png" for image in images}
 
 
 def test_photographs_without_an_image_are_named_in_one_line(reseau: Run, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from .common import (
     Out,
     SensorFile,
     corrected,
+    overlay_files,
     progress,
     read_frame,
     required,
@@ -65,6 +66,12 @@ def calibrate(
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
     out: Out = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a PNG of each photograph: what was measured, what was declined, and why."
+        ),
+    ] = None,
     model: Annotated[
         str,
         typer.Option(
@@ -108,8 +115,10 @@ def calibrate(
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
+    from ..procedures.target_measurement import drawing_overlays
 
     outputs(out, report)
+    drawn = {} if overlay is None else overlay_files(overlay, images)
     distance = positive(distance)
     target, kind = parse_design(read_text(design), design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
@@ -117,6 +126,7 @@ def calibrate(
     options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
     camera = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
+    measure = drawing_overlays(measure, {path.name: file for path, file in drawn.items()})
     with progress("measuring", len(images)) as step:
         frames = _frames(images, channel, sensor, step)
         done = required(calibrate_camera(frames, target, measure, _size(size), camera, options), design)

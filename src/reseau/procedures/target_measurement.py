@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from ..io import ReseauDesign, TestfieldDesign
 from ..measure import TestfieldOptions, measure_reseau, measure_testfield
 from ..measure.points import Measured
 
-__all__ = ["Measurer", "measured_in_order", "measurer_of"]
+__all__ = ["Measurer", "drawing_overlays", "measured_in_order", "measurer_of"]
 
 Measurer = Callable[[Frame], Measured | Failure]
 """A function that measures a target in a frame."""
@@ -49,6 +50,31 @@ def measurer_of(
     if isinstance(design, TestfieldDesign):
         return partial(measure_testfield, design=design, options=testfield)
     return partial(measure_reseau, design=design)
+
+
+def drawing_overlays(measure: Measurer, files: Mapping[str, Path]) -> Measurer:
+    """Return a measurer that also draws what it found in a frame, and what it declined.
+
+    Parameters
+    ----------
+    measure : callable
+        Measures a frame.
+    files : mapping
+        PNG files by names of frames; other frames are not drawn.
+
+    Examples
+    --------
+    >>> callable(drawing_overlays(lambda frame: Failure("no target"), {}))
+    True
+    """
+    return partial(_drawn, measure, dict(files))
+
+
+def _drawn(measure: Measurer, files: Mapping[str, Path], frame: Frame) -> Measured | Failure:
+    found = measure(frame)
+    if frame.name in files:
+        found.overlay(frame, files[frame.name])
+    return found
 
 
 def measured_in_order(
