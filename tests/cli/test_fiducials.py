@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reseau.exchange import read_micmac
 from reseau.io.images import read_image, write_image
 
 from ..measure.photographs import UNEVEN, camera, photograph
@@ -76,3 +77,19 @@ def test_a_damaged_design_is_named(files, tmp_path: Path, reseau: Run, change, m
     status, _, err = reseau("measure", "fiducials", files[0], "-d", tmp_path / "bad.json")
     assert status == 2
     assert message in err
+
+
+def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: Path, reseau: Run) -> None:
+    photo, design = files
+    reseau("measure", "fiducials", photo, "-d", design, "-o", tmp_path / "photo.json")
+    script = tmp_path / "marks.py"
+    status, _, _ = reseau("export", tmp_path / "photo.json", "--micmac", tmp_path, "--metashape", script)
+    assert status == 0
+    (found,) = read_micmac(tmp_path)
+    expected = camera(UNEVEN)
+    assert found.names == expected.ids
+    assert np.abs(found.mm - (expected.xy - [-20.0, 15.0])).max() < 1e-4  # mm
+    assert "Marker.Type.Fiducial" in script.read_text()
+    status, _, err = reseau("export", tmp_path / "photo.json")
+    assert status == 2
+    assert "--micmac" in err

@@ -26,6 +26,7 @@ from . import (
     capture_sensor,
     demo,
     design,
+    export,
     fiducials,
     measure,
     orient,
@@ -56,6 +57,7 @@ app.add_typer(archive.app, name="archive")
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)
+app.command()(export.export)
 app.command()(bundle.bundle)
 app.command()(calibrate.calibrate)
 app.command()(bundle_compare.compare)
