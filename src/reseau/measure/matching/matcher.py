@@ -416,9 +416,9 @@ class Matches:
     form_sigma : ndarray (k, m)
         Standard deviations of `form`.
     influence : ndarray (k, 2, rows, columns)
-        Change of the position with the grey value of each pixel, if it was wanted.
+        Change of the position with the grey value of each pixel; (k, 2, 0, 0) if it was not wanted.
     leverage : ndarray (k, rows, columns)
-        Share of the error of each pixel that the adjustment takes from its residual.
+        Share of the error of each pixel that the adjustment takes from its residual; empty as `influence`.
 
     Examples
     --------
@@ -656,7 +656,7 @@ def _columns(
         expected = -plane * flat if patch.options.polarity == "dark" else flat
         correlation = _correlation(patch.grey - plane, expected, used)
         t = correlation * np.sqrt(np.maximum(used.sum(axis=1) - patch.form_at, 1) / (1 - correlation**2))
-    influence, leverage = np.zeros((k, 2, *patch.shape[1:])), np.zeros(patch.shape)
+    influence, leverage = np.zeros((k, 2, 0, 0)), np.zeros((k, 0, 0))
     if patch.options.influence:
         influence, leverage = patch.influence(x, found.cofactor, used, scale)
     return Matches(

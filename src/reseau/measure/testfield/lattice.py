@@ -248,7 +248,8 @@ def _candidates(ridges: Ridges) -> _Lines:
     order = np.argsort(-weight, kind="stable")
     order = order[share[order] > _LEAST_SHARE]
     thin = slice(None, None, max(1, len(ridges.xy) // _ENOUGH_FOR_LINES))
-    xy, normal, centre = ridges.xy[thin], ridges.normal[thin], _centre(ridges.darkness.shape)
+    xy, normal = (np.ascontiguousarray(columns[thin]) for columns in (ridges.xy, ridges.normal))
+    centre = _centre(ridges.darkness.shape)
     kept: list[tuple[Array, float, Array, float]] = []
     free = np.ones(len(xy), dtype=bool)
     for k in order:
@@ -269,13 +270,14 @@ def _candidates(ridges: Ridges) -> _Lines:
 
 def _line_through(xy: Array, normal: Array, across: Array, distance: float) -> tuple[Any, ...]:
     """A line adjusted to the ridge points along it: normal, distance, ends (2, 2), and rows of its points."""
+    from .compiled import near_line  # takes half a second to import; not every command needs it
+
     along = np.array([-across[1], across[0]])
-    off = xy @ across - distance
-    near = np.flatnonzero((np.abs(off) < _APART_PX / 2) & (np.abs(normal @ across) > _PARALLEL))
-    at, off = xy[near] @ along, off[near]
+    near = near_line(xy, normal, across, distance, _APART_PX / 2, _PARALLEL)
+    at, off = xy[near] @ along, xy[near] @ across - distance
     if len(near) < _FEW_POINTS:
         return across, distance, across * distance + np.zeros((2, 1)) * along, near
-    low, high = np.quantile(at, [0.02, 0.98])
+    low, high = np.sort(at)[np.rint(np.array([0.02, 0.98]) * (len(at) - 1)).astype(np.intp)]
     middle = at.mean()
     weight = np.clip(1 - (2 * off / _APART_PX) ** 2, 0, None)
     slope = (weight * (at - middle) * off).sum() / max((weight * (at - middle) ** 2).sum(), 1e-9)
@@ -324,10 +326,11 @@ def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
     along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     each = max(1, len(ridges.xy) // _ENOUGH_FOR_LINES)
-    points = (ridges.xy - _centre(darkness.shape))[::each]
+    points = ridges.xy[::each] - _centre(darkness.shape)
+    normals = np.ascontiguousarray(ridges.normal[::each])
     step = _STEP_PX * each
     ends = supported(
-        points, ridges.normal[::each], normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each
+        points, normals, normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each
     )
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
     y = _centre(darkness.shape)[1] + rho[:, None] * normal[:, 1:] + along * normal[:, :1]

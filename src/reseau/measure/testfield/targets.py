@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
@@ -22,7 +21,7 @@ from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
 from .lattice_fit import slope_of
-from .line_profiles import blur_of, crossings, strip
+from .line_profiles import blur_of, crossings
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
@@ -283,7 +282,9 @@ class _Canvas:
 
     def _lay(self, part: Rows, half: Rows, *, wanted: bool = False) -> _Part:
         """Add the light of some targets to the sum; derivatives are formed for those to be measured."""
-        (h, w), xy = self.total.shape, self.xy[part]
+        from .compiled import add_windows  # takes half a second to import; not every command needs it
+
+        xy = self.xy[part]
         centre = np.rint(xy)
         right, down = (np.arange(-n, n + 1.0) for n in half)
         window = Window(centre[:, :1] + right, centre[:, 1:] + down, self.scene.response)
@@ -295,12 +296,7 @@ class _Canvas:
         else:
             share = self.images.image(xy, width, form, part, window)
         own = self.scene.light.at(xy)[1][:, None, None] * share
-        column, row = window.columns.astype(np.intp), window.rows.astype(np.intp)
-        seen = ((row >= 0) & (row < h))[:, :, None] & ((column >= 0) & (column < w))[:, None, :]
-        flat = (row[:, :, None] * w + column[:, None, :])[seen]
-        self.total += np.bincount(flat, own[seen], minlength=h * w).reshape(h, w)
-        if wanted:
-            self.near.reshape(-1)[flat] = True
+        add_windows(self.total, self.near, centre.astype(np.intp) - half, own, wanted)
         return _Part(part, half, own, formed)
 
     def match(
@@ -374,8 +370,10 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> Array:
     """Grey values that the lines attenuate or add, (h, w)."""
+    from .compiled import shade  # takes half a second to import; not every command needs it
+
     h, w = scene.grey.shape
-    lines, free = scene.design.lines, np.ones(h * w)
+    lines, free = scene.design.lines, np.ones((h, w))
     x0, y0, x1, y1 = lines.extent
     blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
     steps = steps_of(scene.path)
@@ -399,28 +397,20 @@ def _line_light(scene: Scene) -> Array:
             reach = int(
                 np.ceil((3.5 * blur + longest + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min())
             )
-            row, column, distance = line.around(reach)
-            share = sum(
-                weight * strip(distance - (line.normal @ place)[:, None], half[:, None], blur)
-                for place, weight in zip(*steps, strict=True)
-            )
-            # The ends of the line are blurred, too.
-            ends = np.sort(middle[[0, -1], line.axis])
-            share *= (ndtr((line.step - ends[0]) / blur) * ndtr((ends[1] - line.step) / blur))[:, None]
-            keep = (row >= 0) & (row < h) & (column >= 0) & (column < w)
-            free[(row * w + column)[keep]] *= 1 - share[keep]
-    taken: Array = scene.light.contrast_over((h, w)) * (1 - free.reshape(h, w))
+            ends = np.sort(middle[[0, -1], line.axis])  # they are blurred, too
+            shade(free, line.axis, line.step, line.place, line.normal, half, ends, steps, blur, reach)
+    taken: Array = scene.light.contrast_over((h, w)) * (1 - free)
     return taken
 
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
     """Matches of several parts in the order of their rows; smaller windows are padded."""
     order = np.argsort(np.concatenate(parts), kind="stable")
-    most = np.max([matches.residuals.shape[1:] for matches in found], axis=0)
     columns: dict[str, Any] = {}
     for name in Matches.__dataclass_fields__:
         values = [getattr(matches, name) for matches in found]
         if name in ("residuals", "influence", "leverage"):
+            most = np.max([v.shape[-2:] for v in values], axis=0)
             values = [
                 np.pad(
                     v,
