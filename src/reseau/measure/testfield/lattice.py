@@ -329,9 +329,7 @@ def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
     points = ridges.xy[::each] - _centre(darkness.shape)
     normals = np.ascontiguousarray(ridges.normal[::each])
     step = _STEP_PX * each
-    ends = supported(
-        points, normals, normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each
-    )
+    ends = supported(points, normals, normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each)
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
     y = _centre(darkness.shape)[1] + rho[:, None] * normal[:, 1:] + along * normal[:, :1]
     inside = (x > 0) & (x < w - 1) & (y > 0) & (y < h - 1)
