@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import scipy.stats
+from scipy.special import bdtrc
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
@@ -291,7 +291,7 @@ def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
         return ""
     passed, tried = measurement.found_by_chance(visible)
     share = (passed + 1) / (tried + 2)
-    if scipy.stats.binom.sf(good - 1, len(visible), share) < _BY_CHANCE:
+    if bdtrc(good - 1, len(visible), share) < _BY_CHANCE:
         return ""
     return f"{good} of {len(visible)} places look like its marks, and {passed} of {tried} where it has none"
 
