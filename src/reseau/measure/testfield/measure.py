@@ -29,8 +29,9 @@ from .tone import SHRUNK, ToneCurve, best_curve
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
-_LEAST_FIRST, _MOST_FIRST = 8, 36
-"""Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness."""
+_LEAST_FIRST, _MOST_FIRST, _FIRST_SHARE = 8, 36, 0.125
+"""Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness; more
+than the maximum if it is less than this share of all targets in the frame."""
 _FEW, _AGAIN = 0.05, 4
 """Share of targets not measured for which another round is made; maximum number of rounds."""
 _BESIDE_PX = 0.025
@@ -418,7 +419,8 @@ class _Measurement:
             candidates = candidates[(out <= beyond).all(axis=1)]
             if len(candidates) < _LEAST_FIRST:
                 continue
-            targets = self.rows[candidates[:: max(1, len(candidates) // _MOST_FIRST)]]
+            most = max(_MOST_FIRST, int(_FIRST_SHARE * self.inside.sum()))
+            targets = self.rows[candidates[:: max(1, len(candidates) // most)]]
             predicted = self.predicted
             for _ in range(_MOVES):
                 self._learn(np.isin(self.rows, targets) & self.inside)
