@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -30,6 +31,10 @@ _SPREAD_MM, _SPREAD = 0.008, 0.15
 """Standard deviation of the displacement of edges: in mm, and in units of the thinnest line."""
 _AROUND = 5
 """Pixels around the expected position in which a mark is tracked from level to level."""
+_GREYS, _FEW = 8, 20.0
+"""Classes of grey values whose noise is estimated apart, and pixels by which a class is drawn to the mean."""
+_NEAR = 3
+"""Distance along an axis up to which correlations on the marks themselves are used."""
 _LAGS = 24
 """Largest distance of pixels whose errors count as correlated."""
 
@@ -155,21 +160,53 @@ def match_marks(
         Approximate positions, pixels of the scan.
     """
     xy, cov = np.full((len(rows), 2), np.nan), np.full((len(rows), 2, 2), np.nan)
-    found, reduction = [], np.ones(len(rows))
+    found, first, formed = [], [], []
+    reduction = np.array([_reduction(design, k, linear) for k in rows], dtype=np.intp)
     for i, k in enumerate(rows):
-        level = _reduction(design, k, linear)
-        matched, first = _matched(scan, design, k, linear / level, at[i], level)
-        xy[i] = first + level * matched.xy[0]
-        cov[i] = level**2 * _correlated(matched)
+        level = int(reduction[i])
+        matched, corner, grey = _matched(scan, design, k, linear / level, at[i], level)
         found.append(matched)
-        reduction[i] = level
-    return MatchedMarks(xy, cov, found, reduction)
+        first.append(corner)
+        formed.append(grey + matched.residuals[0])
+    spread = _spread_by_grey(found, formed)
+    spreads = [spread(grey) for grey in formed]
+    on_marks = _on_marks(found, spreads)
+    for i, matched in enumerate(found):
+        xy[i] = first[i] + reduction[i] * matched.xy[0]
+        cov[i] = reduction[i] ** 2 * _correlated(matched, spreads[i], on_marks)
+    return MatchedMarks(xy, cov, found, reduction.astype(np.float64))
+
+
+def _spread_by_grey(found: list[Matches], formed: list[Array]) -> Callable[[Array], Array]:
+    """Standard deviation of residuals as a function of the grey value that was formed.
+
+    Grain depends on the density of the film: a small mark is noisier, or less noisy, than what is around it,
+    and the adjustment takes a large part of its few residuals. All marks of a scan show it together.
+    """
+    columns = []
+    for matched, grey in zip(found, formed, strict=True):
+        used = np.isfinite(matched.residuals[0])
+        if matched.converged[0] and used.any():
+            v, free = matched.residuals[0][used], 1 - np.clip(matched.leverage[0][used], 0.0, 0.95)
+            columns.append(np.stack([grey[used], v * v, free]))
+    if not columns:
+        return np.zeros_like
+    grey, square, free = np.concatenate(columns, axis=1)
+    low, high = np.quantile(grey, [0.001, 0.999])
+    ends = np.linspace(low, max(high, low + 1e-6), _GREYS + 1)
+    kind = np.clip(np.digitize(grey, ends) - 1, 0, _GREYS - 1)
+    total, weight = (np.bincount(kind, values, _GREYS) for values in (square, free))
+    mean = square.sum() / free.sum()
+    # Few pixels of a class are drawn to the mean of all.
+    sigma = np.sqrt((total + _FEW * mean) / (weight + _FEW))
+    middle = (ends[1:] + ends[:-1]) / 2
+    return lambda values: np.asarray(np.interp(np.nan_to_num(values, nan=low), middle, sigma))
 
 
 def _matched(
     scan: Scan, design: FiducialDesign, k: int, linear: Array, at: Array, level: int
-) -> tuple[Matches, Array]:
-    """The best of several matches of one mark, and the place of its window's first pixel."""
+) -> tuple[Matches, Array, NDArray[np.float32]]:
+    """The best of several matches of one mark, the place of its window's first pixel, and its grey values."""
     point = design.points[k]
     mark = design.marks[point.mark]
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
@@ -209,7 +246,7 @@ def _matched(
         if best.converged[0] and best.correlation[0] > _GOOD:
             break
     assert best is not None
-    return best, first
+    return best, first, grey
 
 
 def _better(one: Matches, other: Matches) -> bool:
@@ -226,33 +263,31 @@ def _quiet(grey: NDArray[np.float32], inside: Mask) -> float:
     return float(1.4826 * np.median(np.abs(used)) / np.sqrt(1.25)) if used.size else 0.0
 
 
-def _correlated(found: Matches) -> Array:
+def _correlated(found: Matches, by_grey: Array, on_marks: Array) -> Array:
     """Covariance (2, 2) of a position with the variances and correlations that the residuals show.
 
     With the influence L of each pixel, the local standard deviation s and the autocorrelation ρ of the
     residuals, the covariance is Σ Σ (L s)(p) ρ(p - q) (L s)(q). :mod:`reseau.measure.matching.correlation`
-    needs many marks. Here a window has thousands of pixels beside its mark.
+    needs many marks. Here a window has thousands of pixels beside its mark; `on_marks` are the correlations
+    of neighbours on the marks of the scan, where grain may be coarser than the noise around them.
     """
     cov = np.asarray(found.cov[0])
-    residuals = found.residuals[0]
-    used = np.isfinite(residuals)
+    used = np.isfinite(found.residuals[0])
     if not found.converged[0] or used.sum() < 100 or not np.isfinite(cov).all():
         return cov
-    v = np.where(used, residuals, 0.0)
-    weight = gaussian_filter(used.astype(np.float64), 4.0)
-    local = np.sqrt(gaussian_filter(v * v, 4.0) / np.maximum(weight, 1e-3))
-    local = np.maximum(local, 0.3 * float(np.sqrt((v * v).sum() / used.sum())))
-    unit = v / local
-    size = [2 * n for n in v.shape]
-    power = np.abs(np.fft.rfft2(unit, size)) ** 2
-    pairs = np.abs(np.fft.rfft2(used.astype(np.float64), size)) ** 2
-    auto = np.fft.irfft2(power, size) / np.maximum(np.fft.irfft2(pairs, size), 1.0)
+    unit, local = _unit(found, by_grey)
+    auto, pairs = _pair_sums(unit, used.astype(np.float64))
+    auto /= np.maximum(pairs, 1.0)
     auto /= auto[0, 0]
+    size = auto.shape
     lag = np.hypot(*np.meshgrid(*(np.minimum(np.arange(n), n - np.arange(n)) for n in size), indexing="ij"))
     auto = np.where(lag <= _LAGS, auto * np.cos(np.pi / 2 * np.minimum(lag / _LAGS, 1.0)) ** 2, 0.0)
-    kernel = np.fft.rfft2(auto)
+    reach = np.arange(-_NEAR, _NEAR + 1)
+    near = np.ix_(reach, reach)
+    auto[near] = np.maximum(auto[near], on_marks)
     gain = np.where(used, found.influence[0] * local, 0.0)
-    spread = np.fft.irfft2(np.fft.rfft2(gain, size) * kernel.real, size)[:, : v.shape[0], : v.shape[1]]
+    kernel = np.fft.rfft2(auto)
+    spread = np.fft.irfft2(np.fft.rfft2(gain, size) * kernel.real, size)[:, : used.shape[0], : used.shape[1]]
     uneven = np.einsum("irc,jrc->ij", gain, spread)
     uneven = (uneven + uneven.T) / 2
     # What the prior knowledge of size and spread leaves is in the covariance of independent errors.
@@ -260,3 +295,51 @@ def _correlated(found: Matches) -> Array:
     value, vector = np.linalg.eigh(cov + uneven - even)
     least = np.linalg.eigvalsh(cov)[0]
     return np.asarray((vector * np.maximum(value, least)) @ vector.T)
+
+
+def _unit(found: Matches, by_grey: Array) -> tuple[Array, Array]:
+    """Residuals (rows, columns) in units of their local standard deviations, and these."""
+    residuals = found.residuals[0]
+    used = np.isfinite(residuals)
+    v = np.where(used, residuals, 0.0)
+    weight = gaussian_filter(used.astype(np.float64), 4.0)
+    local = np.sqrt(gaussian_filter(v * v, 4.0) / np.maximum(weight, 1e-3))
+    rms = float(np.sqrt((v * v).sum() / max(int(used.sum()), 1)))
+    local = np.maximum(np.maximum(local, by_grey), max(0.3 * rms, 1e-9))
+    return v / local, local
+
+
+def _pair_sums(values: Array, weight: Array) -> tuple[Array, Array]:
+    """Sums of products of weighted values, and of weights, for each displacement of two windows."""
+    size = [2 * n for n in values.shape]
+    power = np.abs(np.fft.rfft2(values * weight, size)) ** 2
+    pairs = np.abs(np.fft.rfft2(weight, size)) ** 2
+    return np.fft.irfft2(power, size), np.fft.irfft2(pairs, size)
+
+
+def _on_marks(found: list[Matches], spreads: list[Array]) -> Array:
+    """Correlations (2r + 1, 2r + 1) of residuals near each other where they influence positions.
+
+    What the adjustment takes from residuals lowers their correlations by the leverage of these pixels.
+    """
+    reach = np.arange(-_NEAR, _NEAR + 1)
+    near = np.ix_(reach, reach)
+    sums, pairs = np.zeros((2, len(reach), len(reach)))
+    taken, weights = 0.0, 0.0
+    for matched, by_grey in zip(found, spreads, strict=True):
+        used = np.isfinite(matched.residuals[0])
+        activity = np.sqrt((matched.influence[0] ** 2).sum(axis=0)) * used
+        if not matched.converged[0] or not activity.max() > 0:
+            continue
+        activity = activity / activity.max()
+        unit, _ = _unit(matched, by_grey)
+        own, count = _pair_sums(unit, activity)
+        sums, pairs = sums + own[near], pairs + count[near]
+        taken += float((activity**2 * np.clip(matched.leverage[0], 0, 1)).sum())
+        weights += float((activity**2).sum())
+    if not weights > 0:
+        return np.full((len(reach), len(reach)), -1.0)
+    r = sums / np.maximum(pairs, 1e-9)
+    share = taken / weights
+    r = r / max(r[_NEAR, _NEAR], 1e-9) + share * np.exp(-np.hypot(*np.meshgrid(reach, reach)) / 2)
+    return np.asarray(np.minimum(r, 1.0))
