@@ -12,7 +12,7 @@ import pytest
 
 from reseau.bundle import ResultDocument, adjust_network, calibration_of
 from reseau.exchange import read_network
-from reseau.io import FrameOrientation
+from reseau.io import FiducialOrientation, FrameOrientation, FrameTransform
 from reseau.io.network import Network1
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import Pose, matrix_to_vector, project
@@ -300,3 +300,29 @@ def test_a_camera_without_id_or_file_is_refused(
     status, out, err = reseau("bundle", network(), "--camera", given)
     assert (status, out) == (2, "")
     assert "ID=calibration.json" in err
+
+
+def test_fiducial_marks_on_the_command_line_give_pixel_size_and_principal_point(
+    reseau: Run, network: Callable[..., Path], tmp_path: Path
+) -> None:
+    values = {"a1": 1.0, "b1": 0.0, "c1": -0.02, "a2": 0.0, "b2": 1.0, "c2": 0.0}
+    cov = tuple(tuple(4e-6 * float(i == j) for j in range(6)) for i in range(6))
+    transform = FrameTransform(
+        kind="affine",
+        residuals_mm={},
+        sigma_mm=(0.002, 0.002),
+        parameters={key: {"value": value, "sigma": 0.002} for key, value in values.items()},
+    )
+    found = FiducialOrientation(
+        image="scan.tif", sha256="", camera="film", status="oriented", why="", size=(640, 480), px_per_mm=100.0,
+        rotation_deg=0, mirrored=False, marks=(), extent=(-3.0, -2.2, 3.0, 2.2), covariance=cov,
+        transform=transform)  # fmt: skip
+    found.write(tmp_path / "photo.json")
+    result = tmp_path / "result.json"
+    photo = f"cam={tmp_path / 'photo.json'}"
+    status, _, err = reseau("bundle", network(), "--camera", photo, "-o", result)
+    assert (status, err) == (0, "")
+    camera = ResultDocument.read(result).cameras[0]
+    for name, true in (("c", 8.0), ("x0", 0.02), ("y0", 0.0)):
+        assert abs(camera.parameters[name].value - true) < 4 * camera.parameters[name].sigma
+    assert camera.parameters["x0"].sigma < 0.002 * 1.5
