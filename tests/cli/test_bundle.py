@@ -314,9 +314,20 @@ def test_fiducial_marks_on_the_command_line_give_pixel_size_and_principal_point(
         parameters={key: {"value": value, "sigma": 0.002} for key, value in values.items()},
     )
     found = FiducialOrientation(
-        image="scan.tif", sha256="", camera="film", status="oriented", why="", size=(640, 480), px_per_mm=100.0,
-        rotation_deg=0, mirrored=False, marks=(), extent=(-3.0, -2.2, 3.0, 2.2), covariance=cov,
-        transform=transform)  # fmt: skip
+        image="scan.tif",
+        sha256="",
+        camera="film",
+        status="oriented",
+        why="",
+        size=(640, 480),
+        px_per_mm=100.0,
+        rotation_deg=0,
+        mirrored=False,
+        marks=(),
+        extent=(-3.0, -2.2, 3.0, 2.2),
+        covariance=cov,
+        transform=transform,
+    )
     found.write(tmp_path / "photo.json")
     result = tmp_path / "result.json"
     photo = f"cam={tmp_path / 'photo.json'}"
