@@ -5,7 +5,8 @@ recordings of Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 
 In the Cramér–Rao bound, position, sharpness, contrast, background (level and slopes) and size are unknown,
 and all simulated noise is included, also row jitter. The figures refer to the 256 targets of the central
 4 × 4 squares. ``--freed`` measures photographs whose blur, light, print, board and processing the measurement
-does not model as they are, instead; see :class:`reseau_sims.Photograph`.
+does not model as they are, instead; see :class:`reseau_sims.Photograph`. ``--speed`` prints only processor
+times, ``--small`` measures fields that are small in the frame.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from reseau.designs import HIDDEN, coded_testfield
 from reseau.io import SHAPES
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
 from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations
-from reseau_sims.testfield import JITTER_PX
+from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
 DESIGN = coded_testfield()
 OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
@@ -307,14 +308,53 @@ def freed(seeds: int, conditions: list[str]) -> bool:
     return kept
 
 
+def first_pictures() -> None:
+    """Print the processor time for the first picture of this process, and for those after it."""
+    bench = FieldBench(seed=0)
+    frames = [bench.record(station) for station in paper_stations()[::6]]
+    first, _ = timed(frames[0])
+    cpu = [min(timed(frame)[0] for _ in range(3)) for frame in frames]
+    print(
+        f"240 x 240 pixels, processor time: first picture after import {first * 1e3:.0f} ms, "
+        f"then median {np.median(cpu) * 1e3:.0f} ms, least {min(cpu) * 1e3:.0f} ms"
+    )
+
+
+def small() -> bool:
+    """Print what is found of fields that are small in the frame."""
+    good = True
+    for times in (1.4, 1.8, 2.2, 2.6):
+        bench, station = FieldBench(seed=3, distance_mm=times * DISTANCE_MM), Station(30)
+        truth, found = bench.truth(station).xy, measure(bench.record(station))
+        wide, high = np.ptp(truth, axis=0)
+        if not found:
+            print(f"field of {wide:.0f} x {high:.0f} px: {found.reason}")
+            good &= wide < 150
+            continue
+        error = (found.xy - truth)[found.ok]
+        scaled = error / np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
+        print(
+            f"field of {wide:.0f} x {high:.0f} px: {found.found} of {len(truth)} targets, "
+            f"rms {np.sqrt((error**2).mean()):.4f} px, error/sigma {np.sqrt((scaled**2).mean()):.2f}"
+        )
+    return good
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=1, help="sets of recordings")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--condition", nargs="+", default=list(FREED), help="only these, with --freed")
     parser.add_argument("--freed", action="store_true", help="only photographs of freer formation")
+    parser.add_argument("--speed", action="store_true", help="only the first picture, and those after it")
+    parser.add_argument("--small", action="store_true", help="only fields that are small in the frame")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    if arguments.speed:
+        first_pictures()
+        return 0
+    if arguments.small:
+        return 0 if small() else 1
     if arguments.freed:
         return 0 if freed(arguments.seeds, arguments.condition) else 1
     fields = of_the_tests("measure/fields.py")
