@@ -105,9 +105,9 @@ class Trial:
     depth: Array
 
 
-def trial(seed: int, physics: Physics, folder: Path | None = None) -> Trial | str:
+def trial(seed: int, physics: Physics, folder: Path | None = None, echoes: str = "beam") -> Trial | str:
     """The procedure in one world; a text if it failed."""
-    seen = measured(seed, physics, folder)
+    seen = measured(seed, physics, folder, echoes)
     return seen if isinstance(seen, str) else compared(seen)
 
 

@@ -1,7 +1,7 @@
 """The oscilloscope procedure on the simulated bench: correctness of the sigmas, effect of each factor.
 
 Run from the checkout: ``python benchmarks/oscilloscope.py [--frames 200] [--polynomial 100] [--draws 1000]
-[--jobs 1] [--keep FOLDER]``, or with ``--part``:
+[--jobs 1] [--echoes even] [--keep FOLDER]``, or with ``--part``:
 
 - ``independent``: the sets of another program in ``$RESEAU_DATA``, through ``reseau refine`` (see `refined`);
 - ``worlds``: the same with ``--count 200`` worlds of `worlds.oscilloscope`;
@@ -44,7 +44,7 @@ import group_a
 import group_b
 import numpy as np
 from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
-from photographs import Physics
+from photographs import ECHOES, Physics
 from refined import of_points, print_refined, refined
 from tables import judged, mean_square, rms, rms_over_worlds
 from worlds.oscilloscope import World, write
@@ -170,11 +170,12 @@ def print_physics(physics: Physics, found: Sequence[Trial | str], jobs: int) -> 
 
 
 def through_the_procedure(
-    pool: Executor, physics: Physics, seeds: range, folder: Path | None
+    pool: Executor, physics: Physics, seeds: range, folder: Path | None, echoes: str
 ) -> list[Trial | str]:
     """Process worlds one after the other, and report each on standard error."""
     found = []
-    for seed, one in zip(seeds, pool.map(partial(trial, physics=physics, folder=folder), seeds), strict=True):
+    work = partial(trial, physics=physics, folder=folder, echoes=echoes)
+    for seed, one in zip(seeds, pool.map(work, seeds), strict=True):
         found.append(one)
         text = one if isinstance(one, str) else f"{len(one.rods.row)} rods, {len(one.body.row)} points"
         print(f"{physics} {seed}: {text}", file=sys.stderr, flush=True)
@@ -213,6 +214,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=200, help="worlds of Wong's physics")
     parser.add_argument("--polynomial", type=int, default=100, help="worlds that (7a, b) correct exactly")
     parser.add_argument("--first", type=int, default=0, help="seed of the first of these worlds")
+    parser.add_argument("--echoes", choices=[*ECHOES], default="beam", help="their form")
     parser.add_argument("--draws", type=int, default=1000, help="tests of level, from points")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep there what is measured in frames")
@@ -231,7 +233,9 @@ def main() -> int:
         for physics, count in worlds:
             if count:
                 seeds = range(given.first, given.first + count)
-                print_physics(physics, through_the_procedure(pool, physics, seeds, given.keep), given.jobs)
+                print_physics(
+                    physics, through_the_procedure(pool, physics, seeds, given.keep, given.echoes), given.jobs
+                )
         if given.draws:
             group_a.first_tests(pool, given.draws)
             group_b.f_tests(pool, given.draws)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -19,9 +19,17 @@ from reseau.procedures.oscilloscope import photo_i, photo_ii, photo_iii
 from reseau.refine import Registration
 from reseau_sims import World
 
-__all__ = ["Measured", "Physics", "measured"]
+__all__ = ["ECHOES", "Measured", "Physics", "measured"]
 
 Physics = Literal["wong", "polynomial"]
+ECHOES: dict[str, dict[str, float]] = {
+    "beam": {},
+    "even": {"evenness": 0.85},
+    "fading": {"evenness": 0.8, "fading": 0.25},
+    "tapering": {"evenness": 0.7, "tapering": 0.5},
+    "clipped": {"clip": 0.55},
+}
+"""Echoes of other forms: parameters of :class:`reseau_sims.Scanner`."""
 _T = TypeVar("_T")
 
 
@@ -58,13 +66,13 @@ class Measured:
     similar: tuple[bool, bool]
 
 
-def measured(seed: int, physics: Physics, folder: Path | None = None) -> Measured | str:
+def measured(seed: int, physics: Physics, folder: Path | None = None, echoes: str = "beam") -> Measured | str:
     """Measure the photographs of a world, or read the stored measurements; a text if it failed."""
-    file = None if folder is None else folder / f"{physics}-{seed}.pickle"
+    file = None if folder is None else folder / f"{physics}-{echoes}-{seed}.pickle"
     if file is not None and file.exists():
         kept: Measured = pickle.loads(file.read_bytes())
         return kept
-    found = _from_frames(seed, physics)
+    found = _from_frames(seed, physics, ECHOES[echoes])
     if isinstance(found, Failure):
         return f"seed {seed}: {found.reason}"
     if file is not None:
@@ -75,8 +83,10 @@ def measured(seed: int, physics: Physics, folder: Path | None = None) -> Measure
     return found
 
 
-def _from_frames(seed: int, physics: Physics) -> Measured | Failure:
+def _from_frames(seed: int, physics: Physics, form: dict[str, float]) -> Measured | Failure:
     world = World.standard(seed, display=physics)
+    if form:
+        world = World.standard(seed, display=physics, scanner=replace(world.scanner, **form))
     one, two, three = world.photo_i(), world.photo_ii(), world.photo_iii()
     seconds: list[float] = []
 

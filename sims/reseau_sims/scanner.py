@@ -83,6 +83,15 @@ class Scanner:
         Signal of the transducer's face, a line along the upper edge.
     noise : float
         Standard deviation of the receiver's noise at the greatest depth; half of it at the face.
+    evenness : float
+        0 for echoes that decrease like a Gaussian across the beam; towards 1 they become lines of even
+        brightness.
+    fading : float
+        Change of an echo's signal over the width of the beam (one sigma), relative.
+    tapering : float
+        Loss of an echo's thickness at twice the width of the beam, as a fraction.
+    clip : float
+        Largest signal of the video.
 
     Examples
     --------
@@ -106,11 +115,17 @@ class Scanner:
     loss: float = 0.25
     face: float = 0.5
     noise: float = 0.0015
+    evenness: float = 0.0
+    fading: float = 0.0
+    tapering: float = 0.0
+    clip: float = np.inf
 
     def __post_init__(self) -> None:
         positive = ("frequency_mhz", "diameter_mm", "speed", "cycles", "half_sweep_mm", "depth_mm")
         if min(*self.scale, *(getattr(self, name) for name in positive)) <= 0:
             raise UsageError(f"all of {', '.join(positive)} and the scales are positive", where="scanner")
+        if not (0 <= self.evenness < 1 and 0 <= self.tapering < 1):
+            raise UsageError("evenness and tapering are at least 0 and less than 1", where="scanner")
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Scanner:
@@ -172,7 +187,7 @@ class Scanner:
         lit = 0.5 + 0.5 * np.tanh(np.minimum(depth + 0.5, self.depth_mm - depth) / 0.3)
         noise = gaussian_filter1d(rng.standard_normal(power.shape), 2.0, axis=1)
         noise *= self.noise * np.sqrt(2 * np.sqrt(np.pi) * 2.0) * (0.5 + 0.5 * depth / self.depth_mm)[:, None]
-        signal = (signal + noise) * lit[:, None] * swept[None, :]
+        signal = np.minimum(signal + noise, self.clip) * lit[:, None] * swept[None, :]
         return Video(x, y, signal.astype(np.float32))
 
     def _strength(self, reflectors: Reflectors) -> Array:
@@ -194,5 +209,9 @@ class Scanner:
             return
         offset = place[columns] - at
         late = depth[rows, None] - np.hypot(range_, offset)[None, :]
-        arc = echo * np.exp(-0.5 * ((offset / width) ** 2)[None, :] - 0.5 * (late / self.pulse_mm) ** 2)
+        across = np.abs(offset / width)
+        fall = across ** (2 / (1 - self.evenness))
+        thickness = self.pulse_mm * (1 - self.tapering * np.minimum(across / 2, 1) ** 2)
+        height = np.maximum(1 + self.fading * offset / width, 0)
+        arc = echo * height * np.exp(-0.5 * fall - 0.5 * (late / thickness) ** 2)
         power[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += arc**_MIXING
