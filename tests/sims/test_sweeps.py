@@ -271,3 +271,29 @@ def test_the_reseau_is_redrawn_after_a_change() -> None:
     broken = world.plate.over(light, world.camera)
     assert np.abs(broken - whole).max() > 0.5
     np.testing.assert_array_equal(broken, fresh.plate.over(light, fresh.camera))
+
+
+def test_echoes_may_be_even_fading_tapering_or_clipped() -> None:
+    x, y = np.arange(-20.0, 20.05, 0.1), np.arange(58.0, -55.0, -0.05)
+    rod = Reflectors(("only",), np.array([[0.0, -40.0]]), np.ones(1))
+
+    def signal(**form: float) -> Array:
+        video = Scanner(noise=0.0, face=0.0, **form).sweep(rod, x, y, np.random.default_rng(0))
+        return video.signal
+
+    width = float(Scanner().beam_mm(np.array([40.0]))[0])
+    inner, outer = np.abs(x) < 0.7 * width, np.abs(x) > 1.3 * width
+    beam, even = (signal(**form).max(axis=0) for form in ({}, {"evenness": 0.9}))
+    assert beam[inner].min() < 0.8 * beam.max()
+    assert even[inner].min() > 0.98 * even.max()
+    assert even[outer].max() < 0.01 * even.max()
+    fading = signal(evenness=0.9, fading=0.3).max(axis=0)
+    right, left = (
+        fading[np.isclose(x, 0.5 * width, atol=0.05)],
+        fading[np.isclose(x, -0.5 * width, atol=0.05)],
+    )
+    assert right.mean() / left.mean() == pytest.approx(1.15 / 0.85, abs=0.03)
+    whole, tapering = (signal(evenness=0.9, **form) for form in ({}, {"tapering": 0.5}))
+    column = int(np.abs(x - 0.9 * width).argmin())
+    assert tapering[:, column].sum() / whole[:, column].sum() == pytest.approx(1 - 0.5 * 0.45**2, abs=0.02)
+    assert signal(clip=0.4).max() == pytest.approx(0.4, abs=1e-6)
