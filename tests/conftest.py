@@ -1,4 +1,4 @@
-"""Shared by the tests: the reference data, which is not part of the project."""
+"""Shared by the tests: the reference data, which is not part of the project, and no limits of time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# A loaded machine, or code that is compiled at its first call, is not an error.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 

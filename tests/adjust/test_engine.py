@@ -107,7 +107,7 @@ def test_correlated_blocks_are_equivalent_to_the_full_matrix():
 
 
 @given(st.sets(st.sampled_from("abc"), min_size=1))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_fixing_parameters_is_equivalent_to_the_smaller_problem(free):
     start = Parameters("abc", TRUE, free=free)
     fit = adjust(decay_problem(parameters=start)).required()
@@ -490,7 +490,7 @@ def test_wrong_derivatives_by_the_observations_are_found():
 
 
 @given(st.sampled_from([1e-9, 1e-4, 1.0, 1e6]), st.sampled_from([0.0, 1.0, -3.0]))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
     """A parameter in any unit, also if the function is zero at its value."""
     at = np.linspace(1.0, 2.0, 5)
@@ -505,7 +505,7 @@ def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
 
 
 @given(st.integers(1, 5), st.integers(1, 12), st.integers(0, 2**32 - 1), st.sampled_from(METHODS))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_linear_problem_is_solved_as_by_the_pseudoinverse(u, extra, seed, method):
     rng = np.random.default_rng(seed)
     design = rng.normal(size=(u + extra, u))

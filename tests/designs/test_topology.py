@@ -73,7 +73,7 @@ def test_any_single_misclassified_target_is_corrected() -> None:
         assert (np.sort(differ, axis=1)[:, :2] @ [0, 1] >= 11).all()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     square=st.integers(1, 64),
     quarters=st.integers(0, 3),

@@ -324,7 +324,21 @@ def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():
     assert all(result.codes[k] is Code.OVERLAPPING for k in pair)
     assert result.codes[-1] is Code.NO_COORDINATES
     assert result.found == len(close) - 4
-    assert result.notes == ()
+    assert not [note for note in result.notes if note.code is Code.AMBIGUOUS]
+
+
+def test_deviations_far_above_the_sigmas_are_said_if_tolerances_do_not_explain_them():
+    matrix = np.diag([5.0, -5.0])
+    made = OBJECT + np.random.default_rng(3).normal(0, 0.2, OBJECT.shape)
+    shown = frame(picture((made - 50) @ matrix + [400.2, 300.3], arcs(len(OBJECT), 6.0), (600, 800)))
+    design = rods()
+    toleranced = tuple(point.model_copy(update={"sigma": 0.2}) for point in design.points)
+    codes = []
+    for used in (design, design.model_copy(update={"points": toleranced})):
+        result = measure_pins(shown, used)
+        assert result
+        codes.append([note.code for note in result.notes])
+    assert codes == [[Code.INCONSISTENT], []]
 
 
 def test_a_missing_pattern_is_a_failure_with_the_reason():

@@ -294,7 +294,7 @@ def test_polynomial_is_restored_from_its_dictionary(name: str) -> None:
 
 
 @EVERY
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_derivatives_and_inverse_are_correct_for_other_values(case: Case, seed: int) -> None:
     """Parameters changed so that each moves the image by up to 2 % of its size."""

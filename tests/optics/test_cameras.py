@@ -184,7 +184,7 @@ def test_image_side_distortion_has_no_image_beyond_the_fold() -> None:
     assert np.isnan(camera.derivatives([[largest * 1.1, 0.0]]).d_parameters).any()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(st.floats(-1, 1), min_size=8, max_size=8),
     st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=10),
@@ -221,7 +221,7 @@ def test_coefficients_of_the_derivative_agree_where_series_and_formula_meet() ->
     np.testing.assert_allclose(below, above, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.tuples(*[st.floats(-1.7, 1.7)] * 3))
 def test_rotation_vector_matrix_and_angles_are_one_rotation(r: tuple[float, float, float]) -> None:
     matrix = rotation_matrix(r)

@@ -20,7 +20,7 @@ ULTRASONIC = RationalPolynomial.ultrasonic().with_values(
 POINTS = np.random.default_rng(7).uniform(-50, 50, (40, 2))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.floats(-1, 1), min_size=13, max_size=13),
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=20),

@@ -13,7 +13,7 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign, ReseauMeasurement
 from ...optics.field import SmoothField, trend_degree
-from ..points import Measured, Reason
+from ..points import Measured, Reason, deviating
 from .detection import PinDetections, PinOptions, find_pins
 from .segments import cut_segments
 from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
@@ -206,7 +206,8 @@ def measure_pins(
             places=seen.xy[echoes],
         )
     names = tuple(design.ids[i] for i in known)
-    work = _Rods(frame, source[known], names, seen, echoes, layout)
+    tolerance = np.array([design.points[i].sigma or 0.0 for i in known])
+    work = _Rods(frame, source[known], names, seen, echoes, layout, tolerance)
     return _with_slanted(work.result(design.ids, known), design, echoes, layout.gate_px)
 
 
@@ -267,7 +268,9 @@ class _Rods:
         seen: PinDetections,
         echoes: Rows,
         layout: Layout,
+        tolerance: Array,
     ) -> None:
+        self.tolerance_px = tolerance * np.sqrt(np.abs(np.linalg.det(layout.matrix)))
         self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
         self.row, self.gate_px = layout.row, layout.gate_px
         self.notes = (_AMBIGUOUS,) if layout.ambiguous else ()
@@ -350,6 +353,7 @@ class _Rods:
         ok[known] = found
         predicted = np.full((n, 2), np.nan)
         predicted[known] = self.predicted
+        expected = self.seen.cov[at] + self.tolerance_px[found, None, None] ** 2 * np.eye(2)
         return PinResult(
             image=self.frame.name,
             sha256=self.frame.sha256,
@@ -362,7 +366,7 @@ class _Rods:
             deviation=spread(self.deviation[found]),
             **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
             detections=self.seen,
-            notes=self.notes,
+            notes=self.notes + deviating(self.deviation[found], expected),
         )
 
     def _reason(self, rod: int) -> str:
