@@ -49,7 +49,7 @@ def _half(part: MarkPart) -> float:
 def contours_of(mark: FiducialMark, beyond: float) -> list[Array]:
     """Closed polygons (m, 2) of the union of a mark's parts, interior on the left, y up, in mm.
 
-    The border of a notch extends to `beyond`.
+    The border of a notch extends to twice `beyond`, half the side of a window around it.
 
     Examples
     --------

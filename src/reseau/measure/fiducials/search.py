@@ -25,7 +25,7 @@ from ...optics.formation import PixelResponse
 from ..matching import Window
 from .forms import contours_of, margin_of, outlined, reach_of
 
-__all__ = ["BEYOND_MM", "Attitude", "Pattern", "attitudes", "find_patterns", "formed_mark", "least_scales"]
+__all__ = ["Attitude", "Pattern", "attitudes", "find_patterns", "formed_mark", "least_scales"]
 
 _CANDIDATES = 80
 """Most candidates for each form of a mark."""
@@ -35,8 +35,6 @@ _AWAY_PX, _AFFINE = 3.0, 0.004
 """Tolerance of a mark's position in the pattern: in pixels, and in units of the pattern's extent."""
 _FILLED = 0.55
 """Least share of a scan's sides that the marks of a photograph span."""
-BEYOND_MM = 40.0
-"""Extent of the border of a notch, larger than any window."""
 _LONG = 0.5
 """Least distance of two marks that predict the others, in units of the largest."""
 
@@ -129,7 +127,10 @@ def formed_mark(design: FiducialDesign, k: int, linear: Array, psf: float = 0.8)
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
     half = max(3, int(np.ceil((reach_of(mark) + margin_of(mark)) * scale)))
     shape = outlined(
-        [contours_of(mark, BEYOND_MM)], (linear @ turned(point.turn_deg))[None], 0.7 * psf, np.ones(3)
+        [contours_of(mark, reach_of(mark) + margin_of(mark))],
+        (linear @ turned(point.turn_deg))[None],
+        0.7 * psf,
+        np.ones(3),
     )
     along = np.arange(-half, half + 1.0)[None]
     window = Window(along, along, PixelResponse())

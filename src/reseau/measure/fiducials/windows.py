@@ -15,7 +15,7 @@ from ...io import FiducialDesign
 from ...io.scans import Scan
 from ..matching import Matches, MatchOptions, match
 from .forms import contours_of, margin_of, outlined, reach_of
-from .search import BEYOND_MM, formed_mark, turned
+from .search import formed_mark, turned
 
 __all__ = ["MatchedMarks", "grey_window", "match_marks", "tracked"]
 
@@ -215,7 +215,7 @@ def _matched(
     thinnest = min(part.line_width or part.width or part.size for part in mark.parts)
     spread = max(_SPREAD_MM, _SPREAD * thinnest if thinnest < 0.5 else 0.0) * scale
     shape = outlined(
-        [contours_of(mark, BEYOND_MM)],
+        [contours_of(mark, reach_of(mark) + margin_of(mark))],
         (linear @ turned(point.turn_deg))[None],
         0.5,
         np.array([_SIZE, _TURN, spread]),
