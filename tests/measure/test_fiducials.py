@@ -17,7 +17,7 @@ from .photographs import PLACES, UNEVEN, camera, photograph
 
 
 def measured(image, design: FiducialDesign, **options) -> FiducialResult:
-    found = measure_fiducials(scan_of(image, "photo.tif"), design, FiducialOptions(**options))
+    found = measure_fiducials(scan_of(image, "photo.tif", dpi=255.0), design, FiducialOptions(**options))
     assert not isinstance(found, Failure), found
     return found
 
@@ -89,7 +89,7 @@ def test_a_missing_mark_is_said_and_predicted() -> None:
 
 def test_a_foreign_picture_is_declined() -> None:
     image, _ = photograph(without=tuple(PLACES))
-    found = measure_fiducials(scan_of(image), camera())
+    found = measure_fiducials(scan_of(image, dpi=255.0), camera())
     assert isinstance(found, Failure)
     assert found.code in (Code.NOT_FOUND, Code.UNLIKE, Code.INCONSISTENT)
 
@@ -106,3 +106,11 @@ def test_the_orientation_maps_marks_to_their_calibrated_coordinates(tmp_path) ->
     assert np.abs(mm.xy - design.xy).max() < 0.01  # mm
     assert np.abs(mapping.to_pixels(mm.xy) - places).max() < 1e-6
     assert 0 < mm.sigma.max() < 0.02
+
+
+def test_a_wrong_resolution_of_the_file_is_said() -> None:
+    image, places = photograph(UNEVEN)
+    found = measure_fiducials(scan_of(image, dpi=400.0), camera(UNEVEN))
+    assert not isinstance(found, Failure)
+    assert Code.INCONSISTENT in [note.code for note in found.notes]
+    assert np.abs(found.xy - places).max() < 0.05  # px

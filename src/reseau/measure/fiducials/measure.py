@@ -365,11 +365,16 @@ def _scales(
     grid = np.geomspace(high, low, steps + 1)
     tried = [(float(k), _UNKNOWN + 0.01) for k in (grid[1:] + grid[:-1]) / 2]
     stated: list[tuple[float, float]] = []
-    if scan.dpi is not None and not any(abs(scan.dpi - no) < 1 for no in _NO_TAG):
-        k = scan.dpi / 25.4
+    if _states(scan):
+        k = (scan.dpi or 0.0) / 25.4
         if 0.5 * low < k < high:
             stated = [(k, _STATED)]
     return stated, tried
+
+
+def _states(scan: Scan) -> bool:
+    """Whether the file states a resolution that its program may have known."""
+    return scan.dpi is not None and not any(abs(scan.dpi - no) < 1 for no in _NO_TAG)
 
 
 def _found(
@@ -382,12 +387,14 @@ def _found(
         found: list[tuple[Pattern, float]] = []
         for scale, within in scales:
             found += _at_scale(scan, design, options, scale, within)
+            if any(each.likeness.min() > _SURE for each, _ in found):
+                break  # all marks are there
         found.sort(key=lambda each: -each[0].score)
         found = [each for each in found if _enough(each[0], design)]
         if found:
-            if stated and scales is tried:
-                k = np.sqrt(abs(np.linalg.det(found[0][0].linear))) * found[0][1]
-                text = f"the file states {scan.dpi:.0f} dpi; the marks show about {25.4 * k:.0f} dpi"
+            k = 25.4 * np.sqrt(abs(np.linalg.det(found[0][0].linear))) * found[0][1]
+            if options.dpi is None and _states(scan) and abs((scan.dpi or k) / k - 1) > _STATED:
+                text = f"the file states {scan.dpi:.0f} dpi; the marks show about {k:.0f} dpi"
                 notes = (Remark(text, Code.INCONSISTENT),)
             return found, notes
     n = len(design.points)
