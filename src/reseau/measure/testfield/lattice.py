@@ -55,6 +55,8 @@ _PARALLEL = float(np.cos(np.deg2rad(12.0)))
 _FEW_POINTS, _ENOUGH_FOR_LINES = 10, 15000
 _BEYOND_ALL = np.float32(1e30)
 """Larger than all grey values."""
+_WIDEST = 200
+"""Most lines of a family, found or not; a step that asks for more fits any lines."""
 _ALIKE = 0.7
 """Share of lines with the same numbers from which two numberings are the same."""
 _MOST_TRIED, _NUMBERINGS, _MOST_PAIRS, _CONSISTENT = 300, 5, 6, 0.04
@@ -435,7 +437,8 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
     count = fits.sum(axis=1) - same.sum(axis=1)
     span = np.where(fits, whole, -np.inf).max(axis=1) - np.where(fits, whole, np.inf).min(axis=1) + 1
     # With a sufficiently small step any lines fit; therefore gaps are penalized.
-    worth = np.where(np.isfinite(worth) & (count >= 2), worth * count / np.maximum(span, 1), -np.inf)
+    possible = np.isfinite(worth) & (count >= 2) & (span <= _WIDEST)
+    worth = np.where(possible, worth * count / np.maximum(span, 1), -np.inf)
     found: list[_Numbering] = []
     for k in np.argsort(-worth, kind="stable")[:_MOST_TRIED]:
         if not np.isfinite(worth[k]):

@@ -49,6 +49,9 @@ _LEAST_VARIANCE = 1e-6
 """Residual variance assumed where an image of a few pixels fits exactly."""
 _LEAST_STEP_PX = 2.5
 """Least distance of targets in the image, along either direction, at which they can be told apart."""
+_MOST_SQUARES = 4
+"""Most squares between the lines that are compared, relative to those of the design; more belong to another
+pattern."""
 _FAINT = 0.3
 """Minimum contrast of a target relative to the usual contrast."""
 _SURE = 3
@@ -193,6 +196,7 @@ class _Clusters:
         seen: Mask = np.asarray(((xy > 1) & (xy < [w - 2, h - 2])).all(axis=2))
         sides = np.linalg.svd(np.nan_to_num(frames), compute_uv=False) * self.step
         legible = seen.any(axis=1) & (sides[:, 1] > _LEAST_STEP_PX) & (sides[:, 0] < max(h, w) / 2)
+        legible &= legible.sum() <= _MOST_SQUARES * len(design.centres)
         self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
         if not legible.any():
             return
@@ -201,9 +205,13 @@ class _Clusters:
         self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach)
         offset = np.stack(np.meshgrid(self.columns, self.rows), axis=-1).reshape(-1, 2)
         sampled = (self.xy[:, :, None] + offset).astype(np.float32)
-        flat = sampled.reshape(-1, len(offset), 2)
-        self.seen = cv2.remap(
-            grey, flat[..., 0], flat[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        # OpenCV samples less than 32768 rows and columns at a time.
+        lines = sampled.reshape(-1, len(self.columns), 2)
+        self.seen = np.concatenate(
+            [
+                cv2.remap(grey, some[..., 0], some[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                for some in np.array_split(lines, 1 + len(lines) // 30_000)
+            ]
         ).reshape(*self.xy.shape[:2], -1)
         # Pixels that are nearer to a neighbour than to the target are ignored.
         on_board = np.einsum("gij,nj->gni", np.linalg.inv(self.frames), offset)
