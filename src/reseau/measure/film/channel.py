@@ -19,7 +19,7 @@ from .adjacent_lines import (
     edge_beside_line,
     sharp_steps,
 )
-from .border import Band, Film
+from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import EdgeData, robust_line, shared_error
 from .steps import StepForm
@@ -63,9 +63,15 @@ _MOST_GOOD = 0.85
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge."""
+    """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge.
+
+    Also the number of the channel, the polarity of the film, and film and picture beside each edge.
+    """
 
     name: str
+    number: int
+    polarity: int
+    borders: list[Border | None]
     data: list[EdgeData | None]
     rejected: list[int]
     why: list[str]
@@ -136,7 +142,8 @@ def measure_channel(
         for k, (found, sharp) in enumerate(zip(profiles, sharp_steps(profiles), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
-    return Channel(name, data, rejected, why)
+    borders = [None if found is None else found.border for found in profiles]
+    return Channel(name, channel, polarity, borders, data, rejected, why)
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:

@@ -42,6 +42,19 @@ _FILM_MM, _GAP_MM = 0.25, 0.2
 _MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
 """Largest standard deviation of a corner's coordinate of an oriented frame: the larger of the two applies, so
 that a scan finer than its film is not required to be better than the film."""
+_FITS, _AGREES, _CONTRADICTS = (0.3, 1.1), 0.015, 0.08
+"""Size of a frame relative to the scan at which the resolution stated in the file can be that of the scan;
+and relative differences of the scale from it: from the first the frame is not of its format, from the second
+it is another structure."""
+_LEAST_TONE, _LEAST_CUT = 0.12, 0.5
+"""Least difference from film, as a share of the contrast, of a place in the picture; and the share of such
+places along the border of a scan that cuts a frame."""
+_COVERED, _NEAR = 0.25, 0.05
+"""Least share of the scan within a frame with an edge outside it; and largest distance of a missing edge from
+the given corners, as a share of their extent."""
+_REACHED, _SEEN, _SAMPLES = 0.12, 0.4, 20
+"""Shares of the edges beside a missing one: of the edge at its end that may be hidden, and of all its parts
+that must be seen; and the number of these parts."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Rank of each status."""
 _SLANT = float(np.deg2rad(0.7))
@@ -108,6 +121,8 @@ class FrameResult(Display):
         Result for each edge.
     code : Code or None
         Reason for a declined or incomplete frame, or a remark on it, for programs.
+    resolution : float, optional
+        Pixels per millimetre of the scan where they contradict the format: the opening of a slide mount.
 
     Examples
     --------
@@ -125,6 +140,7 @@ class FrameResult(Display):
     lines: Lines | None
     edges: dict[str, MeasuredEdge]
     code: Code | None = None
+    resolution: float | None = None
 
     def __bool__(self) -> bool:
         return self.status != "declined"
@@ -220,9 +236,14 @@ class FrameResult(Display):
 
     @property
     def px_per_mm(self) -> tuple[float, float] | None:
-        """Pixels per millimetre along x and y, from the mean sides of the frame and its format."""
+        """Pixels per millimetre along x and y, from the mean sides of the frame and its format.
+
+        Those of the scan, if the frame is known not to have the size of its format.
+        """
         if self.lines is None or self.format_mm is None:
             return None
+        if self.resolution is not None:
+            return self.resolution, self.resolution
         side = np.roll(self.lines.corners, -1, axis=0) - self.lines.corners
         length = np.hypot(*side.T)
         w, h = self.format_mm
@@ -289,12 +310,19 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     ('oriented', True)
     """
     options = options or FrameOptions()
-    guesses, reduction = _found(scan, options)
-    if isinstance(guesses, Failure):
-        return [_declined(scan, guesses)]
-    results = [_oriented(scan, guess, reduction, options) for guess in guesses]
-    good = [result for result in results if result]
-    return sorted(good or results[:1], key=_reading)
+    declined: list[FrameResult] = []
+    for missing in (False, True):
+        guesses, reduction = _found(scan, options, missing)
+        if isinstance(guesses, Failure):
+            declined = declined or ([_declined(scan, guesses)] if missing else [])
+            continue
+        results = [_oriented(scan, guess, reduction, options) for guess in guesses]
+        good = [result for result in results if result]
+        if good:
+            return sorted(good, key=_reading)
+        # The reason why four edges are no frame is more useful than why three of them are none.
+        declined = declined or results[:1]
+    return declined
 
 
 def _reading(result: FrameResult) -> tuple[float, float]:
@@ -313,7 +341,7 @@ def _declined(scan: Scan, failure: Failure) -> FrameResult:
     return FrameResult(scan.name, "declined", failure.reason, None, None, None, lost, failure.code)
 
 
-def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failure, float]:
+def _found(scan: Scan, options: FrameOptions, missing: bool) -> tuple[list[FrameGuess] | Failure, float]:
     """Frames in an overview; a finer overview is used if the first gives no reliable frame."""
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
@@ -333,6 +361,7 @@ def _found(scan: Scan, options: FrameOptions) -> tuple[list[FrameGuess] | Failur
             hint=None if scan.dpi is None else scan.dpi / 25.4 / r,
             tried=tried,
             near=near,
+            missing=missing,
         )
         if found and (not best or _rank(found) > _rank(best)):
             best, reduction = found, r
@@ -376,7 +405,7 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
-        result = _judged(scan, guess, measured, corners, shape)
+        result = _judged(scan, guess, measured, corners, shape, options)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
             best = result
@@ -393,8 +422,100 @@ def _seen(result: FrameResult) -> tuple[int, float]:
     )
 
 
+def _resolution(scan: Scan, options: FrameOptions, size: tuple[float, float]) -> float | None:
+    """Pixels per millimetre that are given, or stated in the file if they can be those of the scan.
+
+    A camera states a number that has nothing to do with the film: a frame of that resolution would be far
+    smaller than its picture, or larger.
+    """
+    if options.dpi is not None:
+        return options.dpi / 25.4
+    if scan.dpi is None:
+        return None
+    share = [
+        side * scan.dpi / 25.4 / pixels for side, pixels in zip(size, (scan.width, scan.height), strict=True)
+    ]
+    return scan.dpi / 25.4 if _FITS[0] < max(share) < _FITS[1] else None
+
+
+def _unproven(
+    scan: Scan,
+    lines: Lines,
+    measured: Channel,
+    missing: int,
+    shape: FrameShape,
+    options: FrameOptions,
+) -> str:
+    """Why three edges are not those of a frame; empty if they are.
+
+    Any three lines of a picture make a frame with a fourth edge that nobody sees. That edge must lie where
+    the given corners are; or outside a scan of which the frame covers a large part, or where the resolution
+    of the scan puts it, and then the two edges that end there must be seen up to it.
+    """
+    corners = lines.corners
+    ends = corners[[missing, (missing + 1) % 4]]
+    if options.near is not None:
+        away = np.abs(ends - options.near[[missing, (missing + 1) % 4]]).max()
+        return "" if away < _NEAR * np.ptp(options.near) else "the given corners are elsewhere"
+    known = _resolution(scan, options, (shape.width, shape.height))
+    last = np.array([scan.width, scan.height]) - 1.0
+    within = ((ends > 0) & (ends < last)).all(axis=1)
+    if within.any():
+        if known is None:
+            return "without it three lines are no frame; give --dpi, or scan it with more contrast"
+        opposite = float(np.hypot(*(corners[(missing + 3) % 4] - corners[(missing + 2) % 4])))
+        off = opposite / (known * (shape.height if missing % 2 else shape.width)) - 1
+        if abs(off) > _AGREES:
+            return f"the edge opposite to it is {100 * abs(off):.1f} % off the resolution of the scan"
+    left = []
+    for k, towards in (((missing + 1) % 4, -1), ((missing - 1) % 4, 1)):
+        data = measured.data[k]
+        assert data is not None
+        start, stop = (corners[k], corners[(k + 1) % 4])[::towards]
+        place = (data.xy - start) @ (stop - start) / ((stop - start) @ (stop - start))
+        t = np.linspace(0, 1, 400)
+        at = start + t[:, None] * (stop - start)
+        end = float(t[((at > 0) & (at < last)).all(axis=1)].max(initial=0.0))
+        left.append(start + end * (stop - start))
+        parts = np.unique(np.floor(place[(place > 0) & (place < end)] / max(end, 0.1) * _SAMPLES))
+        if place.max() < (1 - _REACHED) * end or len(parts) < _SEEN * _SAMPLES:
+            return f"the {EDGES[k]} edge is not seen up to it"
+    x, y = np.clip(corners, 0, last).T
+    covered = float(np.abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 / np.prod(last))
+    if known is None and covered < _COVERED:
+        return (
+            f"the lines enclose only {100 * covered:.0f} % of the scan; give --dpi or the approximate corners"
+        )
+    if not within.all() and not _cut(scan, measured, *left):
+        return "the scan shows unexposed film there, not the picture"
+    return ""
+
+
+def _cut(scan: Scan, measured: Channel, first: Array, second: Array) -> bool:
+    """Whether picture lies at the border of the scan between two edges that leave it."""
+    borders = [border for border in measured.borders if border is not None]
+    film = float(np.median(np.concatenate([border.level for border in borders])))
+    least = max(
+        _LEAST_TONE * float(np.median([border.contrast for border in borders])),
+        4 * float(np.median([border.spread for border in borders])),
+    )
+    size = np.array([scan.width, scan.height])
+    t = np.linspace(0.05, 0.95, 60)[:, None]
+    at = np.clip(np.rint(first + t * (second - first)), 3, size - 4).astype(int)
+    tones = [
+        np.mean(scan.window(y - 2, y + 3, x - 2, x + 3)[:, :, measured.number]) * measured.polarity
+        for x, y in at
+    ]
+    return bool(np.mean(np.array(tones) - film > least) > _LEAST_CUT)
+
+
 def _judged(
-    scan: Scan, guess: FrameGuess, measured: Channel, corners: Array, shape: FrameShape
+    scan: Scan,
+    guess: FrameGuess,
+    measured: Channel,
+    corners: Array,
+    shape: FrameShape,
+    options: FrameOptions,
 ) -> FrameResult:
     """Adjust the edges found; decline the frame if they contradict the format."""
     missing = [EDGES[k] for k in range(4) if measured.data[k] is None]
@@ -423,12 +544,29 @@ def _judged(
     sigma = np.sqrt(np.diag(lines.covariance))
     if missing:
         reason = measured.why[EDGES.index(missing[0])]
+        if doubt := _unproven(scan, lines, measured, EDGES.index(missing[0]), shape, options):
+            why = f"{missing[0]} edge: {reason}; {doubt}"
+            return replace(base, lines=None, why=why, code=Code.EDGE_MISSING)
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
     scale = max(base.px_per_mm or (0.0, 0.0))
     if (most := float(sigma.max())) > max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale):
         why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
         return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
+    known = _resolution(scan, options, guess.format_mm)
+    own = float(np.mean(base.px_per_mm or (1.0, 1.0)))
+    if known is not None and abs(own / known - 1) > _AGREES:
+        w, h = (side * own / known for side in guess.format_mm)
+        what = f"at the {25.4 * known:.0f} dpi of the scan it has {w:.2f} mm × {h:.2f} mm"
+        if abs(own / known - 1) > _CONTRADICTS:
+            why = f"{what}, which is not the format; give the correct --frame or --dpi"
+            return replace(base, lines=None, why=why, code=Code.INCONSISTENT)
+        # The opening of a mount hides the edges of the frame and is smaller: its size gives no scale.
+        why = "; ".join(
+            part for part in (base.why, f"{what}: the opening of a mount? The scale is that") if part
+        )
+        why += " of the scan, not of the format"
+        return replace(base, status="oriented", why=why, code=Code.UNEQUAL_SCALES, resolution=known)
     return replace(base, status="oriented")
 
 

@@ -22,7 +22,7 @@ from scipy.ndimage import median_filter
 from ...core.data import Array
 from .border import best_line, likelihood
 
-__all__ = ["FrameGuess", "crossings_of", "judged", "lies_in", "search_frames", "settled", "size_of"]
+__all__ = ["FrameGuess", "crossings_of", "judged", "search_frames", "settled", "size_of"]
 
 Plane = NDArray[np.float32]
 
@@ -83,11 +83,6 @@ def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
     if total < 0.4 * seen.sum():
         return None
     return FrameGuess(guess.corners, guess.polarity, guess.format_mm, guess.supported, total)
-
-
-def lies_in(xy: Array, shape: tuple[int, ...]) -> bool:
-    """Whether a point lies within an image of this shape."""
-    return bool((xy > 0).all() and (xy < np.array(shape[::-1]) - 1).all())
 
 
 def _within(corners: Array, shape: tuple[int, ...]) -> bool:
@@ -214,6 +209,7 @@ def search_frames(
     hint: float | None = None,
     tried: int = 60,
     near: Array | None = None,
+    missing: bool = False,
 ) -> list[FrameGuess]:
     """Find frames in an overview; the best first, without overlap.
 
@@ -235,29 +231,27 @@ def search_frames(
         Number of combinations of lines whose surroundings are tested.
     near : ndarray (4, 2), optional
         Approximate corners, accurate to one tenth of the frame's size; no other frames are searched.
+    missing : bool
+        Whether to search frames of which one edge was not detected.
     """
     grey, gradient = _gradients(overview)
     votes, reach = _votes(*gradient, grey.shape, max_tilt_deg)
     shapes = list(dict.fromkeys([f for w, h in formats for f in ((w, h), (h, w))]))
-    for missing in (False, True):
-        scale = (px_per_mm or hint) if missing else px_per_mm
-        found = [
-            guess
-            for turn in _turns(max_tilt_deg)
-            for guess in _combined(votes, reach, turn, shapes, tolerance, scale, grey.shape, missing)
-        ]
-        if near is not None:
-            most = 0.1 * float(size_of(near).max())
-            found = [guess for guess in found if np.abs(guess.corners - near).max() < most]
-        found.sort(key=lambda guess: -guess.score)
-        with warnings.catch_warnings():  # an edge outside the scan has no tones; it is excluded later
-            warnings.simplefilter("ignore", RuntimeWarning)
-            scored = [judged(guess, grey) for guess in _distinct(found, tried)]
-            good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
-            found = [settled(guess, grey) for guess in _apart(good)]
-        if found:
-            return found
-    return []
+    scale = (px_per_mm or hint) if missing else px_per_mm
+    found = [
+        guess
+        for turn in _turns(max_tilt_deg)
+        for guess in _combined(votes, reach, turn, shapes, tolerance, scale, grey.shape, missing)
+    ]
+    if near is not None:
+        most = 0.1 * float(size_of(near).max())
+        found = [guess for guess in found if np.abs(guess.corners - near).max() < most]
+    found.sort(key=lambda guess: -guess.score)
+    with warnings.catch_warnings():  # an edge outside the scan has no tones; it is excluded later
+        warnings.simplefilter("ignore", RuntimeWarning)
+        scored = [judged(guess, grey) for guess in _distinct(found, tried)]
+        good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
+        return [settled(guess, grey) for guess in _apart(good)]
 
 
 def _far(guess: FrameGuess, near: Array | None) -> float:
@@ -406,19 +400,31 @@ def _completed(
         if px_per_mm is not None:
             good &= np.abs(np.log(np.maximum(span, 1) / (size[1 if lying else 0] * px_per_mm))) < 0.06
         i, j = np.nonzero(good[:, None] & np.ones(len(ones), dtype=bool))
-        share = np.minimum(pairs[i, 2:] / length[i, None], 1.5).sum(axis=1)
-        share += np.minimum(ones[j, 2:].max(axis=1) / np.maximum(span[i], 1), 1.5)
+        first = alone[j, 0]
+        low = np.where(first, ones[j, 0], ones[j, 1] - length[i])
+        # A missing edge inside the scan is accepted only if the scale is known.
+        if px_per_mm is None and len(i):
+            gone = np.where(first, low + length[i], low), pairs[i, :2].mean(axis=1)
+            outside = ~_in_scan(gone if lying else gone[::-1], turn * _BIN, shape)
+            i, j, first, low = i[outside], j[outside], first[outside], low[outside]
+        # Votes relative to the length of the edges: a long line does not speak for a short edge.
+        share = np.minimum(pairs[i, 2:] / length[i, None], 1.0).sum(axis=1)
+        share += np.minimum(ones[j, 2:].max(axis=1) / np.maximum(span[i], 1), 1.0)
         for n in np.argsort(-share, kind="stable")[:6]:
-            p, o, first = pairs[i[n]], ones[j[n]], bool(alone[j[n], 0])
-            low = o[0] if first else o[1] - length[i[n]]
-            high = low + length[i[n]]
-            box = (low, p[0], high, p[1]) if lying else (p[0], low, p[1], high)
-            gone = (1 if first else 3) if lying else (2 if first else 0)
-            seen = tuple(k != gone for k in range(4))
+            p, high = pairs[i[n]], low[n] + length[i[n]]
+            box = (low[n], p[0], high, p[1]) if lying else (p[0], low[n], p[1], high)
+            missed = (1 if first[n] else 3) if lying else (2 if first[n] else 0)
+            seen = tuple(k != missed for k in range(4))
             corners = _rectangle(box, turn * _BIN, shape)
-            # A missing edge inside the scan is accepted only if the scale is known.
-            if px_per_mm is not None or not lies_in(corners[[gone, (gone + 1) % 4]].mean(axis=0), shape):
-                yield FrameGuess(corners, polarity, size, seen, float(share[n]))  # type: ignore[arg-type]
+            yield FrameGuess(corners, polarity, size, seen, float(share[n]))  # type: ignore[arg-type]
+
+
+def _in_scan(at: tuple[Array, Array], angle: float, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which points, in axes rotated about the centre of the overview, lie within it."""
+    x, y = at
+    c, s = np.cos(angle), np.sin(angle)
+    column, row = c * x - s * y + (shape[1] - 1) / 2, s * x + c * y + (shape[0] - 1) / 2
+    return np.asarray((column > 0) & (column < shape[1] - 1) & (row > 0) & (row < shape[0] - 1))
 
 
 def _rectangle(box: Sequence[float], angle: float, shape: tuple[int, int]) -> Array:
