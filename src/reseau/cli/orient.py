@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..io import FrameCorners, FrameOrientation
+    from ..io import FrameCorners, FrameOrientation, FrameOutcome
     from ..procedures.film_frame import FrameOptions, FrameResult, Roll
 
 __all__ = ["orient"]
@@ -57,6 +57,7 @@ class _Done:
     documents: list[FrameOrientation]
     results: list[FrameResult]
     failed: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def orient(
@@ -128,8 +129,11 @@ def orient(
         _sheet(out, done, work)
         if found is not None:
             found.corners.write(out / "corners.json")
+        if len(work) > 1:
+            _summarize(out, work, done)
     _report(work, done, found, as_json)
-    return 0 if any(d.status != "declined" for item in done.values() for d in item.documents) else 1
+    oriented = any(d.status != "declined" for item in done.values() for d in item.documents)
+    return 0 if oriented and not any(item.failed for item in done.values()) else 1
 
 
 def _names(images: list[Path]) -> list[str]:
@@ -213,7 +217,7 @@ def _run(job: _Job, before: _Done | None = None) -> _Done:
             scan_overlay(job.overlay, scan, results)
     except ReseauError as error:
         return _Done([], [], str(error))
-    return _Done(documents, results)
+    return _Done(documents, results, notes=tuple(f"{job.image.name}: {note}" for note in scan.notes))
 
 
 def _write(job: _Job, scan: Any, documents: list[FrameOrientation]) -> None:
@@ -260,6 +264,7 @@ def _earlier(job: _Job) -> _Done | None:
     import json
 
     from ..io import FrameOrientation
+    from ..procedures.film_frame import result_of
 
     if job.out is None or job.overlay is not None:
         return None
@@ -270,7 +275,8 @@ def _earlier(job: _Job) -> _Done | None:
         if json.loads(json.dumps(_provenance(job))) != content:
             return None
         stems = [job.name] if count == 1 else [f"{job.name}-{i + 1}" for i in range(count)]
-        return _Done([FrameOrientation.read(job.out / f"{stem}.json") for stem in stems], [])
+        documents = [FrameOrientation.read(job.out / f"{stem}.json") for stem in stems]
+        return _Done(documents, [result_of(document) for document in documents])
     except (OSError, ValueError, KeyError, AttributeError, ReseauError):
         return None
 
@@ -337,6 +343,41 @@ def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
     contact_sheet(out / "overview.png", tiles)
 
 
+def _outcomes(work: list[_Job], done: dict[str, _Done]) -> list[FrameOutcome]:
+    """What became of each frame and of each file that could not be read, in the order of the files."""
+    from ..io import FrameOutcome
+
+    rows = []
+    for job in work:
+        item = done[job.name]
+        if item.failed:
+            rows.append(FrameOutcome(image=job.image.name, name=job.name, status="failed", why=item.failed))
+        for i, d in enumerate(item.documents):
+            name = job.name if len(item.documents) == 1 else f"{job.name}-{i + 1}"
+            largest = max((max(c.sx, c.sy) for c in (d.corners or {}).values()), default=None)
+            rows.append(
+                FrameOutcome(
+                    image=d.image,
+                    name=name,
+                    status=d.status,
+                    why=d.why,
+                    by_roll=bool(d.roll_frames),
+                    sigma_px=largest,
+                )
+            )
+    return rows
+
+
+def _summarize(out: Path, work: list[_Job], done: dict[str, _Done]) -> None:
+    """Write `summary.json` and `summary.html` of a roll."""
+    from ..io import RollSummary, write_whole
+    from ..report.frames import roll_page
+
+    summary = RollSummary.of(_outcomes(work, done))
+    summary.write(out / "summary.json")
+    write_whole(out / "summary.html", roll_page(summary, out / "provenance"))
+
+
 def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json: bool) -> None:
     from ..core.provenance import canonical_json
 
@@ -353,10 +394,26 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
             x, y = (1000 * scatter for scatter in roll.scatter_mm)
             say(f"roll: {roll.frames} frames, scatter of corners {x:.2g} µm in x, {y:.2g} µm in y, ")
             say(f"calibrated corners ± {1000 * max(sx, sy):.2g} µm\n")
+        if len(work) > 1:
+            _print_summary(_outcomes(work, done))
+    for note in (note for item in done.values() for note in item.notes):
+        typer.echo(f"reseau: {note}", err=True)
     if failed and len(failed) == len(work):
         raise InputError(failed[0] if len(failed) == 1 else f"{failed[0]} (and {len(failed) - 1} more)")
     for line in failed:
         typer.echo(f"reseau: {line}", err=True)
+
+
+def _print_summary(rows: list[FrameOutcome]) -> None:
+    """Print how many frames were oriented, with and without the roll, and which were not and why."""
+    from ..io import RollSummary
+
+    summary = RollSummary.of(rows)
+    say(f"{len(rows)} frames: " + ", ".join(f"{count} {what}" for what, count in summary.counts() if count))
+    say("\n")
+    for row in rows:
+        if row.status in ("declined", "failed"):
+            say(f"  {row.image}: {row.status}: {row.why.removeprefix(row.image + ': ')}\n")
 
 
 def _line(document: FrameOrientation) -> str:

@@ -19,9 +19,11 @@ from .frame import (
     EDGES,
     FrameCorners,
     FrameOrientation,
+    FrameOutcome,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
+    RollSummary,
 )
 from .measurement import MeasuredPoint, ReseauMeasurement
 from .reading import is_points, read_design, read_measurement
@@ -41,6 +43,7 @@ __all__ = [
     "FieldTargets",
     "FrameCorners",
     "FrameOrientation",
+    "FrameOutcome",
     "FrameTransform",
     "Mark",
     "MarkPart",
@@ -51,6 +54,7 @@ __all__ = [
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
+    "RollSummary",
     "Strict",
     "TestfieldDesign",
     "is_points",

@@ -1,7 +1,9 @@
-"""``frame-corners/1`` and ``reseau-orientation/1``: the frame of a camera, and the orientation of a scan."""
+"""``frame-corners/1``, ``reseau-orientation/1``, ``reseau-roll/1``: the frame of a camera, the orientation of
+a scan, and what became of the frames of a roll."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -16,9 +18,11 @@ __all__ = [
     "CornerPositions",
     "FrameCorners",
     "FrameOrientation",
+    "FrameOutcome",
     "FrameTransform",
     "MeasuredCorner",
     "MeasuredEdge",
+    "RollSummary",
 ]
 
 CORNERS = ("ul", "ur", "lr", "ll")
@@ -144,6 +148,7 @@ class FrameOrientation(Document):
 
     The numbers of a declined frame are null. `angle_deg` is the direction of the photo x-axis, which
     runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
+    `roll_frames` is the number of frames of a roll whose shape was used.
 
     Examples
     --------
@@ -168,6 +173,7 @@ class FrameOrientation(Document):
     px_per_mm: Pair | None
     edges: dict[Literal["upper", "right", "lower", "left"], MeasuredEdge]
     transform: FrameTransform | None = None
+    roll_frames: int | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -190,6 +196,77 @@ class FrameOrientation(Document):
         return ImagePoints(tuple(name for name, _ in found), xy, cov)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; a missing `transform` is left out."""
+        """Return the content of the file; a missing `transform`, and `roll_frames`, are left out."""
         content = super().to_dict()
-        return content if self.transform else {k: v for k, v in content.items() if k != "transform"}
+        missing = [key for key in ("transform", "roll_frames") if content[key] is None]
+        return {key: value for key, value in content.items() if key not in missing}
+
+
+class FrameOutcome(Strict):
+    """What became of one frame of a roll, or of a file that could not be read (status ``failed``).
+
+    `name` is the stem of its output files, `sigma_px` the largest sigma of a corner's coordinate.
+
+    Examples
+    --------
+    >>> FrameOutcome(image="07.tif", name="07", status="oriented").by_roll
+    False
+    """
+
+    image: str
+    name: str
+    status: Literal["oriented", "three-edges", "declined", "failed"]
+    why: str = ""
+    by_roll: bool = False
+    sigma_px: float | None = None
+
+
+class RollSummary(Document):
+    """``reseau-roll/1``: what became of the frames of a roll.
+
+    Examples
+    --------
+    >>> rows = [
+    ...     FrameOutcome(image="07.tif", name="07", status="oriented", sigma_px=0.02),
+    ...     FrameOutcome(image="08.tif", name="08", status="oriented", by_roll=True, sigma_px=0.1),
+    ...     FrameOutcome(image="09.tif", name="09", status="declined", why="is of one tone"),
+    ... ]
+    >>> [count for count in RollSummary.of(rows).counts() if count[1]]
+    [('oriented', 1), ('oriented with the help of the roll', 1), ('declined', 1)]
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-roll/1"
+    oriented: int
+    helped: int
+    three_edges: int
+    declined: int
+    failed: int
+    frames: tuple[FrameOutcome, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[FrameOutcome]) -> Self:
+        """Create the summary of outcomes."""
+        number = {
+            status: sum(row.status == status and not row.by_roll for row in rows) for status in _OUTCOMES
+        }
+        return cls(
+            oriented=number["oriented"],
+            helped=sum(row.status == "oriented" and row.by_roll for row in rows),
+            three_edges=sum(row.status == "three-edges" for row in rows),
+            declined=number["declined"],
+            failed=number["failed"],
+            frames=tuple(rows),
+        )
+
+    def counts(self) -> list[tuple[str, int]]:
+        """Return what became of the frames in words, and of how many."""
+        return [
+            ("oriented", self.oriented),
+            ("oriented with the help of the roll", self.helped),
+            ("with three edges", self.three_edges),
+            ("declined", self.declined),
+            ("not read", self.failed),
+        ]
+
+
+_OUTCOMES = ("oriented", "declined", "failed")

@@ -36,6 +36,8 @@ _LUMA = {"blue": 0.114, "green": 0.587, "red": 0.299}
 """Weights of Rec. 601, in the order in which they are summed."""
 _HELD, _AROUND = 50_000_000, 65_536
 """Bytes of a mapped file that are held in memory, and bytes that a system maps around one that is read."""
+_DECODED = 50_000_000
+"""Bytes of decoded strips or tiles that are kept: windows side by side cross the same ones."""
 _HELP = "convert it to grey or RGB of 8 or 16 bit"
 _AGAIN = "copy or scan it again"
 
@@ -230,6 +232,7 @@ def _open_tiff(path: Path) -> Scan:
                 raise ImageError("is a truncated TIFF", where=path, do=_AGAIN)
             window = _mapped(page, path) if mapped else _decoding(page, path)
             dpi = _tiff_dpi(page)
+            notes = _further_pages(tiff)
     except ImageError:
         raise
     except Exception as error:  # tifffile and its codecs raise exceptions of every kind on damaged files
@@ -244,7 +247,17 @@ def _open_tiff(path: Path) -> Scan:
         dpi,
         dtype,
         _as_stored(window, page, path, dtype, full_scale),
+        notes,
     )
+
+
+def _further_pages(tiff: Any) -> tuple[str, ...]:
+    """A note if a file has images beside the first one; previews do not count."""
+    try:
+        more = sum(not (page.subfiletype & 1) for page in tiff.pages[1:])
+    except Exception:  # the chain of pages is damaged, and the first one is not
+        return ("further pages are damaged; the first is used",)
+    return (f"has {more + 1} pages, of which only the first is used",) if more else ()
 
 
 def _damaged(path: Path, error: Exception) -> ImageError:
@@ -360,8 +373,9 @@ def _decoding(page: Any, path: Path) -> Window:
                 found = decode(coded, index, jpegtables=tables, jpegheader=header)[0]
             except Exception as error:
                 raise _damaged(path, error) from None
-            # Enough for one row of segments.
-            while len(kept) >= max(2 * across * planes, 4):
+            # The oldest are dropped, but at least one row of segments is kept.
+            size = high * wide * np.dtype(page.dtype).itemsize * (channels if planes == 1 else 1)
+            while len(kept) >= max(2 * across * planes, 4, _DECODED // size):
                 kept.pop(next(iter(kept)))
             empty = np.full((high, wide, channels), page.nodata, page.dtype)
             kept[index] = empty if found is None else found[0]

@@ -26,6 +26,7 @@ from ..measure.film import (
     Kind,
     Roll,
     orient_frames,
+    result_of,
     roll_of,
     transformed,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "orient_scan",
     "orientation_of",
     "reorient_scan",
+    "result_of",
     "roll_of",
 ]
 
@@ -112,7 +114,10 @@ def reorient_scan(
     if not better:
         return list(before)
     note = f"by the shape of {roll.frames} frames of its roll"
-    return [replace(r, why=f"{r.why}; {note}" if r.why else note) for r in again]
+    return [
+        replace(r, why=f"{r.why}; {note}" if r.why else note, roll_frames=roll.frames) if r else r
+        for r in again
+    ]
 
 
 def orientation_of(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,15 +14,16 @@ from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import InputError
-from ..io import FrameOrientation
+from ..io import FrameOrientation, RollSummary
 from ..io.images import write_image
 from ..io.scans import Scan
 from ..measure.film import FrameResult
+from .template import rendered
 
-__all__ = ["contact_sheet", "frame_tile", "scan_overlay", "write_marked"]
+__all__ = ["contact_sheet", "frame_tile", "roll_page", "scan_overlay", "write_marked"]
 
-_STRIPE = 512
-"""Rows copied at a time."""
+_STRIPE, _UNWRITTEN = 512, 50_000_000
+"""Rows copied at a time, and bytes that are held before they are written."""
 _SIDE, _ZOOM, _PART = 420, 208, 0.02
 """Side of the picture of a frame and of a corner in pixels, and the least part of an edge shown on both sides
 of a corner."""
@@ -50,6 +53,7 @@ def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
     shape = (scan.height, scan.width) if grey else (scan.height, scan.width, 3)
     draft = path.with_name(f".{path.name}.draft")
     resolution = None if scan.dpi is None else (scan.dpi, scan.dpi)
+    written = 0
     try:
         image = tifffile.memmap(
             draft,
@@ -62,6 +66,12 @@ def write_marked(path: Path, scan: Scan, corners: Sequence[Array]) -> None:
             bottom = min(top + _STRIPE, scan.height)
             part = scan.window(top, bottom, 0, scan.width)
             image[top:bottom] = part[:, :, 0] if grey else part
+            written += part.nbytes
+            if written > _UNWRITTEN and hasattr(mmap, "MADV_DONTNEED"):
+                # Rows that are written no longer count as memory of this process.
+                image.flush()
+                image._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+                written = 0
         for xy in np.concatenate(list(corners)) if corners else ():
             _mark(image, xy, scan.full_scale)
         image.flush()
@@ -170,3 +180,26 @@ def contact_sheet(path: Path, tiles: Sequence[NDArray[np.uint8]]) -> None:
         y, x = (i // across) * (h + 8), (i % across) * (w + 8)
         sheet[y : y + h, x : x + w] = tile
     write_image(path, sheet)
+
+
+def roll_page(summary: RollSummary, pictures: Path) -> str:
+    """Return an HTML page of a roll: numbers, and each frame with its picture and why it was declined.
+
+    Parameters
+    ----------
+    summary : RollSummary
+        What became of the frames.
+    pictures : Path
+        Folder with a PNG of each frame; a missing one is left out.
+    """
+    rows = []
+    for frame in summary.frames:
+        path, shown = pictures / f"{frame.name}.png", ""
+        picture = cv2.imread(str(path)) if path.is_file() else None
+        if picture is not None:
+            # The whole frame beside its corners; half the size is enough on a page of a roll.
+            small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+            shown = b64encode(coded).decode()
+        rows.append({"frame": frame, "picture": shown})
+    return rendered("roll.html.j2", title="Frames of a roll", counts=summary.counts(), rows=rows)

@@ -2,7 +2,7 @@
 
 from .orientation import FrameOptions, FrameResult, orient_frames
 from .perforations import PITCH_MM, FilmPlane, edge_of, film_plane
-from .roll import Kind, Roll, roll_of, transformed
+from .roll import Kind, Roll, result_of, roll_of, transformed
 
 __all__ = [
     "PITCH_MM",
@@ -14,6 +14,7 @@ __all__ = [
     "edge_of",
     "film_plane",
     "orient_frames",
+    "result_of",
     "roll_of",
     "transformed",
 ]

@@ -123,6 +123,8 @@ class FrameResult(Display):
         Reason for a declined or incomplete frame, or a remark on it, for programs.
     resolution : float, optional
         Pixels per millimetre of the scan where they contradict the format: the opening of a slide mount.
+    roll_frames : int, optional
+        Number of frames of the roll whose shape was used.
 
     Examples
     --------
@@ -141,6 +143,7 @@ class FrameResult(Display):
     edges: dict[str, MeasuredEdge]
     code: Code | None = None
     resolution: float | None = None
+    roll_frames: int | None = None
 
     def __bool__(self) -> bool:
         return self.status != "declined"
@@ -258,6 +261,7 @@ class FrameResult(Display):
             "format_mm": self.format_mm,
             "channel": self.channel,
             "edges": self.edges,
+            "roll_frames": self.roll_frames,
         }
         if self.lines is None or not self:
             none = dict.fromkeys(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,10 +14,10 @@ from ...core.failure import Code, Failure
 from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
 from ...optics import RationalPolynomial
 from ..fitting import fit_mapping
-from .lines import FrameShape, shape_of
+from .lines import FrameShape, Lines, shape_of
 from .orientation import FrameOptions, FrameResult
 
-__all__ = ["KINDS", "Roll", "roll_of", "transformed"]
+__all__ = ["KINDS", "Roll", "result_of", "roll_of", "transformed"]
 
 Kind = Literal["similarity", "affine", "projective", "bilinear"]
 
@@ -128,6 +128,48 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
     )
 
 
+def result_of(document: FrameOrientation) -> FrameResult:
+    """Return the result of a frame from its document, without the covariances between its corners.
+
+    Parameters
+    ----------
+    document : FrameOrientation
+        The document of a frame, as written by an earlier run.
+
+    Returns
+    -------
+    FrameResult
+        With corners, as a frame of its roll; without the quality of its edges.
+
+    Examples
+    --------
+    >>> found = FrameResult("07.tif", "declined", "of one tone", None, None, None, {})
+    >>> result_of(found.document()).why
+    'of one tone'
+    """
+    points, none = document.image_points(), np.zeros(4)
+    lines = None
+    if len(points):
+        covariance = np.zeros((8, 8))
+        for k in range(4):
+            covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = points.cov[k]
+        lines = Lines(points.xy, covariance, *[none] * 7, 1.0, 0)
+    result = FrameResult(
+        document.image,
+        document.status,
+        document.why,
+        document.format_mm,
+        document.channel,
+        lines,
+        document.edges,  # type: ignore[arg-type]
+        roll_frames=document.roll_frames,
+    )
+    if lines is not None and document.px_per_mm is not None and document.px_per_mm != result.px_per_mm:
+        x, y = document.px_per_mm
+        result = replace(result, resolution=x if x == y else None)
+    return result
+
+
 def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | Failure:
     """Determine the common properties of frames of one roll, taken by one camera and scanned alike.
 
@@ -156,7 +198,8 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     >>> roll_of(frames[:3]).code
     <Code.TOO_FEW_IMAGES: 'too-few-images'>
     """
-    sure = [r for r in results if r.status == "oriented" and r.lines is not None]
+    # A frame that was oriented by the shape of the roll says nothing about it.
+    sure = [r for r in results if r.status == "oriented" and r.lines is not None and not r.roll_frames]
     lying = [r.format_mm for r in sure]
     most = max(set(lying), key=lying.count) if lying else None
     sure = [r for r in sure if r.format_mm == most]
@@ -182,10 +225,13 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     shapes = np.array([shape_of(c, nominal) for c in corners[keep]])
     own = shapes.std(axis=0, ddof=1)
     deviation = tuple(float(v) for v in shapes.mean(axis=0))
+    # Another frame differs from the mean of n by the scatter, itself known from n − 1 differences only, and
+    # by the error of the mean: Student's distribution, with its standard deviation.
+    wider = float(np.sqrt((1 + 1 / n) * (n - 1) / max(n - 3, 0.5)))
     shape = FrameShape(
         *most,
-        max(float(own[3]), _LEAST_ASPECT),
-        max(float(own[:3].max()), _LEAST_ANGLE),
+        wider * max(float(own[3]), _LEAST_ASPECT),
+        wider * max(float(own[:3].max()), _LEAST_ANGLE),
         deviation,  # type: ignore[arg-type]
     )
     sigma = (float(scatter[0] / np.sqrt(n)), float(scatter[1] / np.sqrt(n)))
