@@ -316,7 +316,7 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     options = options or FrameOptions()
     declined: list[FrameResult] = []
     for missing in (False, True):
-        guesses, reduction = _found(scan, options, missing)
+        guesses, reduction = _found(scan, options, missing, cut=bool(declined))
         if isinstance(guesses, Failure):
             declined = declined or ([_declined(scan, guesses)] if missing else [])
             continue
@@ -345,8 +345,13 @@ def _declined(scan: Scan, failure: Failure) -> FrameResult:
     return FrameResult(scan.name, "declined", failure.reason, None, None, None, lost, failure.code)
 
 
-def _found(scan: Scan, options: FrameOptions, missing: bool) -> tuple[list[FrameGuess] | Failure, float]:
-    """Frames in an overview; a finer overview is used if the first gives no reliable frame."""
+def _found(
+    scan: Scan, options: FrameOptions, missing: bool, cut: bool
+) -> tuple[list[FrameGuess] | Failure, float]:
+    """Frames in an overview; a finer overview is used if the first gives no reliable frame.
+
+    After four edges that are no frame, one may be `missing` only because the scan is `cut` there.
+    """
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
     for longest, tried in _OVERVIEWS:
@@ -362,7 +367,7 @@ def _found(scan: Scan, options: FrameOptions, missing: bool) -> tuple[list[Frame
             options.formats if options.shape is None else [(options.shape.width, options.shape.height)],
             max_tilt_deg=options.max_tilt_deg,
             px_per_mm=None if options.dpi is None else options.dpi / 25.4 / r,
-            hint=None if scan.dpi is None else scan.dpi / 25.4 / r,
+            hint=None if scan.dpi is None or cut else scan.dpi / 25.4 / r,
             tried=tried,
             near=near,
             missing=missing,
