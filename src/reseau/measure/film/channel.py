@@ -50,7 +50,7 @@ _LEAST_AGREE = 0.45
 _BOWED, _OUTWARDS = 0.6, 0.1
 """Inward bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
 outwards of a straight edge."""
-_PARTS, _MOST_PARTS = 20, 0.5
+_PARTS, _MOST_PARTS = 20, 0.4
 """Parts of an edge, and share of them in which undisturbed profiles determine it."""
 _CHORD = 30
 """Number of points that represent an edge known by its two ends."""
@@ -65,13 +65,15 @@ _MOST_GOOD = 0.85
 class Channel:
     """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge.
 
-    Also the number of the channel, the polarity of the film, and film and picture beside each edge.
+    Also the number of the channel, the polarity of the film, film and picture beside each edge, and the width
+    of a step.
     """
 
     name: str
     number: int
     polarity: int
     borders: list[Border | None]
+    width: float
     data: list[EdgeData | None]
     rejected: list[int]
     why: list[str]
@@ -143,7 +145,8 @@ def measure_channel(
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     borders = [None if found is None else found.border for found in profiles]
-    return Channel(name, channel, polarity, borders, data, rejected, why)
+    width = float(np.median([found.width for found in profiles if found is not None] or [1.0]))
+    return Channel(name, channel, polarity, borders, width, data, rejected, why)
 
 
 def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
@@ -206,10 +209,9 @@ def _edge(
 
 
 def _spans(place: Array) -> bool:
-    """Whether profiles at these positions are seen along most of an edge, and towards both of its ends."""
+    """Whether profiles at these positions are seen along enough of an edge to determine it by themselves."""
     seen = np.bincount(((place + 1) / 2 * _PARTS).astype(np.intp).clip(0, _PARTS - 1), minlength=_PARTS) > 2
-    third = _PARTS // 3
-    return bool(seen.mean() > _MOST_PARTS and seen[:third].any() and seen[-third:].any())
+    return bool(seen.mean() > _MOST_PARTS)
 
 
 def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:

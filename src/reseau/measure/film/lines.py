@@ -31,8 +31,11 @@ __all__ = [
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 """Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""
-_SECTIONS = 24
-"""Number of sections of an edge whose means show the errors common to neighbouring profiles."""
+_SECTIONS = 24, 12
+"""Numbers of sections of an edge whose means show the errors common to neighbouring profiles: structures of
+the picture and phases of the pixels are longer than some of them."""
+_MODEL_PX = 0.012
+"""Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +308,7 @@ def _lines(
     cofactor = fit.covariance[:12, :12].copy()
     for k, edge in enumerate(edges):
         if edge is not None:
-            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2
+            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2 + _MODEL_PX**2 * np.eye(2)
     covariance = slope @ cofactor @ slope.T
     used, out, rms, coverage = (np.zeros(4) for _ in range(4))
     a, b, _ = _frame_axes(corners)
@@ -352,12 +355,14 @@ def shared_error(place: Array, residuals: Array, sigma: Array) -> float:
         Factor, at least 1: the larger of that of single profiles and that of means over sections.
     """
     single = float(np.mean((residuals / sigma) ** 2))
-    section = np.clip(((place + 1) / 2 * _SECTIONS).astype(np.intp), 0, _SECTIONS - 1)
-    weight = np.bincount(section, 1 / sigma**2, minlength=_SECTIONS)
-    mean = np.bincount(section, residuals / sigma**2, minlength=_SECTIONS)
-    seen = weight > 0
-    together = float((mean[seen] ** 2 / weight[seen]).sum()) / max(int(seen.sum()) - 3, 1)
-    return float(np.sqrt(max(single, together, 1.0)))
+    together = []
+    for count in _SECTIONS:
+        section = np.clip(((place + 1) / 2 * count).astype(np.intp), 0, count - 1)
+        weight = np.bincount(section, 1 / sigma**2, minlength=count)
+        mean = np.bincount(section, residuals / sigma**2, minlength=count)
+        seen = weight > 0
+        together.append(float((mean[seen] ** 2 / weight[seen]).sum()) / max(int(seen.sum()) - 3, 1))
+    return float(np.sqrt(max(single, *together, 1.0)))
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:

@@ -39,9 +39,9 @@ _REACH = 4.0
 """Largest error of an approximate edge, in pixels of the overview."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
 """Width of film examined beyond an edge, and width that separates the frame from other structures."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.33, 0.01
-"""Largest standard deviation of a corner's coordinate of an oriented frame: the larger of the two applies, so
-that a scan finer than its film is not required to be better than the film."""
+_MOST_SIGMA_PX, _MOST_SIGMA_MM, _MOST_SIGMA_WIDTHS = 0.33, 0.01, 0.18
+"""Largest standard deviation of a corner's coordinate of an oriented frame: the largest of the three applies,
+the last in widths of a blurred step, so that a scan finer than its film need not be better than the film."""
 _FITS, _AGREES, _CONTRADICTS = (0.3, 1.1), 0.015, 0.08
 """Size of a frame relative to the scan at which the resolution stated in the file can be that of the scan;
 and relative differences of the scale from it: from the first the frame is not of its format, from the second
@@ -559,7 +559,9 @@ def _judged(
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
     scale = max(base.px_per_mm or (0.0, 0.0))
-    if (most := float(sigma.max())) > max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale):
+    if (most := float(sigma.max())) > max(
+        _MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width
+    ):
         why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
         return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
     known = _resolution(scan, options, guess.format_mm)

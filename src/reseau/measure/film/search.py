@@ -113,7 +113,9 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
     moved = np.zeros((4, 2))
     for k in np.flatnonzero(seen):
         near = _running(outside[k], level)
-        far = _running(np.nanmean(np.where(known[k], profiles[k], level)[:, : out // 2], axis=1), level)
+        # Nothing is known beyond the border of the scan, where film may be brighter than at other edges.
+        beyond = np.nanmean(np.where(known[k], profiles[k], np.nan)[:, : out // 2], axis=1)
+        far = _running(np.where(np.isfinite(beyond), beyond, near), level)
         # If tones beyond the detected line differ from film, search for film further outside.
         further = guess.polarity * (np.median(far) - np.median(near)) / strong
         raised = guess.polarity * (np.median(near) - level) > 0.1 * strong
