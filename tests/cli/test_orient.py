@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.io import FrameCorners, FrameOrientation
+from reseau.io import FrameCorners, FrameOrientation, RollSummary
 from reseau_sims.filmframe import FilmFrame
 
 Run = Callable[..., tuple[int, str, str]]
@@ -37,7 +37,8 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     images = sorted(roll.glob("*.tif"))
     status, out, err = reseau("orient", *images, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)
     assert (status, err) == (0, "")
-    assert out.count("oriented") == 4
+    assert out.count(".tif: oriented") == 4
+    assert "5 frames: 4 oriented, 1 with three edges" in out
     assert "4.tif: three-edges" in out
     assert "4 frames of its roll" in out
     frame = FilmFrame(0, dpi=300)
@@ -49,6 +50,13 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     assert marked[y, x] == 255
     assert (marked != plain).sum() < 4 * 30
     assert (tmp_path / "overview.png").stat().st_size > 10_000
+    summary = RollSummary.read(tmp_path / "summary.json")
+    assert [frame.by_roll for frame in summary.frames] == [False] * 4 + [True]
+    assert (tmp_path / "summary.html").read_text("utf-8").count("<img") == 5
+    # A second run finds the results of the first one, and its roll is still the same.
+    (tmp_path / "corners.json").rename(tmp_path / "before.json")
+    assert reseau("orient", *images, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
+    assert (tmp_path / "corners.json").read_text() == (tmp_path / "before.json").read_text()
     corners = FrameCorners.read(tmp_path / "corners.json")
     np.testing.assert_allclose(corners.xy(), frame.gate, rtol=0, atol=0.15)
     # The frame that lacks an edge is surer by its roll than by the format alone.
@@ -199,8 +207,9 @@ def test_frames_that_cannot_be_oriented_are_reported_in_one_line(
         status, _, err = reseau("orient", roll / "0.tif", *arguments)
         assert status == 2
         assert "write " in err
-    # One bad file does not keep the others of a roll from being oriented.
+    # One bad file does not keep the others of a roll from being oriented, but the command has not succeeded.
     status, out, err = reseau("orient", roll / "0.tif", tmp_path / "cut.tif", "--jobs", 1)
-    assert status == 0
+    assert status == 1
+    assert "2 frames: 1 oriented, 1 not read" in out
     assert "0.tif: oriented" in out
     assert "cut.tif: is a truncated TIFF" in err

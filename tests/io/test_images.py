@@ -11,7 +11,7 @@ import tifffile
 
 from reseau.core.errors import ImageError, InputError
 from reseau.core.provenance import sha256_of
-from reseau.io.images import MAX_PIXELS, read_image, write_image
+from reseau.io.images import MAX_PIXELS, open_scan, read_image, write_image
 
 GREY8 = np.random.default_rng(1).integers(0, 256, (40, 60)).astype(np.uint8)
 GREY16 = np.random.default_rng(2).integers(0, 65536, (40, 60)).astype(np.uint16)
@@ -95,3 +95,19 @@ def test_only_images_are_written(tmp_path: Path) -> None:
     rgb = np.dstack([GREY8, GREY8, 0 * GREY8])
     write_image(tmp_path / "c.png", rgb)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "c.png"))[..., ::-1], rgb)
+
+
+@pytest.mark.parametrize("compression", ["jpeg", "lzw"])
+def test_windows_of_compressed_strips_are_those_of_the_whole_image(tmp_path: Path, compression: str) -> None:
+    pixels = np.add.outer(np.arange(96), np.arange(160)).astype(np.uint8)
+    rows = 16 if compression == "jpeg" else 1
+    tifffile.imwrite(tmp_path / "a.tif", pixels, compression=compression, rowsperstrip=rows)
+    scan = open_scan(tmp_path / "a.tif")
+    assert np.abs(scan.window(10, 60, 20, 90)[:, :, 0].astype(int) - pixels[10:60, 20:90]).max() <= 3
+
+
+def test_further_pages_of_a_tiff_are_reported(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for _ in range(2):
+            file.write(np.zeros((16, 16), np.uint8), photometric="minisblack")
+    assert open_scan(tmp_path / "a.tif").notes == ("has 2 pages, of which only the first is used",)

@@ -245,3 +245,31 @@ def test_the_document_contains_principal_point_axes_and_scale() -> None:
     np.testing.assert_allclose([point.x, point.y], ul + s * (lr - ul), rtol=0, atol=0.15)
     assert document.px_per_mm == pytest.approx((600 / 25.4, 600 / 25.4), rel=0.005)
     assert 0 < t < 1
+
+
+def test_a_sharp_edge_is_not_displaced_by_the_grid_of_the_pixels() -> None:
+    """Its pixels are smoothed with their neighbours; by a Gaussian step it was displaced by up to 0.4 px."""
+    frame = FilmFrame(31, tilt_deg=-0.05, blur_px=0.2, noise=0.7, grain=0.3, contrast=0.6)
+    light = cv2.GaussianBlur(frame.scan(), (3, 3), 0.47)
+    result = orient_frames(scan_of(light, dpi=600.0), FrameOptions(((36.0, 24.0),)))[0]
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.1
+
+
+def test_the_resolution_of_the_file_decides_between_rectangles() -> None:
+    frame = FilmFrame(32, dpi=300.0)
+    scan, options = frame.scan(), FrameOptions(((36.0, 24.0),))
+    (other,) = orient_frames(scan_of(scan, dpi=250.0), options)
+    assert other.status == "declined"
+    assert other.code is Code.INCONSISTENT
+    (mount,) = orient_frames(scan_of(scan, dpi=309.0), options)
+    assert mount.status == "oriented"
+    assert mount.px_per_mm == (309 / 25.4, 309 / 25.4)
+    assert "opening of a mount" in mount.why
+
+
+def test_a_picture_that_fades_on_one_side_is_no_frame_of_three_edges() -> None:
+    frame = FilmFrame(33, dpi=300.0, noise=0.7, grain=0.3)
+    fading = np.clip(np.linspace(2.5, -0.8, frame.shape[1]), 0, 1)
+    scan = np.rint(14 + (frame.scan() - 14.0) * fading).clip(0, 255).astype(np.uint8)
+    assert not orient_frames(scan_of(scan), FrameOptions(((36.0, 24.0),)))[0]
