@@ -153,7 +153,7 @@ def result_of(document: FrameOrientation) -> FrameResult:
         covariance = np.zeros((8, 8))
         for k in range(4):
             covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = points.cov[k]
-        lines = Lines(points.xy, covariance, *[none] * 7, 1.0, 0)
+        lines = Lines(points.xy, covariance, none, none, none, none, none, none, none, 1.0, 0)
     result = FrameResult(
         document.image,
         document.status,
