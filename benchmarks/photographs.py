@@ -9,7 +9,7 @@ from __future__ import annotations
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -17,7 +17,7 @@ from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
 from reseau.procedures.oscilloscope import photo_i, photo_ii, photo_iii
 from reseau.refine import Registration
-from reseau_sims import World
+from reseau_sims import Display, World
 
 __all__ = ["ECHOES", "Measured", "Physics", "measured"]
 
@@ -27,9 +27,9 @@ ECHOES: dict[str, dict[str, float]] = {
     "even": {"evenness": 0.85},
     "fading": {"evenness": 0.8, "fading": 0.25},
     "tapering": {"evenness": 0.7, "tapering": 0.5},
-    "clipped": {"clip": 0.55},
+    "saturated": {"saturation": 130.0},
 }
-"""Echoes of other forms: parameters of :class:`reseau_sims.Scanner`."""
+"""Echoes of other forms: parameters of :class:`reseau_sims.Scanner`, and of its display."""
 _T = TypeVar("_T")
 
 
@@ -85,8 +85,10 @@ def measured(seed: int, physics: Physics, folder: Path | None = None, echoes: st
 
 def _from_frames(seed: int, physics: Physics, form: dict[str, float]) -> Measured | Failure:
     world = World.standard(seed, display=physics)
+    tube = {name: value for name, value in form.items() if name in {f.name for f in fields(Display)}}
     if form:
-        world = World.standard(seed, display=physics, scanner=replace(world.scanner, **form))
+        scanner = replace(world.scanner, **{name: form[name] for name in form if name not in tube})
+        world = World.standard(seed, display=replace(world.display, **tube), scanner=scanner)
     one, two, three = world.photo_i(), world.photo_ii(), world.photo_iii()
     seconds: list[float] = []
 

@@ -150,6 +150,8 @@ class Display:
         Distance of the lines of the raster and of the samples on a line.
     spot_mm : float
         Width (one sigma) of the spot across the lines.
+    saturation : float
+        Largest grey value of the phosphor; by default it does not saturate.
     glow : float
         Grey value of black: the raster is never completely dark, so that the reseau is visible.
     contrast : float
@@ -177,6 +179,7 @@ class Display:
     line_mm: float = 0.4
     sample_mm: float = 0.1
     spot_mm: float = 0.18
+    saturation: float = np.inf
     glow: float = 45.0
     contrast: float = 180.0
     grain: float = 0.005
@@ -272,7 +275,7 @@ class Display:
         z = (fine[:, None] - video.y[None, :]) / self.spot_mm
         spot = np.exp(-0.5 * z * z) * (self.line_mm / (self.spot_mm * np.sqrt(2 * np.pi)))
         picture: NDArray[np.float32] = spot.astype(np.float32) @ (self.glow + self.contrast * signal)
-        return np.maximum(picture, 0, out=picture)
+        return np.clip(picture, 0, self.saturation, out=picture)
 
     def _with_disks(self, video: Video) -> NDArray[np.float32]:
         signal = video.signal

@@ -90,8 +90,6 @@ class Scanner:
         Change of an echo's signal over the width of the beam (one sigma), relative.
     tapering : float
         Loss of an echo's thickness at twice the width of the beam, as a fraction.
-    clip : float
-        Largest signal of the video.
 
     Examples
     --------
@@ -118,7 +116,6 @@ class Scanner:
     evenness: float = 0.0
     fading: float = 0.0
     tapering: float = 0.0
-    clip: float = np.inf
 
     def __post_init__(self) -> None:
         positive = ("frequency_mhz", "diameter_mm", "speed", "cycles", "half_sweep_mm", "depth_mm")
@@ -187,7 +184,7 @@ class Scanner:
         lit = 0.5 + 0.5 * np.tanh(np.minimum(depth + 0.5, self.depth_mm - depth) / 0.3)
         noise = gaussian_filter1d(rng.standard_normal(power.shape), 2.0, axis=1)
         noise *= self.noise * np.sqrt(2 * np.sqrt(np.pi) * 2.0) * (0.5 + 0.5 * depth / self.depth_mm)[:, None]
-        signal = np.minimum(signal + noise, self.clip) * lit[:, None] * swept[None, :]
+        signal = (signal + noise) * lit[:, None] * swept[None, :]
         return Video(x, y, signal.astype(np.float32))
 
     def _strength(self, reflectors: Reflectors) -> Array:
