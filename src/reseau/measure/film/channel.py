@@ -209,9 +209,13 @@ def _edge(
 
 
 def _spans(place: Array) -> bool:
-    """Whether profiles at these positions are seen along enough of an edge to determine it by themselves."""
+    """Whether profiles at these positions are seen along enough of an edge, and towards both of its ends.
+
+    A line beside one half hides an edge there; continued from the other half, it was wrong by 1 px.
+    """
     seen = np.bincount(((place + 1) / 2 * _PARTS).astype(np.intp).clip(0, _PARTS - 1), minlength=_PARTS) > 2
-    return bool(seen.mean() > _MOST_PARTS)
+    third = _PARTS // 3
+    return bool(seen.mean() > _MOST_PARTS and seen[:third].any() and seen[-third:].any())
 
 
 def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
