@@ -91,6 +91,7 @@ def compare(found: ImagePoints, drawn: Array) -> None:
         np.testing.assert_allclose(white @ white.T / len(drawn), np.eye(2), atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_directions_of_a_camera_have_the_covariance_of_points_and_calibration() -> None:
     calibration, rng = camera(), np.random.default_rng(1)
     mapping = calibration.mapping()
@@ -107,6 +108,7 @@ def test_directions_of_a_camera_have_the_covariance_of_points_and_calibration() 
     compare(found, np.array(drawn))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", [None, projective()], ids=["corners", "projective"])
 def test_photo_coordinates_have_the_covariance_of_points_and_corners(
     transform: dict[str, object] | None,

@@ -60,6 +60,7 @@ def test_corners_of_an_upright_frame_are_named_as_seen() -> None:
     np.testing.assert_allclose(result.lines.corners, seen, rtol=0, atol=0.35)
 
 
+@pytest.mark.slow
 def test_predicted_sigmas_cover() -> None:
     normalised = []
     for seed in range(14):
@@ -131,6 +132,7 @@ def test_a_curve_that_leaves_a_dark_edge_is_not_measured_as_its_bow() -> None:
     assert not result or np.abs(errors(result, frame)).max() < 0.5
 
 
+@pytest.mark.slow
 def test_edge_positions_are_unbiased_in_noise() -> None:
     """With a noise of a tenth of the contrast the mean of eight frames was 0.04 px, five standard errors."""
     inwards = []

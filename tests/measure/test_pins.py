@@ -97,6 +97,7 @@ def test_the_derivatives_of_images_are_correct(start: tuple[float, ...], at: tup
         assert np.abs(difference - derivatives[0, k]).max() < 1e-6 * max(1.0, np.abs(difference).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("along", "across", "curvature", "tilt"),
     [(7.0, 1.7, 0.015, 0.0), (10.0, 1.4, 0.02, 0.5), (5.0, 2.2, -0.01, -0.7)],
