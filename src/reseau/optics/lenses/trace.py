@@ -64,6 +64,11 @@ class Rays:
         Points on the rays, mm.
     directions : ndarray (n, 3)
         Unit vectors in the direction of the light.
+
+    Examples
+    --------
+    >>> Rays.between(np.zeros(3), np.array([[0.0, 0.0, 5.0]])).directions
+    array([[0., 0., 1.]])
     """
 
     xyz: Array
@@ -92,6 +97,11 @@ class Traced:
         or stopped by its aperture.
     seen : ndarray (s, n, 6), optional
         Rays behind each surface, in its axes.
+
+    Examples
+    --------
+    >>> Traced(Rays(np.ones((2, 3)), np.ones((2, 3))), np.array([0, 3])).arrived
+    array([ True, False])
     """
 
     rays: Rays
@@ -121,6 +131,19 @@ class RayDerivatives:
         the direction itself has no effect.
     by_surface : ndarray (n, 2, s, p)
         By the parameters of each surface, in the order of :data:`SURFACE_PARAMETERS`.
+
+    Examples
+    --------
+    The image moves with a decentred lens by 1 - m of its shift; here the object is far away, and m is 0:
+
+    >>> from reseau.optics.lenses import AIR, Constant, Prescription, in_order
+    >>> surfaces = in_order([(0.02, 1e-6, Constant(1.5)), (-0.02, 50.0, AIR)])
+    >>> lens = Prescription(surfaces, stop=0, stop_radius=1.0)
+    >>> axial = Rays(np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]]))
+    >>> by_surface = Tracer(lens).derivatives(axial).by_surface
+    >>> by_x = by_surface[0, 0, :, SURFACE_PARAMETERS.index("vertex_x")]
+    >>> by_x.round(3).tolist()
+    [0.5, 0.5, -1.0]
     """
 
     xy: Array
@@ -180,7 +203,10 @@ class Tracer:
             Whether the rays behind each surface are wanted.
         """
         work = np.concatenate([rays.xyz.T, rays.directions.T]).astype(np.float64)
+        none = ~np.isfinite(work).all(axis=0)
+        work[:, none] = 0.0
         lost, records = self._run(work, seen)
+        lost[none] = 1
         work[:, lost != 0] = np.nan
         history = None if records is None else records.transpose(0, 2, 1)
         return Traced(Rays(work[:3].T, work[3:].T), lost.astype(np.int64), history)

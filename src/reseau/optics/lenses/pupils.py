@@ -1,0 +1,295 @@
+r"""Rays from points of the object through given points of the stop.
+
+The real stop limits the light, not its paraxial image. A ray through a point of the stop is found by Newton's
+method on the point of the entrance pupil's plane at which it is aimed; the determinant of that mapping also
+gives the solid angle of an element of the stop, and with it the light that passes the element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.data import Array, Mask
+from ...core.errors import UsageError
+from .paraxial import Paraxial
+from .prescription import Prescription
+from .trace import Rays, Traced, Tracer
+
+__all__ = ["Aimed", "PupilElements", "RayKind", "aim", "labels", "principal_rays"]
+
+RayKind = Literal["principal", "marginal", "meridional", "sagittal", "skew"]
+
+_STEPS = 12
+"""Largest number of Newton steps."""
+_NEAR = 1e-10
+"""A ray is aimed when it passes the stop this near to its point, in radii of the stop."""
+
+
+@dataclass(frozen=True, eq=False)
+class PupilElements:
+    """Points of the stop with weights that add up to 1.
+
+    Parameters
+    ----------
+    xy : ndarray (n, 2)
+        In radii of the stop.
+    weights : ndarray (n,)
+
+    Examples
+    --------
+    >>> equal, gauss = PupilElements.equal_areas(3), PupilElements.gauss(3)
+    >>> len(equal.xy), len(gauss.xy), bool(np.isclose(gauss.weights @ (gauss.xy**2).sum(axis=1), 0.5))
+    (19, 40, True)
+    """
+
+    xy: Array
+    weights: Array
+
+    @classmethod
+    def equal_areas(cls, rings: int) -> PupilElements:
+        """A central element, and rings of 6, 12, 18 … elements around it, all of the same area."""
+        total = 1 + 3 * rings * (rings - 1)
+        found = [np.zeros((1, 2))]
+        for k in range(1, rings):
+            inner, outer = (np.sqrt((1 + 3 * j * (j - 1)) / total) for j in (k, k + 1))
+            found.append(_ring(np.sqrt((inner**2 + outer**2) / 2), 6 * k, 0.5 * (k % 2)))
+        return cls(np.concatenate(found), np.full(total, 1 / total))
+
+    @classmethod
+    def gauss(cls, rings: int) -> PupilElements:
+        """Gauss's quadrature in the square of the radius (Forbes 1988, J. Opt. Soc. Am. A 5, 1943).
+
+        Moments of a spot are exact for aberrations that are polynomials, already with few rings.
+        """
+        node, weight = np.polynomial.legendre.leggauss(rings)
+        found, weights = [], []
+        for k, (square, w) in enumerate(zip((node + 1) / 2, weight / 2, strict=True)):
+            count = max(8, int(np.ceil(2 * np.pi * np.sqrt(square) * rings)) // 2 * 2)
+            # The golden section keeps points of different rings from lining up.
+            found.append(_ring(np.sqrt(square), count, (k * 0.618034) % 1.0))
+            weights.append(np.full(count, w / count))
+        return cls(np.concatenate(found), np.concatenate(weights))
+
+
+def _ring(radius: float, count: int, offset: float) -> Array:
+    angle = 2 * np.pi * (np.arange(count) + offset) / count
+    return np.asarray(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Aimed:
+    """Rays from points of the object through points of the stop.
+
+    Parameters
+    ----------
+    rays : Rays
+        n rays in the axes of the lens; NaN where there is none.
+    solid_angle : ndarray (n,)
+        Solid angle, seen from the point of the object, of a unit area of the stop, sr/mm².
+    found : ndarray of bool (n,)
+        Whether there is a ray through the point of the stop.
+
+    Examples
+    --------
+    See :func:`aim`, which returns them.
+    """
+
+    rays: Rays
+    solid_angle: Array
+    found: Mask
+
+
+def labels(pupil: Array, object_xy: Array) -> NDArray[np.str_]:
+    """Name rays by where they pass the stop: principal, marginal, meridional, sagittal, skew.
+
+    Parameters
+    ----------
+    pupil : ndarray (n, 2)
+        Points of the stop, in its radii.
+    object_xy : ndarray (2,)
+        Point of the object, in the axes of the lens: with the axis it spans the meridional plane. For a point
+        on the axis every plane through the axis is meridional.
+
+    Examples
+    --------
+    >>> at = np.array([[0, 0], [0, 1.0], [0, 0.5], [0.5, 0], [0.3, 0.3]])
+    >>> labels(at, np.array([0.0, 10.0])).tolist()
+    ['principal', 'marginal', 'meridional', 'sagittal', 'skew']
+    """
+    away = np.hypot(*object_xy)
+    radius = np.hypot(pupil[:, 0], pupil[:, 1])
+    if away < 1e-12:
+        along, across = radius, np.zeros(len(pupil))
+    else:
+        e = np.asarray(object_xy) / away
+        along, across = pupil @ e, pupil[:, 0] * e[1] - pupil[:, 1] * e[0]
+    near = 1e-9
+    return np.select(
+        [
+            radius < near,
+            (np.abs(across) < near) & (radius > 1 - near),
+            np.abs(across) < near,
+            np.abs(along) < near,
+        ],
+        ["principal", "marginal", "meridional", "sagittal"],
+        "skew",
+    )
+
+
+def aim(lens: Prescription, points: Array, pupil: Array, wavelength_nm: float | None = None) -> Aimed:
+    """Aim rays from points of the object at points of the real stop.
+
+    Parameters
+    ----------
+    lens : Prescription
+    points : ndarray (n, 3)
+        Points of the object in the axes of the lens, mm, in front of its first surface.
+    pupil : ndarray (n, 2)
+        Points of the stop in its radii.
+    wavelength_nm : float, optional
+        By default that of the corresponding rays.
+
+    Raises
+    ------
+    UsageError
+        When a point lies behind the first surface, or the radius of the stop is not known.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Prescription, Tracer, glass, in_order
+    >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 3.0, AIR), (0.0, 60.0, AIR)]
+    >>> lens = Prescription(in_order(rows), stop=2, stop_radius=4.0)
+    >>> rays = aim(lens, np.array([[10.0, 0.0, -200.0]]), np.array([[0.5, 0.5]])).rays
+    >>> Tracer(lens, last=2).trace(rays).xy.round(9)
+    array([[2., 2.]])
+    """
+    points, pupil = np.atleast_2d(points), np.atleast_2d(pupil)
+    _checked(lens, points)
+    first = Paraxial(lens, wavelength_nm)
+    position, scale = first.entrance_pupil
+    radius = lens.stop_radius
+    if radius is None:
+        raise UsageError("the radius of its stop is not known", where=lens.name, do="give `stop_radius`")
+    front = lens.surfaces[0]
+    # A plane in which rays are aimed: that of the entrance pupil unless it is far away.
+    depth = position if np.isfinite(position) and abs(position) < 1e3 * radius else 0.0
+    to_stop = Tracer(lens, wavelength_nm, last=lens.stop, apertures=False)
+    wanted = radius * pupil
+
+    def through(targets: Array, start: Array) -> tuple[Array, Rays]:
+        on_plane = np.concatenate([targets, np.full((len(targets), 1), depth)], axis=1)
+        rays = Rays.between(start, on_plane @ front.axes.T + front.vertex)
+        # The direction of the light also where the pupil lies in front of the object.
+        rays = Rays(rays.xyz, rays.directions * np.sign(rays.directions @ front.axes[:, 2])[:, None])
+        return to_stop.trace(rays).xy, rays
+
+    guess = scale * wanted if np.isfinite(scale) and depth == position else wanted
+    targets, det, ok = _newton(through, points, guess, wanted, radius)
+    if not ok.all():  # wide angles: approach the point from the axis
+        targets, det, ok = _approached(
+            through, points, front.vertex, guess, wanted, radius, (targets, det, ok)
+        )
+    rays = through(targets, points)[1]
+    on_plane = (
+        np.concatenate([targets, np.full((len(targets), 1), depth)], axis=1) @ front.axes.T + front.vertex
+    )
+    away = on_plane - points
+    distance = np.linalg.norm(away, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        angle = np.abs(away @ front.axes[:, 2]) / distance**3 / np.abs(det)
+    directions = np.where(ok[:, None], rays.directions, np.nan)
+    return Aimed(Rays(np.where(ok[:, None], rays.xyz, np.nan), directions), np.where(ok, angle, 0.0), ok)
+
+
+def _checked(lens: Prescription, points: Array) -> None:
+    front = lens.surfaces[0]
+    local = (points - front.vertex) @ front.axes
+    if not np.isfinite(local).all():
+        raise UsageError("a point of the object is not finite", where=lens.name)
+    with np.errstate(invalid="ignore"):
+        sag = np.nan_to_num(front.sag(local[:, 0], local[:, 1]))
+    if (local[:, 2] >= np.minimum(sag, 0)).any():
+        raise UsageError(
+            f"a point of the object lies behind {front.name or 'the first surface'}",
+            where=lens.name,
+            do="objects are in front of the lens, at negative z",
+        )
+
+
+Through = Callable[[Array, Array], tuple[Array, Rays]]
+
+
+def _newton(
+    through: Through, points: Array, targets: Array, wanted: Array, radius: float
+) -> tuple[Array, Array, Mask]:
+    """Targets for rays through the wanted points of the stop, determinants, and which were found."""
+    targets = targets.copy()
+    det, ok = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.bool_)
+    h = 1e-6 * radius
+    todo = np.arange(len(points))
+    for _ in range(_STEPS):
+        at, start = targets[todo], points[todo]
+        three = np.concatenate([at, at + np.array([h, 0]), at + np.array([0, h])])
+        hit = through(three, np.tile(start, (3, 1)))[0].reshape(3, -1, 2)
+        miss = hit[0] - wanted[todo]
+        j = np.stack([(hit[1] - hit[0]) / h, (hit[2] - hit[0]) / h], axis=2)
+        d = j[:, 0, 0] * j[:, 1, 1] - j[:, 0, 1] * j[:, 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = j[:, 1, 1] * miss[:, 0] - j[:, 0, 1] * miss[:, 1]
+            y = j[:, 0, 0] * miss[:, 1] - j[:, 1, 0] * miss[:, 0]
+            step = np.stack([x, y], axis=1) / d[:, None]
+        det[todo] = d
+        done = np.hypot(miss[:, 0], miss[:, 1]) < _NEAR * radius
+        ok[todo[done]] = True
+        usable = ~done & np.isfinite(step).all(axis=1)
+        targets[todo[usable]] -= step[usable]
+        todo = todo[usable]
+        if not len(todo):
+            break
+    return targets, det, ok
+
+
+def _approached(
+    through: Through,
+    points: Array,
+    vertex: Array,
+    guess: Array,
+    wanted: Array,
+    radius: float,
+    found: tuple[Array, Array, Mask],
+) -> tuple[Array, Array, Mask]:
+    """Aim again what was not found, from points nearer to the axis outwards."""
+    targets, det, ok = found[0].copy(), found[1].copy(), found[2].copy()
+    rest = np.flatnonzero(~ok)
+    axis, current = points[rest].copy(), guess[rest]
+    axis[:, :2] = vertex[:2]
+    alive = np.ones(len(rest), dtype=np.bool_)
+    for share in np.linspace(0, 1, 9):
+        near = axis + share * (points[rest] - axis)
+        new, d, good = _newton(through, near, current, wanted[rest], radius)
+        alive &= good
+        current = np.where(good[:, None], new, current)
+        det[rest], targets[rest] = d, current
+    ok[rest] = alive
+    return targets, det, ok
+
+
+def principal_rays(lens: Prescription, points: Array, wavelength_nm: float | None = None) -> Traced:
+    """Corresponding rays: principal rays of points (n, 3), traced to the image; lost rays are NaN.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
+    >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 3.0, AIR), (0.0, 60.0, AIR)]
+    >>> lens = Prescription(in_order(rows), stop=2, stop_radius=4.0)
+    >>> principal_rays(lens, np.array([[0.0, 10.0, -200.0]])).xy.round(3)
+    array([[ 0.   , -3.207]])
+    """
+    points = np.atleast_2d(points)
+    aimed = aim(lens, points, np.zeros((len(points), 2)), wavelength_nm)
+    return Tracer(lens, wavelength_nm).trace(aimed.rays)
