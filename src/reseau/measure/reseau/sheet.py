@@ -33,7 +33,7 @@ from ..points import Reason
 from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
 from ..screening import Screened, screen
 from ..testfield.lattice_fit import second_order
-from ..testfield.targets import merged
+from ..testfield.targets import merged, replaced
 from ..testfield.tone import ToneCurve
 from .disks import Disks, find_disks
 from .marks import ReseauOptions
@@ -228,8 +228,7 @@ class _Sheet:
         if doubtful.any() and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS and field is not None:
             # Look again where their neighbours predict them, without what lies in front of them.
             self._uncover(rows, found, doubtful, field)
-            parts = [np.flatnonzero(~doubtful), np.flatnonzero(doubtful)]
-            found = merged(parts, [found.select(~doubtful), self._match_all(rows[doubtful])])
+            found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
         found = _with_all_errors(found)
         why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
@@ -264,8 +263,7 @@ class _Sheet:
         self.dazzled[rows] |= dim
         if not dim.any():
             return found
-        parts = [np.flatnonzero(~dim), np.flatnonzero(dim)]
-        return merged(parts, [found.select(~dim), self._match(rows[dim], background=0, influence=True)])
+        return replaced(found, ~dim, self._match(rows[dim], background=0, influence=True))
 
     def _match(self, rows: Rows, background: int = 2, influence: bool = False) -> Matches:
         """Match disks, grouped by window size."""

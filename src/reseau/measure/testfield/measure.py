@@ -24,7 +24,7 @@ from .lattice_fit import LatticeFit, refit, slope_of
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
-from .targets import Light, Scene, match_targets, merged, pixels_of_targets
+from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
 from .tone import SHRUNK, ToneCurve, best_curve
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
@@ -259,11 +259,6 @@ def _curved(curve: ToneCurve) -> Remark:
     return Remark(text, Code.NONLINEAR)
 
 
-def _replaced(found: Matches, keep: Mask, others: Matches) -> Matches:
-    """The matches to keep, and others in the places of the remaining ones."""
-    return merged([np.flatnonzero(keep), np.flatnonzero(~keep)], [found.select(keep), others])
-
-
 class _Measurement:
     """The two rounds of matching, and the tests of every target."""
 
@@ -369,7 +364,7 @@ class _Measurement:
         better = again.converged & ~(again.noise > _REPEATED * found.noise[some])
         keep = np.ones(len(found), dtype=bool)
         keep[some] = ~better
-        found = _replaced(found, keep, again.select(better))
+        found = replaced(found, keep, again.select(better))
         return found, *self._judged(self.scene, wanted, found)
 
     def curve(self, full_scale: float) -> ToneCurve | None:
@@ -492,7 +487,7 @@ class _Measurement:
         found, covered = self._uncovered(found)
         amiss = ~found.converged & ~covered
         if amiss.any():
-            found = _replaced(found, ~amiss, match_targets(self.scene, self.rows, self._among(amiss)))
+            found = replaced(found, ~amiss, match_targets(self.scene, self.rows, self._among(amiss)))
         if not found.converged.any():
             return found
         usual = np.median(found.contrast[found.converged])
@@ -508,7 +503,7 @@ class _Measurement:
             better = curved.converged & ~(curved.noise > (0.9 if slope is None else 0.97) * found.noise[some])
             keep = ~some
             keep[some] = ~better
-            found = _replaced(found, keep, curved.select(better))
+            found = replaced(found, keep, curved.select(better))
         return found
 
     def _among(self, some: Mask) -> Mask:
@@ -551,7 +546,7 @@ class _Measurement:
         better = again.converged & (again.seen >= _SEEN) & ~(again.noise > _CLEARED * found.noise[some])
         keep = np.ones(len(found), dtype=bool)
         keep[some] = ~better
-        return _replaced(found, keep, again.select(better)), covered
+        return replaced(found, keep, again.select(better)), covered
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
         """Reason why each target is rejected, and the positions predicted by the mapping through all."""

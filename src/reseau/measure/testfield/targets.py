@@ -25,7 +25,7 @@ from .line_profiles import blur_of, crossings
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
-__all__ = ["Light", "Scene", "match_targets", "merged", "pixels_of_targets"]
+__all__ = ["Light", "Scene", "match_targets", "merged", "pixels_of_targets", "replaced"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,3 +422,8 @@ def merged(parts: list[Rows], found: list[Matches]) -> Matches:
             ]
         columns[name] = np.concatenate(values)[order]
     return Matches(**columns)
+
+
+def replaced(found: Matches, keep: Mask, others: Matches) -> Matches:
+    """The matches to keep (n,), and others in the places of the remaining ones."""
+    return merged([np.flatnonzero(keep), np.flatnonzero(~keep)], [found.select(keep), others])
