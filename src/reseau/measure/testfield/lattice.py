@@ -245,13 +245,13 @@ def _candidates(ridges: Ridges) -> _Lines:
     strongest = np.argsort(-votes[turn, distance], kind="stable")[:_MOST_PEAKS]
     turn, distance = turn[strongest], distance[strongest]
     angle, rho = turn * _TURN, (distance - reach).astype(np.float64)
-    share = _dark_share(ridges, angle, rho) if len(turn) else rho
+    each = max(1, len(ridges.xy) // _ENOUGH_FOR_LINES)
+    xy, normal = (np.ascontiguousarray(columns[::each]) for columns in (ridges.xy, ridges.normal))
+    centre = _centre(ridges.darkness.shape)
+    share = _dark_share(ridges.darkness, xy - centre, normal, each, angle, rho) if len(turn) else rho
     weight = votes[turn, distance] * share
     order = np.argsort(-weight, kind="stable")
     order = order[share[order] > _LEAST_SHARE]
-    thin = slice(None, None, max(1, len(ridges.xy) // _ENOUGH_FOR_LINES))
-    xy, normal = (np.ascontiguousarray(columns[thin]) for columns in (ridges.xy, ridges.normal))
-    centre = _centre(ridges.darkness.shape)
     kept: list[tuple[Array, float, Array, float]] = []
     free = np.ones(len(xy), dtype=bool)
     for k in order:
@@ -316,20 +316,19 @@ def _hough(ridges: Ridges) -> tuple[NDArray[np.float32], int]:
     return votes.reshape(turns, width).astype(np.float32), reach
 
 
-def _dark_share(ridges: Ridges, angle: Array, rho: Array) -> Array:
+def _dark_share(
+    darkness: NDArray[np.float32], points: Array, normals: Array, each: int, angle: Array, rho: Array
+) -> Array:
     """Share of the best sections of straight lines (n,) with at least half of the usual darkness.
 
-    Of the whole line, or of the part of it with dense ridge points: a testfield may be small in the frame.
+    Of the whole line, or of the part of it with dense ridge points, of which every `each`-th is given with
+    its normal, from the centre of the frame: a testfield may be small in the frame.
     """
     from .compiled import supported  # takes half a second to import; not every command needs it
 
-    darkness = ridges.darkness
     h, w = darkness.shape
     along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    each = max(1, len(ridges.xy) // _ENOUGH_FOR_LINES)
-    points = ridges.xy[::each] - _centre(darkness.shape)
-    normals = np.ascontiguousarray(ridges.normal[::each])
     step = _STEP_PX * each
     ends = supported(points, normals, normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each)
     x = _centre(darkness.shape)[0] + rho[:, None] * normal[:, :1] - along * normal[:, 1:]
