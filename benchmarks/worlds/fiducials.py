@@ -24,14 +24,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from worlds.pixels import Array, edge
+
 KINDS = ("wild", "wild8", "rings", "dark", "zeiss", "notches", "round", "wedges", "arcs", "checks")
 _OVER = 6
-
-
-def _soft(inside: Array, step: float) -> Array:
-    """Share of a sample inside, from the signed distance (mm, positive inside)."""
-    return np.clip(0.5 + inside / step, 0.0, 1.0)
 
 
 def _turn(u: Array, v: Array, degrees: float) -> tuple[Array, Array]:
@@ -47,31 +44,31 @@ def drawn_part(part: dict[str, Any], u: Array, v: Array, step: float) -> Array:
     w = part.get("line_width", 0.0) / 2
     shape = part["shape"]
     if shape == "disk":
-        return _soft(half - r, step)
+        return edge(half - r, step)
     if shape == "square":
-        return _soft(half - np.abs(u), step) * _soft(half - np.abs(v), step)
+        return edge(half - np.abs(u), step) * edge(half - np.abs(v), step)
     if shape == "cross":
         arms = np.maximum(
-            _soft(w - np.abs(u), step) * _soft(half - np.abs(v), step),
-            _soft(w - np.abs(v), step) * _soft(half - np.abs(u), step),
+            edge(w - np.abs(u), step) * edge(half - np.abs(v), step),
+            edge(w - np.abs(v), step) * edge(half - np.abs(u), step),
         )
         gap = part.get("gap", 0.0) / 2
         if gap > w:  # arms that end straight
-            arms = arms * _soft(np.maximum(np.abs(u), np.abs(v)) - gap, step)
+            arms = arms * edge(np.maximum(np.abs(u), np.abs(v)) - gap, step)
         return arms
     if shape in ("ring", "arc"):
-        ring = _soft(half - r, step) * _soft(r - half + 2 * w, step)
+        ring = edge(half - r, step) * edge(r - half + 2 * w, step)
         if shape == "arc":
             angle = np.rad2deg(np.arctan2(v, u)) - part["from_deg"]
             ring = ring * ((angle % 360) < part["to_deg"] - part["from_deg"])
         return ring
     slope = part["width"] / 2 / part["size"]
     if shape == "wedge":
-        return _soft((-v * slope - np.abs(u)) / np.hypot(1, slope), step) * _soft(v + part["size"], step)
+        return edge((-v * slope - np.abs(u)) / np.hypot(1, slope), step) * edge(v + part["size"], step)
     if part.get("form") == "round":
-        return np.maximum(_soft(part["width"] / 2 - r, step), _soft(-v, step))
-    tooth = _soft((-v * slope - np.abs(u)) / np.hypot(1, slope), step)
-    return np.maximum(tooth * (v < 0), _soft(-part["size"] - v, step))
+        return np.maximum(edge(part["width"] / 2 - r, step), edge(-v, step))
+    tooth = edge((-v * slope - np.abs(u)) / np.hypot(1, slope), step)
+    return np.maximum(tooth * (v < 0), edge(-part["size"] - v, step))
 
 
 @dataclass
@@ -237,7 +234,7 @@ def photograph(kind: str, seed: int, px_per_mm: float | None = None) -> Photogra
     }
 
     def film(x: Array, y: Array, step: float) -> Array:
-        inner = _soft(np.minimum(cam.half - np.abs(x), cam.half - np.abs(y)), step)
+        inner = edge(np.minimum(cam.half - np.abs(x), cam.half - np.abs(y)), step)
         tu, tv = ((a / (2 * 124.0) + 0.5) * 2047 for a in (x, y))
         tone = cv2.remap(texture, tu.astype(np.float32), tv.astype(np.float32), cv2.INTER_LINEAR).astype(
             float
@@ -252,7 +249,7 @@ def photograph(kind: str, seed: int, px_per_mm: float | None = None) -> Photogra
             u, v, here = u[near], v[near], light[near]
             seat = cam.seats.get(point["mark"])
             if seat is not None:
-                plate = _soft(seat[0] - np.hypot(u, v), step)
+                plate = edge(seat[0] - np.hypot(u, v), step)
                 here = here + plate * (seat[1] - here)
             mark = cam.marks[point["mark"]]
             tu2, tv2 = _turn(u, v, point.get("turn_deg", 0.0))

@@ -103,7 +103,7 @@ def test_frames_of_another_sensor_and_files_of_another_kind_are_refused() -> Non
         with pytest.raises(UsageError, match="calibrated sensor"):
             result.correction.correct(Frame(pixels, full_scale))
     document = result.calibration("sensor", {}, {})
-    with pytest.raises(FormatError, match="no calibration of a sensor"):
+    with pytest.raises(FormatError, match="not of a sensor"):
         SensorCorrection.from_calibration(document.model_copy(update={"model": "brown"}))
     for damage in ({"fields": {}}, {"fields": None}, {"b2": "x"}):
         broken = document.model_copy(update={"model": {**result.correction.to_model(), **damage}})

@@ -131,9 +131,7 @@ class CameraMapping(CalibratedMapping):
         """
         where = f"calibration {calibration.name}"
         if calibration.kind != "camera":
-            raise FormatError(
-                f"is a calibration of a {calibration.kind.replace('_', ' ')}, not of a camera", where=where
-            )
+            raise FormatError(calibration.not_of("camera"), where=where)
         model = cast(dict[str, Any], calibration.model)
         extra: dict[str, Any] | None = model.get("additional")
         values = calibration.values()

@@ -34,6 +34,13 @@ __all__ = [
 ]
 
 Kind = Literal["oscilloscope", "camera", "film_frame", "fiducials", "sensor"]
+_IN_WORDS: dict[Kind, str] = {
+    "oscilloscope": "an oscilloscope",
+    "camera": "a camera",
+    "film_frame": "a film frame",
+    "fiducials": "fiducial marks",
+    "sensor": "a sensor",
+}
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
@@ -225,6 +232,10 @@ class Calibration(Document):
         if unknown:
             raise ValueError(f"`covariance` names {unknown[0]!r}, which is not a parameter")
         return self
+
+    def not_of(self, wanted: Kind) -> str:
+        """What to report where a calibration of another kind is wanted."""
+        return f"is a calibration of {_IN_WORDS[self.kind]}, not of {_IN_WORDS[wanted]}"
 
     def values(self) -> dict[str, float]:
         """Parameter values by name."""

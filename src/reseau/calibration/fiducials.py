@@ -12,16 +12,10 @@ from ..core.errors import FormatError, UsageError
 from ..io import FiducialOrientation
 from ..optics import RationalPolynomial
 from .document import Calibration, Covariance, FiducialModel, Quantity, readable_as
+from .film import TRANSFORMS
 from .mapping import CalibratedMapping, Target, reasons
 
 __all__ = ["FiducialMapping", "calibration_of_fiducials", "film_axes", "scan_coordinates"]
-
-_TRANSFORMS = {
-    "similarity": RationalPolynomial.similarity,
-    "affine": RationalPolynomial.affine,
-    "projective": RationalPolynomial.projective,
-    "bilinear": RationalPolynomial.bilinear,
-}
 
 
 def film_axes(rotation: int, mirrored: bool) -> Array:
@@ -140,13 +134,10 @@ class FiducialMapping(CalibratedMapping):
         """
         where = f"calibration {calibration.name}"
         if calibration.kind != "fiducials":
-            raise FormatError(
-                f"is a calibration of a {calibration.kind.replace('_', ' ')}, not of fiducial marks",
-                where=where,
-            )
+            raise FormatError(calibration.not_of("fiducials"), where=where)
         model, values = cast(dict[str, Any], calibration.model), calibration.values()
         try:
-            transform = _TRANSFORMS[model["transform"]]()
+            transform = TRANSFORMS[model["transform"]]
             transform = transform.with_values(np.array([values[name] for name in transform.names]))
             left, low, right, high = map(float, calibration.validity["extent"])
             width, height = map(int, calibration.validity["size"])

@@ -14,16 +14,17 @@ from ..optics import RationalPolynomial
 from .document import Calibration, Covariance, FilmFrameModel, Quantity, readable_as
 from .mapping import CalibratedMapping, Target, reasons
 
-__all__ = ["FilmFrameMapping", "calibration_of_frame", "photo_coordinates"]
+__all__ = ["TRANSFORMS", "FilmFrameMapping", "calibration_of_frame", "photo_coordinates"]
 
 _STEP_PX = 1e-3
 """Of the central differences by the corners; the coordinates are almost linear in them."""
-_TRANSFORMS = {
-    "similarity": RationalPolynomial.similarity,
-    "affine": RationalPolynomial.affine,
-    "projective": RationalPolynomial.projective,
-    "bilinear": RationalPolynomial.bilinear,
+TRANSFORMS = {
+    "similarity": RationalPolynomial.similarity(),
+    "affine": RationalPolynomial.affine(),
+    "projective": RationalPolynomial.projective(),
+    "bilinear": RationalPolynomial.bilinear(),
 }
+"""Transformations to the calibrated coordinates of a camera's frame or fiducial marks, by kind."""
 
 
 def photo_coordinates(xy: Array, corners: Array, px_per_mm: tuple[float, float]) -> Array:
@@ -213,10 +214,7 @@ class FilmFrameMapping(CalibratedMapping):
         """
         where = f"calibration {calibration.name}"
         if calibration.kind != "film_frame":
-            raise FormatError(
-                f"is a calibration of a {calibration.kind.replace('_', ' ')}, not of a film frame",
-                where=where,
-            )
+            raise FormatError(calibration.not_of("film_frame"), where=where)
         model, values = cast(dict[str, Any], calibration.model), calibration.values()
         try:
             corners = np.array([[values[f"{name}.x"], values[f"{name}.y"]] for name in CORNERS])
@@ -247,7 +245,7 @@ def _transform(
     """The transformation of a document, and the covariance of its parameters where it has redundancy."""
     if content is None:
         return None, None
-    model = _TRANSFORMS[content["kind"]]()
+    model = TRANSFORMS[content["kind"]]
     entries = [content["parameters"][name] for name in model.names]
     model = model.with_values(np.array([float(entry["value"]) for entry in entries]))
     if content["sigma_mm"] is None:

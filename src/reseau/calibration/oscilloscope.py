@@ -265,10 +265,7 @@ class CameraCorrection(CalibratedMapping):
         """
         content = cast(dict[str, Any], calibration.model)
         if not isinstance(content, dict) or content.get("name") not in _MODELS:
-            raise FormatError(
-                f"is a calibration of a {calibration.kind.replace('_', ' ')}, not of an oscilloscope",
-                where=f"calibration {calibration.name}",
-            )
+            raise FormatError(calibration.not_of("oscilloscope"), where=f"calibration {calibration.name}")
         try:
             model = with_stored_values(RationalPolynomial.from_dict(content["mapping"]), calibration)
             systems = [system_from_dict(content[key]) for key in ("photo_system", "object_system")]

@@ -189,10 +189,7 @@ class SensorCorrection(CalibratedMapping):
         """
         model = cast(dict[str, Any], calibration.model)
         if not isinstance(model, dict) or model.get("type") != "sensor":
-            raise FormatError(
-                f"is a calibration of a {calibration.kind.replace('_', ' ')}: no calibration of a sensor",
-                where=calibration.name,
-            )
+            raise FormatError(calibration.not_of("sensor"), where=f"calibration {calibration.name}")
         try:
             fields = {name: unpacked(model["fields"][name]) for name in ("bias", "dark_current", "response")}
             defects = np.zeros(fields["bias"].size, dtype=bool)

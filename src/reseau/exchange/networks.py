@@ -90,7 +90,7 @@ def _from_file(
     if calibration.kind not in ("film_frame", "fiducials"):
         if film and calibration.kind == "camera":
             raise UsageError(
-                f"{file.name} is a calibration of a camera, not of a film frame",
+                f"{file.name} {calibration.not_of('film_frame')}",
                 where=f"camera {name}",
                 do="use only the keys id, calibration and use",
             )

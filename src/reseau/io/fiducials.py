@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from ..core.data import Array, ImagePoints
 from .document import Document, Strict
-from .frame import FrameTransform, MeasuredCorner
+from .frame import FrameTransform, MeasuredCorner, points_of
 
 __all__ = [
     "FiducialDesign",
@@ -307,12 +307,7 @@ class FiducialOrientation(Document):
 
     def image_points(self) -> ImagePoints:
         """Return the measured marks with their covariances."""
-        found = [(m.id, m.at) for m in self.marks if m.ok and m.at is not None]
-        xy = np.array([(c.x, c.y) for _, c in found], dtype=np.float64).reshape(-1, 2)
-        cov = [[[c.sx**2, c.rho * c.sx * c.sy], [c.rho * c.sx * c.sy, c.sy**2]] for _, c in found]
-        return ImagePoints(
-            tuple(name for name, _ in found), xy, np.array(cov, dtype=np.float64).reshape(-1, 2, 2)
-        )
+        return points_of({m.id: m.at for m in self.marks if m.ok and m.at is not None})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what is not known is left out."""

@@ -3,7 +3,7 @@ a scan, and what became of the frames of a roll."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -23,6 +23,7 @@ __all__ = [
     "MeasuredCorner",
     "MeasuredEdge",
     "RollSummary",
+    "points_of",
 ]
 
 CORNERS = ("ul", "ur", "lr", "ll")
@@ -107,6 +108,19 @@ class MeasuredCorner(Strict):
         return cls(x=float(xy[0]), y=float(xy[1]), sx=sx, sy=sy, rho=rho)
 
 
+def points_of(measured: Mapping[str, MeasuredCorner]) -> ImagePoints:
+    """Measured points of a scan by name, with their covariances.
+
+    Examples
+    --------
+    >>> points_of({"ul": MeasuredCorner(x=10.5, y=20.25, sx=0.1, sy=0.2, rho=0.0)}).sigma
+    array([[0.1, 0.2]])
+    """
+    xy = np.array([(c.x, c.y) for c in measured.values()], dtype=np.float64).reshape(-1, 2)
+    cov = [[[c.sx**2, c.rho * c.sx * c.sy], [c.rho * c.sx * c.sy, c.sy**2]] for c in measured.values()]
+    return ImagePoints(tuple(measured), xy, np.array(cov, dtype=np.float64).reshape(-1, 2, 2))
+
+
 class MeasuredEdge(Strict):
     """Quality of an edge: profiles used and rejected, their scatter, and the bow of the edge.
 
@@ -188,12 +202,7 @@ class FrameOrientation(Document):
     def image_points(self) -> ImagePoints:
         """Return the corners in the scan with their covariances; empty for a declined frame."""
         corners = self.corners or {}
-        found = [(name, corners[name]) for name in CORNERS if name in corners]
-        xy = np.array([(c.x, c.y) for _, c in found], dtype=np.float64).reshape(-1, 2)
-        cov = np.array(
-            [[[c.sx**2, c.rho * c.sx * c.sy], [c.rho * c.sx * c.sy, c.sy**2]] for _, c in found]
-        ).reshape(-1, 2, 2)
-        return ImagePoints(tuple(name for name, _ in found), xy, cov)
+        return points_of({name: corners[name] for name in CORNERS if name in corners})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; a missing `transform`, and `roll_frames`, are left out."""

@@ -54,10 +54,7 @@ def calibrated_camera(name: str, calibration: Calibration, *, held: bool = False
     """
     mapping = calibration.mapping()
     if not isinstance(mapping, CameraMapping):
-        raise UsageError(
-            f"is a calibration of a {calibration.kind.replace('_', ' ')}, not of a camera",
-            where=f"camera {name}",
-        )
+        raise UsageError(calibration.not_of("camera"), where=f"camera {name}")
     model = cast(dict[str, Any], calibration.model)
     names, covariance = mapping.mapping.names, np.zeros((len(mapping.mapping.names),) * 2)
     covariance[np.ix_(mapping.rows, mapping.rows)] = mapping.covariance
@@ -126,8 +123,7 @@ def film_camera(camera: Camera, frame: Calibration | FrameOrientation, *, held: 
     calibration = calibration_of_frame(frame) if isinstance(frame, FrameOrientation) else frame
     mapping, model, where = calibration.mapping(), camera.registered, f"camera {camera.id}"
     if not isinstance(mapping, FilmFrameMapping | FiducialMapping):
-        kind = calibration.kind.replace("_", " ")
-        raise UsageError(f"is a calibration of a {kind}, not of a film frame", where=where)
+        raise UsageError(calibration.not_of("film_frame"), where=where)
     centre = () if model is None else model.of_role("centre")
     if model is None or not model.needs_pitch or len(centre) != 2:
         raise UsageError(

@@ -8,11 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from ...calibration.film import photo_coordinates
+from ...calibration.film import TRANSFORMS, photo_coordinates
 from ...core.data import Array, ImagePoints
 from ...core.failure import Code, Failure
 from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
-from ...optics import RationalPolynomial
 from ..fitting import fit_mapping
 from .lines import FrameShape, Lines, shape_of
 from .orientation import FrameOptions, FrameResult
@@ -103,12 +102,7 @@ def transformed(found: FrameOrientation, calibrated: FrameCorners, kind: Kind) -
     if not len(points) or found.px_per_mm is None:
         return Failure("a declined frame has no corners to transform", Code.DECLINED)
     xy = photo_coordinates(points.xy, points.xy, found.px_per_mm)
-    model = {
-        "similarity": RationalPolynomial.similarity,
-        "affine": RationalPolynomial.affine,
-        "projective": RationalPolynomial.projective,
-        "bilinear": RationalPolynomial.bilinear,
-    }[kind]()
+    model = TRANSFORMS[kind]
     # Sigmas of 0.01 mm; only their equality matters.
     fit = fit_mapping(model, ImagePoints.with_sigma(CORNERS, xy, 0.01), calibrated.xy())
     if isinstance(fit, Failure):
