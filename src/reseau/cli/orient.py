@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..io import FrameCorners, FrameOrientation, FrameOutcome
+    from ..io import FrameOrientation, FrameOutcome, RollSummary
     from ..procedures.film_frame import FrameOptions, FrameResult, Roll
 
 __all__ = ["orient"]
@@ -97,7 +97,8 @@ def orient(
 
     The JSON document of a frame is the calibration of its scan for `reseau apply`.
     """
-    from ..io import FrameCorners
+    from ..io import FrameCorners, RollSummary, write_whole
+    from ..report.frames import roll_page
 
     if corners is not None:
         FrameCorners.read(corners)  # an invalid file is reported before the computation
@@ -129,9 +130,11 @@ def orient(
         _sheet(out, done, work)
         if found is not None:
             found.corners.write(out / "corners.json")
-        if len(work) > 1:
-            _summarize(out, work, done)
-    _report(work, done, found, as_json)
+    summary = RollSummary.of(_outcomes(work, done)) if len(work) > 1 else None
+    if out is not None and summary is not None:
+        summary.write(out / "summary.json")
+        write_whole(out / "summary.html", roll_page(summary, out / "provenance"))
+    _report(work, done, found, summary, as_json)
     oriented = any(d.status != "declined" for item in done.values() for d in item.documents)
     return 0 if oriented and not any(item.failed for item in done.values()) else 1
 
@@ -368,17 +371,9 @@ def _outcomes(work: list[_Job], done: dict[str, _Done]) -> list[FrameOutcome]:
     return rows
 
 
-def _summarize(out: Path, work: list[_Job], done: dict[str, _Done]) -> None:
-    """Write `summary.json` and `summary.html` of a roll."""
-    from ..io import RollSummary, write_whole
-    from ..report.frames import roll_page
-
-    summary = RollSummary.of(_outcomes(work, done))
-    summary.write(out / "summary.json")
-    write_whole(out / "summary.html", roll_page(summary, out / "provenance"))
-
-
-def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json: bool) -> None:
+def _report(
+    work: list[_Job], done: dict[str, _Done], roll: Roll | None, summary: RollSummary | None, as_json: bool
+) -> None:
     from ..core.provenance import canonical_json
 
     failed = [item.failed for item in done.values() if item.failed]
@@ -394,8 +389,8 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
             x, y = (1000 * scatter for scatter in roll.scatter_mm)
             say(f"roll: {roll.frames} frames, scatter of corners {x:.2g} µm in x, {y:.2g} µm in y, ")
             say(f"calibrated corners ± {1000 * max(sx, sy):.2g} µm\n")
-        if len(work) > 1:
-            _print_summary(_outcomes(work, done))
+        if summary is not None:
+            _print_summary(summary)
     for note in (note for item in done.values() for note in item.notes):
         typer.echo(f"reseau: {note}", err=True)
     if failed and len(failed) == len(work):
@@ -404,11 +399,9 @@ def _report(work: list[_Job], done: dict[str, _Done], roll: Roll | None, as_json
         typer.echo(f"reseau: {line}", err=True)
 
 
-def _print_summary(rows: list[FrameOutcome]) -> None:
+def _print_summary(summary: RollSummary) -> None:
     """Print how many frames were oriented, with and without the roll, and which were not and why."""
-    from ..io import RollSummary
-
-    summary = RollSummary.of(rows)
+    rows = summary.frames
     say(f"{len(rows)} frames: " + ", ".join(f"{count} {what}" for what, count in summary.counts() if count))
     say("\n")
     for row in rows:
