@@ -3,7 +3,7 @@
 from .camera import CameraMapping, ProjectionField, projection_field
 from .compare import FieldDifference, calibration_difference
 from .document import Calibration, Covariance, Quantity
-from .fiducials import FiducialMapping, calibration_of_fiducials, film_axes, scan_coordinates
+from .fiducials import FiducialMapping, calibration_of_fiducials, film_axes, scan_coordinates, scan_pixels
 from .film import FilmFrameMapping, calibration_of_frame
 from .mapping import CalibratedMapping
 from .oscilloscope import CameraCorrection, Datum, InstrumentCorrection, LocalModel, ObjectPlane
@@ -37,6 +37,7 @@ __all__ = [
     "projection_field",
     "read_calibration",
     "scan_coordinates",
+    "scan_pixels",
     "undistorted_camera",
     "write_corrected",
 ]

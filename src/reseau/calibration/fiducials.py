@@ -15,7 +15,7 @@ from .document import Calibration, Covariance, FiducialModel, Quantity, readable
 from .film import TRANSFORMS
 from .mapping import CalibratedMapping, Target, reasons
 
-__all__ = ["FiducialMapping", "calibration_of_fiducials", "film_axes", "scan_coordinates"]
+__all__ = ["FiducialMapping", "calibration_of_fiducials", "film_axes", "scan_coordinates", "scan_pixels"]
 
 
 def film_axes(rotation: int, mirrored: bool) -> Array:
@@ -53,6 +53,17 @@ def scan_coordinates(
     """
     centre = (np.array(size) - 1) / 2
     return np.asarray((xy - centre) @ film_axes(rotation, mirrored) / px_per_mm)
+
+
+def scan_pixels(uv: Array, size: tuple[int, int], px_per_mm: float, rotation: int, mirrored: bool) -> Array:
+    """Pixels of scan coordinates (n, 2) in mm: the inverse of :func:`scan_coordinates`.
+
+    Examples
+    --------
+    >>> scan_pixels(np.array([[5.0, 10.0]]), (200, 100), 10.0, 90, False)
+    array([[-0.5, -0.5]])
+    """
+    return np.asarray(uv @ (px_per_mm * film_axes(rotation, mirrored)).T + (np.array(size) - 1) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +128,7 @@ class FiducialMapping(CalibratedMapping):
     def to_pixels(self, xy: Array) -> Array:
         """Pixels (n, 2) of camera coordinates (n, 2) in mm; NaN where the transformation has no inverse."""
         uv = np.asarray(self.transform.inverse(xy))
-        axes = self.scale * film_axes(self.rotation, self.mirrored)
-        return np.asarray(uv @ axes.T + (np.array(self.size) - 1) / 2)
+        return scan_pixels(uv, self.size, self.scale, self.rotation, self.mirrored)
 
     def _why(self, xy: Array, mapped: Array) -> list[str]:
         return reasons(self.extent, mapped, mapped, "the picture")

@@ -3,38 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjust import Adjustment
-from ...calibration import scan_coordinates
+from ...calibration import scan_coordinates, scan_pixels
+from ...calibration.film import TRANSFORMS
 from ...core.data import Array, ImagePoints, Mask, Rows
-from ...core.display import Display
 from ...core.failure import Code, Failure, Remark
-from ...io import FiducialDesign, FiducialOrientation, FrameTransform, MeasuredCorner, MeasuredFiducial
+from ...io import FiducialDesign
 from ...io.scans import Scan
 from ...optics import RationalPolynomial
 from ..film import Kind
 from ..fitting import fit_mapping
 from ..points import Reason
 from .forms import margin_of, reach_of
+from .result import FiducialResult
 from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
 from .windows import match_marks, tracked
 
-if TYPE_CHECKING:
-    from ...core.overlay import Layer
+__all__ = ["FiducialOptions", "measure_fiducials"]
 
-__all__ = ["FiducialOptions", "FiducialResult", "measure_fiducials"]
-
-_MODELS = {
-    "similarity": RationalPolynomial.similarity,
-    "affine": RationalPolynomial.affine,
-    "projective": RationalPolynomial.projective,
-    "bilinear": RationalPolynomial.bilinear,
-}
 _MARK_PX, _LONGEST = 24.0, 3000
 """Size of the smallest mark with its surroundings in the overview, and largest longer side of that."""
 _STATED, _UNKNOWN = 0.03, 0.08
@@ -93,199 +83,6 @@ class FiducialOptions:
     mirrored: bool | None = None
     transform: Kind = "affine"
     max_tilt_deg: float = 8.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class FiducialResult(Display):
-    """Fiducial marks of one photograph, and its inner orientation.
-
-    Parameters
-    ----------
-    image, sha256 : str
-        The scan.
-    design : FiducialDesign
-        The camera.
-    size : (int, int)
-        Width and height of the scan.
-    attitude : Attitude
-        How the film lies in the scan.
-    px_per_mm : float
-        Scale.
-    xy, cov : ndarray (n, 2), (n, 2, 2)
-        Marks in pixels of the scan; NaN where not measured.
-    ok : ndarray of bool (n,)
-        Which marks were measured.
-    why : tuple of str (n,)
-        Why not.
-    predicted : ndarray (n, 2)
-        Positions by the transformation.
-    likeness, psf_px : ndarray (n,)
-        Correlation with the formed mark, and width of the point-spread function in pixels of the scan.
-    kind : str
-        Of the transformation.
-    fit : Adjustment
-        The transformation from scan coordinates to the calibrated ones.
-    residuals : ndarray (n, 2)
-        Transformed minus calibrated coordinates, mm.
-    notes : tuple of Remark
-        What to know about the result.
-
-    Examples
-    --------
-    >>> from reseau.io import FiducialMark, FiducialPoint, MarkPart
-    >>> dot = FiducialMark(polarity="bright", parts=(MarkPart(shape="disk", size=0.2),))
-    >>> places = {"1": (100, 0), "2": (-100, 0), "3": (0, 100)}
-    >>> points = tuple(FiducialPoint(id=k, x=x, y=y, mark="dot") for k, (x, y) in places.items())
-    >>> design = FiducialDesign(name="camera", marks={"dot": dot}, points=points)
-    >>> uv, none, one = design.xy, np.zeros((3, 2)), np.ones(3)
-    >>> fit = fit_mapping(RationalPolynomial.similarity(), ImagePoints.with_sigma("123", uv, 0.01), uv)
-    >>> found = FiducialResult(
-    ...     "7.tif", "", design, (2300, 2300), Attitude(0, False), 10.0, 1149.5 + uv * [10, -10],
-    ...     np.tile(0.01 * np.eye(2), (3, 1, 1)), one > 0, ("", "", ""), none, one, one,
-    ...     "similarity", fit, none, ())
-    >>> found.document().marks[0].at.x, found.sigma_mm
-    (2149.5, (0.0, 0.0))
-    """
-
-    image: str
-    sha256: str
-    design: FiducialDesign
-    size: tuple[int, int]
-    attitude: Attitude
-    px_per_mm: float
-    xy: Array
-    cov: Array
-    ok: Mask
-    why: tuple[str, ...]
-    predicted: Array
-    likeness: Array
-    psf_px: Array
-    kind: Kind
-    fit: Adjustment
-    residuals: Array
-    notes: tuple[Remark, ...]
-
-    @property
-    def sigma_mm(self) -> tuple[float, float] | None:
-        """Standard deviation of a coordinate in X and Y by the residuals; None without redundancy."""
-        free = 2 * int(self.ok.sum()) - len(self.fit.values)
-        if free <= 0:
-            return None
-        sx, sy = np.sqrt((self.residuals[self.ok] ** 2).sum(axis=0) / (free / 2))
-        return float(sx), float(sy)
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance matrix of the transformation's parameters; enlarged where residuals ask for it."""
-        return self.fit.covariance
-
-    def _facts(self) -> list[tuple[str, str]]:
-        sigma = self.sigma_mm
-        return [
-            ("image", self.image),
-            ("measured", f"{int(self.ok.sum())} of {len(self.ok)}"),
-            ("film", str(self.attitude)),
-            (
-                self.kind,
-                "no residuals" if sigma is None else f"residuals {sigma[0]:.2g}, {sigma[1]:.2g} mm",
-            ),
-        ]
-
-    @property
-    def points(self) -> ImagePoints:
-        """The marks that were measured."""
-        names = tuple(name for name, ok in zip(self.design.ids, self.ok, strict=True) if ok)
-        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
-
-    def document(self) -> FiducialOrientation:
-        """The result as a document."""
-        marks = tuple(
-            MeasuredFiducial(
-                id=name,
-                at=MeasuredCorner.from_columns(self.xy[k], self.cov[k]) if self.ok[k] else None,
-                ok=bool(self.ok[k]),
-                why=str(self.why[k]),
-            )
-            for k, name in enumerate(self.design.ids)
-        )
-        spread = [None] * len(self.fit.values) if self.sigma_mm is None else np.sqrt(np.diag(self.covariance))
-        transform = FrameTransform(
-            kind=self.kind,
-            parameters={
-                name: {"value": float(v), "sigma": None if s is None else float(s)}
-                for name, v, s in zip(_MODELS[self.kind]().names, self.fit.values, spread, strict=True)
-            },
-            residuals_mm={
-                name: (float(x), float(y))
-                for name, (x, y), ok in zip(self.design.ids, self.residuals, self.ok, strict=True)
-                if ok
-            },
-            sigma_mm=self.sigma_mm,
-        )
-        return FiducialOrientation(
-            image=self.image,
-            sha256=self.sha256,
-            camera=self.design.name,
-            status="oriented",
-            why="",
-            size=self.size,
-            px_per_mm=self.px_per_mm,
-            rotation_deg=self.attitude.rotation,  # type: ignore[arg-type]
-            mirrored=self.attitude.mirrored,
-            marks=marks,
-            transform=transform,
-            covariance=tuple(tuple(map(float, row)) for row in self.covariance),
-            extent=_extent(self.design),
-            notes=tuple(str(note) for note in self.notes),
-            note_codes=tuple(note.code.value for note in self.notes),
-        )
-
-    def layers(self) -> list[Layer]:
-        """What is drawn over the scan: measured marks, and those that were not measured."""
-        from ...core.overlay import Layer, declined_layers
-
-        ids, rest = self.design.ids, np.flatnonzero(~self.ok)
-        measured = Layer(
-            f"measured, {int(self.ok.sum())}", self.points.xy, self.points.names, self.points.cov
-        )
-        codes = [_code(self.why[i]).value for i in rest]
-        declined = declined_layers(
-            [ids[i] for i in rest], self.predicted[rest], [str(self.why[i]) for i in rest], codes
-        )
-        return [measured, *declined]
-
-    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw what was measured and what was declined, and why, over the scan.
-
-        Parameters
-        ----------
-        pixels : ndarray (h, w) or (h, w, 3)
-            Grey or RGB values of the scan.
-        path : str or Path, optional
-            PNG file to write.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ...core.overlay import draw_overlay
-
-        title = f"{self.image}: {int(self.ok.sum())} of {len(self.ok)} fiducial marks, {self.attitude}"
-        return draw_overlay(pixels, self.layers(), title, [str(note) for note in self.notes], path=path)
-
-
-def _code(why: str) -> Code:
-    return why.code if isinstance(why, Reason) else Code.DECLINED
-
-
-def _extent(design: FiducialDesign) -> tuple[float, float, float, float]:
-    if design.extent is not None:
-        return design.extent
-    low, high = design.xy.min(axis=0), design.xy.max(axis=0)
-    room = 0.02 * (high - low)
-    (left, bottom), (right, top) = (low - room).tolist(), (high + room).tolist()
-    return left, bottom, right, top
 
 
 def measure_fiducials(
@@ -462,17 +259,17 @@ def _measured(
     columns = _Columns.empty(n)
     _look(scan, design, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
+    film = _Film(pattern.attitude, (scan.width, scan.height), scale)
     for _ in range(2):
-        _drop(design, pattern.attitude, scan, scale, columns)
+        _drop(design, film, columns)
         if columns.ok.sum() < 3:
             break
         fitted = _fitted(
-            design, columns, pattern.attitude, scan, scale, "affine" if columns.ok.sum() > 3 else "similarity"
+            design, film, columns, columns.ok, "affine" if columns.ok.sum() > 3 else "similarity"
         )
         if isinstance(fitted, Failure):
             return fitted
-        fit, _ = fitted
-        near = _predicted(design, fit[1], pattern.attitude, scan, scale)
+        near = film.pixels(fitted.model, design)
         linear = _linear_of(design, near, linear)
         again = np.flatnonzero(~columns.ok)
         if not len(again):
@@ -488,7 +285,48 @@ def _measured(
             Code.NOT_FOUND,
             places=expected,
         )
-    return _result(scan, design, options, pattern.attitude, scale, columns, sha256)
+    return _result(scan.name, design, options, film, columns, sha256)
+
+
+@dataclass(frozen=True)
+class _Film:
+    """How the film lies in the scan, the size of this, and pixels per mm."""
+
+    attitude: Attitude
+    size: tuple[int, int]
+    scale: float
+
+    @classmethod
+    def of(cls, result: FiducialResult, attitude: Attitude) -> _Film:
+        """The film of a result in an attitude."""
+        return cls(attitude, result.size, result.px_per_mm)
+
+    def coordinates(self, xy: Array) -> Array:
+        """Scan coordinates (mm) of pixels (n, 2)."""
+        return scan_coordinates(xy, self.size, self.scale, self.attitude.rotation, self.attitude.mirrored)
+
+    def pixels(self, model: RationalPolynomial, design: FiducialDesign) -> Array:
+        """Pixels (n, 2) of all marks of the design by a transformation of scan coordinates."""
+        uv = np.asarray(model.inverse(design.xy))
+        return scan_pixels(uv, self.size, self.scale, self.attitude.rotation, self.attitude.mirrored)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A transformation from scan coordinates to the calibrated ones, and its residuals (m, 2)."""
+
+    fit: Adjustment
+    model: RationalPolynomial
+    residuals: Array
+
+
+class _Places(Protocol):
+    """Pixels (n, 2) of marks with their covariances (n, 2, 2)."""
+
+    @property
+    def xy(self) -> Array: ...
+    @property
+    def cov(self) -> Array: ...
 
 
 @dataclass
@@ -555,44 +393,17 @@ def _look(
         columns.predicted[k] = at[k]
 
 
-def _scan_points(
-    columns: _Columns, keep: Mask, attitude: Attitude, scan: Scan, scale: float, ids: tuple[str, ...]
-) -> ImagePoints:
-    """Marks in scan coordinates; their covariances contain the irregular deformation of film."""
-    size = (scan.width, scan.height)
-    turn = attitude.matrix / scale
-    uv = scan_coordinates(columns.xy[keep], size, scale, attitude.rotation, attitude.mirrored)
-    cov = turn.T @ columns.cov[keep] @ turn + _FILM_MM**2 * np.eye(2)
-    return ImagePoints(tuple(np.array(ids)[keep].tolist()), uv, cov)
-
-
-def _fitted(
-    design: FiducialDesign,
-    columns: _Columns,
-    attitude: Attitude,
-    scan: Scan,
-    scale: float,
-    kind: Kind,
-    keep: Mask | None = None,
-) -> tuple[tuple[Adjustment, RationalPolynomial], Array] | Failure:
-    """Transformation from scan coordinates to the calibrated ones, and its residuals (m, 2)."""
-    keep = columns.ok if keep is None else keep
-    points = _scan_points(columns, keep, attitude, scan, scale, design.ids)
+def _fitted(design: FiducialDesign, film: _Film, marks: _Places, keep: Mask, kind: Kind) -> _Fitted | Failure:
+    """Fit a transformation to some of the marks; the weights contain the irregular deformation of film."""
+    turn = film.attitude.matrix / film.scale
+    cov = turn.T @ marks.cov[keep] @ turn + _FILM_MM**2 * np.eye(2)
+    points = ImagePoints(tuple(np.array(design.ids)[keep].tolist()), film.coordinates(marks.xy[keep]), cov)
     target, sigma = design.xy[keep], np.repeat(design.sigma[keep][:, None], 2, axis=1)
-    fit = fit_mapping(_MODELS[kind](), points, target, sigma)
+    fit = fit_mapping(TRANSFORMS[kind], points, target, sigma)
     if isinstance(fit, Failure):
         return fit
-    model = _MODELS[kind]().with_values(fit.values)
-    return (fit, model), model(points.xy) - target
-
-
-def _predicted(
-    design: FiducialDesign, model: RationalPolynomial, attitude: Attitude, scan: Scan, scale: float
-) -> Array:
-    """Pixels (n, 2) of all marks of the design."""
-    uv = np.asarray(model.inverse(design.xy))
-    centre = (np.array([scan.width, scan.height]) - 1) / 2
-    return np.asarray(uv @ (scale * attitude.matrix).T + centre)
+    model = TRANSFORMS[kind].with_values(fit.values)
+    return _Fitted(fit, model, model(points.xy) - target)
 
 
 def _linear_of(design: FiducialDesign, pixels: Array, start: Array) -> Array:
@@ -603,34 +414,33 @@ def _linear_of(design: FiducialDesign, pixels: Array, start: Array) -> Array:
     return np.asarray(np.linalg.lstsq(a, b, rcond=None)[0].T)
 
 
-def _drop(design: FiducialDesign, attitude: Attitude, scan: Scan, scale: float, columns: _Columns) -> None:
+def _drop(design: FiducialDesign, film: _Film, columns: _Columns) -> None:
     """Reject marks that contradict the others: without them the residuals fall, with them they are large."""
     while columns.ok.sum() > 3:
         kind: Kind = "affine" if columns.ok.sum() > 4 else "similarity"
-        whole = _fitted(design, columns, attitude, scan, scale, kind)
+        whole = _fitted(design, film, columns, columns.ok, kind)
         if isinstance(whole, Failure):
             return
         limit = _OFF_MM + (0.0 if kind == "affine" else _AFFINE / 2 * float(np.ptp(design.xy)))
-        if np.abs(whole[1]).max() < limit:
+        if np.abs(whole.residuals).max() < limit:
             return
         rms = []
         for k in np.flatnonzero(columns.ok):
             keep = columns.ok.copy()
             keep[k] = False
             fewer: Kind = "affine" if keep.sum() > 3 and kind == "affine" else "similarity"
-            part = _fitted(design, columns, attitude, scan, scale, fewer, keep)
-            rms.append(np.inf if isinstance(part, Failure) else float(np.sqrt((part[1] ** 2).mean())))
+            part = _fitted(design, film, columns, keep, fewer)
+            rms.append(np.inf if isinstance(part, Failure) else float(np.sqrt((part.residuals**2).mean())))
         worst = np.flatnonzero(columns.ok)[int(np.argmin(rms))]
         columns.ok[worst] = False
         columns.why[worst] = Reason("contradicts the other marks", Code.DEVIATES)
 
 
 def _result(
-    scan: Scan,
+    image: str,
     design: FiducialDesign,
     options: FiducialOptions,
-    attitude: Attitude,
-    scale: float,
+    film: _Film,
     columns: _Columns,
     sha256: str,
 ) -> FiducialResult | Failure:
@@ -652,12 +462,12 @@ def _result(
             Code.TOO_FEW_POINTS,
             places=columns.xy[ok],
         )
-    affine = _fitted(design, columns, attitude, scan, scale, "affine")
+    affine = _fitted(design, film, columns, ok, "affine")
     if isinstance(affine, Failure):
         return affine
-    values = affine[0][1].derivatives(np.zeros((1, 2))).d_xy[0]
+    values = affine.model.derivatives(np.zeros((1, 2))).d_xy[0]
     s = np.linalg.svd(values, compute_uv=False)
-    off = np.abs(affine[1]).max()
+    off = np.abs(affine.residuals).max()
     if s[0] / s[1] - 1 > _AFFINE or off > 2 * _OFF_MM:
         return Failure(
             f"the marks found do not form the pattern of {design.name!r}: scales differ by "
@@ -665,32 +475,36 @@ def _result(
             Code.INCONSISTENT,
             places=columns.xy[ok],
         )
-    fitted = _fitted(design, columns, attitude, scan, scale, kind)
+    fitted = _fitted(design, film, columns, ok, kind)
     if isinstance(fitted, Failure):
         return fitted
-    (fit, model), left = fitted
-    residuals = np.full((len(ok), 2), np.nan)
-    residuals[ok] = left
     columns.xy[~ok], columns.cov[~ok] = np.nan, np.nan
     return FiducialResult(
-        image=scan.name,
+        image=image,
         sha256=sha256,
         design=design,
-        size=(scan.width, scan.height),
-        attitude=attitude,
-        px_per_mm=scale,
+        size=film.size,
+        attitude=film.attitude,
+        px_per_mm=film.scale,
         xy=columns.xy,
         cov=columns.cov,
         ok=ok,
         why=tuple(columns.why),
-        predicted=_predicted(design, model, attitude, scan, scale),
+        predicted=film.pixels(fitted.model, design),
         likeness=columns.likeness,
         psf_px=columns.psf_px,
         kind=kind,
-        fit=fit,
-        residuals=residuals,
+        fit=fitted.fit,
+        residuals=_spread(fitted.residuals, ok),
         notes=(),
     )
+
+
+def _spread(residuals: Array, ok: Mask) -> Array:
+    """Residuals (n, 2) of all marks, NaN of those that were not used."""
+    every = np.full((len(ok), 2), np.nan)
+    every[ok] = residuals
+    return every
 
 
 def _oriented(result: FiducialResult, options: FiducialOptions) -> FiducialResult:
@@ -748,44 +562,32 @@ def _exchanged(result: FiducialResult, attitude: Attitude) -> Rows | None:
 
 def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> FiducialResult:
     """The result with its marks named as in another attitude."""
-    scan_size, design = result.size, result.design
-    ok = result.ok[order]
     renamed = replace(
         result,
         attitude=attitude,
         xy=result.xy[order],
         cov=result.cov[order],
-        ok=ok,
+        ok=result.ok[order],
         why=tuple(result.why[i] for i in order),
         likeness=result.likeness[order],
         psf_px=result.psf_px[order],
     )
-    columns = _Columns(
-        renamed.xy, renamed.cov, ok, list(renamed.why), renamed.likeness, renamed.psf_px, renamed.xy
-    )
-    scan = _SizeOnly(*scan_size)
-    fitted = _fitted(design, columns, attitude, scan, result.px_per_mm, result.kind)  # type: ignore[arg-type]
+    film = _Film.of(result, attitude)
+    fitted = _fitted(result.design, film, renamed, renamed.ok, result.kind)
     if isinstance(fitted, Failure):
         return result
-    (fit, model), left = fitted
-    residuals = np.full((len(ok), 2), np.nan)
-    residuals[ok] = left
-    predicted = _predicted(design, model, attitude, scan, result.px_per_mm)  # type: ignore[arg-type]
-    return replace(renamed, fit=fit, residuals=residuals, predicted=predicted)
-
-
-@dataclass(frozen=True)
-class _SizeOnly:
-    width: int
-    height: int
+    return replace(
+        renamed,
+        fit=fitted.fit,
+        residuals=_spread(fitted.residuals, renamed.ok),
+        predicted=film.pixels(fitted.model, result.design),
+    )
 
 
 def _misfit(result: FiducialResult, attitude: Attitude, order: Rows) -> float:
     """Rms of the residuals (mm) of an affine transformation in another attitude, of a similarity of three."""
     ok = result.ok[order]
-    uv = scan_coordinates(
-        result.xy[order][ok], result.size, result.px_per_mm, attitude.rotation, attitude.mirrored
-    )
+    uv = _Film.of(result, attitude).coordinates(result.xy[order][ok])
     target = result.design.xy[ok]
     if ok.sum() > 3:
         a = np.column_stack([uv, np.ones(len(uv))])
