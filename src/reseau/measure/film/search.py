@@ -230,7 +230,7 @@ def search_frames(
     hint : float, optional
         The same according to the file, which may be wrong; used for frames with a missing edge.
     tried : int
-        Number of combinations of lines whose surroundings are tested.
+        Number of combinations of lines of each format whose surroundings are tested.
     near : ndarray (4, 2), optional
         Approximate corners, accurate to one tenth of the frame's size; no other frames are searched.
     missing : bool
@@ -249,9 +249,14 @@ def search_frames(
         most = 0.1 * float(size_of(near).max())
         found = [guess for guess in found if np.abs(guess.corners - near).max() < most]
     found.sort(key=lambda guess: -guess.score)
+    # The lines of any picture form frames of one format or another, which must not displace each other.
+    of_format: dict[tuple[float, ...], list[FrameGuess]] = {}
+    for guess in found:
+        of_format.setdefault(tuple(sorted(guess.format_mm)), []).append(guess)
+    tested = [guess for alike in of_format.values() for guess in _distinct(alike, tried)]
     with warnings.catch_warnings():  # an edge outside the scan has no tones; it is excluded later
         warnings.simplefilter("ignore", RuntimeWarning)
-        scored = [judged(guess, grey) for guess in _distinct(found, tried)]
+        scored = [judged(guess, grey) for guess in tested]
         good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
         return [settled(guess, grey) for guess in _apart(good)]
 
