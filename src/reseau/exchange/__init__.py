@@ -1,25 +1,32 @@
-"""Networks, control points and marks of film: files of this project and of other programs."""
+"""Networks, control points, marks of film, lenses: files of this project and of other programs."""
 
 from __future__ import annotations
 
 from .bal import read_bal
+from .codev import read_codev
 from .colmap import read_colmap
 from .control import read_control
 from .film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
+from .lenses import Lens, read_lens
 from .networks import calibration_files, read_foreign, read_network
 from .photomodeler import read_photomodeler
+from .zemax import read_zemax
 
 __all__ = [
     "FilmMarks",
+    "Lens",
     "calibration_files",
     "metashape_script",
     "read_bal",
+    "read_codev",
     "read_colmap",
     "read_control",
     "read_film_marks",
     "read_foreign",
+    "read_lens",
     "read_micmac",
     "read_network",
     "read_photomodeler",
+    "read_zemax",
     "write_micmac",
 ]

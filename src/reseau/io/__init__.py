@@ -1,4 +1,4 @@
-"""Images and documents: designs, measurements, frame orientations, networks.
+"""Images and documents: designs, measurements, frame orientations, networks, lenses.
 
 A document is a strict pydantic model: unknown and missing keys are errors that name the key. Files are
 written completely or not at all.
@@ -25,6 +25,7 @@ from .frame import (
     MeasuredEdge,
     RollSummary,
 )
+from .lens import LensDocument, LensSensor
 from .measurement import MeasuredPoint, ReseauMeasurement
 from .reading import is_points, read_design, read_measurement
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
@@ -45,6 +46,8 @@ __all__ = [
     "FrameOrientation",
     "FrameOutcome",
     "FrameTransform",
+    "LensDocument",
+    "LensSensor",
     "Mark",
     "MarkPart",
     "MeasuredCorner",

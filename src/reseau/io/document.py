@@ -111,13 +111,24 @@ class Document(Strict):
             content = json.loads(text)
         except (json.JSONDecodeError, RecursionError) as error:
             raise FormatError(f"is not JSON ({error})", where=where) from None
+        return cls.from_content(content, where=where)
+
+    @classmethod
+    def from_content(cls, content: Any, *, where: object) -> Self:
+        """Return the document of decoded content; `where` names it in messages.
+
+        Raises
+        ------
+        FormatError
+            When it is not this document.
+        """
         found = content.pop("schema", None) if isinstance(content, dict) else None
         if found != cls.SCHEMA:
             kind = "has no key `schema`" if found is None else f"has the schema {found!r}"
             raise FormatError(f"{kind}; {cls.SCHEMA!r} was expected", where=where)
         try:
             # As JSON again: pydantic's strict mode accepts a JSON array as a tuple, but not a Python list.
-            return cls.model_validate_json(json.dumps(content))
+            return cls.model_validate_json(json.dumps(content, default=str))
         except ValidationError as error:
             raise FormatError(_one_line(error), where=where) from None
 

@@ -25,7 +25,7 @@ from .media import (
     model_glass,
 )
 from .paraxial import Paraxial
-from .prescription import Aperture, Prescription, Surface, in_order
+from .prescription import Aperture, Layout, Prescription, Surface, in_order
 from .pupils import Aimed, PupilElements, RayKind, aim, labels, principal_rays
 from .trace import SURFACE_PARAMETERS, RayDerivatives, Rays, Traced, Tracer
 
@@ -37,6 +37,7 @@ __all__ = [
     "Aperture",
     "Cauchy",
     "Constant",
+    "Layout",
     "LensCamera",
     "Medium",
     "Paraxial",

@@ -16,12 +16,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
 from .media import AIR, Medium
 
-__all__ = ["Aperture", "Prescription", "Surface", "in_order"]
+__all__ = ["Aperture", "Layout", "Prescription", "Surface", "in_order"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +242,51 @@ class Prescription:
         return replace(self, surfaces=tuple(surfaces))
 
 
+class Layout:
+    """Place and axes of the next surface, while surfaces are placed one after the other.
+
+    Examples
+    --------
+    >>> layout = Layout()
+    >>> layout.advance(10.0)
+    >>> layout.turn((0.0, 1.0), (90.0, 0.0, 0.0))
+    >>> layout.advance(5.0)
+    >>> layout.vertex.round(12) + 0.0
+    array([ 0., -4., 10.])
+    """
+
+    def __init__(self) -> None:
+        self.vertex, self.axes = np.zeros(3), np.eye(3)
+
+    def advance(self, distance: float) -> None:
+        """Go along the z axis."""
+        self.vertex = self.vertex + distance * self.axes[:, 2]
+
+    def turn(
+        self,
+        decentre: tuple[float, float],
+        tilt_deg: tuple[float, float, float],
+        *,
+        tilt_first: bool = False,
+    ) -> None:
+        """Shift and turn the axes: a break of coordinates, as lens programs call it.
+
+        Parameters
+        ----------
+        decentre : (float, float)
+            Along x and y, mm.
+        tilt_deg : (float, float, float)
+            About x, then about the new y, then about the newest z, right-handed.
+        tilt_first : bool
+            Whether the axes are turned before they are shifted, and then about z, y, x.
+        """
+        if tilt_first:
+            self.axes = self.axes @ Rotation.from_euler("ZYX", tilt_deg[::-1], degrees=True).as_matrix()
+        self.vertex = self.vertex + self.axes[:, :2] @ np.asarray(decentre, dtype=float)
+        if not tilt_first:
+            self.axes = self.axes @ Rotation.from_euler("XYZ", tilt_deg, degrees=True).as_matrix()
+
+
 def in_order(rows: Sequence[tuple[float, float, Medium]]) -> tuple[Surface, ...]:
     """Centred surfaces from rows of a table: curvature, distance to the next surface, medium in between.
 
@@ -251,11 +297,9 @@ def in_order(rows: Sequence[tuple[float, float, Medium]]) -> tuple[Surface, ...]
     >>> [float(surface.vertex[2]) for surface in in_order([(0.02, 5.0, AIR), (-0.02, 45.0, AIR)])]
     [0.0, 5.0, 50.0]
     """
-    found, z = [], 0.0
-    for k, (curvature, distance, medium) in enumerate(rows):
-        found.append(
-            Surface(curvature, medium=medium, vertex=np.array([0.0, 0.0, z]), name=f"surface {k + 1}")
-        )
-        z += distance
-    found.append(Surface(kind="plain", vertex=np.array([0.0, 0.0, z]), name="image"))
+    found, layout = [], Layout()
+    for k, (curvature, distance, medium) in enumerate(rows, 1):
+        found.append(Surface(curvature, medium=medium, vertex=layout.vertex, name=f"surface {k}"))
+        layout.advance(distance)
+    found.append(Surface(kind="plain", vertex=layout.vertex, name="image"))
     return tuple(found)

@@ -1,0 +1,124 @@
+"""What imports of lenses from other programs share: rows of their tables, and the radius of the stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from ..core.errors import FormatError, InputError, UsageError
+from ..optics.lenses import Medium, Prescription, Rays, Tracer, glass
+from ..optics.lenses.paraxial import Paraxial
+
+__all__ = ["Opening", "catalogue_glass", "kind_behind", "read_bytes", "with_stop", "within"]
+
+T = TypeVar("T")
+
+_MOULDED = {"D-ZK3M": "D-ZK3", "L-TIM28_MOLD": "L-TIM28"}
+"""Glasses after precision moulding, under the names of makers of lenses, and the glass before moulding."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a program states the width of the beam.
+
+    Parameters
+    ----------
+    kind : {"diameter", "f-number", "working f-number", "object aperture", "stop"}
+        Diameter of the entrance pupil, f-number for objects at infinity or for the object as it is, numerical
+        aperture on the side of the object, radius of the stop.
+    value : float
+    object_distance : float
+        Distance of the object from the first surface, mm.
+    real : bool
+        Whether the edge of the stop is where the real, not the paraxial, ray from the edge of the entrance
+        pupil meets it.
+    """
+
+    kind: Literal["diameter", "f-number", "working f-number", "object aperture", "stop"]
+    value: float
+    object_distance: float = np.inf
+    real: bool = False
+
+
+def within(where: object, call: Callable[[], T]) -> T:
+    """Call a function; what it refuses is an error in `where`, a file or a part of it."""
+    try:
+        return call()
+    except (UsageError, FormatError) as error:
+        what = error.what if error.where is None else f"{error.where}: {error.what}"
+        raise FormatError(what, where=where, do=error.do) from None
+
+
+def catalogue_glass(name: str, where: str, notes: list[str]) -> Medium:
+    """Glass of the catalogue; a note is added where it is a moulded one."""
+    base = _MOULDED.get(name.upper())
+    if base is None:
+        return within(where, lambda: glass(name))
+    notes.append(
+        f"the glass {name} is {base} after precision moulding; the index of {base} before moulding is used, "
+        "which is higher by some 0.003"
+    )
+    return glass(base)
+
+
+def kind_behind(before: Medium, medium: Medium) -> Literal["refracting", "plain"]:
+    """Whether a surface between two media is ``refracting`` or ``plain``."""
+    return "plain" if before == medium else "refracting"
+
+
+def with_stop(lens: Prescription, opening: Opening) -> Prescription:
+    """The lens with the radius of its stop, from the width of the beam."""
+    value, distance = opening.value, opening.object_distance
+    if not (np.isfinite(value) and value > 0):
+        raise UsageError(f"the width of its beam is {value:g}")
+    if opening.kind == "stop":
+        return replace(lens, stop_radius=value)
+    first, stop = Paraxial(lens), lens.stop
+    wide, oblique = (float(first.ray(*start, last=stop)[0][-1]) for start in ((1.0, 0.0), (0.0, 1.0)))
+    # Height and slope, at the first surface, of the ray from the axis of the object to the edge of the pupil.
+    start = (distance, 1.0) if np.isfinite(distance) else (1.0, 0.0)
+    reach = wide * start[0] + oblique * start[1]
+    if opening.kind == "object aperture":
+        if not np.isfinite(distance):
+            raise UsageError("states a numerical aperture of an object at infinity")
+        n = lens.before.index(lens.wavelength_nm)
+        if value >= n:
+            raise UsageError(f"a numerical aperture of {value:g} is impossible")
+        scale = float(np.tan(np.arcsin(value / n)))
+    elif opening.kind == "working f-number":
+        scale = abs(1 / (2 * value * float(first.ray(*start)[1][-1])))
+    else:
+        diameter = value if opening.kind == "diameter" else abs(first.focal_length) / value
+        scale = wide * diameter / 2 / reach
+    radius = abs(scale * reach)
+    if opening.real:
+        height, slope = scale * start[0], scale * start[1]
+        direction = np.array([[0.0, slope, 1.0]]) / np.hypot(slope, 1.0)
+        # From well in front of the first surface, which may be concave towards the object.
+        back = distance if np.isfinite(distance) else abs(first.focal_length)
+        at = np.array([[0.0, height - slope * back, -back]])
+        traced = Tracer(lens, last=stop, apertures=False).trace(Rays(at, direction))
+        if not traced.arrived[0]:
+            raise UsageError("the ray at the edge of its beam does not reach the stop")
+        radius = float(np.abs(traced.xy[0, 1]))
+    return replace(lens, stop_radius=radius)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a file of at most 10 MB.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or is larger.
+    """
+    try:
+        if path.stat().st_size > 10_000_000:
+            raise InputError("is larger than 10 MB, which no prescription is", where=path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
