@@ -68,8 +68,9 @@ class RayMap(Protocol):
     def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
         """Pixels (w, n, e, 2) of rays from points (n, 3), at w wavelengths, through e elements of the stop.
 
-        Besides, the light (w, n, e) that each carries: 0 where it is stopped. A pixel is NaN where there is
-        no ray.
+        Besides, the light (w, n, e, 3) that each carries, as a vector along the ray in camera axes: 0 where
+        it is stopped. Its product with the normal of a surface is what a part of this surface of diffuse
+        remission (Lambert's law) emits into the ray. A pixel is NaN where there is no ray.
         """
 
 
@@ -88,7 +89,7 @@ class _ByRays(ABC):
 
     @abstractmethod
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
-        """Pixels (n, 2) and light (n,) of rays from points (n, 3) through points (n, 2) of the stop."""
+        """Pixels (n, 2) and light (n, 3) of rays from points (n, 3) through points (n, 2) of the stop."""
 
     def corresponding(self, points: Array) -> Array:
         """See :class:`RayMap`."""
@@ -102,7 +103,7 @@ class _ByRays(ABC):
         for wavelength, weight in self.wavelengths:
             arrived, carried = self.rays(starts, through, wavelength)
             xy.append(arrived.reshape(*shape, 2))
-            light.append(carried.reshape(shape) * elements.weights * weight)
+            light.append(carried.reshape(*shape, 3) * (elements.weights * weight)[:, None])
         return np.stack(xy), np.stack(light)
 
 
@@ -210,7 +211,8 @@ class LensCamera(_ByRays):
         weight = aimed.solid_angle
         if any(surface.apertures for surface in self.lens.surfaces):
             weight = weight * Tracer(self.lens, wavelength_nm).trace(aimed.rays).arrived
-        return self.sensor.to_pixels(free.xy), np.where(free.arrived, weight, 0.0)
+        flux = np.where(free.arrived, weight, 0.0)[:, None] * np.nan_to_num(aimed.rays.directions)
+        return self.sensor.to_pixels(free.xy), flux @ self.rotation
 
 
 @dataclass(frozen=True)
@@ -262,8 +264,9 @@ class ThinLens(_ByRays):
         # In the axes of the lens; the image of a point lies at f z / (z - f), through which its rays pass.
         defocus = 1 - c * (1 / self.focal_length - 1 / depth)
         xy = np.stack([-c * x / depth, c * y / depth], axis=1) + at * defocus[:, None]
-        away = np.hypot(np.hypot(x - at[:, 0], y + at[:, 1]), depth)
-        return self.sensor.to_pixels(xy), (depth / away) ** 3
+        away = np.stack([at[:, 0] - x, -at[:, 1] - y, -depth], axis=1)
+        # The area of an element over the square of its distance, seen obliquely.
+        return self.sensor.to_pixels(xy), away * (depth / (away**2).sum(axis=1) ** 2)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +297,11 @@ class PlaneTarget:
     def extent(self) -> float:
         """Half the side of a square around the target, mm."""
         return float(np.abs(self.outline.xy).max())
+
+    @property
+    def normal(self) -> Array:
+        """Unit vector (3,) across the plane."""
+        return np.asarray(np.cross(self.axes[:, 0], self.axes[:, 1]))
 
     def points(self, uv: Array) -> Array:
         """Points (n, 3) in camera axes of points (n, 2) of the plane."""
@@ -360,7 +368,7 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     point = camera.corresponding(target.centre[None])[0]
     usable = np.asarray(np.isfinite(xy).all(axis=(1, 3)))
     maps = np.einsum("tg,wgex->wetx", _FIT, np.where(usable[:, None, :, None], xy, 0.0))
-    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, light.mean(axis=1), 0.0).ravel()
+    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, np.abs(light.mean(axis=1) @ target.normal), 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
         raise UsageError("no light of the target reaches the sensor", do="is it in the field of the lens?")
     coefficients, share = coefficients[share > 0], share[share > 0] / share.sum()
@@ -421,7 +429,7 @@ def counted_image(
     ends = [np.append(pixels - 0.5, pixels[-1] + 0.5) for pixels in (rows, columns)]
     for at, weight in zip(elements.xy, elements.weights, strict=True):
         xy, light = camera.spots(target.points(uv), PupilElements(at[None], weight[None]))
-        xy, light = xy.reshape(-1, 2), np.nan_to_num(light).ravel()
+        xy, light = xy.reshape(-1, 2), np.abs(np.nan_to_num(light) @ target.normal).ravel()
         image += np.histogram2d(xy[:, 1], xy[:, 0], bins=ends, weights=light)[0]
         total += float(light.sum())
     return image / total
@@ -439,8 +447,8 @@ class RaySurrogate:
     elements : PupilElements
     low, high : ndarray (3,)
         Range of X/Z, Y/Z and 1/Z in which it holds.
-    coefficients : ndarray (a, b, c, w, e, 3)
-        By the degrees in the three; x, y and light.
+    coefficients : ndarray (a, b, c, w, e, 5)
+        By the degrees in the three; x, y and the light.
     corresponding_coefficients : ndarray (a, b, c, 2)
     error_px : float
         Largest difference from traced rays at points between those of the fit.
@@ -520,15 +528,15 @@ class RaySurrogate:
     def _sampled(
         camera: RayMap, elements: PupilElements, low: Array, high: Array, unit: Array
     ) -> tuple[Array, Array]:
-        """Pixels and light (n, w, e, 3) of rays, and corresponding points (n, 2), at points of the range."""
+        """Pixels and light (n, w, e, 5) of rays, and corresponding points (n, 2), at points of the range."""
         scaled = low + (unit + 1) / 2 * (high - low)
         points = np.stack([scaled[:, 0], scaled[:, 1], np.ones(len(unit))], axis=1) / scaled[:, 2:]
         xy, light = camera.spots(points, elements)
-        if not (light > 0).all():
+        if not light.any(axis=-1).all():
             raise UsageError(
                 "light is stopped by an aperture in the range of the surrogate; trace rays instead"
             )
-        both = np.concatenate([xy, light[..., None]], axis=-1)
+        both = np.concatenate([xy, light], axis=-1)
         return np.moveaxis(both, 1, 0), camera.corresponding(points)
 
     def _at(self, unit: Array, coefficients: Array) -> Array:
@@ -557,4 +565,4 @@ class RaySurrogate:
         if elements is not self.elements:
             raise UsageError("these elements of the stop are not those of the surrogate")
         found = np.moveaxis(self._at(self._unit(points), self.coefficients), 0, 1)
-        return found[..., :2], found[..., 2]
+        return found[..., :2], found[..., 2:]

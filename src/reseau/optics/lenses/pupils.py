@@ -96,7 +96,9 @@ class Aimed:
 
     Examples
     --------
-    See :func:`aim`, which returns them.
+    >>> nothing = np.full((1, 3), np.nan)
+    >>> Aimed(Rays(nothing, nothing), np.zeros(1), np.array([False])).found.any()
+    np.False_
     """
 
     rays: Rays

@@ -1,0 +1,344 @@
+"""Blurred targets in photographs drawn with rays of batoid: errors beside bound, sigmas and other methods.
+
+Run from the checkout: ``python benchmarks/blurred.py [--count N] [--first K] [--keep FOLDER]``; needs batoid
+(`pip install batoid`). Each photograph shows twelve targets, disks and squares of 10 to 60 px, tilted to 40°,
+over the field of a double Gauss; its focus gives a blur of about 0, 3, 6, 10 or 15 px (diameter of 80 % of
+the energy), and it is measured with noise of 30, 40 and 50 dB below the contrast. The truth is batoid's
+principal ray of 546.1 nm. Nothing is shared with what draws (``benchmarks/worlds/blurred.py``).
+
+Reported for each cell: targets, declined, rms error over the rms of the Cramér–Rao bound over all estimated
+parameters, mean error (bias) along and across the direction to the axis, errors over sigmas; the rms errors
+of a centre of gravity, of an ellipse fitted to the edge, and of ordinary least-squares matching; and whether
+any is wrong (beyond 5 sigma and 0.15 px).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from worlds.blurred import (
+    ROWS,
+    SCALE,
+    WAVELENGTHS,
+    WEIGHTS,
+    Array,
+    Lens,
+    Target,
+    energy_diameter,
+    light,
+    noisy,
+)
+
+from reseau.core.data import Frame
+from reseau.measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from reseau.measure.matching import GrownOutline, MatchOptions, Window, match
+from reseau.optics.formation import Outline, PixelResponse, mark_outline
+from reseau.optics.lenses import (
+    AIR,
+    LensCamera,
+    PlaneTarget,
+    Prescription,
+    PupilElements,
+    SensorPlane,
+    glass,
+    in_order,
+    ray_image,
+)
+
+PITCH = 0.006
+SIZE = (1600, 1200)
+PRINCIPAL = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+PSF = 0.45
+DISTANCE = 500.0
+BRIGHT, DARK = 200.0, 50.0
+DECIBELS = (30.0, 40.0, 50.0)
+BLURS = (0.0, 3.0, 6.0, 10.0, 15.0)
+STOP = 3.963
+"""Radius of the full stop, f/2, mm."""
+
+
+@dataclass(frozen=True)
+class World:
+    """One drawn photograph without noise, its targets, and where their corresponding rays arrive."""
+
+    image: Array
+    targets: list[Target]
+    truth: Array
+    blurs: Array
+    stop: float
+    image_z: float
+    centre: Array
+
+
+def world(seed: int) -> World:
+    """The photograph of a seed; seeds run through the blurs."""
+    rng = np.random.default_rng(10_000 + seed)
+    wanted = BLURS[seed % len(BLURS)]
+    stop = STOP * (0.25 if wanted < 2 else rng.uniform(0.4, 0.6) if wanted < 8 else rng.uniform(0.5, 0.9))
+    sharp = sum(row[1] for row in ROWS[:-1]) * SCALE + _image_distance()
+    lens = Lens(stop, sharp, PITCH, PRINCIPAL)
+    middle = np.array([0.08, 0.06, 1.0]) * DISTANCE
+    z, side = sharp, rng.choice([-1.0, 1.0])
+    if wanted > 2:
+        low, high = 0.0, 2.5
+        for _ in range(12):
+            half = (low + high) / 2
+            wide = energy_diameter(Lens(stop, sharp + side * half, PITCH, PRINCIPAL), middle)
+            low, high = (half, high) if wide < wanted else (low, half)
+        z = sharp + side * low
+        lens = Lens(stop, z, PITCH, PRINCIPAL)
+    image = np.full(SIZE[::-1], BRIGHT)
+    targets, truth, blurs = [], [], []
+    for k in range(12):
+        column, row = k % 4, k // 4
+        at = np.array([(column + 0.5) * SIZE[0] / 4, (row + 0.5) * SIZE[1] / 3]) + rng.uniform(-90, 90, 2)
+        depth = DISTANCE * rng.uniform(0.985, 1.015)
+        slope = (at - PRINCIPAL) * PITCH / 25.7
+        centre = np.array([*slope, 1.0]) * depth
+        pixels = (10.0, 20.0, 35.0, 60.0)[int(rng.integers(4))]
+        target = Target(
+            str(rng.choice(["disk", "square"])), pixels * PITCH * depth / 25.7, centre, _axes(rng)
+        )
+        point = lens.principal_ray(centre, WAVELENGTHS[1])
+        half = int(0.75 * pixels + 1.2 * wanted) + 12
+        columns, rows = (np.arange(-half, half + 1) + round(v) for v in point)
+        share = light(lens, target, columns.astype(float), rows.astype(float), PSF)
+        inside = (rows[:, None] >= 0) & (rows[:, None] < SIZE[1]) & (columns >= 0) & (columns < SIZE[0])
+        y, x = np.broadcast_arrays(rows[:, None], columns[None])
+        image[y[inside], x[inside]] -= (BRIGHT - DARK) * share[inside]
+        targets.append(target)
+        truth.append(point)
+        blurs.append(energy_diameter(lens, centre))
+    return World(image, targets, np.array(truth), np.array(blurs), stop, z, np.array([0, 0, lens.pupil_z]))
+
+
+def _image_distance() -> float:
+    from reseau.optics.lenses import Paraxial
+
+    return Paraxial(_prescription(1.0, 0.0)).image_distance(DISTANCE)
+
+
+def _axes(rng: np.random.Generator) -> Array:
+    tilt, towards, turn = rng.uniform(0, np.deg2rad(40)), rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi)
+    axis = np.array([np.cos(towards), np.sin(towards), 0.0])
+    rotation = cv2.Rodrigues(tilt * axis)[0] @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
+    return np.asarray(rotation[:, :2])
+
+
+def _prescription(stop: float, image_z: float) -> Prescription:
+    """The same lens for the project."""
+    rows = [(c / SCALE, d * SCALE, glass(g) if g not in ("", "stop") else AIR) for c, d, g in ROWS]
+    surfaces = list(in_order(rows))
+    surfaces[5] = replace(surfaces[5], kind="plain")
+    surfaces[-1] = replace(surfaces[-1], vertex=np.array([0.0, 0.0, image_z]))
+    return Prescription(
+        tuple(surfaces), stop=5, stop_radius=stop, wavelengths_nm=WAVELENGTHS, weights=WEIGHTS, reference=1
+    )
+
+
+def camera_of(drawn: World) -> LensCamera:
+    """The camera of a world for the project: the true lens, its focus and its projection centre."""
+    sensor = SensorPlane((PITCH, PITCH), PRINCIPAL)
+    return LensCamera(_prescription(drawn.stop, drawn.image_z), sensor, centre=drawn.centre)
+
+
+def plane_targets(drawn: World) -> list[PlaneTarget]:
+    """The targets of a world for the project."""
+    spacing = 0.6 * PITCH * DISTANCE / 25.7
+    return [
+        PlaneTarget(t.centre, t.axes, mark_outline(t.shape, t.size, None, spacing)) for t in drawn.targets
+    ]
+
+
+def bound(camera: LensCamera, target: PlaneTarget, sigma: float) -> Array:
+    """Cramér–Rao bound (2,) of the position, over position, width, contrast and background."""
+    image = ray_image(camera, target, PupilElements.gauss(8))
+    half = int(np.abs(image.outline.xy).max()) + 6
+    pixels = np.rint(image.point) + np.arange(-half, half + 1.0)[:, None]
+    nodes = Outline(image.outline.xy[None], image.outline.dxy[None])
+    window = Window(pixels[None, :, 0], pixels[None, :, 1], PixelResponse())
+    at = image.point[None], np.array([PSF]), np.zeros((1, 0)), np.zeros(1, np.intp), window
+    share, slopes = GrownOutline(nodes.single(), np.zeros((0, 2, 2))).derivatives(*at)
+    u = np.broadcast_to(np.linspace(-1, 1, 2 * half + 1), share[0].shape)
+    contrast, rest = 1 - DARK / BRIGHT, BRIGHT * (1 - (1 - DARK / BRIGHT) * share[0])
+    grey = [-BRIGHT * contrast * slopes[0, k] for k in range(3)] + [-BRIGHT * share[0]]
+    grey[2] = grey[2] * PSF  # by the logarithm of the width
+    design = np.stack([*grey, rest / BRIGHT, rest * u / BRIGHT, rest * u.T / BRIGHT], axis=-1).reshape(-1, 7)
+    normal = design.T @ design / sigma**2
+    normal[2, 2] += 1 / BlurredOptions().psf_log_sigma ** 2
+    return np.sqrt(np.diagonal(np.linalg.inv(normal))[:2])
+
+
+def others(pixels: Array, drawn: World, k: int) -> dict[str, Array]:
+    """Positions of a target by other methods, in the window around it."""
+    target, at = drawn.targets[k], drawn.truth[k]
+    half = int(0.75 * target.size / DISTANCE * 25.7 / PITCH + 1.2 * drawn.blurs[k]) + 9
+    left, top = (round(v) - half for v in at)
+    patch = pixels[max(top, 0) : top + 2 * half + 1, max(left, 0) : left + 2 * half + 1].astype(float)
+    corner = np.array([max(left, 0), max(top, 0)])
+    ring = np.concatenate(
+        [patch[:3].ravel(), patch[-3:].ravel(), patch[:, :3].ravel(), patch[:, -3:].ravel()]
+    )
+    depth = np.median(ring) - patch
+    found = {}
+    weight = np.where(depth > 0.15 * depth.max(), depth, 0)
+    y, x = np.indices(patch.shape)
+    found["gravity"] = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum() + corner
+    mask = (depth > 0.5 * depth.max()).astype(np.uint8)
+    outline = max(cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], key=len, default=None)
+    if outline is not None and len(outline) >= 5:
+        edge = _refined(depth, outline[:, 0].astype(float))
+        found["ellipse"] = np.array(cv2.fitEllipse(edge.astype(np.float32))[0]) + corner
+    # Ordinary matching: the outline in the projection of the principal rays, and one Gaussian blur.
+    camera = camera_of(drawn)
+    plane = plane_targets(drawn)[k]
+    sharp = camera.corresponding(plane.points(plane.outline.xy)) - drawn.truth[k]
+    ends = [
+        camera.corresponding(plane.points(plane.outline.xy + s * 1e-4 * plane.outline.dxy)) for s in (1, -1)
+    ]
+    nodes = Outline(sharp[None], (ends[0] - ends[1])[None] / 2e-4).oriented().single()
+    psf = float(np.hypot(PSF, drawn.blurs[k] / 3.6))
+    options = MatchOptions(half_px=half, psf_px=psf, psf_log_sigma=0.5)
+    ordinary = match(pixels.astype(np.float32), pixels >= 0, nodes, at[None], options, noise=1.0)
+    found["matching"] = ordinary.xy[0]
+    return found
+
+
+def _refined(depth: Array, outline: Array) -> Array:
+    """Places at which the profiles across an outline (n, 2) cross half the depth."""
+    middle = outline.mean(axis=0)
+    away = outline - middle
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    t = np.linspace(-3, 3, 25)
+    at = outline[:, None] + t[:, None] * away[:, None]
+    values = cv2.remap(
+        depth.astype(np.float32), at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), 1
+    )
+    below = values < 0.5 * depth.max()
+    first = np.maximum(below.argmax(axis=1), 1)
+    each = np.arange(len(outline))
+    a, b = values[each, first - 1], values[each, first]
+    share = np.clip((a - 0.5 * depth.max()) / np.where(a == b, 1, a - b), 0, 1)
+    return np.asarray(outline + (t[first - 1] + share * (t[1] - t[0]))[:, None] * away)
+
+
+def kept(seed: int, folder: Path | None) -> World:
+    """A world, drawn or read."""
+    if folder is None:
+        return world(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"blurred{seed:04d}.npy"
+    if not file.exists():
+        np.save(file, np.array([world(seed)], dtype=object), allow_pickle=True)
+    drawn: World = np.load(file, allow_pickle=True)[0]
+    return drawn
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=57, help="photographs, each measured with three noises")
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="drawn photographs are kept and reused there"
+    )
+    chosen = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    seconds = 0.0
+    for seed in range(chosen.first, chosen.first + chosen.count):
+        drawn = kept(seed, chosen.keep)
+        camera, planes = camera_of(drawn), plane_targets(drawn)
+        for decibels in DECIBELS:
+            sigma = (BRIGHT - DARK) * 10 ** (-decibels / 20)
+            pixels = noisy(drawn.image, BRIGHT - DARK, decibels, np.random.default_rng((seed, int(decibels))))
+            start = time.process_time()
+            names = [str(k) for k in range(len(planes))]
+            found = measure_blurred(Frame(pixels, 255.0, f"world {seed}"), camera, names, planes)
+            seconds += time.process_time() - start
+            rows += _rows(seed, decibels, drawn, camera, planes, found, pixels, sigma)
+    _report(rows, seconds)
+
+
+def _rows(
+    seed: int,
+    decibels: float,
+    drawn: World,
+    camera: LensCamera,
+    planes: list[PlaneTarget],
+    found: BlurredResult,
+    pixels: Array,
+    sigma: float,
+) -> list[dict[str, object]]:
+    rows = []
+    for k, target in enumerate(drawn.targets):
+        row: dict[str, object] = {
+            "blur": float(BLURS[seed % len(BLURS)]),
+            "decibels": decibels,
+            "shape": target.shape,
+            "pixels": round(target.size / target.centre[2] * 25.7 / PITCH),
+            "field": float(np.hypot(*(drawn.truth[k] - PRINCIPAL)) / np.hypot(*PRINCIPAL)),
+            "ok": bool(found.ok[k]),
+        }
+        if found.ok[k]:
+            error = found.xy[k] - drawn.truth[k]
+            s = np.sqrt(np.diagonal(found.cov[k]))
+            row |= {"error": error, "sigma": s, "bound": bound(camera, planes[k], sigma)}
+            outwards = drawn.truth[k] - PRINCIPAL
+            outwards /= np.hypot(*outwards)
+            row["radial"] = float(error @ outwards)
+            row["others"] = {n: p - drawn.truth[k] for n, p in others(pixels, drawn, k).items()}
+            if (np.abs(error) > np.maximum(5 * s, 0.15)).any():
+                name = f"world {seed}, {decibels:g} dB, target {k}"
+                print(f"wrong: {name}: {error.round(3)} px, sigma {s.round(4)}")
+        else:
+            print(f"declined: world {seed}, {decibels:g} dB, target {k} ({row['pixels']} px): {found.why[k]}")
+        rows.append(row)
+    return rows
+
+
+def _report(rows: list[dict[str, object]], seconds: float) -> None:
+    print(
+        f"\n{'':24s} {'n':>5s} {'declined':>8s} {'rms px':>8s} {'/ bound':>8s} {'radial':>8s} {'err/sig':>8s}"
+        f" {'gravity':>8s} {'ellipse':>8s} {'matching':>8s}"
+    )
+    for name, values in (
+        ("blur", BLURS),
+        ("decibels", DECIBELS),
+        ("pixels", (10, 20, 35, 60)),
+        ("shape", ("disk", "square")),
+    ):
+        for value in values:
+            _line(f"{name} {value}", [row for row in rows if row[name] == value])
+    for low, high in ((0, 0.33), (0.33, 0.66), (0.66, 1.1)):
+        _line(f"field {low}-{high}", [row for row in rows if low <= float(str(row["field"])) < high])
+    for value in BLURS:
+        for decibels in DECIBELS:
+            those = [row for row in rows if row["blur"] == value and row["decibels"] == decibels]
+            _line(f"blur {value:g}, {decibels:g} dB", those)
+    _line("all", rows)
+    print(f"{1e3 * seconds / max(len(rows), 1):.1f} ms of processor time per target")
+
+
+def _line(name: str, rows: list[dict[str, object]]) -> None:
+    good = [row for row in rows if row["ok"]]
+    if not good:
+        return
+    error, sigma, least = (np.array([row[key] for row in good]) for key in ("error", "sigma", "bound"))
+    rms = float(np.sqrt((error**2).mean()))
+    line = (
+        f"{name:24s} {len(rows):5d} {len(rows) - len(good):8d} {rms:8.4f} "
+        f"{np.sqrt(((error / least) ** 2).mean()):8.2f} {np.mean([row['radial'] for row in good]):8.4f} "
+        f"{np.sqrt(((error / sigma) ** 2).mean()):8.2f}"
+    )
+    for method in ("gravity", "ellipse", "matching"):
+        deviations = [row["others"][method] for row in good if method in row["others"]]  # type: ignore[index, operator]
+        line += f" {np.sqrt((np.array(deviations) ** 2).mean()):8.3f}"
+    print(line)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,289 @@
+"""Blurred photographs of targets, drawn with the rays of batoid.
+
+A double Gauss of six elements, focused in front of or behind a target. For thousands of points of the
+entrance pupil, rays from a grid of points on the target's plane are traced by batoid; where they arrive
+gives, as polynomials, the point of the target that each place of the sensor sees through that point of the
+pupil. The share of the pupil through which a place sees the target is its light. Nothing is shared with the
+project: neither rays, nor indices, nor the formation of images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import batoid
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+__all__ = ["WAVELENGTHS", "WEIGHTS", "Lens", "Target", "energy_diameter", "light", "noisy"]
+
+Array = NDArray[Any]
+
+WAVELENGTHS = (486.1, 546.1, 632.8)
+WEIGHTS = (0.3, 1.0, 0.6)
+SCALE = 0.25
+"""Of the prescription with a focal length of 100 mm."""
+ROWS: tuple[tuple[float, float, str], ...] = (
+    (0.01779284094091543, 8.75, "N-SSK2"),
+    (0.006566600536925569, 0.5, ""),
+    (0.02653743294670983, 12.5, "N-SK2"),
+    (0.0, 3.8, "F5"),
+    (0.04126892878570084, 16.36944492653564, ""),
+    (0.0, 13.74795696388906, "stop"),
+    (-0.03523942654429074, 3.8, "F5"),
+    (0.0, 11.0, "N-SK16"),
+    (-0.02636750828657709, 0.5, ""),
+    (0.005636604951748545, 7.0, "N-SK16"),
+    (-0.0125926458590576, 61.4875364179821, ""),
+)
+"""Curvature, distance to the next surface, glass; of a double Gauss f/2 for 100 mm."""
+SELLMEIER = {
+    "N-SSK2": (1.4306027, 0.153150554, 1.01390904, 0.00823982975, 0.0333736841, 106.870822),
+    "N-SK2": (1.28189012, 0.257738258, 0.96818604, 0.0072719164, 0.0242823527, 110.377773),
+    "F5": (1.3104463, 0.19603426, 0.96612977, 0.00958633048, 0.0457627627, 115.011883),
+    "N-SK16": (1.34317774, 0.241144399, 0.994317969, 0.00704687339, 0.0229005, 92.7508526),
+}
+"""B1, B2, B3, C1, C2, C3 (µm²) as published by Schott."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A target: shape, diameter or side (mm), place, and axes of its plane, in camera axes."""
+
+    shape: str
+    size: float
+    centre: Array
+    axes: Array
+
+
+class Lens:
+    """The lens in batoid, in millimetres, focused at a distance.
+
+    Parameters
+    ----------
+    stop_radius : float
+        mm.
+    image_z : float
+        Place of the image plane behind the first surface, mm.
+    pitch_mm : float
+    principal : (float, float)
+        Pixel on the axis.
+    """
+
+    def __init__(
+        self, stop_radius: float, image_z: float, pitch_mm: float, principal: tuple[float, float]
+    ) -> None:
+        self.pitch, self.principal, self.stop_radius = pitch_mm, np.array(principal), stop_radius
+        items, z, medium = [], 0.0, batoid.ConstMedium(1.0)
+        self.stop_z = 0.0
+        for k, (curvature, distance, name) in enumerate(ROWS):
+            place = batoid.CoordSys(np.array([0.0, 0.0, z]))
+            surface = batoid.Plane() if curvature == 0 else batoid.Sphere(SCALE / curvature)
+            if name == "stop":
+                self.stop_z = z
+                behind = medium
+                stop = batoid.ObscNegation(batoid.ObscCircle(stop_radius))
+                items.append(batoid.Baffle(surface, name="stop", coordSys=place, obscuration=stop))
+            else:
+                behind = batoid.SellmeierMedium(SELLMEIER[name]) if name else batoid.ConstMedium(1.0)
+                items.append(
+                    batoid.RefractiveInterface(
+                        surface, name=f"s{k}", coordSys=place, inMedium=medium, outMedium=behind
+                    )
+                )
+            medium, z = behind, z + distance * SCALE
+        place = batoid.CoordSys(np.array([0.0, 0.0, image_z]))
+        items.append(
+            batoid.Detector(batoid.Plane(), name="image", coordSys=place, inMedium=medium, outMedium=medium)
+        )
+        self.optic = batoid.CompoundOptic(items, inMedium=batoid.ConstMedium(1.0), outMedium=medium)
+        self.pupil_z, self.pupil_radius = self._entrance_pupil()
+
+    def _entrance_pupil(self) -> tuple[float, float]:
+        """Place and radius of the entrance pupil, from rays near the axis."""
+
+        def at_stop(height: float, slope: float) -> float:
+            rays = self._traced(
+                np.array([[0.0, height - 50 * slope, -50.0]]), np.array([[0.0, slope, 1.0]]), 550.0, "stop"
+            )
+            return float(rays.y[0])
+
+        h = 1e-3
+        a, b = at_stop(h, 0.0) / h, at_stop(0.0, h) / h
+        return -(-b / a), self.stop_radius / a
+
+    def _traced(self, xyz: Array, direction: Array, wavelength_nm: float, until: str | None = None) -> Any:
+        away = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        count = np.zeros(len(xyz))
+        rays = batoid.RayVector(
+            *xyz.T.copy(), *away.T.copy(), count, np.full(len(xyz), wavelength_nm * 1e-9), count + 1
+        )
+        items = self.optic.items
+        if until is not None:
+            names = [item.name for item in items]
+            items = items[: names.index(until) + 1]
+        for item in items:
+            item.trace(rays)
+        return rays
+
+    def arrive(self, points: Array, pupil: Array, wavelength_nm: float, *, stopped: bool = True) -> Array:
+        """Pixels (n, 2) of rays from points (n, 3), in camera axes, through points (n, 2) of the pupil.
+
+        NaN where the stop stops them.
+        """
+        start = points * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
+        through = np.concatenate([pupil, np.full((len(pupil), 1), self.pupil_z)], axis=1)
+        rays = self._traced(start, through - start, wavelength_nm)
+        good = ~rays.failed & (~rays.vignetted | (not stopped))
+        xy = np.stack([-rays.x, rays.y], axis=1) / self.pitch + self.principal
+        return np.where(good[:, None], xy, np.nan)
+
+    def principal_ray(self, point: Array, wavelength_nm: float) -> Array:
+        """Pixel of the ray from a point (3,) through the centre of the stop."""
+        start = point * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
+        at, h = np.zeros(2), 1e-4
+        for _ in range(12):
+            through = np.array(
+                [[*at, self.pupil_z], [at[0] + h, at[1], self.pupil_z], [at[0], at[1] + h, self.pupil_z]]
+            )
+            rays = self._traced(np.tile(start, (3, 1)), through - start, wavelength_nm, "stop")
+            hit = np.stack([rays.x, rays.y], axis=1)
+            at = at - np.linalg.solve(((hit[1:] - hit[0]) / h).T, hit[0])
+        return self.arrive(point[None], at[None], wavelength_nm)[0]
+
+    def pupil_points(self, point: Array, wavelength_nm: float, count: int) -> tuple[Array, Array]:
+        """Points (n, 2) of the entrance pupil whose rays from a point (3,) fill the stop, and areas (n,).
+
+        At the stop they lie on Fibonacci's spiral. The points of the pupil are a polynomial of those at the
+        stop, fitted to rays.
+        """
+        k = np.arange(400) + 0.5
+        wide = 1.08 * self.pupil_radius * np.sqrt(k / len(k))[:, None] * _spiral(k)
+        start = point * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
+        for _ in range(2):  # the second time about the principal ray
+            through = np.concatenate([wide, np.full((len(wide), 1), self.pupil_z)], axis=1)
+            rays = self._traced(np.tile(start, (len(k), 1)), through - start, wavelength_nm, "stop")
+            at_stop = np.stack([rays.x, rays.y], axis=1) / self.stop_radius
+            fit = np.linalg.lstsq(_terms(at_stop)[0], wide, rcond=None)[0]
+            wide = _terms(1.08 * np.sqrt(k / len(k))[:, None] * _spiral(k))[0] @ fit
+        k = np.arange(count) + 0.5
+        terms, by_x, by_y = _terms(np.sqrt(k / count)[:, None] * _spiral(k))
+        dx, dy = by_x @ fit, by_y @ fit
+        return terms @ fit, np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
+
+
+def _spiral(k: Array) -> Array:
+    angle = k * np.pi * (3 - np.sqrt(5))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _terms(xy: Array, degree: int = 7) -> tuple[Array, Array, Array]:
+    """Terms (n, t) of a polynomial, and their derivatives by x and y."""
+    x, y = xy.T
+    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    terms = np.stack([x**i * y**j for i, j in powers], axis=1)
+    by_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=1)
+    by_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=1)
+    return terms, by_x, by_y
+
+
+def energy_diameter(lens: Lens, point: Array, share: float = 0.8) -> float:
+    """Diameter in pixels that contains a share of the light of a point (3,), about its centroid."""
+    spots = []
+    for w in WAVELENGTHS:
+        pupil, _ = lens.pupil_points(point, w, 400)
+        spots.append(lens.arrive(np.tile(point, (len(pupil), 1)), 0.9999 * pupil, w))
+    weight = np.concatenate([np.full(len(s), w) for s, w in zip(spots, WEIGHTS, strict=True)])
+    xy = np.concatenate(spots)
+    good = np.isfinite(xy[:, 0])
+    xy, weight = xy[good], weight[good]
+    away = np.hypot(*(xy - np.average(xy, axis=0, weights=weight)).T)
+    order = np.argsort(away)
+    inside = np.cumsum(weight[order]) / weight.sum()
+    return 2 * float(away[order][np.searchsorted(inside, share)])
+
+
+@numba.njit(cache=True)
+def _add(
+    image: Any, maps: Any, low: Any, step: float, square: bool, half: float, weights: Any, jitter: Any
+) -> None:
+    """Add, to every sample, the weights of the points of the pupil through which it sees the target."""
+    rows, columns = image.shape
+    for p in range(len(maps)):
+        a, b = maps[p, 0], maps[p, 1]
+        for r in range(rows):
+            y = low[1] + (r + jitter[p, 1]) * step
+            for c in range(columns):
+                x = low[0] + (c + jitter[p, 0]) * step
+                u = a[0] + a[1] * x + a[2] * y + a[3] * x * x + a[4] * x * y + a[5] * y * y
+                v = b[0] + b[1] * x + b[2] * y + b[3] * x * x + b[4] * x * y + b[5] * y * y
+                inside = max(abs(u), abs(v)) <= half if square else u * u + v * v <= half * half
+                if inside:
+                    image[r, c] += weights[p]
+
+
+def light(
+    lens: Lens,
+    target: Target,
+    columns: Array,
+    rows: Array,
+    sigma: float,
+    count: int = 9000,
+) -> Array:
+    """Share (r, c) of the light of each pixel that the target takes.
+
+    Parameters
+    ----------
+    columns, rows : ndarray
+        Adjacent pixels.
+    sigma : float
+        Of an additional Gaussian point-spread function, pixels.
+    count : int
+        Points of the entrance pupil.
+    """
+    side = 4 if len(columns) < 50 else 3
+    grid = 0.75 * target.size * np.array([[u, v] for u in (-1, 0, 1) for v in (-1, 0, 1)])
+    points = target.centre + grid @ target.axes.T
+    normal = np.cross(*target.axes.T)
+    maps, weights = [], []
+    for weight, wavelength in zip(WEIGHTS, WAVELENGTHS, strict=True):
+        pupil, area = lens.pupil_points(target.centre, wavelength, count // len(WAVELENGTHS))
+        # The stop is where the pupil ends; rays of other points of the target may miss its edge by a little.
+        xy = lens.arrive(
+            np.repeat(points, len(pupil), axis=0), np.tile(pupil, (9, 1)), wavelength, stopped=False
+        )
+        xy = xy.reshape(9, len(pupil), 2)
+        # What each place of the sensor sees, relative to the middle of the window for the sake of the digits.
+        x, y = xy[..., 0] - columns.mean(), xy[..., 1] - rows.mean()
+        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).transpose(1, 0, 2)
+        turned = np.swapaxes(terms, 1, 2)
+        found = np.linalg.solve(turned @ terms, turned @ np.broadcast_to(grid, (len(pupil), 9, 2)))
+        maps.append(found.transpose(0, 2, 1))
+        through = np.concatenate([pupil, np.zeros((len(pupil), 1))], axis=1) * [1.0, -1.0, 1.0]
+        away = through - target.centre
+        distance = np.linalg.norm(away, axis=1)
+        weights.append(weight * area * np.abs(away[:, 2] * (away @ normal)) / distance**4)
+    low = np.array([columns[0] - columns.mean() - 0.5, rows[0] - rows.mean() - 0.5])
+    margin = int(np.ceil(5 * sigma)) + 1
+    samples = np.zeros(((len(rows) + 2 * margin) * side, (len(columns) + 2 * margin) * side))
+    seen, share = np.concatenate(maps), np.concatenate(weights)
+    # A sequence that fills the square evenly: the average of places within samples is their centre.
+    jitter = (0.5 + np.arange(len(seen))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0
+    _add(samples, seen, low - margin, 1 / side, target.shape == "square", target.size / 2, share, jitter)
+    samples /= share.sum()
+    samples = gaussian_filter(samples, sigma * side, truncate=5)
+    pixels = samples.reshape(len(rows) + 2 * margin, side, len(columns) + 2 * margin, side).mean(axis=(1, 3))
+    return pixels[margin:-margin, margin:-margin]
+
+
+def noisy(image: Array, contrast: float, decibels: float, rng: np.random.Generator) -> Array:
+    """8-bit grey values with photon, read and quantisation noise, in all `decibels` below the contrast."""
+    sigma = contrast * 10 ** (-decibels / 20)
+    rest = max(sigma**2 - 1 / 12, 0.0)
+    gain = 0.5 * rest / float(np.median(image))
+    electrons = rng.poisson(image / gain) if gain > 0 else image
+    values = electrons * gain + rng.normal(0.0, np.sqrt(0.5 * rest), image.shape)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
