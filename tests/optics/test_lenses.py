@@ -336,6 +336,43 @@ def test_a_ray_that_misses_a_surface_is_lost_there() -> None:
     assert np.isfinite(traced.xy[1]).all()
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_ray_that_is_not_finite_is_lost_and_disturbs_no_other(wrong: float) -> None:
+    start, directions = np.tile([0.0, 1.0, -30.0], (600, 1)), np.tile(AHEAD, (600, 1))
+    expected = ball().trace(Rays(start, directions)).xy[0]
+    start[300, 1], directions[450, 2] = wrong, wrong
+    traced = ball().trace(Rays(start, directions))
+    assert np.flatnonzero(~traced.arrived).tolist() == [300, 450]
+    np.testing.assert_array_equal(np.delete(traced.xy, [300, 450], axis=0), np.tile(expected, (598, 1)))
+
+
+def test_a_ray_does_not_meet_the_second_branch_of_a_hyperboloid() -> None:
+    lens = Prescription(
+        (
+            Surface(0.1, -4.0, medium=Constant(1.5), name="hyperboloid"),
+            Surface(kind="plain", vertex=50 * AHEAD),
+        ),
+        stop=0,
+        stop_radius=1.0,
+    )
+    # Through the gap between the branches at z = 0 and z = -20/3, towards the second only.
+    start, directions = (
+        np.array([[0.0, 0.0, -4.0], [0.0, 0.0, -4.0]]),
+        np.array([[0.0, 0.9, -1.0], [0.0, 0.1, 1.0]]),
+    )
+    tracer = Tracer(lens)
+    traced = tracer.trace(Rays(start, directions / np.linalg.norm(directions, axis=1)[:, None]))
+    sag = lens.surfaces[0].sag
+    at = (
+        Tracer(lens, last=0)
+        .trace(Rays(start, directions / np.linalg.norm(directions, axis=1)[:, None]))
+        .rays.xyz
+    )
+    good = traced.arrived
+    assert good[1]
+    np.testing.assert_allclose(at[good, 2], sag(at[good, 0], at[good, 1]), atol=1e-12)
+
+
 def test_a_ray_beyond_the_critical_angle_is_totally_reflected() -> None:
     lens = Prescription(in_order([(0.0, 5.0, Constant(1.5)), (0.0, 5.0, AIR)]), stop=0, before=Constant(1.5))
     critical = np.arcsin(1 / 1.5)

@@ -24,11 +24,12 @@ COEFFICIENTS = 10
 _BLOCK = 256
 _MOST = 30
 """Largest number of Newton steps towards an asphere."""
-_EXACT = 1e-13
-"""Newton's method ends with steps of all rays below this, relative to their distance from the vertex."""
+_NEAR = 1e-8
+"""Newton's method ends with steps of all rays below this, relative to their distance from the vertex: what is
+left is the square of it."""
 
-# No NaN occurs; sums are not reordered, so that results do not depend on the block.
-_FREE = {"nnan", "ninf", "nsz"}
+# Products and sums may be one instruction; sums are not reordered: results do not depend on the block.
+_FREE = {"contract", "nsz"}
 
 
 def _compiled(function: F) -> F:
@@ -38,128 +39,139 @@ def _compiled(function: F) -> F:
 
 
 @_compiled
-def _into(place: Numbers, rays: Numbers) -> None:
-    """Rays in the axes of a surface; `place` holds shift (3), rotation (9) and whether there is one."""
-    if place[12] == 0:
+def _turn(turn: Numbers, rays: Numbers) -> None:
+    """Turn rays by a rotation (9,)."""
+    a, b, c, d, e, f, g, h, k = turn
+    for first in (0, 3):
         for i in range(rays.shape[1]):
-            rays[0, i] += place[0]
-            rays[1, i] += place[1]
-            rays[2, i] += place[2]
-        return
-    a, b, c, d, e, f, g, h, k = place[3:12]
-    for i in range(rays.shape[1]):
-        u, v, w = rays[0, i], rays[1, i], rays[2, i]
-        rays[0, i] = a * u + b * v + c * w + place[0]
-        rays[1, i] = d * u + e * v + f * w + place[1]
-        rays[2, i] = g * u + h * v + k * w + place[2]
-    for i in range(rays.shape[1]):
-        u, v, w = rays[3, i], rays[4, i], rays[5, i]
-        rays[3, i] = a * u + b * v + c * w
-        rays[4, i] = d * u + e * v + f * w
-        rays[5, i] = g * u + h * v + k * w
+            u, v, w = rays[first, i], rays[first + 1, i], rays[first + 2, i]
+            rays[first, i] = a * u + b * v + c * w
+            rays[first + 1, i] = d * u + e * v + f * w
+            rays[first + 2, i] = g * u + h * v + k * w
 
 
 @_compiled
-def _to_plane(rays: Numbers, lost: Numbers, code: float) -> None:
-    """Rays to the plane z = 0."""
+def _to_plane(shift: Numbers, rays: Numbers, lost: Numbers, code: float) -> None:
+    """Shift rays, and follow them to the plane z = 0."""
+    right, up, along = shift[0], shift[1], shift[2]
     for i in range(rays.shape[1]):
         none = abs(rays[5, i]) < 1e-12
-        t = -rays[2, i] / (1.0 if none else rays[5, i])
-        rays[0, i] += rays[3, i] * t
-        rays[1, i] += rays[4, i] * t
+        t = -(rays[2, i] + along) / (1.0 if none else rays[5, i])
+        rays[0, i] += right + rays[3, i] * t
+        rays[1, i] += up + rays[4, i] * t
         rays[2, i] = 0.0
-        lost[i] = code if (none and lost[i] == 0) else lost[i]
+        lost[i] = code if none & (lost[i] == 0) else lost[i]
 
 
 @_compiled
-def _to_conic(curvature: float, conic: float, rays: Numbers, lost: Numbers, code: float) -> None:
-    """Rays from the plane z = 0 to a conic (Welford 1986, equation 4.32, for any direction)."""
-    c, k = curvature, conic
+def _to_conic(shift: Numbers, c: float, k: float, rays: Numbers, lost: Numbers, code: float) -> None:
+    """Shift rays, and follow them to a conic (Welford 1986, section 4.5, for any direction).
+
+    From the point of the ray nearest to the vertex: it is found without a division, and distances from there
+    are small.
+    """
+    branch = c * (1.0 + k) if k < -1.0 else 0.0
+    k1, right, up, along = 1.0 + k, shift[0], shift[1], shift[2]
     for i in range(rays.shape[1]):
-        f = c * (rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i])
-        g = rays[5, i] - c * (rays[3, i] * rays[0, i] + rays[4, i] * rays[1, i])
-        root = g * g - c * f * (1.0 + k * rays[5, i] * rays[5, i])
-        lost[i] = code if (root < 0.0 and lost[i] == 0) else lost[i]
-        root = np.sqrt(max(root, 0.0))
-        t = f / (g + (root if rays[5, i] >= 0 else -root))
-        rays[0, i] += rays[3, i] * t
-        rays[1, i] += rays[4, i] * t
-        rays[2, i] = rays[5, i] * t
+        x, y, z = rays[0, i] + right, rays[1, i] + up, rays[2, i] + along
+        l, m, n = rays[3, i], rays[4, i], rays[5, i]  # noqa: E741
+        t = -(x * l + y * m + z * n)
+        x, y, z = x + t * l, y + t * m, z + t * n
+        f = c * (x * x + y * y + k1 * z * z) - 2.0 * z
+        g = n - c * (x * l + y * m + k1 * z * n)
+        square = g * g - c * f * (1.0 + k * n * n)
+        root = np.sqrt(square if square > 0.0 else 0.0)
+        below = g + (root if n >= 0.0 else -root)
+        t = f / (below if below != 0.0 else 1.0)
+        rays[0, i], rays[1, i], z = x + t * l, y + t * m, z + t * n
+        rays[2, i] = z
+        # Behind the second branch of a hyperboloid there is nothing.
+        missed = (square < 0.0) | (below == 0.0) | (branch * z > 1.0)
+        lost[i] = code if missed & (lost[i] == 0) else lost[i]
 
 
 @_compiled
-def _profile(surface: Numbers, square: float) -> tuple[float, float, float]:
-    """Sag of an asphere, its derivative by r², and whether it exists there."""
-    c, k = surface[1], surface[2]
-    inside = 1.0 - (1.0 + k) * c * c * square
-    root = np.sqrt(max(inside, 1e-30))
-    sag = c * square / (1.0 + root)
-    slope = 0.5 * c / root
+def _slope(surface: Numbers, square: float) -> float:
+    """Derivative by r² of the sag of an asphere."""
+    inside = 1.0 - (1.0 + surface[2]) * surface[1] * surface[1] * square
     a, b = 0.0, 0.0
-    for j in range(int(surface[3]) - 1, -1, -1):
-        # Horner's scheme for Σ a r^(2j) and its derivative.
+    for j in range(COEFFICIENTS - 1, -1, -1):
         b = b * square + a
         a = a * square + surface[4 + j]
-    return sag + a * square * square, slope + b * square * square + 2.0 * a * square, inside
+    return 0.5 * surface[1] / np.sqrt(inside if inside > 1e-30 else 1e-30) + (b * square + 2.0 * a) * square
 
 
 @_compiled
-def _to_asphere(surface: Numbers, rays: Numbers, lost: Numbers, code: float) -> None:
-    """Rays from near an even asphere to it, by Newton's method."""
+def _to_asphere(surface: Numbers, rays: Numbers, lost: Numbers, code: float, bad: Numbers) -> None:
+    """Rays from near an even asphere to it, by Newton's method; `bad` is memory for a block."""
+    c, k1 = surface[1], 1.0 + surface[2]
     for _ in range(_MOST):
-        far = 0
         for i in range(rays.shape[1]):
             square = rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i]
-            sag, slope, inside = _profile(surface, square)
-            miss = rays[2, i] - sag
+            inside = 1.0 - k1 * c * c * square
+            root = np.sqrt(inside if inside > 1e-30 else 1e-30)
+            # Horner's scheme for Σ a r^(2j) and its derivative; their number is constant, to be unrolled.
+            a, b = 0.0, 0.0
+            for j in range(COEFFICIENTS - 1, -1, -1):
+                b = b * square + a
+                a = a * square + surface[4 + j]
+            both = c / (root * (1.0 + root))
+            slope = 0.5 * both * (1.0 + root) + (b * square + 2.0 * a) * square
+            miss = rays[2, i] - (both * root + a * square) * square
             t = -miss / (rays[5, i] - 2.0 * slope * (rays[3, i] * rays[0, i] + rays[4, i] * rays[1, i]))
             rays[0, i] += rays[3, i] * t
             rays[1, i] += rays[4, i] * t
             rays[2, i] += rays[5, i] * t
-            far += 1 if (t * t > _EXACT * _EXACT * (square + 1.0) and lost[i] == 0) else 0
+            # Also true where the step is no number.
+            bad[i] = 0.0 if (inside > 0.0) & (t * t <= _NEAR * _NEAR * (square + 1.0)) else 1.0
+        far = 0
+        for i in range(rays.shape[1]):
+            far += 1 if (bad[i] != 0.0) & (lost[i] == 0) else 0
         if far == 0:
             break
     for i in range(rays.shape[1]):
-        square = rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i]
-        sag, slope, inside = _profile(surface, square)
-        missed = inside <= 0.0 or abs(rays[2, i] - sag) > 1e-9 * (1.0 + abs(rays[2, i]))
-        lost[i] = code if (missed and lost[i] == 0) else lost[i]
+        lost[i] = code if (bad[i] != 0.0) & (lost[i] == 0) else lost[i]
 
 
 @_compiled
-def _bend_conic(
-    curvature: float,
-    conic: float,
-    ratio: float,
-    rays: Numbers,
-    lost: Numbers,
-    code: float,
-) -> None:
-    """Refract rays at a conic, by the vector form of Snell's law; the normal points to +z."""
-    c, k1 = curvature, 1.0 + conic
+def _bent(ratio: float, q: float, square: float) -> tuple[float, float]:
+    """Return by how much of its normal a refracted ray differs, and what is under its root.
+
+    By Snell's law, for a normal with the square of its length and its product q with the ray.
+    """
+    under = square * (1.0 - ratio * ratio) + ratio * ratio * q * q
+    root = np.sqrt(under if under > 0.0 else 0.0)
+    return (root if q >= 0.0 else -root) - ratio * q, under
+
+
+@_compiled
+def _bend_conic(c: float, k: float, ratio: float, rays: Numbers, lost: Numbers, code: float) -> None:
+    """Refract rays at a conic; its normal (-c x, -c y, 1 - c (1 + k) z) has the length 1 on a sphere."""
+    if k == 0.0:
+        for i in range(rays.shape[1]):
+            u, v, w = -c * rays[0, i], -c * rays[1, i], 1.0 - c * rays[2, i]
+            step, under = _bent(ratio, rays[3, i] * u + rays[4, i] * v + rays[5, i] * w, 1.0)
+            lost[i] = code if (under < 0.0) & (lost[i] == 0) else lost[i]
+            rays[3, i] = ratio * rays[3, i] + step * u
+            rays[4, i] = ratio * rays[4, i] + step * v
+            rays[5, i] = ratio * rays[5, i] + step * w
+        return
     for i in range(rays.shape[1]):
-        u, v, w = -c * rays[0, i], -c * rays[1, i], 1.0 - c * k1 * rays[2, i]
-        scale = 1.0 / np.sqrt(u * u + v * v + w * w)
-        cosine = (rays[3, i] * u + rays[4, i] * v + rays[5, i] * w) * scale
-        square = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-        lost[i] = code if (square < 0.0 and lost[i] == 0) else lost[i]
-        root = np.sqrt(max(square, 0.0))
-        step = ((root if cosine >= 0 else -root) - ratio * cosine) * scale
+        u, v, w = -c * rays[0, i], -c * rays[1, i], 1.0 - c * (1.0 + k) * rays[2, i]
+        square = u * u + v * v + w * w
+        step, under = _bent(ratio, rays[3, i] * u + rays[4, i] * v + rays[5, i] * w, square)
+        step /= square
+        lost[i] = code if (under < 0.0) & (lost[i] == 0) else lost[i]
         rays[3, i] = ratio * rays[3, i] + step * u
         rays[4, i] = ratio * rays[4, i] + step * v
         rays[5, i] = ratio * rays[5, i] + step * w
 
 
 @_compiled
-def _mirror_conic(
-    curvature: float,
-    conic: float,
-    rays: Numbers,
-) -> None:
+def _mirror_conic(c: float, k: float, rays: Numbers) -> None:
     """Reflect rays at a conic."""
-    c, k1 = curvature, 1.0 + conic
     for i in range(rays.shape[1]):
-        u, v, w = -c * rays[0, i], -c * rays[1, i], 1.0 - c * k1 * rays[2, i]
+        u, v, w = -c * rays[0, i], -c * rays[1, i], 1.0 - c * (1.0 + k) * rays[2, i]
         step = -2.0 * (rays[3, i] * u + rays[4, i] * v + rays[5, i] * w) / (u * u + v * v + w * w)
         rays[3, i] += step * u
         rays[4, i] += step * v
@@ -177,14 +189,13 @@ def _bend_asphere(
 ) -> None:
     """Refract or reflect rays at an even asphere."""
     for i in range(rays.shape[1]):
-        _, slope, _ = _profile(surface, rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i])
-        u, v = -2.0 * slope * rays[0, i], -2.0 * slope * rays[1, i]
-        scale = 1.0 / np.sqrt(u * u + v * v + 1.0)
-        cosine = (rays[3, i] * u + rays[4, i] * v + rays[5, i]) * scale
-        square = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-        lost[i] = code if (square < 0.0 and lost[i] == 0) else lost[i]
-        root = np.sqrt(max(square, 0.0))
-        step = (-2.0 * cosine if mirror else (root if cosine >= 0 else -root) - ratio * cosine) * scale
+        slope = -2.0 * _slope(surface, rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i])
+        u, v = slope * rays[0, i], slope * rays[1, i]
+        square = u * u + v * v + 1.0
+        q = rays[3, i] * u + rays[4, i] * v + rays[5, i]
+        step, under = _bent(ratio, q, square)
+        step = (-2.0 * q if mirror else step) / square
+        lost[i] = code if (under < 0.0) & (lost[i] == 0) else lost[i]
         rays[3, i] = ratio * rays[3, i] + step * u
         rays[4, i] = ratio * rays[4, i] + step * v
         rays[5, i] = ratio * rays[5, i] + step
@@ -198,14 +209,14 @@ def _stop_at(aperture: Numbers, corners: Numbers, rays: Numbers, lost: Numbers, 
         for i in range(rays.shape[1]):
             u, v = rays[0, i] - cx, rays[1, i] - cy
             square = u * u + v * v
-            inside = square <= a * a and square >= b * b
-            lost[i] = code if (inside == (blocks != 0) and lost[i] == 0) else lost[i]
+            inside = (square <= a * a) & (square >= b * b)
+            lost[i] = code if (inside == (blocks != 0)) & (lost[i] == 0) else lost[i]
         return
     if shape == 1:
         for i in range(rays.shape[1]):
             u, v = rays[0, i] - cx, rays[1, i] - cy
-            inside = abs(c * u + s * v) <= a and abs(c * v - s * u) <= b
-            lost[i] = code if (inside == (blocks != 0) and lost[i] == 0) else lost[i]
+            inside = (abs(c * u + s * v) <= a) & (abs(c * v - s * u) <= b)
+            lost[i] = code if (inside == (blocks != 0)) & (lost[i] == 0) else lost[i]
         return
     first, last = int(aperture[9]), int(aperture[10])
     for i in range(rays.shape[1]):
@@ -216,7 +227,7 @@ def _stop_at(aperture: Numbers, corners: Numbers, rays: Numbers, lost: Numbers, 
             if (y0 > v) != (y1 > v):
                 x0, x1 = corners[j, 0], corners[k, 0]
                 inside = inside != (u < x0 + (v - y0) * (x1 - x0) / (y1 - y0))
-        lost[i] = code if (inside == (blocks != 0) and lost[i] == 0) else lost[i]
+        lost[i] = code if (inside == (blocks != 0)) & (lost[i] == 0) else lost[i]
 
 
 @_compiled
@@ -228,6 +239,7 @@ def _through(
     rays: Numbers,
     lost: Numbers,
     seen: Numbers,
+    bad: Numbers,
 ) -> None:
     """Trace one block of rays (6, n) through all surfaces; see :func:`traced`."""
     at = 0
@@ -235,13 +247,16 @@ def _through(
         surface = surfaces[s]
         kind, c, k, ratio = surface[0], surface[1], surface[2], surface[4 + COEFFICIENTS]
         code = 4.0 * s + 1.0
-        _into(places[s], rays)
-        _to_plane(rays, lost, code)
+        shift = places[s, :3]
+        if places[s, 12] != 0:
+            _turn(places[s, 3:12], rays)
         if c != 0:
-            _to_conic(c, k, rays, lost, code)
+            _to_conic(shift, c, k, rays, lost, code)
+        else:
+            _to_plane(shift, rays, lost, code)
         aspheric = surface[3] > 0
         if aspheric:
-            _to_asphere(surface, rays, lost, code)
+            _to_asphere(surface, rays, lost, code, bad)
         while at < len(apertures) and apertures[at, 0] == s:
             _stop_at(apertures[at], corners, rays, lost, code + 2.0)
             at += 1
@@ -262,7 +277,7 @@ def traced(
     apertures: Numbers,
     corners: Numbers,
     rays: Numbers,
-    lost: Numbers,
+    lost: NDArray[np.int64],
     seen: Numbers,
 ) -> None:
     """Trace rays through all surfaces.
@@ -280,24 +295,32 @@ def traced(
     corners : ndarray (c, 2)
         Corners of all polygons.
     rays : ndarray (6, n)
-        Positions and directions in the axes of the lens; afterwards in those of the last surface.
-    lost : ndarray (n,)
-        0; afterwards 4 s + 1, 2 or 3 for rays that miss surface s, are totally reflected, or are stopped.
+        Positions and directions in the axes of the lens; afterwards in those of the last surface, and NaN for
+        lost rays. A ray that is not finite misses the first surface.
+    lost : ndarray of int (n,)
+        Takes 0, or 4 s + 1, 2 or 3 for rays that miss surface s, are totally reflected, or are stopped.
     seen : ndarray (s, 6, n) or (0, 6, n)
         Takes the rays behind each surface, in its axes.
     """
     total = rays.shape[1]
-    block, gone = np.empty((6, _BLOCK)), np.empty(_BLOCK)
+    block, gone, bad = np.empty((6, _BLOCK)), np.empty(_BLOCK), np.empty(_BLOCK)
     some = np.empty((len(seen), 6, _BLOCK))
     for first in range(0, total, _BLOCK):
         count = min(_BLOCK, total - first)
-        block[:, :count] = rays[:, first : first + count]
-        gone[:count] = lost[first : first + count]
-        for i in range(count, _BLOCK):  # the rest of the last block repeats its first ray
-            block[:, i] = block[:, 0]
-            gone[i] = gone[0]
-        _through(surfaces, places, apertures, corners, block, gone, some)
-        rays[:, first : first + count] = block[:, :count]
-        lost[first : first + count] = gone[:count]
+        gone[:] = 0.0
+        for k in range(6):
+            for i in range(count):
+                value = rays[k, first + i]
+                finite = value - value == 0.0
+                block[k, i] = value if finite else 0.0
+                gone[i] = gone[i] if finite else 1.0
+            block[k, count:] = block[k, 0]  # the rest of the last block repeats its first ray
+        gone[count:] = 1.0
+        _through(surfaces, places, apertures, corners, block, gone, some, bad)
+        for k in range(6):
+            for i in range(count):
+                rays[k, first + i] = block[k, i] if gone[i] == 0.0 else np.nan
+        for i in range(count):
+            lost[first + i] = np.int64(gone[i])
         if len(seen):
             seen[:, :, first : first + count] = some[:, :, :count]

@@ -202,21 +202,18 @@ class Tracer:
         seen : bool
             Whether the rays behind each surface are wanted.
         """
-        work = np.concatenate([rays.xyz.T, rays.directions.T]).astype(np.float64)
-        none = ~np.isfinite(work).all(axis=0)
-        work[:, none] = 0.0
+        work = np.empty((6, len(rays)))
+        work[:3], work[3:] = rays.xyz.T, rays.directions.T
         lost, records = self._run(work, seen)
-        lost[none] = 1
-        work[:, lost != 0] = np.nan
         history = None if records is None else records.transpose(0, 2, 1)
-        return Traced(Rays(work[:3].T, work[3:].T), lost.astype(np.int64), history)
+        return Traced(Rays(work[:3].T, work[3:].T), lost, history)
 
-    def _run(self, work: Array, seen: bool) -> tuple[Array, Array | None]:
+    def _run(self, work: Array, seen: bool) -> tuple[NDArray[np.int64], Array | None]:
         """Trace rays (6, n) in place; codes of lost rays, and rays (s, 6, n) behind each surface."""
         from .compiled import traced  # takes half a second to import; not every command needs it
 
         n = work.shape[1]
-        lost = np.zeros(n)
+        lost = np.empty(n, dtype=np.int64)
         records = np.empty((len(self.surfaces) if seen else 0, 6, n))
 
         def part(first: int, last: int) -> None:
