@@ -1,12 +1,12 @@
 """Rays a second through lenses, beside batoid and optiland, and how well the three agree ray by ray.
 
 Run from the checkout: ``python benchmarks/raytrace.py [--rays N]``. The other programs are installed by
-``pip install .[peers]``; missing ones are listed. Two lenses: a double Gauss of spheres, four of them with a
-conic constant, and the whole LSST of batoid: three mirrors, three lenses and a filter, of whose surfaces four are
-even aspheres. Each surface has a circular or annular aperture, and rays are vignetted. All programs trace the
-same rays with two threads, in turn; of five times the best counts. The time includes everything from rays in
-columns to points on the image and which rays arrived. Times of processors count, too: other work on the machine
-disturbs them less.
+``pip install .[peers]``; missing ones are listed. Two lenses: a double Gauss of spheres, four of them with
+a conic constant, and the whole LSST of batoid: three mirrors, three lenses and a filter, of whose surfaces
+four are even aspheres. Each surface has a circular or annular aperture, and rays are vignetted. All
+programs trace the same rays with two threads, in turn; of five times the best counts. The time includes
+everything from rays in columns to points on the image and which rays arrived. Times of processors count,
+too: other work on the machine disturbs them less.
 """
 
 from __future__ import annotations
