@@ -98,7 +98,9 @@ def _slope(surface: Numbers, square: float) -> float:
     for j in range(COEFFICIENTS - 1, -1, -1):
         b = b * square + a
         a = a * square + surface[4 + j]
-    return 0.5 * surface[1] / np.sqrt(inside if inside > 1e-30 else 1e-30) + (b * square + 2.0 * a) * square
+    root = np.sqrt(inside if inside > 1e-30 else 1e-30)
+    slope: float = 0.5 * surface[1] / root + (b * square + 2.0 * a) * square
+    return slope
 
 
 @_compiled
