@@ -27,6 +27,14 @@ _STRIPE, _UNWRITTEN = 512, 50_000_000
 _SIDE, _ZOOM, _PART = 420, 208, 0.02
 """Side of the picture of a frame and of a corner in pixels, and the least part of an edge shown on both sides
 of a corner."""
+_LABEL = 22
+"""Height of the line above the picture of a frame."""
+_WORDS = {
+    "oriented": "oriented",
+    "three-edges": "three edges",
+    "declined": "declined",
+    "failed": "not read",
+}
 _COLOURS = {"oriented": (60, 170, 60), "three-edges": (230, 150, 30), "declined": (200, 50, 50)}
 
 
@@ -98,7 +106,7 @@ def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
     overview, r = scan.overview(_SIDE)
     step = np.quantile(overview, [0.002, 0.998]).astype(np.float64)
     small = _shown(overview, step)
-    tile = np.full((_SIDE + 22, _SIDE + 2 * _ZOOM + 8, 3), 255, dtype=np.uint8)
+    tile = np.full((_SIDE + _LABEL, _SIDE + 2 * _ZOOM + 8, 3), 255, dtype=np.uint8)
     points = found.image_points().xy
     colour = _COLOURS[found.status]
     if len(points):
@@ -106,9 +114,9 @@ def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
         cv2.polylines(small, [at], True, colour, 1, cv2.LINE_AA, 4)
         for k in range(4):
             zoom = _corner(scan, points, k, step, colour)
-            y, x = 22 + (k // 2) * (_ZOOM + 4), _SIDE + 4 + ((k in (1, 2)) * (_ZOOM + 4))
+            y, x = _LABEL + (k // 2) * (_ZOOM + 4), _SIDE + 4 + ((k in (1, 2)) * (_ZOOM + 4))
             tile[y : y + _ZOOM, x : x + _ZOOM] = zoom
-    tile[22 : 22 + small.shape[0], : small.shape[1]] = small
+    tile[_LABEL : _LABEL + small.shape[0], : small.shape[1]] = small
     text = f"{found.image}  {found.status}"
     # OpenCV's built-in fonts contain ASCII characters only.
     text = text.encode("ascii", "replace").decode()
@@ -197,9 +205,12 @@ def roll_page(summary: RollSummary, pictures: Path) -> str:
         path, shown = pictures / f"{frame.name}.png", ""
         picture = cv2.imread(str(path)) if path.is_file() else None
         if picture is not None:
-            # The whole frame beside its corners; half the size is enough on a page of a roll.
-            small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            # The whole frame beside its corners; half the size is enough on a page of a roll, which names it.
+            small = cv2.resize(picture[_LABEL:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
             shown = b64encode(coded).decode()
-        rows.append({"frame": frame, "picture": shown})
-    return rendered("roll.html.j2", title="Frames of a roll", counts=summary.counts(), rows=rows)
+        # A reason begins with the file, of which the row has the name.
+        rows.append({"frame": frame, "why": frame.why.split(f"{frame.image}: ")[-1], "picture": shown})
+    return rendered(
+        "roll.html.j2", title="Frames of a roll", counts=summary.counts(), rows=rows, words=_WORDS
+    )
