@@ -49,6 +49,11 @@ scatter of its logarithm, with a minimum."""
 _UNEVEN, _SCRATCHED = 0.2, 0.5
 """Differences of logarithmic widths: of three edges if the scan is sharper on one side, and of the sharpest
 from the next if it is no edge."""
+_PIXEL = float(np.sqrt(1 / 12))
+"""Width that a pixel adds to that of a step, which is hardly determined if it is much smaller."""
+_SMOOTH, _ANISOTROPIC, _END = 0.24, 0.5, 0.5
+"""Largest rms deviation of logarithmic widths at the ends of edges from sharpness that changes smoothly over
+the scan, largest such difference of the two directions, and share of half an edge that makes an end."""
 _TOO_SHARP = 0.3
 """Difference of logarithmic width from which steps are too sharp for an edge."""
 _LARGEST_DISPLACEMENT = 1.5
@@ -92,7 +97,7 @@ def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | Non
     )
     if not measured:
         return [None] * len(profiles)
-    if _uneven([form.width for form in measured]):
+    if _uneven([form.width for form in measured], profiles):
         return [None if p is None else p.form for p in profiles]
     width = measured[(len(measured) - 1) // 2].width
     weight = sum(form.weight for form in measured)
@@ -110,7 +115,7 @@ def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:
     # A line beside one of the edges scatters the widths of that edge only.
     second = min(1, len(seen) - 1)
     texture = sorted(each.texture for each in seen)[second]
-    if _uneven(sorted(each.width for each in seen)):
+    if _uneven(sorted(each.width for each in seen), profiles):
         return [each._replace(texture=texture) for each in sharp]
     scatter = sorted(each.scatter for each in seen)[second]
     return [SharpSteps(_sharp_steps(np.concatenate(own)).log_width, scatter, texture)] * len(profiles)
@@ -153,11 +158,32 @@ def _sharp_steps(widths: Array) -> SharpSteps:
     return SharpSteps(float(high), max(float(high - low), _EVEN), texture)
 
 
-def _uneven(widths: Sequence[float]) -> bool:
+def _uneven(widths: Sequence[float], profiles: Sequence[EdgeProfiles | None]) -> bool:
     """Whether sorted widths differ by more than a picture structure at one of the edges can cause."""
     if len(widths) > 3 and np.log(widths[1] / widths[0]) > _SCRATCHED:
         widths = widths[1:]  # a lens cannot be that sharp at a single edge
-    return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN)
+    return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN) and _smooth(profiles)
+
+
+def _smooth(profiles: Sequence[EdgeProfiles | None]) -> bool:
+    """Whether widths at the ends of edges are those of a scan whose sharpness changes smoothly.
+
+    Then two edges are alike where they meet, apart from a difference of the two directions, which scanners
+    have. Lines beside two of the edges widen these all along.
+    """
+    rows, widths = [], []
+    for k, found in enumerate(profiles):
+        for end in (-1.0, 1.0):
+            if found is not None and (near := found.good & (found.place * end > _END)).sum() >= NEIGHBOURS:
+                x, y = ((end, -1.0), (1.0, end), (-end, 1.0), (-1.0, -end))[k]
+                rows.append((1.0, x, y, float(k % 2)))
+                widths.append(np.log(np.hypot(np.exp(np.median(found.blur[0][near])), _PIXEL)))
+    if len(rows) < 6:
+        return True
+    design, observed = np.array(rows), np.array(widths)
+    change = np.linalg.lstsq(design, observed, rcond=None)[0]
+    rms = np.sqrt(((observed - design @ change) ** 2).sum() / (len(rows) - len(change)))
+    return bool(rms < _SMOOTH and abs(change[3]) < _ANISOTROPIC)
 
 
 _SECTIONS = 20
@@ -172,6 +198,8 @@ edge, and change of the latter from the centre to an end."""
 _MOST_MISFIT, _LEAST_GAIN, _CLEAR_GAIN = 1.0, 3.0, 20.0
 """Largest χ² over redundancy with two lines; minimum ratio of χ² with one line to that with two; and the same
 if nothing else can be there."""
+_CROSSED, _FEW_CROSSED = 9.0, 0.15
+"""Misfit of a section, relative to the others, that another structure crosses; and largest share of such."""
 _TOGETHER = 1.7
 """Factor on the standard deviation of the edge, because errors of bins are correlated by grain."""
 _BOW = 0.3
@@ -275,13 +303,18 @@ def _two_lines(
     starts = np.array([model.start(slope, top) for slope in _SLOPES])
     shared = np.array([4.0, 4.0, _BOW, 4.0, 4.0, 4.0, 4.0]) * width
     spread = np.concatenate([shared, _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
-    estimates, cofactor, chi = model.fitted(value, weight, starts, spread)
-    best = int(np.argmin(chi))
     alone = model.start(0.0, top)
     alone[0], alone[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
-    held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-6 * top, 2 * top)])
-    without = float(model.fitted(value, weight, alone[None], held)[2][0])
-    return _TwoLines(estimates[best], cofactor[best], place, top, float(chi[best]), without)
+    held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-3 * top, 2 * top)])
+    for _ in range(2):
+        both = model.fitted(value, weight, starts, spread)
+        one = model.fitted(value, weight, alone[None], held)
+        misfit = np.minimum(both.misfit, one.misfit)
+        crossed = misfit > _CROSSED * np.median(misfit)
+        if not 0 < crossed.mean() <= _FEW_CROSSED:
+            break
+        weight = np.where(crossed[:, None], 0.0, weight)
+    return _TwoLines(both.x, both.cofactor, place, top, both.chi, one.chi)
 
 
 def _sections(
@@ -303,7 +336,8 @@ def _sections(
         where[i, full] = np.nanmedian(at[group][:, full], axis=0)
     if (known > 3).mean() < 0.35:
         return None
-    top = np.maximum(value.max(axis=1), 1e-6)
+    # Where the picture is as dark as film, the noise is the scale of its steps.
+    top = np.maximum(value.max(axis=1), noise)
     pixels = np.maximum(known * band.columns * step, 1.0)
     variance = (1.25 * noise) ** 2 / pixels + (_MODEL * top[:, None]) ** 2
     place = np.array([band.place[group].mean() for group in groups])
@@ -313,6 +347,15 @@ def _sections(
 def _of_steps(film: Array, first: Array, second: Array, change: Array) -> Array:
     """Parameters of the sections in the order of the model."""
     return np.stack([film, first, second, change], axis=1).ravel()
+
+
+class _Fitted(NamedTuple):
+    """Parameters (u,), cofactors (u, u), χ² over the redundancy, and χ² per bin of the sections (s,)."""
+
+    x: Array
+    cofactor: Array
+    chi: float
+    misfit: Array
 
 
 class _Model:
@@ -326,8 +369,8 @@ class _Model:
         shared = np.array([_OUT, 0.0, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
         return np.concatenate([shared, _of_steps(0 * top, 0.2 * top, 0.8 * top, -0.3 * top)])
 
-    def fitted(self, value: Array, weight: Array, starts: Array, spread: Array) -> tuple[Array, Array, Array]:
-        """Estimates from several starts, their cofactors, and χ² over the redundancy."""
+    def fitted(self, value: Array, weight: Array, starts: Array, spread: Array) -> _Fitted:
+        """The best fit from several starts."""
         count = len(starts)
         fit = adjust_batch(
             self,
@@ -338,9 +381,12 @@ class _Model:
             options=BatchOptions(max_iterations=40, share=0.01),
         )
         left = value.ravel() - self(fit.estimates, np.arange(count))[0]
+        squares = (weight.ravel() * left**2).reshape(count, *weight.shape).sum(axis=2)
+        total = np.where(np.isfinite(squares).all(axis=1), squares.sum(axis=1), np.inf)
+        best = int(np.argmin(total))
         redundancy = max(int((weight > 0).sum()) - starts.shape[1], 1)
-        chi = (weight.ravel() * left**2).sum(axis=1) / redundancy
-        return fit.estimates, fit.cofactor, np.where(np.isfinite(chi), chi, np.inf)
+        misfit = squares[best] / np.maximum((weight > 0).sum(axis=1), 1)
+        return _Fitted(fit.estimates[best], fit.cofactor[best], float(total[best]) / redundancy, misfit)
 
     def __call__(self, x: Array, rows: Rows) -> tuple[Array, Array]:
         m, (s, n), w, t = len(x), self.at.shape, self.width, self.place

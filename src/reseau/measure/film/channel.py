@@ -4,7 +4,7 @@ edge."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -77,6 +77,34 @@ class Channel:
     data: list[EdgeData | None]
     rejected: list[int]
     why: list[str]
+
+    def doubted(self, other: Channel, corners: Array) -> Channel:
+        """The channel with the doubts of one of more contrast: lines that may be hidden beside edges.
+
+        Where both put an edge at the same place, both show the same, and less contrast does not show it
+        better. A channel without the line shows the edge further outwards.
+        """
+        data = list(self.data)
+        for k, (own, doubtful) in enumerate(zip(self.data, other.data, strict=True)):
+            if own is None or doubtful is None or own.ends >= doubtful.ends:
+                continue
+            start, along = corners[k], corners[(k + 1) % 4] - corners[k]
+            normal = np.array([-along[1], along[0]]) / np.hypot(*along)
+            ends = [
+                np.polynomial.polynomial.polyval(
+                    [0.0, 1.0],
+                    np.polynomial.polynomial.polyfit(
+                        (edge.xy - start) @ along / (along @ along),
+                        (edge.xy - start) @ normal,
+                        1,
+                        w=1 / edge.sigma,
+                    ),
+                )
+                for edge in (own, doubtful)
+            ]
+            if (ends[1] - ends[0]).max() < doubtful.ends:
+                data[k] = replace(own, ends=doubtful.ends)
+        return replace(self, data=data)
 
 
 def channels_by_contrast(bands: Sequence[Band | None], count: int, reach: float) -> list[int]:

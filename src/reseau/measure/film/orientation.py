@@ -411,9 +411,13 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
     best: FrameResult | None = None
+    earlier: list[Channel] = []
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
+        for other in earlier:
+            measured = measured.doubted(other, corners)
+        earlier.append(measured)
         result = _judged(scan, guess, measured, corners, shape, options)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
