@@ -194,7 +194,7 @@ def _commanded(*arguments: object) -> tuple[str, float, float, float]:
 
 
 def print_times() -> None:
-    """A roll of 36, a frame of 40 megapixels, and a scan of 600 MB by the command, for its memory."""
+    """A roll of 36, a frame of 40 megapixels, and scans of 600 MB by the command, for its memory."""
     print("\nWall time, processor time and memory of `reseau orient`, including its start")
     with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(2) as pool:
         # Other processes make the scans: a child begins with the memory of its parent.
@@ -203,16 +203,22 @@ def print_times() -> None:
         said, took, used, _ = _commanded(*paths, "--out", folder / "out", "--jobs", 2)
         done = said.count(": oriented")
         print(f"  roll of 36 at 1200 dpi, with marked copies: {took:.1f} s, {used:.1f} s, {done} oriented")
-        plain, wide = pool.submit(_large, folder).result()
+        plain, wide, coded = pool.submit(_large, folder).result()
         runs = [pool.submit(_oriented_within, plain).result() for _ in range(3)]
         took, used = (min(run[k] for run in runs) for k in (1, 2))
         print(f"  40 megapixels, uncompressed, without the start: {took:.2f} s, {used:.2f} s, {runs[0][0]}")
-        said, took, used, peak = _commanded(wide, "--no-marked", "--jobs", 1)
-        done, size = said.count(": oriented"), wide.stat().st_size / 1e6
-        print(
-            f"  RGB of 16 bit, {size:.0f} MB: {took:.1f} s, {used:.1f} s, {peak:.0f} MB at most, "
-            f"{done} oriented"
-        )
+        size, out = wide.stat().st_size / 1e6, folder / "large"
+        for what, path, given in (
+            ("", wide, ()),
+            (", with a marked copy", wide, ("--out", out)),
+            (", LZW, one row per strip, with a marked copy", coded, ("--out", out)),
+        ):
+            said, took, used, peak = _commanded(path, "--jobs", 1, *given)
+            done = said.count(": oriented")
+            print(
+                f"  RGB of 16 bit, {size:.0f} MB{what}: {took:.1f} s, {used:.1f} s, {peak:.0f} MB at most, "
+                f"{done} oriented"
+            )
 
 
 def _roll_frame(folder: Path, seed: int) -> Path:
@@ -224,17 +230,19 @@ def _roll_frame(folder: Path, seed: int) -> Path:
     return path
 
 
-def _large(folder: Path) -> tuple[Path, Path]:
-    """A scan of 40 megapixels, and the same at 7700 dpi in colour."""
+def _large(folder: Path) -> tuple[Path, Path, Path]:
+    """A scan of 40 megapixels, the same at 7700 dpi in colour, and this compressed row by row."""
     import cv2
     import tifffile
 
     pixels = FilmFrame(1, dpi=4800, blur_px=2.0, margin_mm=2.0).scan()
-    plain, wide = folder / "plain.tif", folder / "wide.tif"
+    plain, wide, coded = (folder / f"{name}.tif" for name in ("plain", "wide", "coded"))
     tifffile.imwrite(plain, pixels, photometric="minisblack", resolution=(4800, 4800))
     finer = cv2.resize(pixels, None, fx=1.6, fy=1.6, interpolation=cv2.INTER_LINEAR).astype(np.uint16) * 257
-    tifffile.imwrite(wide, np.repeat(finer[:, :, None], 3, axis=2), photometric="rgb")
-    return plain, wide
+    colours = np.repeat(finer[:, :, None], 3, axis=2)
+    tifffile.imwrite(wide, colours, photometric="rgb")
+    tifffile.imwrite(coded, colours, photometric="rgb", compression="lzw", rowsperstrip=1)
+    return plain, wide, coded
 
 
 def _oriented_within(path: Path) -> tuple[str, float, float]:

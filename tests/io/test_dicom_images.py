@@ -114,9 +114,9 @@ def test_a_frame_of_several_is_named_by_its_number(tmp_path: Path) -> None:
         read_image(tmp_path / "none.dcm#1")
 
 
-def test_a_number_is_for_dicom_files_only(tmp_path: Path) -> None:
+def test_a_number_is_for_dicom_files_and_tiffs_only(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(ImageError, match="is no DICOM file"):
+    with pytest.raises(ImageError, match="is no TIFF or DICOM file"):
         read_image(tmp_path / "a.png#2")
 
 

@@ -107,7 +107,34 @@ def test_windows_of_compressed_strips_are_those_of_the_whole_image(tmp_path: Pat
 
 
 def test_further_pages_of_a_tiff_are_reported(tmp_path: Path) -> None:
-    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        for _ in range(2):
-            file.write(np.zeros((16, 16), np.uint8), photometric="minisblack")
-    assert open_scan(tmp_path / "a.tif").notes == ("has 2 pages, of which only the first is used",)
+    two_pages(tmp_path / "a.tif")
+    assert open_scan(tmp_path / "a.tif").notes == (
+        "has 2 pages, of which the first is used; a.tif#2 is the second",
+    )
+
+
+@pytest.mark.parametrize("compression", [None, "lzw"])
+def test_a_page_of_a_tiff_is_chosen_by_its_number(tmp_path: Path, compression: str | None) -> None:
+    two_pages(tmp_path / "a.tif", compression)
+    assert [int(read_image(tmp_path / name).pixels[0, 0]) for name in ("a.tif", "a.tif#1", "a.tif#2")] == [
+        0,
+        0,
+        100,
+    ]
+    second = open_scan(tmp_path / "a.tif#2")
+    assert second.name == "a.tif#2"
+    assert not second.notes
+
+
+def test_a_page_that_a_file_does_not_have_is_reported(tmp_path: Path) -> None:
+    two_pages(tmp_path / "a.tif")
+    with pytest.raises(ImageError, match="has 2 pages; there is no page 3"):
+        open_scan(tmp_path / "a.tif#3")
+
+
+def two_pages(path: Path, compression: str | None = None) -> None:
+    """Write a TIFF of a black and a grey page."""
+    with tifffile.TiffWriter(path) as file:
+        for tone in (0, 100):
+            page = np.full((16, 16), tone, np.uint8)
+            file.write(page, photometric="minisblack", compression=compression)

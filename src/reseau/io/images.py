@@ -1,8 +1,9 @@
 """Image files: one reader for whole frames and for windows of scans, and a writer.
 
-Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and the first page of a TIFF with grey or RGB
-samples of 1, 8 or 16 bit, signed 16 bit, or floating point, uncompressed or in a compression that tifffile
-decodes; and a frame of a DICOM file, see :mod:`reseau.io.dicom`. Other grey values are never rescaled; an
+Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and a page of a TIFF (``scan.tif#2`` is the second,
+``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed 16 bit, or floating point,
+uncompressed or in a compression that tifffile decodes; and a frame of a DICOM file, see
+:mod:`reseau.io.dicom`. Other grey values are never rescaled; an
 alpha channel is ignored, and so is an orientation tag: pixel coordinates are those of the sensor.
 
 An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
@@ -135,10 +136,11 @@ def open_scan(path: Path | str) -> Scan:
     if is_dicom(whole, magic):
         return open_dicom(whole, number, MAX_PIXELS)
     path = Path(path)
-    if number is not None:
-        raise ImageError("is no DICOM file, which could have frames", where=path, do=f"give {whole.name}")
     if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        return _open_tiff(path)
+        return _open_tiff(path, whole, number)
+    if number is not None:
+        what = "is no TIFF or DICOM file, which could have several images"
+        raise ImageError(what, where=path, do=f"give {whole.name}")
     pixels = _decoded(path, magic)
     _check_least(path, pixels.shape[1], pixels.shape[0])
     if pixels.ndim == 3:
@@ -215,12 +217,13 @@ def _coded_dpi(magic: bytes) -> float | None:
 # TIFF
 
 
-def _open_tiff(path: Path) -> Scan:
+def _open_tiff(given: Path, path: Path, number: int | None) -> Scan:
+    """Open a page of a TIFF, by default the first, of the file `path` that was `given` with its number."""
     import tifffile
 
     try:
         with tifffile.TiffFile(path) as tiff:
-            page: Any = tiff.pages.first
+            page: Any = tiff.pages.first if number is None else _page(tiff, given, number)
             full_scale = _usable(page, path)
             mapped = page.is_memmappable and page.dtype.kind != "b"
             # The file must hold all data: reading a mapping beyond the end of its file is a bus error.
@@ -232,14 +235,14 @@ def _open_tiff(path: Path) -> Scan:
                 raise ImageError("is a truncated TIFF", where=path, do=_AGAIN)
             window = _mapped(page, path) if mapped else _decoding(page, path)
             dpi = _tiff_dpi(page)
-            notes = _further_pages(tiff)
+            notes = _further_pages(tiff, path) if number is None else ()
     except ImageError:
         raise
     except Exception as error:  # tifffile and its codecs raise exceptions of every kind on damaged files
         raise _damaged(path, error) from None
     dtype = np.dtype(np.uint8 if page.dtype.kind == "b" else page.dtype)
     return Scan(
-        path.name,
+        given.name,
         page.imagewidth,
         page.imagelength,
         CHANNELS[_colours(page)],
@@ -251,13 +254,27 @@ def _open_tiff(path: Path) -> Scan:
     )
 
 
-def _further_pages(tiff: Any) -> tuple[str, ...]:
-    """A note if a file has images beside the first one; previews do not count."""
+def _page(tiff: Any, given: Path, number: int) -> Any:
+    """A page by its number, from 1; previews do not count."""
+    pages = _pages(tiff)
+    if not 1 <= number <= len(pages):
+        raise ImageError(f"has {len(pages)} pages; there is no page {number}", where=given)
+    return pages[number - 1]
+
+
+def _pages(tiff: Any) -> list[Any]:
+    return [tiff.pages.first, *(page for page in tiff.pages[1:] if not page.subfiletype & 1)]
+
+
+def _further_pages(tiff: Any, path: Path) -> tuple[str, ...]:
+    """A note if a file has images beside the first one."""
     try:
-        more = sum(not (page.subfiletype & 1) for page in tiff.pages[1:])
+        count = len(_pages(tiff))
     except Exception:  # the chain of pages is damaged, and the first one is not
         return ("further pages are damaged; the first is used",)
-    return (f"has {more + 1} pages, of which only the first is used",) if more else ()
+    if count == 1:
+        return ()
+    return (f"has {count} pages, of which the first is used; {path.name}#2 is the second",)
 
 
 def _damaged(path: Path, error: Exception) -> ImageError:
