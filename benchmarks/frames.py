@@ -1,6 +1,6 @@
 """Inner orientation of scanned frames: accuracy, time and memory.
 
-    python benchmarks/frames.py [--frames 200] [--jobs 2] [--only NAME …] [--real DIR] [--pictures DIR]
+    python benchmarks/frames.py [--frames 200] [--jobs 2] [--only NAME …] [--without] [--real DIR] [--pictures DIR]
 
 Simulated frames of every difficulty compared with their truth, and with the method of Cruz, Cardenal and
 Delgado (`cruz.py`, with given search areas); table 1 of the paper on a roll of each camera; time of a roll of
@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -51,6 +52,14 @@ CASES = {
     "bowed edges": FilmFrame(bow_mm=0.1),
     "Hasselblad, slits": FilmFrame(format=HASSELBLAD),
     "soft, hardly noise": FilmFrame(blur_px=1.5, noise=0.5, grain=0.5),
+    "sharp, clean": FilmFrame(blur_px=0.3, noise=0.5, grain=0.0),
+    "sharp, 9°, bowed": FilmFrame(blur_px=0.4, noise=0.8, grain=0.5, tilt_deg=9.0, bow_mm=0.05),
+    "out of focus": FilmFrame(blur_px=0.4, defocus_px=3.0),
+    "trees": FilmFrame(scene="trees"),
+    "trees, faded edges": FilmFrame(scene="trees", fade=0.75),
+    "trees, faint": FilmFrame(scene="trees", fade=0.8, contrast=0.25, noise=2.0, grain=1.0),
+    "two bright lines": FilmFrame(beside=Beside(lines=2)),
+    "two lines, colour": FilmFrame(beside=Beside(lines=2), colour=True),
     "1200 dpi, soft": FilmFrame(dpi=1200, blur_px=2.5),
     "1200 dpi, soft, film": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(**_FILM, dust=40, scratches=3)),
     "1200 dpi, soft, 7A": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(rods=1)),
@@ -78,13 +87,14 @@ def _areas(corners: Array) -> Array:
     return np.array(boxes)
 
 
-def one(frame: FilmFrame) -> Row:
+def one(frame: FilmFrame, known: bool = True) -> Row:
     """Our result, its errors and sigmas, and errors of the paper's method, for one simulated frame."""
     pixels = frame.scan()
-    options = FrameOptions(formats=(frame.format[:2],))
-    result = orient_frames(scan_of(pixels, dpi=frame.dpi), options)[0]
+    grey = pixels if pixels.ndim == 2 else pixels[:, :, 0]
+    options = FrameOptions(formats=(frame.format[:2],)) if known else FrameOptions()
+    result = orient_frames(scan_of(pixels, dpi=frame.dpi if known else None), options)[0]
     truth, none = frame.truth.corners, np.full((4, 2), np.nan)
-    theirs = cruz_corners(pixels, _areas(truth), frame.negative)
+    theirs = cruz_corners(grey, _areas(truth), frame.negative)
     return result, *_errors(result, frame), none if theirs is None else theirs - truth
 
 
@@ -104,15 +114,18 @@ def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float
     return result.status, float(np.abs(_errors(result, frame)[0]).max())
 
 
-def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str]) -> None:
+def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], known: bool) -> None:
     """The table of difficulties."""
-    print(f"\nSimulated frames at 600 dpi, {count} of every difficulty; errors of corners in pixels")
+    what = "" if known else ", format and resolution not given"
+    print(f"\nSimulated frames at 600 dpi, {count} of every difficulty{what}; errors of corners in pixels")
     print("                        oriented  rms   largest  wrong by  sigmas      method of the paper")
     print("                           %      px      px      > 1 px   err/σ rms   rms/px  > 1 px")
     for name, frame in CASES.items():
         if only and not any(part in name for part in only):
             continue
-        rows = list(pool.map(one, [frame.with_seed(SEEDS + seed) for seed in range(count)], chunksize=4))
+        rows = list(
+            pool.map(partial(one, known=known), [frame.with_seed(SEEDS + seed) for seed in range(count)])
+        )
         good = np.array([row[0].status == "oriented" for row in rows])
         error, sigma, theirs = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
         e, s = error[good], sigma[good]
@@ -256,6 +269,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--without", action="store_true", help="frames without their format")
     parser.add_argument(
         "--only", nargs="*", default=[], help="parts of names of difficulties, or: table, times, real"
     )
@@ -268,7 +282,7 @@ def main() -> None:
     only = [name for name in given.only if name not in parts]
     with ProcessPoolExecutor(given.jobs) as pool:
         if only or not given.only:
-            print_cases(pool, given.frames, only)
+            print_cases(pool, given.frames, only, not given.without)
         if not given.only or "table" in given.only:
             print_table_1(pool, max(6, given.frames // 10))
         if not given.only or "times" in given.only:

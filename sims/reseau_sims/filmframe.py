@@ -2,14 +2,15 @@
 
 The gate of a camera limits the exposed area; outside it the film remains unexposed, dark on a slide and
 bright on a negative. The scan is formed from the signed distance of each pixel from the gate's outline: a
-Gaussian point-spread function convolved with the pixel's square, exact along a straight edge.
+Gaussian point-spread function, and the disk of a scanner out of focus, convolved with the pixel's square,
+exact along a straight edge.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ _DARK, _BRIGHT = 14.0, 230.0
 """Grey values of unexposed film on a slide and on a negative."""
 _FAR, _FAR_SIGMAS = 4.0, 5.0
 """Distance from an outline, pixels and widths of the spread, beyond which a pixel is inside or outside."""
+_NODES = 24
+"""Nodes of the integration over the disk of a scanner out of focus."""
 PITCH_35_MM = 38.0
 """From one 35 mm frame to the next: eight perforations."""
 
@@ -112,6 +115,12 @@ class FilmFrame:
         Standard deviation of the film's grain, grey values at full density.
     blur_px : float
         Width of the scanner's and the film's spread, one sigma.
+    defocus_px : float
+        Radius of the disk of a scanner out of focus.
+    scene : {"forms", "trees"}
+        Forms in any direction, or upright trunks before leaves: lines parallel to the edges.
+    fade : float
+        Share of the light that the picture lacks at its edges; it grows over the outer eighth of its width.
     gate_sigma_mm : float
         Standard deviation of the gate's corners about the nominal format.
     gate_seed : int
@@ -142,6 +151,9 @@ class FilmFrame:
     noise: float = 1.5
     grain: float = 3.0
     blur_px: float = 0.7
+    defocus_px: float = 0.0
+    scene: Literal["forms", "trees"] = "forms"
+    fade: float = 0.0
     gate_sigma_mm: float = 0.03
     gate_seed: int = 1
     film_mm: float = 0.004
@@ -249,7 +261,10 @@ def _light(frame: FilmFrame) -> Array:
     x, y = _pixels(frame.shape)
     inside = _share(_gate_distance(frame, x, y, corners), frame)
     view = _View(frame, corners)
-    picture = _picture(frame, rng)
+    picture = (_trees if frame.scene == "trees" else _picture)(frame, rng)
+    if frame.fade > 0:
+        depth = np.minimum.reduce([_edge_depth(view, k, x, y) for k in range(4)]) / (view.size.max() / 8)
+        picture = picture * (1 - np.float32(frame.fade) * np.clip(1 - depth, 0, 1)).astype(np.float32)
     picture = _features(frame, view, picture, x, y, rng)
     base = _BRIGHT if frame.negative else _DARK
     sign = -1.0 if frame.negative else 1.0
@@ -285,13 +300,24 @@ def _share(distance: Plane, frame: FilmFrame) -> Plane:
     major, minor = max(np.cos(tilt), np.sin(tilt)), min(np.cos(tilt), np.sin(tilt))
     sigma, half = float(np.hypot(frame.blur_px, minor / np.sqrt(12))), major / 2
     share: Plane = (distance > 0).astype(np.float32)
-    near = np.abs(distance) < max(_FAR, _FAR_SIGMAS * sigma) + half
+    near = np.abs(distance) < max(_FAR, _FAR_SIGMAS * sigma) + half + frame.defocus_px
     d = distance[near].astype(np.float64)
 
     def integral(t: Array) -> Array:
         return np.asarray(t * ndtr(t) + np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
 
-    share[near] = (integral((d + half) / sigma) - integral((d - half) / sigma)) * sigma / (2 * half)
+    def step(t: Array) -> Array:
+        """The blurred step without the disk."""
+        rises = integral((t + half) / sigma) - integral((t - half) / sigma)
+        return np.asarray(rises * sigma / (2 * half))
+
+    if frame.defocus_px == 0:
+        share[near] = step(d)
+        return share
+    # The disk along a line across the edge is a half circle: Gauss and Chebyshev's rule of the second kind.
+    turn = np.pi * np.arange(1, _NODES + 1) / (_NODES + 1)
+    weight = np.sin(turn) ** 2 / (np.sin(turn) ** 2).sum()
+    share[near] = sum(w * step(d - frame.defocus_px * c) for w, c in zip(weight, np.cos(turn), strict=True))
     return share
 
 
@@ -358,6 +384,29 @@ def _picture(frame: FilmFrame, rng: np.random.Generator) -> Plane:
         shade = float(rng.uniform(0.1, 0.95))
         cv2.fillPoly(scene, [np.rint(box * 16).astype(np.int32)], shade, cv2.LINE_AA, 4)
     return np.clip(cv2.GaussianBlur(scene, (0, 0), frame.blur_px), 0.04, 1.0)
+
+
+def _trees(frame: FilmFrame, rng: np.random.Generator) -> Plane:
+    """A scene, 0 to 1: leaves and sky above a dark ground, and dark trunks, nearly upright."""
+    h, w = frame.shape
+    fine = cv2.GaussianBlur(rng.standard_normal((h, w), dtype=np.float32), (0, 0), w / 300)
+    coarse = cv2.GaussianBlur(rng.standard_normal((h, w), dtype=np.float32), (0, 0), w / 40)
+    leaves = fine / fine.std() + 1.5 * coarse / coarse.std()
+    scene = np.where(leaves > rng.uniform(-0.5, 1.0), 0.25, rng.uniform(0.55, 0.9)).astype(np.float32)
+    ground = round(h * rng.uniform(0.6, 0.95))
+    scene[ground:] = rng.uniform(0.15, 0.5) + 0.05 * coarse[ground:] / coarse.std()
+    for _ in range(int(rng.integers(4, 9))):
+        foot, half, lean = rng.uniform(0, w), rng.uniform(0.003, 0.02) * w, rng.normal(0, 0.03) * h
+        at = [
+            (foot - half, h),
+            (foot + half, h),
+            (foot + 0.8 * half + lean, 0),
+            (foot - 0.8 * half + lean, 0),
+        ]
+        shade = float(rng.uniform(0.05, 0.2))
+        cv2.fillPoly(scene, [np.rint(np.array(at) * 16).astype(np.int32)], shade, cv2.LINE_AA, 4)
+    spread = float(np.hypot(frame.blur_px, frame.defocus_px / 2))
+    return np.clip(cv2.GaussianBlur(scene, (0, 0), spread), 0.04, 1.0)
 
 
 def _features(
