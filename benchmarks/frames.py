@@ -1,6 +1,7 @@
 """Inner orientation of scanned frames: accuracy, time and memory.
 
-    python benchmarks/frames.py [--frames 200] [--jobs 2] [--only NAME …] [--without] [--real DIR] [--pictures DIR]
+    python benchmarks/frames.py [--frames 200] [--jobs 2] [--only NAME …] [--without]
+        [--real DIR] [--pictures DIR]
 
 Simulated frames of every difficulty compared with their truth, and with the method of Cruz, Cardenal and
 Delgado (`cruz.py`, with given search areas); table 1 of the paper on a roll of each camera; time of a roll of

@@ -96,6 +96,31 @@ def test_a_bright_line_that_leaves_the_edge_is_fitted_with_it() -> None:
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
+@pytest.mark.parametrize(
+    "frame",
+    [FilmFrame(320006, beside=Beside(lines=2)), FilmFrame(320023, contrast=0.5, beside=Beside(lines=2))],
+    ids=["contrast 0.7", "contrast 0.5"],
+)
+def test_lines_beside_two_edges_are_not_taken_for_a_scan_that_is_less_sharp_there(frame: FilmFrame) -> None:
+    result = oriented(frame)  # corners were wrong by 3 px and 5 px, with sigmas of 0.1 px
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
+
+
+def test_a_line_beside_an_edge_is_suspected_where_another_line_crosses_its_end() -> None:
+    result = oriented(FilmFrame(320035, beside=Beside(lines=2)))  # it was wrong by 1.1 px at 14 sigma
+    assert result.code is Code.UNCERTAIN, result.why
+
+
+@pytest.mark.parametrize("lines", [1, 2])
+def test_a_channel_of_less_contrast_does_not_overrule_a_line_that_another_suspects(lines: int) -> None:
+    frame = FilmFrame(320035, colour=True, beside=Beside(lines=lines))  # green and blue were wrong by 1 px
+    result = oriented(frame)
+    if result:
+        sigma = np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)  # type: ignore[union-attr]
+        assert (np.abs(errors(result, frame)) < 3 * sigma + 0.1).all()
+
+
 def test_certain_frames_of_a_roll_locate_an_edge_hidden_by_a_line() -> None:
     """The line is parallel to the edge: in a single frame they cannot be distinguished."""
     frame = FilmFrame(320035, beside=Beside(lines=1))
