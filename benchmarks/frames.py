@@ -115,9 +115,9 @@ def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float
     return result.status, float(np.abs(_errors(result, frame)[0]).max())
 
 
-def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], known: bool) -> None:
+def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], stated: bool) -> None:
     """The table of difficulties."""
-    what = "" if known else ", format and resolution not given"
+    what = "" if stated else ", format and resolution not given"
     print(f"\nSimulated frames at 600 dpi, {count} of every difficulty{what}; errors of corners in pixels")
     print("                        oriented  rms   largest  wrong by  sigmas      method of the paper")
     print("                           %      px      px      > 1 px   err/σ rms   rms/px  > 1 px")
@@ -125,7 +125,7 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], known: b
         if only and not any(part in name for part in only):
             continue
         rows = list(
-            pool.map(partial(one, known=known), [frame.with_seed(SEEDS + seed) for seed in range(count)])
+            pool.map(partial(one, known=stated), [frame.with_seed(SEEDS + seed) for seed in range(count)])
         )
         good = np.array([row[0].status == "oriented" for row in rows])
         error, sigma, theirs = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
