@@ -248,7 +248,7 @@ def slope(at: Callable[[float], np.ndarray]) -> tuple[np.ndarray, float]:
     The step is the first decade that moves the end of a ray by more than 1e-4 mm; ends are rounded to some
     1e-13 mm.
     """
-    nominal, step = at(0.0), 1e-24
+    nominal, step = at(0.0), 1e-60
     while step < 1e-3 and not np.abs(at(step) - nominal).max() > 1e-4:
         step *= 10
     found = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
@@ -263,7 +263,7 @@ def changed(surface: Surface, name: str, by: float) -> Surface:
         return replace(surface, vertex=surface.vertex + by * np.eye(3)["xyz".index(axis)])
     if kind == "tilt":
         return replace(surface, axes=surface.axes @ _turned(*(by * np.eye(3)["xyz".index(axis)])))
-    coefficients = [*surface.coefficients, 0.0, 0.0, 0.0, 0.0][: max(4, len(surface.coefficients))]
+    coefficients = [*surface.coefficients, *[0.0] * 10][:10]
     coefficients[int(name[1:]) // 2 - 2] += by
     return replace(surface, coefficients=tuple(coefficients))
 

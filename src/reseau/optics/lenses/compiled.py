@@ -14,13 +14,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["COEFFICIENTS", "traced"]
+from .prescription import COEFFICIENTS
+
+__all__ = ["traced"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Numbers = NDArray[np.float64]
 
-COEFFICIENTS = 10
-"""Largest number of coefficients of an asphere."""
 _BLOCK = 256
 _MOST = 30
 """Largest number of Newton steps towards an asphere."""

@@ -25,6 +25,10 @@ from .media import AIR, Medium
 __all__ = ["Aperture", "Layout", "Prescription", "Surface", "in_order"]
 
 
+COEFFICIENTS = 10
+"""Largest number of coefficients of an asphere."""
+
+
 @dataclass(frozen=True, eq=False)
 class Aperture:
     """Part of a surface that lets light pass, or, as an obscuration, does not.
@@ -132,6 +136,11 @@ class Surface:
         numbers = [self.curvature, self.conic, *self.coefficients, *self.vertex, *self.axes.ravel()]
         if not np.isfinite(numbers).all():
             raise UsageError("has a number that is not finite", where=self.name or "surface")
+        if len(self.coefficients) > COEFFICIENTS:
+            raise UsageError(
+                f"has {len(self.coefficients)} coefficients; {COEFFICIENTS} are possible",
+                where=self.name or "surface",
+            )
 
     def sag(self, x: Array, y: Array) -> Array:
         """Height of the surface above the plane at its vertex; NaN where it has none."""

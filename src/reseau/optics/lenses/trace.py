@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
-from .prescription import Aperture, Prescription, Surface
+from .prescription import COEFFICIENTS, Aperture, Prescription, Surface
 
 __all__ = ["SURFACE_PARAMETERS", "RayDerivatives", "Rays", "Traced", "Tracer"]
 
@@ -40,10 +40,7 @@ SURFACE_PARAMETERS = (
     "tilt_z",
     "index_before",
     "index_behind",
-    "a4",
-    "a6",
-    "a8",
-    "a10",
+    *(f"a{2 * k}" for k in range(2, 2 + COEFFICIENTS)),
 )
 """Parameters of a surface to which a ray has derivatives; tilts are rotations about its own axes, radians."""
 
@@ -270,7 +267,9 @@ class Tracer:
                 before = np.concatenate(
                     [point @ ahead.axes.T + ahead.vertex, direction @ ahead.axes.T], axis=1
                 )
-            by_ray, by_parameter = _at_surface(self.surfaces[s], self.indices[s : s + 2], before)
+            by_ray, by_parameter = _at_surface(
+                self.surfaces[s], self.indices[s : s + 2], before, traced.seen[s, :, :3]
+            )
             by_surface[:, :, s] = after @ by_parameter
             after = after @ by_ray
         # Coordinates in the axes of the last surface change when this surface moves or turns.
@@ -292,14 +291,15 @@ def _crossed(points: Array) -> Array:
     return matrix
 
 
-def _at_surface(surface: Surface, indices: Array, before: Array) -> tuple[Array, Array]:
+def _at_surface(surface: Surface, indices: Array, before: Array, p: Array) -> tuple[Array, Array]:
     """Derivatives of rays (n, 6) behind a surface by the rays in front of it and by its parameters.
 
-    All rays in the axes of the lens; (n, 6, 6) and (n, 6, p).
+    All rays in the axes of the lens, the points p (n, 3) at which they meet the surface in its axes;
+    (n, 6, 6) and (n, 6, parameters).
     """
     n, axes = len(before), surface.axes
     p0, d = (before[:, :3] - surface.vertex) @ axes, before[:, 3:] @ axes
-    p, t = _intersection(surface, p0, d)
+    t = ((p - p0) * d).sum(axis=1)
     x, y = p[:, 0], p[:, 1]
     slope, bend, by_form = _form(surface, x, y)
     # Gradient and Hessian of F = sag(r²) − z.
@@ -369,49 +369,33 @@ def _at_surface(surface: Surface, indices: Array, before: Array) -> tuple[Array,
 
 
 def _form(surface: Surface, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of the sag by r², once and twice, and those of sag and slope by the form (n, 2 + 4, 2)."""
+    """Derivatives of the sag by r², once and twice, and those of sag and slope by the form (n, f, 2)."""
     square, c, k1 = x * x + y * y, surface.curvature, 1 + surface.conic
     root = np.sqrt(1 - k1 * c * c * square)
     slope, bend = c / (2 * root), k1 * c**3 / (4 * root**3)
     for power, a in enumerate(surface.coefficients, 2):
         slope = slope + power * a * square ** (power - 1)
         bend = bend + power * (power - 1) * a * square ** (power - 2)
-    by_form = np.empty((len(x), 6, 2))
+    by_form = np.empty((len(x), 2 + COEFFICIENTS, 2))
     by_form[:, 0, 0] = square / (1 + root) * (1 + k1 * c * c * square / (root * (1 + root)))
     by_form[:, 0, 1] = 1 / (2 * root**3)
     by_form[:, 1, 0] = c**3 * square**2 / (2 * root * (1 + root) ** 2)
     by_form[:, 1, 1] = c**3 * square / (4 * root**3)
-    for power in range(2, 6):
+    for power in range(2, 2 + COEFFICIENTS):
         by_form[:, power, 0], by_form[:, power, 1] = square**power, power * square ** (power - 1)
     return slope, bend, by_form
-
-
-def _intersection(surface: Surface, p: Array, d: Array) -> tuple[Array, Array]:
-    """Points of rays on a surface and distances to them, in its axes; the rays do not miss it."""
-    alone = Tracer.__new__(Tracer)
-    plain = Surface(surface.curvature, surface.conic, surface.coefficients, "plain", name=surface.name)
-    alone.surfaces, alone.threads = (plain,), 1
-    alone._tables = _tables((plain,), np.ones(2), apertures=False)
-    work = np.concatenate([p.T, d.T])
-    alone._run(work, seen=False)
-    found = work[:3].T
-    return found, ((found - p) * d).sum(axis=1)
 
 
 def _tables(
     surfaces: tuple[Surface, ...], indices: Array, apertures: bool
 ) -> tuple[Array, Array, Array, Array]:
     """Tables of surfaces, places, apertures and corners; see :func:`reseau.optics.lenses.compiled.traced`."""
-    from .compiled import COEFFICIENTS
-
     rows, places = np.zeros((len(surfaces), 5 + COEFFICIENTS)), np.zeros((len(surfaces), 13))
     stops: list[Array] = []
     corners: list[Array] = []
     axes, vertex, used = np.eye(3), np.zeros(3), 0
     for s, surface in enumerate(surfaces):
         form = np.trim_zeros(np.array(surface.coefficients, dtype=float), "b")
-        if len(form) > COEFFICIENTS:
-            raise UsageError(f"has {len(form)} coefficients; {COEFFICIENTS} are possible", where=surface.name)
         rows[s, :4] = _KINDS[surface.kind], surface.curvature, surface.conic, len(form)
         rows[s, 4 : 4 + len(form)] = form
         rows[s, 4 + COEFFICIENTS] = indices[s] / indices[s + 1]
