@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -236,3 +237,11 @@ def test_a_lens_telecentric_on_both_sides_has_no_focal_length_and_is_a_lens() ->
 def test_a_vacuum_is_air_without_pressure() -> None:
     medium = LensMedium.model_validate_json('{"air": {"pressure_hpa": 0.0}}').medium()
     assert medium.index(550.0) == pytest.approx(1 / 1.000273, abs=1e-6)
+
+
+def test_the_example_of_the_documentation_is_a_lens() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+    example = text[text.index('    schema = "lens/1"') : text.index("Lengths are millimetres (`unit")]
+    document = LensDocument.parse(dedent(example), where="formats.md")
+    assert Paraxial(document.prescription()).focal_length == pytest.approx(document.focal_length, rel=0.001)
+    assert document.sensor is not None
