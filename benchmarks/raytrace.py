@@ -221,7 +221,7 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=500_000)
     count = parser.parse_args().rays
     gauss = double_gauss()
-    compare(gauss, rays_into(gauss, 18.0, 0.0, count))
+    compare(gauss, rays_into(gauss, 22.0, 0.0, count))
     try:
         import batoid
     except ImportError:

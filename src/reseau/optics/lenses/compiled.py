@@ -278,7 +278,10 @@ def traced(
     places: Numbers,
     apertures: Numbers,
     corners: Numbers,
-    rays: Numbers,
+    points: Numbers,
+    directions: Numbers,
+    ends: Numbers,
+    behind: Numbers,
     lost: NDArray[np.int64],
     seen: Numbers,
 ) -> None:
@@ -296,33 +299,36 @@ def traced(
         corner; in the order of the surfaces.
     corners : ndarray (c, 2)
         Corners of all polygons.
-    rays : ndarray (6, n)
-        Positions and directions in the axes of the lens; afterwards in those of the last surface, and NaN for
-        lost rays. A ray that is not finite misses the first surface.
+    points, directions : ndarray (n, 3)
+        Rays in the axes of the lens. A ray that is not finite misses the first surface.
+    ends, behind : ndarray (n, 3)
+        Take points and directions of rays in the axes of the last surface; NaN for lost rays.
     lost : ndarray of int (n,)
         Takes 0, or 4 s + 1, 2 or 3 for rays that miss surface s, are totally reflected, or are stopped.
     seen : ndarray (s, 6, n) or (0, 6, n)
         Takes the rays behind each surface, in its axes.
     """
-    total = rays.shape[1]
+    total = len(points)
     block, gone, bad = np.empty((6, _BLOCK)), np.empty(_BLOCK), np.empty(_BLOCK)
     some = np.empty((len(seen), 6, _BLOCK))
     for first in range(0, total, _BLOCK):
         count = min(_BLOCK, total - first)
         gone[:] = 0.0
-        for k in range(6):
+        for k in range(3):
             for i in range(count):
-                value = rays[k, first + i]
-                finite = value - value == 0.0
-                block[k, i] = value if finite else 0.0
+                p, d = points[first + i, k], directions[first + i, k]
+                finite = (p - p == 0.0) & (d - d == 0.0)
+                block[k, i], block[3 + k, i] = (p, d) if finite else (0.0, 0.0)
                 gone[i] = gone[i] if finite else 1.0
-            block[k, count:] = block[k, 0]  # the rest of the last block repeats its first ray
+            # The rest of the last block repeats its first ray.
+            block[k, count:], block[3 + k, count:] = block[k, 0], block[3 + k, 0]
         gone[count:] = 1.0
         _through(surfaces, places, apertures, corners, block, gone, some, bad)
-        for k in range(6):
-            for i in range(count):
-                rays[k, first + i] = block[k, i] if gone[i] == 0.0 else np.nan
         for i in range(count):
             lost[first + i] = np.int64(gone[i])
+        for k in range(3):
+            for i in range(count):
+                ends[first + i, k] = block[k, i] if gone[i] == 0.0 else np.nan
+                behind[first + i, k] = block[3 + k, i] if gone[i] == 0.0 else np.nan
         if len(seen):
             seen[:, :, first : first + count] = some[:, :, :count]

@@ -199,32 +199,33 @@ class Tracer:
         seen : bool
             Whether the rays behind each surface are wanted.
         """
-        work = np.empty((6, len(rays)))
-        work[:3], work[3:] = rays.xyz.T, rays.directions.T
-        lost, records = self._run(work, seen)
-        history = None if records is None else records.transpose(0, 2, 1)
-        return Traced(Rays(work[:3].T, work[3:].T), lost, history)
-
-    def _run(self, work: Array, seen: bool) -> tuple[NDArray[np.int64], Array | None]:
-        """Trace rays (6, n) in place; codes of lost rays, and rays (s, 6, n) behind each surface."""
         from .compiled import traced  # takes half a second to import; not every command needs it
 
-        n = work.shape[1]
-        lost = np.empty(n, dtype=np.int64)
+        n = len(rays)
+        points, directions = (np.ascontiguousarray(part, np.float64) for part in (rays.xyz, rays.directions))
+        ends, behind, lost = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, dtype=np.int64)
         records = np.empty((len(self.surfaces) if seen else 0, 6, n))
 
         def part(first: int, last: int) -> None:
             inside = slice(first, last)
-            traced(*self._tables, work[:, inside], lost[inside], records[:, :, inside])
+            traced(
+                *self._tables,
+                points[inside],
+                directions[inside],
+                ends[inside],
+                behind[inside],
+                lost[inside],
+                records[:, :, inside],
+            )
 
         count = max(1, min(self.threads, n // _TOGETHER))
         if count == 1:
             part(0, n)
         else:
-            ends = np.linspace(0, n, count + 1).astype(int)
+            limits = np.linspace(0, n, count + 1).astype(int)
             with ThreadPoolExecutor(count) as pool:
-                list(pool.map(part, ends[:-1], ends[1:]))
-        return lost, records if seen else None
+                list(pool.map(part, limits[:-1], limits[1:]))
+        return Traced(Rays(ends, behind), lost, records.transpose(0, 2, 1) if seen else None)
 
     def reason(self, code: int) -> str:
         """Say why a ray was lost: 'is totally reflected at surface 3'.
