@@ -132,7 +132,7 @@ def test_without_rdm_the_numbers_are_curvatures(tmp_path: Path) -> None:
         ("NBK7_SCHOTT", "NBK7_HOYA", "surface 1: the glass NBK7_HOYA is not in the catalogue"),
         ("NBK7_SCHOTT", "NOA61", "surface 1: the glass NOA61 is not in the catalogue"),
         ("s 50 5", "s fifty 5", "`S fifty 5` is not understood"),
-        ("s 50 5", "s nan 5", "surface 1: has a number that is not finite"),
+        ("s 50 5", "s nan 5", "`S nan 5` is not understood"),
         ("sto", "sto; sps zrn", "surface 1: has SPS, which is not supported"),
         ("sto", "sto; cir hol 2", "surface 1: has CIR, which is not supported"),
         (" NBK7_SCHOTT", "", "not a lens"),

@@ -12,13 +12,11 @@ import numpy as np
 
 from ..core.errors import FormatError
 from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
-from .prescribed import Opening, catalogue_glass, kind_behind, read_bytes, with_stop, within
+from .prescribed import Opening, catalogue_glass, far, finite, kind_behind, read_bytes, with_stop, within
 
 __all__ = ["read_codev"]
 
 _UNITS = {"M": ("mm", 1.0), "C": ("cm", 10.0), "I": ("inches", 25.4)}
-_FAR = 1e9
-"""Objects at this distance (mm) or farther are at infinity."""
 _LETTERS = "ABCDEFGHIJ"
 """Coefficients of r⁴ to r²²."""
 _CODE = re.compile(r"(\d{3,})[.:](\d{3,})")
@@ -107,7 +105,7 @@ def _quoted(found: re.Match[str]) -> str:
 
 def _numbers(name: str, words: list[str], count: int = 1) -> list[float]:
     try:
-        found = [float(word) for word in words]
+        found = [finite(word) for word in words]
     except ValueError:
         found = []
     if len(found) < count:
@@ -160,8 +158,7 @@ def _lens(commands: list[tuple[str, list[str]]], stem: str) -> Prescription:
         before=before,
         name=" ".join(stated.get("TIT", [])).replace("\xa0", " ").strip("'\" ") or stem,
     )
-    distance = scale * listed[0].thickness
-    lens = with_stop(lens, _opening(stated, scale, distance if distance < _FAR else np.inf, notes))
+    lens = with_stop(lens, _opening(stated, scale, far(scale * listed[0].thickness), notes))
     clear = [a.size[0] for a in lens.surfaces[lens.stop].apertures if a.shape == "circle" and not a.blocks]
     if clear and lens.stop_radius is not None and min(clear) < lens.stop_radius:
         notes.append(
@@ -269,8 +266,6 @@ def _surface(
     """A surface, and the medium behind it."""
     if at.glass.upper() == "REFL":
         raise FormatError("is a mirror (REFL), which is not supported", where=at.name)
-    if not np.isfinite([at.shape, at.thickness]).all():
-        raise FormatError("has a number that is not finite", where=at.name)
     curvature = at.shape if not radii else (1 / at.shape if at.shape else 0.0)
     form = [at.coefficients.get(letter, 0.0) / scale ** (2 * k + 3) for k, letter in enumerate(_LETTERS)]
     medium = before if last else _medium(at, private, notes)

@@ -13,12 +13,16 @@ from ..core.errors import FormatError, InputError, UsageError
 from ..optics.lenses import Medium, Prescription, Rays, Tracer, glass
 from ..optics.lenses.paraxial import Paraxial
 
-__all__ = ["Opening", "catalogue_glass", "kind_behind", "read_bytes", "with_stop", "within"]
+__all__ = ["Opening", "catalogue_glass", "far", "finite", "kind_behind", "read_bytes", "with_stop", "within"]
 
 T = TypeVar("T")
 
 _MOULDED = {"D-ZK3M": "D-ZK3", "L-TIM28_MOLD": "L-TIM28"}
 """Glasses after precision moulding, under the names of makers of lenses, and the glass before moulding."""
+
+
+_FAR = 1e9
+"""Objects at this distance (mm) or farther are at infinity."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,25 @@ def within(where: object, call: Callable[[], T]) -> T:
         raise FormatError(what, where=where, do=error.do) from None
 
 
+def finite(word: str) -> float:
+    """A number of a file.
+
+    Raises
+    ------
+    ValueError
+        When it is none, or not finite.
+    """
+    value = float(word)
+    if not np.isfinite(value):
+        raise ValueError(f"{word} is not finite")
+    return value
+
+
+def far(distance: float) -> float:
+    """Distance of an object; infinite where it is a large number that stands for it."""
+    return distance if distance < _FAR else np.inf
+
+
 def catalogue_glass(name: str, where: str, notes: list[str]) -> Medium:
     """Glass of the catalogue; a note is added where it is a moulded one."""
     base = _MOULDED.get(name.upper())
@@ -82,21 +105,24 @@ def with_stop(lens: Prescription, opening: Opening) -> Prescription:
     # Height and slope, at the first surface, of the ray from the axis of the object to the edge of the pupil.
     start = (distance, 1.0) if np.isfinite(distance) else (1.0, 0.0)
     reach = wide * start[0] + oblique * start[1]
+    slope = float(first.ray(*start)[1][-1])
     if opening.kind == "object aperture":
         if not np.isfinite(distance):
             raise UsageError("states a numerical aperture of an object at infinity")
         n = lens.before.index(lens.wavelength_nm)
         if value >= n:
             raise UsageError(f"a numerical aperture of {value:g} is impossible")
-        scale = float(np.tan(np.arcsin(value / n)))
+        radius = float(np.tan(np.arcsin(value / n))) * reach
     elif opening.kind == "working f-number":
-        scale = abs(1 / (2 * value * float(first.ray(*start)[1][-1])))
+        if slope == 0:
+            raise UsageError("states a working f-number, but its image is at infinity")
+        radius = reach / (2 * value * slope)
     else:
-        diameter = value if opening.kind == "diameter" else abs(first.focal_length) / value
-        scale = wide * diameter / 2 / reach
-    radius = abs(scale * reach)
+        radius = wide * (value if opening.kind == "diameter" else first.focal_length / value) / 2
     if opening.real:
-        height, slope = scale * start[0], scale * start[1]
+        if reach == 0:
+            raise UsageError("has its object in its entrance pupil")
+        height, slope = (radius / reach * part for part in start)
         direction = np.array([[0.0, slope, 1.0]]) / np.hypot(slope, 1.0)
         # From well in front of the first surface, which may be concave towards the object.
         back = distance if np.isfinite(distance) else abs(first.focal_length)
@@ -104,8 +130,8 @@ def with_stop(lens: Prescription, opening: Opening) -> Prescription:
         traced = Tracer(lens, last=stop, apertures=False).trace(Rays(at, direction))
         if not traced.arrived[0]:
             raise UsageError("the ray at the edge of its beam does not reach the stop")
-        radius = float(np.abs(traced.xy[0, 1]))
-    return replace(lens, stop_radius=radius)
+        radius = float(traced.xy[0, 1])
+    return replace(lens, stop_radius=abs(radius))
 
 
 def read_bytes(path: Path) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.errors import FormatError
 from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
-from .prescribed import Opening, catalogue_glass, kind_behind, read_bytes, with_stop, within
+from .prescribed import Opening, catalogue_glass, far, finite, kind_behind, read_bytes, with_stop, within
 
 __all__ = ["read_zemax"]
 
@@ -33,7 +33,7 @@ class _Listed:
 
     @property
     def kind(self) -> str:
-        return self.lines.get("TYPE", ["STANDARD"])[0]
+        return " ".join(self.lines.get("TYPE", ["STANDARD"])[:1]) or "without a name"
 
     @property
     def glass(self) -> str | None:
@@ -45,7 +45,7 @@ class _Listed:
         if words is None:
             return default
         try:
-            return float(words[at])
+            return finite(words[at])
         except (IndexError, ValueError):
             raise FormatError(
                 f"`{key} {' '.join(words)}` has no number", where=f"surface {self.number}"
@@ -159,7 +159,7 @@ def _lens(header: dict[str, list[str]], listed: list[_Listed], stem: str) -> Pre
             f"is meant for {temperature:g} °C and {pressure:g} atm; indices are those at 20 °C and 1 atm"
         )
     before = AIR if listed[0].glass is None else _medium(listed[0], notes)
-    distance = _thickness(listed[0], scale)
+    distance = far(_thickness(listed[0], scale))
     surfaces: list[Surface] = []
     layout, medium, stop = Layout(), before, -1
     for at in listed[1:]:
@@ -204,13 +204,14 @@ def _named(at: _Listed) -> str:
 
 
 def _number(header: dict[str, list[str]], key: str, at: int, default: float | None = None) -> float:
-    """Return a number of a line of the header."""
-    try:
-        return float(header[key][at])
-    except (IndexError, KeyError, ValueError):
-        if default is None:
-            raise FormatError(f"has no number at `{key}`") from None
+    """Return a number of a line of the header, or the default where there is none."""
+    words = header.get(key, [])
+    if at >= len(words) and default is not None:
         return default
+    try:
+        return finite(words[at])
+    except (IndexError, ValueError):
+        raise FormatError(f"`{key} {' '.join(words)}` has no number") from None
 
 
 def _scale(header: dict[str, list[str]], notes: list[str]) -> float:
@@ -229,8 +230,8 @@ def _scale(header: dict[str, list[str]], notes: list[str]) -> float:
 def _wavelengths(header: dict[str, list[str]]) -> tuple[tuple[float, ...], tuple[float, ...], int]:
     """Wavelengths, nm, with weights, and the index of the primary one."""
     if "WAVL" in header:  # files before 2000
-        microns = [float(word) for word in header["WAVL"]]
-        weights = [float(word) for word in header.get("WWGT", ["1"] * len(microns))]
+        microns = [finite(word) for word in header["WAVL"]]
+        weights = [finite(word) for word in header.get("WWGT", ["1"] * len(microns))]
     else:
         rows = [key for key in header if key.startswith("WAVM ")]
         # Unused ones fill a table of 24; FTYP tells how many are used.

@@ -306,7 +306,7 @@ def _powers(values: list[float], name: str, limits: tuple[float, float]) -> Medi
 
 def _checked(wavelength_nm: float, limits: tuple[float, float] | None, name: str) -> float:
     """Return the wavelength in µm, checked against the range of a formula."""
-    if not (np.isfinite(wavelength_nm) and wavelength_nm > 0):
+    if not 1 <= wavelength_nm <= 1e6:
         raise UsageError(f"{wavelength_nm} nm is not a wavelength")
     if limits is not None and not limits[0] <= wavelength_nm <= limits[1]:
         raise UsageError(

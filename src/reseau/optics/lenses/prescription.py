@@ -27,6 +27,8 @@ __all__ = ["Aperture", "Layout", "Prescription", "Surface", "in_order"]
 
 COEFFICIENTS = 10
 """Largest number of coefficients of an asphere."""
+_FARTHEST = 1e9
+"""Largest coordinate of a vertex, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +138,8 @@ class Surface:
         numbers = [self.curvature, self.conic, *self.coefficients, *self.vertex, *self.axes.ravel()]
         if not np.isfinite(numbers).all():
             raise UsageError("has a number that is not finite", where=self.name or "surface")
+        if np.abs(self.vertex).max() > _FARTHEST:
+            raise UsageError(f"lies {np.abs(self.vertex).max():g} mm away", where=self.name or "surface")
         if len(self.coefficients) > COEFFICIENTS:
             raise UsageError(
                 f"has {len(self.coefficients)} coefficients; {COEFFICIENTS} are possible",
