@@ -134,10 +134,11 @@ def test_an_unknown_glass_is_named_and_the_index_beside_it_not_taken(tmp_path: P
 
 def test_a_moulded_glass_is_noted_with_both_names(reference_data: Data) -> None:
     lens = read_zemax(reference_data("raytrace") / "zemax" / "354710-C-Zemax(ZMX).zmx")
-    (note,) = lens.notes
+    note, other = lens.notes
     assert "D-ZK3M" in note
     assert "D-ZK3 after" in note
     assert lens.surfaces[0].medium.name == "D-ZK3"
+    assert "BK7 is catalogued as N-BK7" in other
 
 
 def test_a_model_glass_has_its_index_and_abbe_number(reference_data: Data) -> None:

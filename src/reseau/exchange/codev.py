@@ -164,7 +164,7 @@ def _lens(commands: list[tuple[str, list[str]]], stem: str) -> Prescription:
         notes.append(
             f"the aperture of its stop, {min(clear):g} mm, is smaller than its beam, {lens.stop_radius:g} mm"
         )
-    return replace(lens, notes=tuple(notes))
+    return replace(lens, notes=tuple(dict.fromkeys(notes)))
 
 
 def _listed(

@@ -77,15 +77,18 @@ def far(distance: float) -> float:
 
 
 def catalogue_glass(name: str, where: str, notes: list[str]) -> Medium:
-    """Glass of the catalogue; a note is added where it is a moulded one."""
+    """Glass of the catalogue; a note is added where it is there under another name, or is a moulded one."""
     base = _MOULDED.get(name.upper())
-    if base is None:
-        return within(where, lambda: glass(name))
-    notes.append(
-        f"the glass {name} is {base} after precision moulding; the index of {base} before moulding is used, "
-        "which is higher by some 0.003"
-    )
-    return glass(base)
+    found = within(where, lambda: glass(base or name))
+    plain = name.upper().replace("-", "").partition("_")[0]
+    if base is not None:
+        notes.append(
+            f"the glass {name} is {base} after precision moulding; the index of {base} is used, of which "
+            "moulding takes some 0.001 to 0.005"
+        )
+    elif plain != found.name.replace("-", "").partition("_")[0]:
+        notes.append(f"the glass {name} is catalogued as {found.name}, which has the same coefficients")
+    return found
 
 
 def kind_behind(before: Medium, medium: Medium) -> Literal["refracting", "plain"]:

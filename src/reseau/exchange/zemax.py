@@ -195,7 +195,7 @@ def _lens(header: dict[str, list[str]], listed: list[_Listed], stem: str) -> Pre
     lens = with_stop(lens, _opening(header, listed, scale, distance))
     if header.get("FTYP", ["0", "0"])[1:2] == ["1"]:
         notes.append("is meant to be telecentric on the side of the object; rays are aimed at the real stop")
-    return replace(lens, notes=tuple(notes))
+    return replace(lens, notes=tuple(dict.fromkeys(notes)))
 
 
 def _named(at: _Listed) -> str:

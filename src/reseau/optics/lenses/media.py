@@ -262,8 +262,11 @@ def glass(name: str) -> Medium:
     >>> round(glass("NBK7_SCHOTT").index(587.5618), 5)
     1.5168
     """
-    key, _, maker = name.upper().partition("_")
-    found = _catalogue().get(key.replace("-", ""))
+    key = name.upper().replace("-", "")
+    found, maker = _catalogue().get(key), ""
+    if found is None:
+        key, _, maker = key.rpartition("_")
+        found = _catalogue().get(key)
     if found is None or (maker and found[0] and maker != found[0]):
         raise UsageError(
             f"the glass {name} is not in the catalogue",
