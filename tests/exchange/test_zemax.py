@@ -10,6 +10,7 @@ import pytest
 
 from reseau.core.errors import FormatError, InputError
 from reseau.exchange import read_lens, read_zemax
+from reseau.io import LensDocument
 from reseau.optics.lenses import Paraxial, Prescription, Rays, Tracer
 
 Data = Callable[[str], Path]
@@ -125,6 +126,20 @@ def test_unsupported_surfaces_of_the_reference_data_are_named(
         read_zemax(reference_data("raytrace") / "zemax" / name)
     assert name in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["US08427765-1.ZMX", "US05331467-1.zmx", "HoO-V2C18Ex27.zmx", "HoO-V2C18Ex66.zmx", "US08011793-1.zmx"],
+)
+def test_a_lens_written_as_our_document_images_as_before(
+    reference_data: Data, tmp_path: Path, name: str
+) -> None:
+    lens = read_zemax(reference_data("raytrace") / "zemax" / name)
+    LensDocument.of(lens).write(tmp_path / "lens.toml")
+    same = read_lens(tmp_path / "lens.toml").prescription
+    assert (same.stop, same.stop_radius, same.notes) == (lens.stop, lens.stop_radius, lens.notes)
+    np.testing.assert_allclose(beam(same), beam(lens), rtol=0, atol=1e-10)
 
 
 def test_an_unknown_glass_is_named_and_the_index_beside_it_not_taken(tmp_path: Path) -> None:

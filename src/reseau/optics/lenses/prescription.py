@@ -26,7 +26,7 @@ __all__ = ["Aperture", "Layout", "Prescription", "Surface", "in_order"]
 
 
 COEFFICIENTS = 10
-"""Largest number of coefficients of an asphere."""
+"""Largest number of coefficients of an asphere; Numba's cache of `compiled.py` does not notice a change."""
 _FARTHEST = 1e9
 """Largest coordinate of a vertex, mm."""
 
