@@ -221,6 +221,7 @@ def test_the_stop_follows_from_every_statement_of_the_beam(
         ("WAVM 1 0.5875618 1", "PWAV nan\nWAVM 1 0.5875618 1", "`PWAV nan` has no number"),
         ("WAVM 1 0.5875618 1", "WAVM 1 1e-9 1", "is not a wavelength"),
         ("ENPD 10", "OBNA 1.2 0", "numerical aperture"),
+        ("  DISZ 5\n", "  DISZ 5\n  CLAP 0 -3 0\n", "surface 1: .* is not the size of an aperture"),
         ("DISZ 5", "DISZ 1e300", "away"),
         ("CURV 0.02", "CURV round", "surface 1: `CURV round` has no number"),
         ("DISZ 5", "DISZ INFINITY", "surface 1: has an infinite distance"),

@@ -305,7 +305,7 @@ def _surface(
         medium,
         layout.vertex,
         layout.axes,
-        _apertures(at, scale),
+        within(_named(at), lambda: _apertures(at, scale)),
         _named(at),
     )
     return found, medium
@@ -316,7 +316,7 @@ def _apertures(at: _Listed, scale: float) -> tuple[Aperture, ...]:
     found = []
     for key in _REFUSED:
         if key in at.lines:
-            raise FormatError(f"has an aperture of the kind {key}, which is not supported", where=_named(at))
+            raise FormatError(f"has an aperture of the kind {key}, which is not supported")
     centre = scale * at.value("OBDC"), scale * at.value("OBDC", at=1) if "OBDC" in at.lines else 0.0
     for key in ("CLAP", "FLAP", "OBSC"):
         if key in at.lines:
