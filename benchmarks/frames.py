@@ -129,6 +129,9 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], stated: 
         )
         good = np.array([row[0].status == "oriented" for row in rows])
         error, sigma, theirs = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
+        if not good.any():
+            print(f"  {name:22s}    0.0", flush=True)
+            continue
         e, s = error[good], sigma[good]
         far = np.abs(e).max(axis=(1, 2))
         away = np.nanmax(np.abs(np.nan_to_num(theirs, nan=99.0)), axis=(1, 2))

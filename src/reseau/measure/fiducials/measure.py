@@ -43,7 +43,7 @@ _SURE = 0.85
 """Median of these correlations from which no other pattern is examined."""
 _ALIKE_ALL = 0.7
 """Least median of these correlations."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM = 0.5, 0.03
+_MOST_SIGMA_PX, _MOST_SIGMA_MM = 1.0, 0.03
 """Largest standard deviation of a coordinate; the larger of the two applies."""
 _FILM_MM = 0.005
 """Irregular deformation of film and scanner between marks, one sigma: the least weight of their distances."""

@@ -27,8 +27,9 @@ _GOOD = 0.9
 """Correlation of a match from which other widths need not be tried."""
 _SIZE, _TURN = 0.03, 0.012
 """Standard deviations of the size (relative) and rotation (rad) of a mark."""
-_SPREAD_MM, _SPREAD = 0.008, 0.15
-"""Standard deviation of the displacement of edges: in mm, and in units of the thinnest line."""
+_SPREAD_MM, _SPREAD, _SPREAD_PX = 0.008, 0.15, 0.12
+"""Standard deviation of the displacement of edges: in mm, in units of the thinnest line, and in pixels of the
+scan, by grey values that are not proportional to the light; the tip of a notch moves by several times that."""
 _AROUND = 5
 """Pixels around the expected position in which a mark is tracked from level to level."""
 _GREYS, _FEW = 8, 20.0
@@ -214,6 +215,7 @@ def _matched(
     grey, inside, first = grey_window(scan, at, half, level)
     thinnest = min(part.line_width or part.width or part.size for part in mark.parts)
     spread = max(_SPREAD_MM, _SPREAD * thinnest if thinnest < 0.5 else 0.0) * scale
+    spread = float(np.hypot(spread, _SPREAD_PX / level))
     shape = outlined(
         [contours_of(mark, reach_of(mark) + margin_of(mark))],
         (linear @ turned(point.turn_deg))[None],

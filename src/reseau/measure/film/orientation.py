@@ -354,6 +354,10 @@ def _found(
     """
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
+    sizes = options.formats if options.shape is None else [(options.shape.width, options.shape.height)]
+    # Four lines of the picture may be a frame of another scale: that of the scan first, if it is stated.
+    known = next((k for size in sizes if (k := _resolution(scan, options, size)) is not None), None)
+    scales = [known] if options.dpi is not None else [None] if missing or known is None else [known, None]
     for longest, tried in _OVERVIEWS:
         overview, r = scan.overview(longest)
         if longest > _OVERVIEWS[0][0] and r == reduction:
@@ -362,16 +366,19 @@ def _found(
         if dark:
             break
         near = None if options.near is None else (options.near + 0.5) / r - 0.5
-        found = search_frames(
-            overview,
-            options.formats if options.shape is None else [(options.shape.width, options.shape.height)],
-            max_tilt_deg=options.max_tilt_deg,
-            px_per_mm=None if options.dpi is None else options.dpi / 25.4 / r,
-            hint=None if scan.dpi is None or cut else scan.dpi / 25.4 / r,
-            tried=tried,
-            near=near,
-            missing=missing,
-        )
+        for scale in scales:
+            found = search_frames(
+                overview,
+                sizes,
+                max_tilt_deg=options.max_tilt_deg,
+                px_per_mm=None if scale is None else scale / r,
+                hint=None if scan.dpi is None or cut else scan.dpi / 25.4 / r,
+                tried=tried,
+                near=near,
+                missing=missing,
+            )
+            if found and found[0].score > _RELIABLE:
+                break
         if found and (not best or _rank(found) > _rank(best)):
             best, reduction = found, r
         if best and all(best[0].supported) and best[0].score > _RELIABLE:
@@ -439,16 +446,15 @@ def _resolution(scan: Scan, options: FrameOptions, size: tuple[float, float]) ->
     """Pixels per millimetre that are given, or stated in the file if they can be those of the scan.
 
     A camera states a number that has nothing to do with the film: a frame of that resolution would be far
-    smaller than its picture, or larger.
+    smaller than its picture, or larger, whichever way it lies in the scan.
     """
     if options.dpi is not None:
         return options.dpi / 25.4
     if scan.dpi is None:
         return None
-    share = [
-        side * scan.dpi / 25.4 / pixels for side, pixels in zip(size, (scan.width, scan.height), strict=True)
-    ]
-    return scan.dpi / 25.4 if _FITS[0] < max(share) < _FITS[1] else None
+    long, short = sorted((scan.width, scan.height), reverse=True)
+    share = max(max(size) / long, min(size) / short) * scan.dpi / 25.4
+    return scan.dpi / 25.4 if _FITS[0] < share < _FITS[1] else None
 
 
 def _unproven(
