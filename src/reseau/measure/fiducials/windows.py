@@ -29,7 +29,7 @@ _SIZE, _TURN = 0.03, 0.012
 """Standard deviations of the size (relative) and rotation (rad) of a mark."""
 _SPREAD_MM, _SPREAD, _SPREAD_PX = 0.008, 0.15, 0.12
 """Standard deviation of the displacement of edges: in mm, in units of the thinnest line, and in pixels of the
-scan, by grey values that are not proportional to the light; the tip of a notch moves by several times that."""
+scan, by a curved response of film and scanner; the tip of a notch moves by several times that."""
 _AROUND = 5
 """Pixels around the expected position in which a mark is tracked from level to level."""
 _GREYS, _FEW = 8, 20.0
