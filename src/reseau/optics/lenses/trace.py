@@ -93,7 +93,7 @@ class Traced:
         0 for a ray that arrives; 4 s + 1, 2 or 3 for one that misses surface s, is totally reflected there,
         or stopped by its aperture.
     seen : ndarray (s, n, 6), optional
-        Rays behind each surface, in its axes.
+        Rays behind each surface, in its axes; those of a lost ray mean nothing from where it is lost on.
 
     Examples
     --------
