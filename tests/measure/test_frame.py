@@ -121,6 +121,16 @@ def test_a_channel_of_less_contrast_does_not_overrule_a_line_that_another_suspec
         assert (np.abs(errors(result, frame)) < 3 * sigma + 0.1).all()
 
 
+@pytest.mark.parametrize("seed", [700003, 700019])
+@pytest.mark.parametrize("stated", [True, False], ids=["resolution stated", "not stated"])
+def test_a_trunk_in_the_picture_is_no_edge_of_a_frame_that_stands_upright(seed: int, stated: bool) -> None:
+    frame = FilmFrame(seed, scene="trees")  # three of its edges and a trunk formed a frame of 24x36
+    options = FrameOptions(formats=((36.0, 24.0),))
+    (result,) = orient_frames(scan_of(frame.scan(), dpi=600.0 if stated else None), options)
+    assert not result or np.abs(errors(result, frame)).max() < 0.5
+    assert bool(result) or not stated
+
+
 def test_certain_frames_of_a_roll_locate_an_edge_hidden_by_a_line() -> None:
     """The line is parallel to the edge: in a single frame they cannot be distinguished."""
     frame = FilmFrame(320035, beside=Beside(lines=1))

@@ -33,7 +33,7 @@ _TONE = 0.12
 _FEW_GOOD, WIDER_SEARCH = 0.2, 2.5
 """Minimum share of profiles that show a step; otherwise the edge is searched in a wider range, by this
 factor."""
-_FOREIGN = 0.25
+_FOREIGN = 0.08
 """Difference of the tone beyond an edge from film beyond the others, as a share of the picture's contrast,
 from which it is no film."""
 _UNEVEN = 0.45
