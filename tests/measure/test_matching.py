@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from reseau.measure import MatchOptions, match
+from reseau.measure.matching import matcher
 from reseau.measure.matching.matcher import SIZE, Patches
-from reseau.measure.matching.shapes import GrownOutline
+from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.optics.formation import Outline, PixelResponse, draw, mark_outline
 
 SHAPE, LEVEL, NOISE = (150, 190), 170.0, 2.0
@@ -218,3 +219,50 @@ def test_the_result_of_a_mark_does_not_depend_on_the_others():
     kept = together.select(np.arange(len(xy)) == 4)
     assert len(kept) == 1
     assert together.replaced(np.array([2]), kept).xy[2] == pytest.approx(together.xy[4])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"polarity": "bright"},
+        {"row_jitter_px": 0.1},
+        {"contrast_slope": 0.3},
+        {"row_jitter_px": 0.1, "polarity": "bright", "response": PixelResponse(0.8)},
+    ],
+)
+def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(options, monkeypatch):
+    xy, bright = places(), options.get("polarity") == "bright"
+    pixels = formed("square", xy, bright=bright, fill=options.get("response", PixelResponse()).fill) + noise(
+        8
+    )
+    pixels[20:24, 20:60] += 40.0  # one is searched for blunders
+    level = np.zeros((len(xy), 3))
+    level[:, 0] = 0.4 * LEVEL if bright else LEVEL
+    given = pixels, pixels > -np.inf, GrownOutline(outlines("square", len(xy)).single(), SIZE), xy + 0.2
+    settings = MatchOptions(**{"half_px": 9, "psf_px": 0.75, "settled": 0.1} | options)
+    known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": False}
+    light = np.full(len(xy), 102.0 if bright else 0.68), level
+    compiled = match(*given, settings, light=light, **known)
+    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy))))
+    general = match(*given, settings, light=light, **known)
+    assert compiled.converged.sum() > len(xy) - 5
+    for name in ("converged", "seen", "rejected"):
+        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=0, atol=1e-6)
+    sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
+    # Rounding of sums in single precision; a sigma is 0.01 px.
+    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(compiled.cov, general.cov, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(compiled.residuals, general.residuals, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=1e-4, atol=0)
+    for name in ("psf_px", "contrast", "level", "noise", "correlation", "t"):
+        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=1e-4, atol=0)
+
+
+def test_values_without_an_image_do_not_disturb_other_marks():
+    shape = GrownOutline(outlines("disk", 2).single(), SIZE)
+    window = Window(np.tile(np.arange(17.0), (2, 1)), np.tile(np.arange(17.0), (2, 1)), PixelResponse())
+    given = np.full((2, 2), 8.0), np.array([0.8, np.inf]), np.zeros((2, 1)), np.arange(2), window
+    image = shape.image(*given)
+    assert np.isnan(image[1]).all()
+    assert image[0].sum() == pytest.approx(np.pi * 3.5**2, abs=1e-3)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...core.data import Array, Mask, Rows
+from ...core.threads import one_thread
 from ...optics.formation import Outline, PixelResponse
 from .noise import medians, relative_weights
 from .shapes import GrownOutline, Shape, ShapeSubset, Window
@@ -607,17 +608,25 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
 
 def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple[Matches, Rows]:
     """Matches from good start values, and the rows with blunders or without convergence."""
-    if patch.options.row_jitter_px > 0:
-        patch.whiten(start, np.full((len(start), 1), noise), patch.options.row_jitter_px)
-    found = adjust_batch(
-        patch.form_image,
-        start,
-        patch.grey,
-        weights=patch.weights * patch.relative_weights / noise**2,
-        prior=(start, free),
-        values=patch.form_values,
-        options=BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5),
-    )
+    weights = patch.weights * patch.relative_weights / noise**2
+    options = BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5)
+    found, rows = _compiled(patch, start, free, noise, weights, options)
+    if found is None or len(rows):
+        formed = patch.shares.copy()
+        if patch.options.row_jitter_px > 0:
+            patch.whiten(start, np.full((len(start), 1), noise), patch.options.row_jitter_px)
+        general = adjust_batch(
+            lambda x, at: patch.form_image(x, rows[at]),
+            start[rows],
+            patch.grey[rows],
+            weights=weights[rows],
+            prior=(start[rows], free),
+            values=lambda x, at: patch.form_values(x, rows[at]),
+            options=options,
+        )
+        found = general if found is None else _with_rows(found, rows, general)
+        formed[rows] = patch.shares[rows]
+        patch.shares = formed
     used = patch.weights > 0
     worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)
     rms = found.sigma0 * noise
@@ -627,6 +636,81 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         | ~(rms < 2 * noise)
     )
     return _columns(patch, found, used, np.full(len(start), noise), patch.shares), np.flatnonzero(amiss)
+
+
+def _compiled(
+    patch: Patches, start: Array, free: Array, noise: float, weights: Array, options: BatchOptions
+) -> tuple[BatchAdjustment | None, Rows]:
+    """The adjustment of :func:`_continued` by compiled code, and the rows left to the general one."""
+    every, shape = np.arange(len(start)), patch.form
+    share, slopes = shape.derivatives(
+        patch.xy + start[:, :2], patch.width(start, every), start[:, patch.form_at :], every, patch.window
+    )
+    if share.dtype != np.float32:
+        return None, every
+    from .compiled import ACTIVE, DONE, advanced, linearised  # takes half a second to import
+
+    (k, n), u = patch.grey.shape, start.shape[1]
+    jitter, dark = patch.options.row_jitter_px, patch.options.polarity == "dark"
+    window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
+    prior = 1 / free**2
+    residuals, normal, cofactor = np.zeros((k, n)), np.zeros((k, u, u)), np.full((k, u, u), np.nan)
+    common = np.zeros((2, k if jitter > 0 else 0, n), np.float32)
+    kept = np.empty((k, u, n), np.float32)
+    work = residuals, kept, normal, np.zeros((k, u)), cofactor, common[0], common[1]
+    x, trial, iteration, state = start.copy(), start.copy(), np.zeros((k, 4)), np.zeros(k, np.int64)
+    iteration[:, 1] = options.damping
+    with one_thread():
+        linearised(
+            share.reshape(k, -1),
+            slopes.reshape(k, -1, n),
+            patch.grey,
+            weights,
+            window,
+            (dark, noise**2, (jitter / noise) ** 2),
+            _SHARPEST * patch.psf,
+            prior,
+            options.share,
+            *(x, work, trial, iteration, state),
+        )
+        patch.shares = share.copy()
+        rounds = np.zeros(k, np.int64)
+        for _ in range(options.max_iterations - 1):
+            rows = np.flatnonzero(state == ACTIVE)
+            if not len(rows):
+                break
+            width, form = patch.width(trial[rows], rows), trial[rows, patch.form_at :]
+            tried = shape.image(
+                patch.xy[rows] + trial[rows, :2], width, form, rows, patch.window.select(rows)
+            )
+            patch.shares[rows] = tried
+            rounds[rows] += 1
+            advanced(
+                rows,
+                tried.reshape(len(rows), n),
+                patch.grey,
+                weights,
+                window,
+                dark,
+                start,
+                prior,
+                options.share,
+                *(x, work, trial, iteration, state),
+            )
+    redundancy = (patch.weights > 0).sum(axis=1) + np.count_nonzero(prior) - u
+    left = state != DONE
+    found = BatchAdjustment(
+        estimates=x,
+        cofactor=cofactor,
+        residuals=residuals,
+        sigma0=np.sqrt(iteration[:, 0] / np.maximum(redundancy, 1)),
+        redundancy=redundancy,
+        converged=~left,
+        iterations=rounds,
+        reasons=np.where(left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED).astype(np.int64),
+        factors=np.ones((k, n)),
+    )
+    return found, np.flatnonzero(left)
 
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...core.data import Array, Rows
+from ...core.threads import one_thread
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
 __all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window"]
@@ -142,15 +143,18 @@ class GrownOutline:
 
         corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
         images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
-        formed(
-            self.nodes.xy,
-            self.nodes.dxy,
-            self.generators.astype(np.float32),
-            at,
-            *((xy - corner).astype(np.float32), form.astype(np.float32), width.astype(np.float32)),
-            window.response.fill,
-            images,
-        )
+        place, forms, sigma = (v.astype(np.float32) for v in (xy - corner, form, width))
+        # A step of an adjustment may lead to values without an image.
+        finite = np.isfinite(place).all(axis=1) & np.isfinite(forms).all(axis=1) & np.isfinite(sigma)
+        outlines = self.nodes.xy, self.nodes.dxy, self.generators.astype(np.float32)
+        with one_thread():
+            if finite.all():
+                formed(*outlines, at, place, forms, sigma, window.response.fill, images)
+            else:
+                some = np.empty((int(finite.sum()), *images.shape[1:]), np.float32)
+                given = at[finite], place[finite], forms[finite], sigma[finite]
+                formed(*outlines, *given, window.response.fill, some)
+                images[:], images[finite] = np.nan, some
         return np.asarray(images)
 
 

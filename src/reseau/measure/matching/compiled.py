@@ -1,0 +1,340 @@
+"""Least-squares matching of many windows from good start values, compiled.
+
+The equations are those of :class:`reseau.measure.matching.matcher.Patches` (grey values, derivatives, common
+errors of rows) and of the chord method of :func:`reseau.adjust.adjust_batch`; here they are computed window
+by window, so that they fit into a cache. Windows that need more than the chord method's first Jacobian (a
+refused step, slow convergence, singular normal equations) are marked, and left to the general adjustment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ACTIVE", "DONE", "LEFT", "advanced", "linearised"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+Floats = NDArray[Any]
+
+ACTIVE, DONE, LEFT = 0, 1, 2
+"""States of a window: to be evaluated at its trial, converged, left to the general adjustment."""
+_WIDTH, _CONTRAST, _LEVEL = 2, 3, 4
+_SERVES, _SHRINKS, _SINGULAR, _LEAST_DAMPING = 0.75, 0.1, 1e-12, 1e-10
+"""As in :mod:`reseau.adjust.batch`."""
+f32 = np.float32
+
+
+def _compiled(function: F) -> F:
+    """Compile with Numba, cached on disk, releasing the GIL."""
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+    return cast(F, numba.njit(**options)(function))
+
+
+@_compiled
+def _formed(
+    x: Floats,
+    share: Floats,
+    monomials: Floats,
+    across: Floats,
+    dark: bool,
+    plane: Floats,
+    contrast: Floats,
+    grey: Floats,
+) -> None:
+    """Background, contrast and grey values (n,) of a window of which `share` (n,) is covered."""
+    n, ground = len(share), len(monomials)
+    plane[:], contrast[:] = 0.0, x[_CONTRAST]
+    for m in range(ground):
+        factor, row = x[_LEVEL + m], monomials[m]
+        for i in range(n):
+            plane[i] += factor * row[i]
+    for m in range(len(across)):
+        factor, row = x[_LEVEL + ground + m], across[m]
+        for i in range(n):
+            contrast[i] += factor * row[i]
+    if dark:
+        for i in range(n):
+            grey[i] = plane[i] * (1.0 - contrast[i] * share[i])
+    else:
+        for i in range(n):
+            grey[i] = plane[i] + contrast[i] * share[i]
+
+
+@_compiled
+def _product(a: Floats, b: Floats) -> float:
+    """Scalar product, as four sums side by side: each waits for its own last addition only."""
+    n, one, two, three, four = len(a) - len(a) % 4, 0.0, 0.0, 0.0, 0.0
+    for i in range(0, n, 4):
+        one += a[i] * b[i]
+        two += a[i + 1] * b[i + 1]
+        three += a[i + 2] * b[i + 2]
+        four += a[i + 3] * b[i + 3]
+    for i in range(n, len(a)):
+        one += a[i] * b[i]
+    return (one + two) + (three + four)
+
+
+@_compiled
+def _multiply(a: Floats, b: Floats, out: Floats) -> None:
+    """a · b; few arrays, so that the compiler can prove that they do not overlap."""
+    for i in range(len(out)):
+        out[i] = a[i] * b[i]
+
+
+@_compiled
+def _without_common(values: Floats, slope: Floats, weighted: Floats, columns: int) -> None:
+    """Subtract from each row its common error along `slope`; see `Patches.whiten`."""
+    for first in range(0, len(values), columns):
+        row, along = values[first : first + columns], slope[first : first + columns]
+        total = along.dtype.type(_product(weighted[first : first + columns], row))
+        for i in range(columns):
+            row[i] -= along[i] * total
+
+
+@_compiled
+def _factorised(normal: Floats, damping: float, scale: Floats, lower: Floats) -> bool:
+    """Cholesky factor of normal equations scaled to a unit diagonal; False where they are singular."""
+    u = len(normal)
+    for i in range(u):
+        scale[i] = 1.0 / math.sqrt(normal[i, i]) if normal[i, i] > 0 else 1.0
+    for i in range(u):
+        for j in range(i + 1):
+            total = normal[i, j] * scale[i] * scale[j] + (damping if i == j else 0.0)
+            for m in range(j):
+                total -= lower[i, m] * lower[j, m]
+            if i > j:
+                lower[i, j] = total / lower[j, j]
+            elif total > _SINGULAR:
+                lower[i, i] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@_compiled
+def _solve(lower: Floats, right: Floats) -> None:
+    """Solve L Lᵀ x = right in place."""
+    u = len(right)
+    for i in range(u):
+        for m in range(i):
+            right[i] -= lower[i, m] * right[m]
+        right[i] /= lower[i, i]
+    for i in range(u - 1, -1, -1):
+        for m in range(i + 1, u):
+            right[i] -= lower[m, i] * right[m]
+        right[i] /= lower[i, i]
+
+
+@_compiled
+def _next(
+    k: int,
+    normal: Floats,
+    gradient: Floats,
+    limit: float,
+    x: Floats,
+    trial: Floats,
+    iteration: Floats,
+    state: Floats,
+) -> None:
+    """Correct window `k`, or place its trial; `iteration` (k, 4) is cost, damping, predicted and last one."""
+    u = len(gradient)
+    scale, lower, step = np.empty(u), np.empty((u, u)), np.empty(u)
+    if not _factorised(normal, iteration[k, 1], scale, lower):
+        state[k] = LEFT
+        return
+    for i in range(u):
+        step[i] = gradient[i] * scale[i]
+    _solve(lower, step)
+    # The decrease 2 sᵀ g − sᵀ N s of the sum of squares, with (N + d I) s = g.
+    predicted = 0.0
+    for i in range(u):
+        predicted += step[i] * (gradient[i] * scale[i] + iteration[k, 1] * step[i])
+    last = iteration[k, 3]
+    rate2 = predicted / max(last, predicted) if predicted > 0 else 1.0
+    done = predicted * rate2 <= limit
+    if not done and last > 0 and predicted > _SHRINKS * last:
+        state[k] = LEFT  # corrections decrease slowly
+        return
+    iteration[k, 2] = iteration[k, 3] = predicted
+    for i in range(u):
+        trial[k, i] = x[k, i] + step[i] * scale[i]
+    if done:
+        state[k] = DONE
+        x[k] = trial[k]
+
+
+@_compiled
+def linearised(
+    share: Floats,
+    slopes: Floats,
+    observed: Floats,
+    weights: Floats,
+    window: tuple[Floats, Floats, int],
+    light: tuple[bool, float, float],
+    psf: Floats,
+    prior: Floats,
+    share_of_sigma: float,
+    x: Floats,
+    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats],
+    trial: Floats,
+    iteration: Floats,
+    state: Floats,
+) -> None:
+    """Form the normal equations of all windows at `x`, and the first trial of each.
+
+    Parameters
+    ----------
+    share, slopes : ndarray (k, n), (k, 3 + p, n), float32
+        Formed images, and their derivatives by x, y, width and form.
+    observed, weights : ndarray (k, n)
+        Grey values, and their weights; 0 where a pixel is not used.
+    window : tuple
+        Monomials (b, n) of the background, those (0 or 2, n) of the contrast, number of columns.
+    light : tuple
+        Whether marks are dark; variance of unit weight; variance of the shift of a row over that of a grey
+        value.
+    psf : ndarray (k,)
+        Lower bound of the width of the point-spread function.
+    prior : ndarray (u,)
+        Weights of the initial values as observations.
+    share_of_sigma : float
+        Corrections below this share of their standard deviation end the iteration.
+    x : ndarray (k, u)
+        Initial values, replaced by the estimates where the state becomes DONE.
+    work : tuple
+        Filled: residuals (k, n), Jacobians times weights (k, u, n) float32, normal equations (k, u, u),
+        gradients (k, u), cofactors (k, u, u), slope and weighted slope (k, n) of the common errors of rows,
+        float32, (0, n) if rows have none.
+    trial, iteration, state : ndarray (k, u), (k, 4), (k,)
+        Filled: next values to evaluate; cost, damping, decrease predicted, and the same in the iteration
+        before; ACTIVE, DONE or LEFT. The damping is given.
+    """
+    monomials, across, columns = window
+    dark, variance, jitter = light
+    residuals, kept, normals, gradients, cofactors, slope, weighted = work
+    (count, n), u, ground = observed.shape, x.shape[1], len(monomials)
+    plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
+    by_share, rest, jacobian = np.empty(n, f32), np.empty(n, f32), np.empty((u, n), f32)
+    scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
+    for k in range(count):
+        w, covered = weights[k], share[k]
+        _formed(x[k], covered, monomials, across, dark, plane, contrast, grey)
+        if dark:
+            for i in range(n):
+                by_share[i], rest[i] = -plane[i] * contrast[i], 1.0 - contrast[i] * covered[i]
+            for i in range(n):
+                jacobian[_CONTRAST, i] = -plane[i] * covered[i]
+        else:
+            by_share[:], rest[:] = contrast, f32(1)
+            jacobian[_CONTRAST] = covered
+        wide = math.exp(x[k, _WIDTH])
+        _multiply(by_share, slopes[k, 0], jacobian[0])
+        _multiply(by_share, slopes[k, 1], jacobian[1])
+        _multiply(by_share, slopes[k, 2], jacobian[_WIDTH])
+        jacobian[_WIDTH] *= f32(wide * wide / math.hypot(psf[k], wide))
+        for m in range(ground):
+            _multiply(rest, monomials[m], jacobian[_LEVEL + m])
+        at = _LEVEL + ground
+        for m in range(len(across)):
+            _multiply(jacobian[_CONTRAST], across[m], jacobian[at + m])
+        at += len(across)
+        for m in range(u - at):
+            _multiply(by_share, slopes[k, 3 + m], jacobian[at + m])
+        used = 0
+        for i in range(n):
+            used += w[i] > 0
+        for i in range(n):
+            # Pixels that are not used may carry any value.
+            residuals[k, i] = grey[i] - observed[k, i] if w[i] > 0 else 0.0
+        if len(slope):
+            for i in range(n):
+                slope[k, i] = jacobian[0, i] if w[i] > 0 else f32(0)
+            for i in range(n):
+                weighted[k, i] = slope[k, i] * w[i] * variance
+            for first in range(0, n, columns):
+                row = slice(first, first + columns)
+                length2 = _product(slope[k, row], weighted[k, row])
+                weighted[k, row] *= f32((1.0 - 1.0 / math.sqrt(1.0 + jitter * length2)) / max(length2, 1e-30))
+            _without_common(residuals[k], slope[k], weighted[k], columns)
+            for m in range(u):
+                _without_common(jacobian[m], slope[k], weighted[k], columns)
+        _multiply(w, residuals[k], left)
+        cost = _product(left, residuals[k])
+        for m in range(u):
+            _multiply(jacobian[m], w, kept[k, m])
+        left[:] = residuals[k]
+        normals[k] = np.dot(kept[k], jacobian.T)
+        gradients[k] = -np.dot(kept[k], left)
+        for m in range(u):
+            normals[k, m, m] += prior[m]
+        freedom = used + np.count_nonzero(prior) - u
+        iteration[k, 0], iteration[k, 3] = cost, 0.0
+        if not (math.isfinite(cost) and freedom >= 0 and _factorised(normals[k], 0.0, scale, lower)):
+            state[k] = LEFT
+            continue
+        for m in range(u):
+            for i in range(u):
+                cofactors[k, m, i] = 1.0 if i == m else 0.0
+            _solve(lower, cofactors[k, m])
+            for i in range(u):
+                cofactors[k, m, i] *= scale[i] * scale[m]
+        limit = share_of_sigma**2 * cost / max(freedom, 1)
+        _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
+
+
+@_compiled
+def advanced(
+    rows: Floats,
+    share: Floats,
+    observed: Floats,
+    weights: Floats,
+    window: tuple[Floats, Floats, int],
+    dark: bool,
+    mean: Floats,
+    prior: Floats,
+    share_of_sigma: float,
+    x: Floats,
+    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats],
+    trial: Floats,
+    iteration: Floats,
+    state: Floats,
+) -> None:
+    """Accept the trials of windows `rows` (m,), in which `share` (m, n) was formed, and place the next.
+
+    Parameters as in :func:`linearised`; `mean` (k, u) are the initial values.
+    """
+    monomials, across, columns = window
+    residuals, kept, normals, gradients, _, slope, weighted = work
+    n, u = observed.shape[1], x.shape[1]
+    plane, contrast, grey, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n, f32)
+    for j in range(len(rows)):
+        k = rows[j]
+        _formed(trial[k], share[j], monomials, across, dark, plane, contrast, grey)
+        used = 0
+        for i in range(n):
+            used += weights[k, i] > 0
+        for i in range(n):
+            grey[i] = grey[i] - observed[k, i] if weights[k, i] > 0 else 0.0
+        if len(slope):
+            _without_common(grey, slope[k], weighted[k], columns)
+        _multiply(weights[k], grey, left)
+        cost = _product(left, grey)
+        left[:] = grey
+        for m in range(u):
+            cost += prior[m] * (trial[k, m] - mean[k, m]) ** 2
+        if not iteration[k, 0] - cost > _SERVES * iteration[k, 2]:
+            state[k] = LEFT
+            continue
+        x[k], residuals[k] = trial[k], grey
+        gradients[k] = -np.dot(kept[k], left)
+        for m in range(u):
+            gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
+        iteration[k, 0] = cost
+        iteration[k, 1] = max(iteration[k, 1] / 3, _LEAST_DAMPING)
+        limit = share_of_sigma**2 * cost / max(used + np.count_nonzero(prior) - u, 1)
+        _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
