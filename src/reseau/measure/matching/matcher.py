@@ -163,8 +163,10 @@ class Patches:
         self.grey = pixels[r, c].astype(np.float64).reshape(k, -1)
         if others is not None:
             self.grey -= others.reshape(k, -1)
-        x_off, y_off = columns - xy[:, :1], rows - xy[:, 1:]
-        near = np.hypot(x_off[:, None, :], y_off[:, :, None]) <= options.within_px
+        near = np.ones(self.shape, dtype=bool)
+        if options.within_px < np.inf:
+            x_off, y_off = columns - xy[:, :1], rows - xy[:, 1:]
+            near = np.hypot(x_off[:, None, :], y_off[:, :, None]) <= options.within_px
         self.near = near.reshape(k, -1)
         usable = inside & valid[r, c] & near
         if claims is not None:
@@ -765,8 +767,9 @@ def _columns(
 
 def _correlation(a: Array, b: Array, used: Mask) -> Array:
     """Correlation of the rows of two arrays over the entries in use, (k,)."""
-    n = used.sum(axis=1, keepdims=True)
-    a = np.where(used, a - np.where(used, a, 0).sum(axis=1, keepdims=True) / n, 0)
-    b = np.where(used, b - np.where(used, b, 0).sum(axis=1, keepdims=True) / n, 0)
-    r: Array = (a * b).sum(axis=1) / np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
-    return r
+    n, w = used.sum(axis=1), used.astype(np.float64)
+    a, b = np.where(used, a, 0.0), np.where(used, b, 0.0)
+    a -= w * (a.sum(axis=1) / n)[:, None]
+    b -= w * (b.sum(axis=1) / n)[:, None]
+    ab, aa, bb = (np.einsum("kn,kn->k", x, y) for x, y in ((a, b), (a, a), (b, b)))
+    return np.asarray(ab / np.sqrt(aa * bb))

@@ -9,7 +9,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["add_windows", "near_line", "shade", "supported"]
+__all__ = [
+    "add_windows",
+    "attenuate",
+    "bends",
+    "curved",
+    "line_through",
+    "ridges",
+    "shade",
+    "supported",
+    "voted",
+]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -127,22 +137,84 @@ def shade(
 
 
 @numba.njit(cache=True, nogil=True)
-def near_line(
+def line_through(
     xy: NDArray[Any],
     normal: NDArray[Any],
     across: NDArray[Any],
     distance: float,
     near: float,
     parallel: float,
-) -> NDArray[Any]:
-    """Indices of the ridge points on a line; parameters as in :func:`supported`, of one line."""
-    found, count = np.empty(len(xy), np.intp), 0
+    least: int,
+) -> tuple[NDArray[Any], float, NDArray[Any], NDArray[Any]]:
+    """A line adjusted to the ridge points along it: normal, distance, ends (2, 2), and rows of its points.
+
+    Parameters
+    ----------
+    xy, normal, near, parallel
+        As in :func:`supported`.
+    across, distance : ndarray (2,), float
+        Normal and distance of the approximate line.
+    least : int
+        Number of points from which it is adjusted.
+    """
+    rows, count = np.empty(len(xy), np.intp), 0
     for i in range(len(xy)):
         off = xy[i, 0] * across[0] + xy[i, 1] * across[1] - distance
         if abs(off) < near and abs(normal[i, 0] * across[0] + normal[i, 1] * across[1]) > parallel:
-            found[count] = i
+            rows[count] = i
             count += 1
-    return found[:count].copy()
+    rows, ends = rows[:count].copy(), np.empty((2, 2))
+    along = np.array([-across[1], across[0]])
+    if count < least:
+        ends[0], ends[1] = across * distance, across * distance
+        return across.copy(), distance, ends, rows
+    at, middle = np.empty(count), 0.0
+    for i in range(count):
+        at[i] = xy[rows[i], 0] * along[0] + xy[rows[i], 1] * along[1]
+        middle += at[i] / count
+    total, first, second, of_off, product = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        off, t = xy[rows[i], 0] * across[0] + xy[rows[i], 1] * across[1] - distance, at[i] - middle
+        weight = 1 - (off / near) ** 2
+        total, first, second = total + weight, first + weight * t, second + weight * t * t
+        of_off, product = of_off + weight * off, product + weight * t * off
+    slope, total = product / max(second, 1e-9), max(total, 1e-9)
+    # off = level + slope (at − middle), as a normal of unit length.
+    level, scale = of_off / total - slope * first / total, math.hypot(1.0, slope)
+    at.sort()
+    for k in range(2):
+        t = at[int(np.rint((0.02, 0.98)[k] * (count - 1)))]
+        ends[k] = t * along + (distance + level + slope * (t - middle)) * across
+    return (across - slope * along) / scale, (distance + level - slope * middle) / scale, ends, rows
+
+
+@numba.njit(cache=True, nogil=True)
+def voted(
+    xy: NDArray[Any], own: NDArray[Any], direction: NDArray[Any], spread: int, reach: int
+) -> NDArray[Any]:
+    """Votes of points for lines (angles, 2·reach + 1), linear between distances.
+
+    Parameters
+    ----------
+    xy, own : ndarray (n, 2), ndarray of int (n,)
+        Points, and the indices of the directions of their normals.
+    direction : ndarray (a, 2)
+        Normals of the lines.
+    spread : int
+        Points vote for so many directions to either side.
+    reach : int
+        Index of the distance 0.
+    """
+    turns = len(direction)
+    votes = np.zeros((turns, 2 * reach + 1))
+    for i in range(len(xy)):
+        for turn in range(own[i] - spread, own[i] + spread + 1):
+            k = turn % turns
+            rho = xy[i, 0] * direction[k, 0] + xy[i, 1] * direction[k, 1] + reach
+            low = math.floor(rho)
+            votes[k, low] += 1 - rho + low
+            votes[k, low + 1] += rho - low
+    return votes
 
 
 @numba.njit(cache=True, nogil=True)
@@ -161,3 +233,124 @@ def add_windows(
                 total[top + r, left + c] += images[k, r, c]
                 if wanted:
                     seen[top + r, left + c] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def attenuate(free: NDArray[Any], contrast: NDArray[Any], size: NDArray[Any]) -> None:
+    """Replace the free share of pixels (h, w) by the light that is missing there.
+
+    Parameters
+    ----------
+    contrast : ndarray (6,)
+        Coefficients of 1, u, v, u², u v, v², with u and v from −1 to 1 over the frame.
+    size : ndarray (2,)
+        Width and height of the frame.
+    """
+    for r in range(free.shape[0]):
+        v = 2 * r / size[1] - 1
+        for c in range(free.shape[1]):
+            if free[r, c] == 1.0:
+                free[r, c] = 0.0
+                continue
+            u = 2 * c / size[0] - 1
+            light = contrast[0] + contrast[1] * u + contrast[2] * v
+            light += contrast[3] * u * u + contrast[4] * u * v + contrast[5] * v * v
+            free[r, c] = light * (1.0 - free[r, c])
+
+
+@numba.njit(cache=True, nogil=True)
+def bends(
+    grey: NDArray[Any], total: NDArray[Any], near: NDArray[Any], sign: float, limit: float
+) -> NDArray[Any]:
+    """Differences (n,) of pixels from the mean of both neighbours in the row, where the formed image is flat.
+
+    Parameters
+    ----------
+    grey, total : ndarray (h, w)
+        Grey values; light that marks attenuate or add.
+    near : ndarray (h, w) of bool
+        Pixels to look at.
+    sign : float
+        Factor with which `total` is added to the grey values.
+    limit : float
+        Largest difference of the formed image at the two neighbours.
+    """
+    found, count = np.empty(np.count_nonzero(near)), 0
+    for r in range(grey.shape[0]):
+        for c in range(1, grey.shape[1] - 1):
+            if near[r, c] and abs(total[r, c + 1] - total[r, c - 1]) < limit:
+                beside = grey[r, c - 1] + grey[r, c + 1] + sign * (total[r, c - 1] + total[r, c + 1])
+                found[count] = abs(grey[r, c] + sign * total[r, c] - beside / 2)
+                count += 1
+    return found[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def ridges(
+    xx: NDArray[Any], yy: NDArray[Any], xy: NDArray[Any], x: NDArray[Any], y: NDArray[Any], least: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Ridge points (n, 2) and their normals (n, 2) from the derivatives (h, w) of a smoothed frame.
+
+    The curvature across is at least `least`, that along less than half of it, and the slope across vanishes
+    within 0.7 pixels.
+    """
+    points, normals, count = np.empty((16384, 2)), np.empty((16384, 2)), 0
+    for r in range(xx.shape[0]):
+        for c in range(xx.shape[1]):
+            half, mean = (xx[r, c] - yy[r, c]) / 2, (xx[r, c] + yy[r, c]) / 2
+            root = math.sqrt(half * half + xy[r, c] * xy[r, c])
+            across = mean + root
+            if not (across > least and abs(mean - root) < across / 2):
+                continue
+            angle = 0.5 * math.atan2(xy[r, c], half)
+            u, v = math.cos(angle), math.sin(angle)
+            step = -(x[r, c] * u + y[r, c] * v) / across
+            if abs(step) < 0.7:
+                if count == len(points):
+                    points = np.concatenate((points, np.empty_like(points)))
+                    normals = np.concatenate((normals, np.empty_like(normals)))
+                points[count, 0], points[count, 1] = c + step * u, r + step * v
+                normals[count, 0], normals[count, 1] = u, v
+                count += 1
+    return points[:count].copy(), normals[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def curved(
+    nodes: NDArray[Any],
+    tangents: NDArray[Any],
+    kind: NDArray[Any],
+    ways: NDArray[Any],
+    xy: NDArray[Any],
+    dxy: NDArray[Any],
+    reach: NDArray[Any],
+) -> None:
+    """Images of outlines under mappings of second degree, their interior on the left.
+
+    Parameters
+    ----------
+    nodes, tangents : ndarray (m, j, 2)
+        Flat outlines of the kinds; see :class:`reseau.optics.formation.Outline`.
+    kind : ndarray of int (k,)
+        Kind of each target.
+    ways : ndarray (k, 5, 2)
+        Images of x, y, x², x y and y².
+    xy, dxy, reach : ndarray (k, j, 2), (k, j, 2), (k, 2)
+        Filled: images of nodes and tangents; largest distances from the origin along x and y.
+    """
+    for k in range(len(kind)):
+        (a, b), (c, d), (e, f), (g, h), (p, q) = ways[k]
+        area = 0.0
+        reach[k] = 0.0
+        for j in range(nodes.shape[1]):
+            (x, y), (u, v) = nodes[kind[k], j], tangents[kind[k], j]
+            uu, uv, vv = 2 * x * u, x * v + y * u, 2 * y * v
+            right = a * x + c * y + e * x * x + g * x * y + p * y * y
+            down = b * x + d * y + f * x * x + h * x * y + q * y * y
+            along = a * u + c * v + e * uu + g * uv + p * vv
+            turn = b * u + d * v + f * uu + h * uv + q * vv
+            xy[k, j, 0], xy[k, j, 1], dxy[k, j, 0], dxy[k, j, 1] = right, down, along, turn
+            area += right * turn - down * along
+            reach[k, 0], reach[k, 1] = max(reach[k, 0], abs(right)), max(reach[k, 1], abs(down))
+        if area < 0:
+            dxy[k] = -dxy[k]

@@ -133,6 +133,8 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
     sigma : float
         Width of the smoothing Gaussian in pixels.
     """
+    from .compiled import ridges as compiled_ridges  # takes half a second to import
+
     offset = np.arange(-int(np.ceil(4 * sigma)), int(np.ceil(4 * sigma)) + 1)
     bell = np.exp(-0.5 * (offset / sigma) ** 2)
     bell /= bell.sum()
@@ -143,19 +145,9 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
         return np.asarray(smooth, dtype=np.float32)
 
     xx, yy, xy = filtered(bend, bell), filtered(bell, bend), filtered(slope, slope)
-    half, mean = (xx - yy) / 2, (xx + yy) / 2
-    root = cv2.magnitude(half, xy)
-    across = mean + root
     least = _SIGNIFICANT * noise * float(np.sqrt((bend**2).sum() * (bell**2).sum()))
-    row, column = np.nonzero((across > least) & (np.abs(mean - root) < 0.5 * across))
-    at = row, column
-    angle = 0.5 * np.arctan2(xy[at], half[at])
-    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    gradient = np.stack([filtered(slope, bell)[at], filtered(bell, slope)[at]], axis=1)
-    step = -(gradient * normal).sum(axis=1) / across[at]
-    on = np.abs(step) < 0.7
-    points = np.stack([column, row], axis=1)[on] + step[on, None] * normal[on]
-    return Ridges(points.astype(np.float64), normal[on].astype(np.float64), _darkness(grey))
+    points, normal = compiled_ridges(xx, yy, xy, filtered(slope, bell), filtered(bell, slope), least)
+    return Ridges(points, normal, _darkness(grey))
 
 
 def _darkness(grey: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -254,44 +246,23 @@ def _candidates(ridges: Ridges) -> _Lines:
     order = order[share[order] > _LEAST_SHARE]
     kept: list[tuple[Array, float, Array, float]] = []
     free = np.ones(len(xy), dtype=bool)
+    from .compiled import line_through  # takes half a second to import; not every command needs it
+
     for k in order:
         across = np.array([np.cos(angle[k]), np.sin(angle[k])])
-        distance_k = float(rho[k] + across @ centre)
-        *fitted, near = _line_through(xy, normal, across, distance_k)
+        normal_k, place, ends, near = line_through(
+            xy, normal, across, float(rho[k] + across @ centre), _APART_PX / 2, _PARALLEL, _FEW_POINTS
+        )
         # A line that nearly coincides with a stronger one, or consists of points of such, is skipped.
-        if len(near) and free[near].mean() < _OWN:
+        if len(near) and np.count_nonzero(free[near]) < _OWN * len(near):
             continue
-        if all(np.abs(fitted[2] @ n - d).max() > _APART_PX for n, d, _, _ in kept):
-            kept.append((fitted[0], fitted[1], fitted[2], float(weight[k])))
+        if all(np.abs(ends @ n - d).max() > _APART_PX for n, d, _, _ in kept):
+            kept.append((normal_k, place, ends, float(weight[k])))
             free[near] = False
         if len(kept) == _MOST_LINES:
             break
     columns = [np.array(column) for column in zip(*kept, strict=True)] if kept else [np.zeros(0)] * 4
     return _Lines(*columns)
-
-
-def _line_through(xy: Array, normal: Array, across: Array, distance: float) -> tuple[Any, ...]:
-    """A line adjusted to the ridge points along it: normal, distance, ends (2, 2), and rows of its points."""
-    from .compiled import near_line  # takes half a second to import; not every command needs it
-
-    along = np.array([-across[1], across[0]])
-    near = near_line(xy, normal, across, distance, _APART_PX / 2, _PARALLEL)
-    at, off = xy[near] @ along, xy[near] @ across - distance
-    if len(near) < _FEW_POINTS:
-        return across, distance, across * distance + np.zeros((2, 1)) * along, near
-    low, high = np.sort(at)[np.rint(np.array([0.02, 0.98]) * (len(at) - 1)).astype(np.intp)]
-    middle = at.mean()
-    weight = np.clip(1 - (2 * off / _APART_PX) ** 2, 0, None)
-    slope = (weight * (at - middle) * off).sum() / max((weight * (at - middle) ** 2).sum(), 1e-9)
-    level = (weight * off).sum() / max(weight.sum(), 1e-9) - slope * (
-        (weight * (at - middle)).sum() / max(weight.sum(), 1e-9)
-    )
-    # off = level + slope (at − middle), as a normal of unit length.
-    scale = np.hypot(1.0, slope)
-    turned = (across - slope * along) / scale
-    through = float((distance + level - slope * middle) / scale)
-    ends = np.stack([t * along + (distance + level + slope * (t - middle)) * across for t in (low, high)])
-    return turned, through, ends, near
 
 
 def _centre(shape: tuple[int, ...]) -> Array:
@@ -300,20 +271,14 @@ def _centre(shape: tuple[int, ...]) -> Array:
 
 def _hough(ridges: Ridges) -> tuple[NDArray[np.float32], int]:
     """Votes of the ridge points for lines (angles, distances), and the index of distance 0."""
+    from .compiled import voted  # takes half a second to import; not every command needs it
+
     at = ridges.xy - _centre(ridges.darkness.shape)
     reach = int(np.hypot(*ridges.darkness.shape) / 2) + 2
-    turns, width = round(np.pi / _TURN), 2 * reach + 1
+    turns = round(np.pi / _TURN)
     own = np.rint(np.arctan2(ridges.normal[:, 1], ridges.normal[:, 0]) / _TURN).astype(np.intp)
-    votes = np.zeros(turns * width)
-    for turn in range(-_SPREAD, _SPREAD + 1):
-        k = (own + turn) % turns
-        cosine, sine = np.cos(np.arange(turns) * _TURN)[k], np.sin(np.arange(turns) * _TURN)[k]
-        rho = at[:, 0] * cosine + at[:, 1] * sine + reach
-        low = np.floor(rho).astype(np.intp)
-        part = rho - low
-        votes += np.bincount(k * width + low, 1 - part, minlength=votes.size)
-        votes += np.bincount(k * width + low + 1, part, minlength=votes.size)
-    return votes.reshape(turns, width).astype(np.float32), reach
+    direction = np.exp(1j * np.arange(turns) * _TURN).view(np.float64).reshape(-1, 2)
+    return voted(at, own, direction, _SPREAD, reach).astype(np.float32), reach
 
 
 def _dark_share(

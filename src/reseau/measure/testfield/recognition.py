@@ -213,6 +213,7 @@ class _Clusters:
                 for some in np.array_split(lines, 1 + len(lines) // 30_000)
             ]
         ).reshape(*self.xy.shape[:2], -1)
+        self.variance = self.seen.var(axis=2)
         # Pixels that are nearer to a neighbour than to the target are ignored.
         on_board = np.einsum("gij,nj->gni", np.linalg.inv(self.frames), offset)
         self.own = (np.abs(on_board) <= self.step / 2).all(axis=2)
@@ -244,7 +245,7 @@ class _Clusters:
         cost[amplitude < _FAINT * ordinary] = np.inf
         by_symbol = [cost[..., self.kinds.symbol == symbol].min(axis=2) for symbol in range(8)]
         widening = float(np.median((wider / np.where(contrast == 0, np.inf, contrast))[self.visible]))
-        left = np.maximum(_UNLIKE, _UNEXPLAINED * self.seen.var(axis=2) / noise)
+        left = np.maximum(_UNLIKE, _UNEXPLAINED * self.variance / noise)
         none = 0.5 * pixels[self.group][:, None] * left
         return _Comparison(np.stack(by_symbol, axis=2), none, level, np.abs(contrast), widening)
 

@@ -52,6 +52,8 @@ def form_targets(
     reach : ndarray (k, 2)
         Half the width and half the height of each image.
     """
+    from .compiled import curved  # takes half a second to import; not every command needs it
+
     value, slope, bend = second_order(mapping, at)
     # The spacing of nodes is determined where a millimetre is largest in the image.
     scale = float(np.linalg.norm(slope @ frame, ord=2, axis=(1, 2)).max())
@@ -61,22 +63,17 @@ def form_targets(
     kind = np.array([number[key] for key in keys], dtype=np.intp)
     spacing = float(f"{_SPACING * psf_px / scale:.2g}")
     flat = stacked([flat_outline(*key, spacing) for key in number])
-    # F(s + d) − F(s) = J d + ½ d H d and its derivative J + H d, as polynomials of each target.
-    (x, y), (u, v) = (np.moveaxis(part @ frame.T, 2, 0) for part in (flat.xy, flat.dxy))
-    ways = np.concatenate(
-        [
-            np.swapaxes(slope, 1, 2),
-            np.stack([bend[..., 0, 0] / 2, bend[..., 0, 1], bend[..., 1, 1] / 2], axis=1),
-        ],
+    # F(s + d) − F(s) = J d + ½ d H d with d = frame · (x, y), as polynomials of each target.
+    slope = np.swapaxes(slope @ frame, 1, 2)
+    bend = frame.T @ bend @ frame / 2
+    ways = np.stack(
+        [slope[:, 0], slope[:, 1], bend[..., 0, 0], bend[..., 0, 1] + bend[..., 1, 0], bend[..., 1, 1]],
         axis=1,
-    ).astype(np.float32)
-    xy, dxy = (
-        np.stack(monomials, axis=2).astype(np.float32)[kind] @ ways
-        for monomials in ((x, y, x * x, x * y, y * y), (u, v, 2 * x * u, x * v + y * u, 2 * y * v))
     )
-    image = Outline(cast(Array, xy), cast(Array, dxy)).oriented()
-    reach: Array = np.abs(xy).max(axis=1).astype(np.float64)
-    return GrownOutline(image, SIZE), value, reach
+    xy, dxy = np.empty((2, len(rows), *flat.xy.shape[1:]), np.float32)
+    reach = np.empty((len(rows), 2))
+    curved(flat.xy, flat.dxy, kind, ways, xy, dxy, reach)
+    return GrownOutline(Outline(cast(Array, xy), cast(Array, dxy)), SIZE), value, reach
 
 
 def stacked(outlines: list[Outline]) -> Outline:

@@ -9,11 +9,13 @@ of the board is modelled by polynomials over the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
@@ -62,15 +64,6 @@ class Light:
         """Level and contrast (n,) at points (n, 2)."""
         design = _quadratic(xy, self.size)
         return design @ self.level, design @ self.contrast
-
-    def contrast_over(self, shape: tuple[int, int]) -> Array:
-        """Contrast of every pixel of a frame (h, w)."""
-        u, v = (2 * np.arange(n) / size - 1 for n, size in zip(shape[::-1], self.size, strict=True))
-        one, by_u, by_v, by_uu, by_uv, by_vv = self.contrast
-        over: Array = (
-            (one + by_u * u + by_uu * u * u) + np.outer(v, by_v + by_uv * u) + (by_vv * v * v)[:, None]
-        )
-        return over
 
 
 def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
@@ -133,6 +126,11 @@ class Scene:
     def lattice(self, xy: Array) -> Array:
         """Lattice coordinates (n, 2) of points of the design (n, 2)."""
         return np.asarray(xy @ self.frame.T + self.origin)
+
+    @cached_property
+    def line_light(self) -> Array:
+        """Grey values that the lines attenuate or add, (h, w)."""
+        return _line_light(self)
 
 
 def match_targets(
@@ -201,7 +199,7 @@ def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
     blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(slope)).min())
     far = max(1.5 * step, 1.2 * size + blur)
     keep = inside.copy()
-    keep[~inside] = (np.abs(xy[~inside, None] - xy[inside]).max(axis=2) < far).any(axis=1)
+    keep[~inside] = KDTree(xy[inside]).query(xy[~inside], p=np.inf, distance_upper_bound=far)[0] < far
     return rows[keep], inside[keep]
 
 
@@ -222,7 +220,7 @@ class _Canvas:
         self, scene: Scene, images: Shape, xy: Array, reach: Array, large: Mask, wanted: Mask
     ) -> None:
         self.scene, self.images, self.xy = scene, images, xy
-        self.total = _line_light(scene)
+        self.total = scene.line_light.copy()
         self.near = np.zeros(self.total.shape, dtype=bool)
         self.parts: list[_Part] = []
         for size in (False, True):
@@ -313,14 +311,15 @@ class _Canvas:
         scene = self.scene
         if scene.row_jitter_px == 0:
             return scene.noise
-        left = scene.grey + (self.total if scene.design.polarity == "dark" else -self.total)
-        bend = left[:, 1:-1] - (left[:, :-2] + left[:, 2:]) / 2
-        steep = np.abs(self.total[:, 2:] - self.total[:, :-2]) / 2
-        flat = self.near[:, 1:-1] & scene.valid[:, 1:-1] & (steep * scene.row_jitter_px < _FLAT * scene.noise)
-        if flat.sum() < _LEAST_FLAT:
+        from .compiled import bends  # takes half a second to import; not every command needs it
+
+        sign = 1.0 if scene.design.polarity == "dark" else -1.0
+        limit = 2 * _FLAT * scene.noise / scene.row_jitter_px
+        bend = bends(scene.grey, self.total, self.near & scene.valid, sign, limit)
+        if len(bend) < _LEAST_FLAT:
             return scene.noise
         # The median of normal deviates is 0.6745 of their σ; the variance of such a difference is 3/2 σ².
-        return float(np.median(np.abs(bend[flat])) / (0.6745 * np.sqrt(1.5)))
+        return float(np.median(bend) / (0.6745 * np.sqrt(1.5)))
 
     def _match(
         self,
@@ -370,7 +369,7 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> Array:
     """Grey values that the lines attenuate or add, (h, w)."""
-    from .compiled import shade  # takes half a second to import; not every command needs it
+    from .compiled import attenuate, shade  # takes half a second to import; not every command needs it
 
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones((h, w))
@@ -399,28 +398,29 @@ def _line_light(scene: Scene) -> Array:
             )
             ends = np.sort(middle[[0, -1], line.axis])  # they are blurred, too
             shade(free, line.axis, line.step, line.place, line.normal, half, ends, steps, blur, reach)
-    taken: Array = scene.light.contrast_over((h, w)) * (1 - free)
-    return taken
+    attenuate(free, scene.light.contrast, np.array(scene.light.size))
+    return free
 
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
     """Matches of several parts in the order of their rows; smaller windows are padded."""
-    order = np.argsort(np.concatenate(parts), kind="stable")
+    rows = np.concatenate(parts)
+    place = np.empty(len(rows), np.intp)
+    place[np.argsort(rows, kind="stable")] = np.arange(len(rows))
+    places = np.split(place, np.cumsum([len(part) for part in parts])[:-1])
     columns: dict[str, Any] = {}
     for name in Matches.__dataclass_fields__:
         values = [getattr(matches, name) for matches in found]
-        if name in ("residuals", "influence", "leverage"):
-            most = np.max([v.shape[-2:] for v in values], axis=0)
-            values = [
-                np.pad(
-                    v,
-                    [(0, 0)] * (v.ndim - 2)
-                    + [((n - m) // 2,) * 2 for m, n in zip(v.shape[-2:], most, strict=True)],
-                    constant_values=np.nan if name == "residuals" else 0.0,
-                )
-                for v in values
-            ]
-        columns[name] = np.concatenate(values)[order]
+        shape = tuple(np.max([v.shape[1:] for v in values], axis=0))
+        ragged = any(v.shape[1:] != shape for v in values)
+        column = np.empty((len(rows), *shape), values[0].dtype)
+        if ragged:
+            column[:] = np.nan if name == "residuals" else 0.0
+        for at, v in zip(places, values, strict=True):
+            some: tuple[Any, ...] = (at,)
+            some += tuple(slice((m - n) // 2, (m + n) // 2) for m, n in zip(shape, v.shape[1:], strict=True))
+            column[some] = v
+        columns[name] = column
     return Matches(**columns)
 
 
