@@ -77,6 +77,21 @@ def test_a_mapping_passes_through_its_points() -> None:
     np.testing.assert_allclose(again(at), moved, rtol=0, atol=0.003)
 
 
+def test_a_mapping_follows_a_region_that_deviates_and_not_single_points() -> None:
+    fit = fitted(FieldBench(seed=5), Station(30))
+    at = np.stack(np.meshgrid(np.linspace(-2, 2, 25), np.linspace(-2, 2, 25)), axis=-1).reshape(-1, 2)
+    # Towards one corner, points deviate by up to 2 px; single points anywhere by 1 px.
+    corner = np.clip(at / 2, 0, None).prod(axis=1)
+    true = fit.mapping(at) + 2.0 * corner[:, None] ** 2 * [1.0, -0.5]
+    rng = np.random.default_rng(3)
+    seen = true + rng.normal(0, 0.01, true.shape)
+    seen[rng.choice(len(at), 20, replace=False)] += 1.0
+    again = refit(fit.mapping, at, seen, 0.03)
+    off = np.abs(again(at) - true)
+    assert off[corner > 0.5].max() < 0.15
+    assert np.median(off) < 0.02
+
+
 def test_an_image_without_lines_gives_no_lattice() -> None:
     grey = np.random.default_rng(1).normal(100, 3, (200, 200)).astype(np.float32)
     found = find_lattices(ridge_points(grey, 3.0))

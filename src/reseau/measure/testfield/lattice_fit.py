@@ -15,6 +15,7 @@ from itertools import islice, product
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from ...adjust import BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
@@ -26,6 +27,7 @@ from .line_profiles import crossings, located
 
 __all__ = [
     "LatticeFit",
+    "common_part",
     "fit_lattice",
     "lattices",
     "reduced",
@@ -66,6 +68,10 @@ _BENT_PX = 0.13
 """Rms distance of ridge points from which strong lens distortion is assumed."""
 _TIMES, _STILL_PX = 4, 0.1
 """Maximum rounds of adjusting lines to their profiles, and the movement in pixels that ends them."""
+_NEIGHBOURS, _TOGETHER_PX, _SCATTER, _ALONE = 9, 0.1, 0.5, 6.0
+"""Number of neighbouring points, themselves included, of which the median residual is compared; median from
+which they deviate together from a mapping, and its multiple by which they may scatter; multiple of the usual
+deviation from it that a point may have."""
 _LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
 """Minimum number of ridge points of a lattice, number that is sufficient at first, and number of ridge points
 of the frame (most not on lines) among which they are selected."""
@@ -431,7 +437,37 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     powers = _powers(mapping)
     before = max(i + j for i, j in powers) if len(at) > len(powers) else 1
     mapping = _of_degree(mapping, max(before, trend_degree(len(at))))
-    return _solved(mapping, _monomials(mapping, at), (xy - mapping.first(at)).T, sigma_px)[0]
+    monomials, observed = _monomials(mapping, at), (xy - mapping.first(at)).T
+    fit, residuals = _solved(mapping, monomials, observed, sigma_px)
+    common = common_part(at, residuals.T)
+    if common is None:
+        return fit
+    # A robust adjustment has rejected all points of a region. Points that agree with their neighbours count.
+    own = np.hypot(*(residuals.T - common).T)
+    agree = own < _ALONE * np.median(own)
+    if agree.sum() <= 2 * monomials.shape[1]:
+        return fit
+    size = np.maximum(np.linalg.norm(monomials, axis=0), 1e-12)
+    values: Array = np.linalg.lstsq((monomials / size)[agree], observed.T[agree], rcond=1e-10)[0]
+    names = mapping.second.names
+    curved = mapping.second.with_values(
+        dict(zip(names, mapping.second.values + (values / size[:, None]).T.ravel(), strict=True))
+    )
+    return Chain(mapping.first, curved)
+
+
+def common_part(at: Array, residuals: Array) -> Array | None:
+    """Medians (n, 2) of the residuals (n, 2) of points (n, 2) and their nearest neighbours.
+
+    None if neighbours deviate together nowhere, by more than a tenth of a pixel.
+    """
+    far = (np.abs(residuals) > _TOGETHER_PX).any(axis=1)
+    if len(at) < _NEIGHBOURS or np.count_nonzero(far) <= _NEIGHBOURS // 2:
+        return None
+    near = KDTree(at).query(at, k=_NEIGHBOURS)[1]
+    common: Array = np.median(residuals[near], axis=1)
+    size, scatter = np.abs(common), np.median(np.abs(residuals[near] - common[:, None]), axis=1)
+    return common if ((size > _TOGETHER_PX) & (scatter < _SCATTER * size)).any() else None
 
 
 def _monomials(mapping: Chain, at: Array) -> Array:

@@ -20,7 +20,7 @@ from ...optics.formation import PixelResponse
 from ..matching import Matches, Window
 from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
-from .lattice_fit import LatticeFit, refit, slope_of
+from .lattice_fit import LatticeFit, common_part, refit, slope_of
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
@@ -306,8 +306,9 @@ class _Measurement:
         why, predicted = self._judged(self.scene, wanted, found)
         for _ in range(_AGAIN):
             good = why == ""
-            off = np.abs(found.xy - self.predicted[wanted])[good]
-            settled = good.mean() > 1 - _FEW and np.quantile(off, 0.9) < _BESIDE_PX
+            off = (found.xy - self.predicted[wanted])[good]
+            settled = good.mean() > 1 - _FEW and np.quantile(np.abs(off), 0.9) < _BESIDE_PX
+            settled &= common_part(self.at[wanted[good]], off) is None
             if settled or good.sum() < _MOST_FIRST:
                 break
             # With many targets known, the mapping and the light of neighbours are known better.
