@@ -368,10 +368,8 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     point = camera.corresponding(target.centre[None])[0]
     usable = np.asarray(np.isfinite(xy).all(axis=(1, 3)))
     maps = np.einsum("tg,wgex->wetx", _FIT, np.where(usable[:, None, :, None], xy, 0.0))
-    coefficients, share = (
-        maps.reshape(-1, 6, 2),
-        np.where(usable, np.abs(light.mean(axis=1) @ target.normal), 0.0).ravel(),
-    )
+    emitted = np.abs(light.mean(axis=1) @ target.normal)
+    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, emitted, 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
         raise UsageError("no light of the target reaches the sensor", do="is it in the field of the lens?")
     coefficients, share = coefficients[share > 0], share[share > 0] / share.sum()
