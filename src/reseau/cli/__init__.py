@@ -18,6 +18,7 @@ from . import (
     apply,
     archive,
     bench,
+    blurred,
     bundle,
     bundle_compare,
     calibrate,
@@ -49,6 +50,7 @@ app.add_typer(design.app, name="design")
 app.add_typer(bench.app, name="bench")
 measure.app.command()(perforations.perforations)
 measure.app.command()(fiducials.fiducials)
+measure.app.command()(blurred.blurred)
 app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..io import ReseauMeasurement
     from ..measure.points import Measured
 
-__all__ = ["app", "measurement_csv"]
+__all__ = ["Overlay", "Task", "app", "measurement_csv"]
 
 
 class Channel(StrEnum):
@@ -78,7 +78,7 @@ def reseau(
     from ..io import ReseauDesign
     from ..measure import ReseauOptions, measure_reseau
 
-    task = _Task(image, out, overlay, as_json, "marks")
+    task = Task(image, out, overlay, as_json, "marks")
     target = seen(ReseauDesign.read(design), mirrored)
     options = ReseauOptions(
         mark_px=mark_px,
@@ -114,7 +114,7 @@ def pins(
     from ..io import ReseauDesign
     from ..measure import PinOptions, measure_pins
 
-    task = _Task(image, out, overlay, as_json, "rods")
+    task = Task(image, out, overlay, as_json, "rods")
     target = seen(ReseauDesign.read(design), mirrored)
     options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
     task.run(
@@ -145,7 +145,7 @@ def coded_field(
     from ..io import TestfieldDesign
     from ..measure import TestfieldOptions, measure_testfield
 
-    task = _Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
+    task = Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
     if mirrored:
         target = target.from_behind()
@@ -156,7 +156,7 @@ def coded_field(
     )
 
 
-class _Task:
+class Task:
     """Measure one image, or read its coordinates; write and report what was found.
 
     The names of the outputs are checked first, before anything is computed.

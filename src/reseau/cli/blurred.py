@@ -1,0 +1,90 @@
+"""`reseau measure blurred`: image coordinates of blurred targets, by rays through the lens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .common import AsJson, Out, SensorFile, corrected, read_frame
+from .measure import Overlay, Task
+
+__all__ = ["blurred"]
+
+
+def blurred(
+    image: Annotated[Path, typer.Argument(help="Image.")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the targets, in mm.")],
+    lens: Annotated[
+        Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
+    ],
+    network: Annotated[
+        Path | None,
+        typer.Option(
+            "--network",
+            "-n",
+            help="Network with the orientation of the image, as written by `reseau bundle`. Default: the "
+            "image is oriented by its targets.",
+        ),
+    ] = None,
+    focus: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="Distance from the front of the lens at which objects are sharp (mm). "
+            "Default: the image plane of the lens file.",
+        ),
+    ] = None,
+    pitch: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            max=1000,
+            help="Pitch of the pixels (µm), if the lens file has no sensor; the axis of the lens is "
+            "then at the centre of the image.",
+        ),
+    ] = None,
+    f_number: Annotated[
+        float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
+    ] = None,
+    psf: Annotated[
+        float,
+        typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
+    ] = 0.5,
+    search: Annotated[
+        float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
+    ] = 6.0,
+    out: Out = None,
+    overlay: Overlay = None,
+    sensor: SensorFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure blurred targets: the places of their corresponding rays.
+
+    The images of the targets are formed by rays through the lens and matched with the photograph.
+    """
+    from ..core.failure import Failure
+    from ..exchange import read_lens, read_network
+    from ..io.reading import read_design
+    from ..measure.blurred import BlurredOptions
+    from ..procedures.blurred import lens_camera, measure_blurred_frame, pose_in_network
+
+    task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
+    target, optics = read_design(design), read_lens(lens)
+    frame = corrected(read_frame(image), sensor)
+    size = frame.width, frame.height
+    camera = lens_camera(optics, size, pitch_um=pitch, distance=focus, f_number=f_number)
+    pose = None if network is None else pose_in_network(read_network(network), image.name, target)
+    options = BlurredOptions(
+        polarity=target.polarity,
+        psf_px=psf,
+        search_px=search,
+        fill=1.0 if optics.sensor is None else optics.sensor.fill,
+    )
+
+    def measured(_: object) -> object:
+        found = measure_blurred_frame(frame, target, camera, pose, options)
+        return found if isinstance(found, Failure) else found.measured
+
+    task.run(lambda: frame, measured)

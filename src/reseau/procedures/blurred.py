@@ -1,0 +1,453 @@
+"""Blurred targets of a design: orientation of the image by their corresponding rays, and their measurement.
+
+Meid (1992), section 3, for one image: approximate image coordinates orient the image, the orientation gives
+the images of the targets by rays, matching with these gives better image coordinates, and so on until they no
+longer change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..adjust import GaussMarkov, Options, Parameters, adjust
+from ..bundle import Network
+from ..bundle.solver.spatial import resect
+from ..core.data import Array, Frame, ImagePoints
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure, Remark
+from ..exchange import Lens
+from ..io import ReseauDesign, TestfieldDesign
+from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from ..optics import Pose
+from ..optics.formation import mark_outline
+from ..optics.lenses import LensCamera, Paraxial, PlaneTarget, Prescription, RayMap, SensorPlane
+from ..optics.poses import matrix_to_vector, rotation_matrix
+from ..optics.targets import target_outline
+from .target_measurement import measurer_of
+
+__all__ = [
+    "BlurredFrame",
+    "focused",
+    "lens_camera",
+    "measure_blurred_frame",
+    "orient_by_rays",
+    "pose_in_network",
+    "targets_of",
+]
+
+Design = ReseauDesign | TestfieldDesign
+
+_SPACING_PX = 0.6
+"""Largest distance of nodes along outlines."""
+_ROUNDS = 3
+_SETTLED_PX = 0.3
+"""A change of the predicted positions below this does not change the formed images noticeably."""
+_FEWEST = 6
+"""Points for an orientation: twice what its six unknowns need."""
+_MISFIT, _LEAST_MISFIT_PX = 3.0, 0.05
+"""Residuals of the orientation over sigmas, and in pixels, from which the user is told."""
+_FLAT = 0.01
+"""Largest difference between a design and its points in a network, in extents of the design."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlurredFrame:
+    """Blurred targets of a frame, and its orientation.
+
+    Parameters
+    ----------
+    measured : BlurredResult
+    pose : Pose
+        From the plane of the design to camera axes, millimetres.
+    rms_px : float
+        Root mean square of the residuals of the orientation; NaN where it was given.
+
+    Examples
+    --------
+    See :func:`measure_blurred_frame`, which returns it; the orientation is a pose:
+
+    >>> pose = Pose(np.zeros(3), np.array([0.0, 0.0, -500.0]))
+    >>> pose(np.zeros((1, 3)))
+    array([[  0.,   0., 500.]])
+    """
+
+    measured: BlurredResult
+    pose: Pose
+    rms_px: float
+
+
+def focused(lens: Prescription, distance: float) -> Prescription:
+    """A lens with its image surface moved to where an object on the axis is sharp, in first order.
+
+    Parameters
+    ----------
+    lens : Prescription
+    distance : float
+        From the first surface to the object, mm.
+
+    Raises
+    ------
+    UsageError
+        When the image of that object is not behind the lens.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
+    >>> round(float(focused(lens, 1000.0).surfaces[-1].vertex[2]), 2)
+    113.11
+    """
+    first = Paraxial(lens)
+    behind = first.image_distance(distance)
+    if not 0 < behind < np.inf:
+        raise UsageError(f"forms no real image of an object at {distance:g} mm", where=lens.name)
+    last = max(k for k, surface in enumerate(lens.surfaces) if surface.kind != "plain")
+    surface, image = lens.surfaces[last], lens.surfaces[-1]
+    sign = np.sign(first.indices[last + 1])
+    wanted = surface.vertex + sign * behind * surface.axes[:, 2]
+    along = image.axes[:, 2]
+    return lens.moved(((wanted - image.vertex) @ along) * along)
+
+
+def lens_camera(
+    lens: Lens,
+    size_px: tuple[int, int],
+    *,
+    pitch_um: float | None = None,
+    distance: float | None = None,
+    f_number: float | None = None,
+) -> LensCamera:
+    """A camera of a lens as read from a file.
+
+    Parameters
+    ----------
+    lens : Lens
+        See :func:`reseau.exchange.read_lens`.
+    size_px : (int, int)
+        Width and height of its images.
+    pitch_um : float, optional
+        Pitch of the pixels where the file has no sensor; the axis is then at the centre of the image.
+    distance : float, optional
+        Distance from the first surface at which objects are sharp, mm; by default the image surface is where
+        the prescription has it.
+    f_number : float, optional
+        Sets the radius of the stop.
+
+    Raises
+    ------
+    UsageError
+        When there is no sensor and no pitch, or its size is another one.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
+    >>> camera = lens_camera(Lens(lens), (1001, 801), pitch_um=10.0, distance=1000.0)
+    >>> camera.corresponding(np.array([[0.0, 0.0, 1000.0]]))
+    array([[500., 400.]])
+    """
+    prescription, sensor = lens.prescription, lens.sensor
+    if sensor is None:
+        if pitch_um is None:
+            raise UsageError(
+                "has no sensor",
+                where=prescription.name,
+                do="give the pitch of the pixels, or add [sensor] to the file",
+            )
+        width, height = size_px
+        plane = SensorPlane((pitch_um / 1e3, pitch_um / 1e3), ((width - 1) / 2, (height - 1) / 2))
+    elif pitch_um is not None:
+        raise UsageError("has a sensor; its pitch is not needed", where=prescription.name)
+    elif tuple(sensor.size_px) != tuple(size_px):
+        raise UsageError(
+            "its sensor has {}×{} pixels, the image {}×{}".format(*sensor.size_px, *size_px),
+            where=prescription.name,
+        )
+    else:
+        plane = sensor.plane()
+    if f_number is not None:
+        first = Paraxial(prescription)
+        radius = abs(first.focal_length) / (2 * f_number) / abs(first.entrance_pupil[1])
+        prescription = replace(prescription, stop_radius=radius)
+    return LensCamera(prescription if distance is None else focused(prescription, distance), plane)
+
+
+def targets_of(design: Design, pose: Pose, camera: RayMap) -> tuple[tuple[str, ...], list[PlaneTarget]]:
+    """Names and targets of a design in camera axes.
+
+    Parameters
+    ----------
+    design : ReseauDesign or TestfieldDesign
+        In millimetres.
+    pose : Pose
+        From the plane of the design, z = 0, to camera axes.
+    camera : RayMap
+        The image of a target gives the spacing of the nodes along its outline.
+
+    Raises
+    ------
+    UsageError
+        When the design is not in millimetres, or its marks have no outline of their own.
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> from reseau.optics.lenses import ThinLens
+    >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (500.0, 400.0)))
+    >>> pose = Pose.from_angles(0.0, 0.0, 0.0, [0.0, 0.0, 1500.0])
+    >>> names, targets = targets_of(coded_testfield(), pose, camera)
+    >>> len(names) == len(targets), round(targets[0].centre[2])
+    (True, 1500)
+    """
+    if design.unit != "mm":
+        raise UsageError(f"the design is in {design.unit}, lenses are in mm", where=design.name)
+    matrix = pose.matrix
+    centres = pose(np.concatenate([design.xy, np.zeros((len(design.ids), 1))], axis=1))
+    axes = matrix[:, :2]
+    middle = centres[len(centres) // 2]
+    near = camera.corresponding(np.stack([middle, middle + axes[:, 0], middle + axes[:, 1]]))
+    scale = float(np.sqrt(abs(np.linalg.det(near[1:] - near[0]))))
+    if not (np.isfinite(scale) and scale > 0):
+        raise UsageError("the design is not in the field of the lens", where=design.name)
+    spacing = _SPACING_PX / scale
+    if isinstance(design, TestfieldDesign):
+        t = design.targets
+        outlines = [
+            target_outline(shape, size, angle, spacing)
+            for shape, size, angle in zip(t.shape, t.size, t.angle, strict=True)
+        ]
+    else:
+        mark = design.mark
+        if mark.shape == "line-grid" or mark.size is None:
+            raise UsageError("its marks have no outline of their own", where=design.name)
+        outlines = [mark_outline(mark.shape, mark.size, mark.line_width, spacing)] * len(design.ids)
+    return tuple(design.ids), [
+        PlaneTarget(centre, axes, outline) for centre, outline in zip(centres, outlines, strict=True)
+    ]
+
+
+def orient_by_rays(camera: RayMap, design: Design, points: ImagePoints) -> tuple[Pose, float] | Failure:
+    """Orient an image of a plane design: space resection with the corresponding rays of a lens.
+
+    Parameters
+    ----------
+    camera : RayMap
+    design : ReseauDesign or TestfieldDesign
+    points : ImagePoints
+        Measured points, named as in the design.
+
+    Returns
+    -------
+    (Pose, float) or Failure
+        From the plane of the design to camera axes, and the rms of the residuals in pixels.
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> from reseau.optics.lenses import ThinLens
+    >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (500.0, 400.0)))
+    >>> field, pose = coded_testfield(), Pose.from_angles(0.2, 0.1, 0.3, [30.0, -400.0, 1500.0])
+    >>> plane = np.concatenate([field.xy, np.zeros((len(field.ids), 1))], axis=1)
+    >>> cov = np.tile(1e-4 * np.eye(2), (len(plane), 1, 1))
+    >>> seen = ImagePoints(field.ids, camera.corresponding(pose(plane)), cov)
+    >>> found, rms = orient_by_rays(camera, field, seen)
+    >>> found.x0.round(3), rms < 1e-6
+    (array([  30., -400., 1500.]), True)
+    """
+    at = {name: k for k, name in enumerate(design.ids)}
+    rows = [k for k, name in enumerate(points.names) if name in at]
+    if len(rows) < _FEWEST:
+        return Failure(f"{len(rows)} points; {_FEWEST} are needed to orient an image", Code.TOO_FEW_POINTS)
+    plane = np.concatenate([design.xy[[at[points.names[k]] for k in rows]], np.zeros((len(rows), 1))], axis=1)
+    xy = points.xy[rows]
+    slopes = _approximate_slopes(camera, xy)
+    start = resect(plane, slopes, 0.05)
+    if start is None:
+        return Failure("no pose agrees with the points", Code.WEAK_GEOMETRY)
+
+    def computed(x: Array) -> Array:
+        return camera.corresponding(Pose(x[:3], x[3:])(plane))
+
+    names = ("rotation_x", "rotation_y", "rotation_z", "X0", "Y0", "Z0")
+    values = np.concatenate([matrix_to_vector(start.rotation), start.x0])
+    problem = GaussMarkov(computed, xy, points.cov[rows], Parameters(names, values))
+    found = adjust(problem, Options(scale="a-priori"))
+    if isinstance(found, Failure):
+        return found
+    residuals = computed(found.values) - xy
+    return Pose(found.values[:3], found.values[3:]), float(np.sqrt((residuals**2).mean()))
+
+
+def _approximate_slopes(camera: RayMap, xy: Array) -> Array:
+    """X/Z and Y/Z (n, 2) of points of the image, by Newton's method for objects far away."""
+    far, h = 1e5, 1e-3
+    slopes = np.zeros_like(xy)
+
+    def pixels(s: Array) -> Array:
+        return camera.corresponding(far * np.concatenate([s, np.ones((len(s), 1))], axis=1))
+
+    for _ in range(6):
+        here = pixels(slopes)
+        by = np.stack([(pixels(slopes + step) - here) / h for step in h * np.eye(2)], axis=2)
+        change = np.linalg.solve(by, (xy - here)[..., None])[..., 0]
+        slopes = slopes + np.clip(change, -0.3, 0.3)
+    return slopes
+
+
+def measure_blurred_frame(
+    frame: Frame,
+    design: Design,
+    camera: RayMap,
+    pose: Pose | None = None,
+    options: BlurredOptions | None = None,
+) -> BlurredFrame | Failure:
+    """Measure the blurred targets of a plane design in a frame.
+
+    Without a pose, the targets are first measured as if they were sharp, and the image is oriented by the
+    principal rays; measurement and orientation are then repeated until the images formed no longer change.
+
+    Parameters
+    ----------
+    frame : Frame
+    design : ReseauDesign or TestfieldDesign
+        In millimetres.
+    camera : RayMap
+        The lens with its sensor.
+    pose : Pose, optional
+        From the plane of the design to camera axes, from a bundle adjustment; it is not changed.
+    options : BlurredOptions, optional
+
+    Returns
+    -------
+    BlurredFrame or Failure
+
+    Examples
+    --------
+    >>> from reseau.designs import coded_testfield
+    >>> from reseau.optics.lenses import ThinLens
+    >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (500.0, 400.0)))
+    >>> blank = Frame(np.random.default_rng(0).normal(100, 1, (800, 1000)), 255.0)
+    >>> bool(measure_blurred_frame(blank, coded_testfield(), camera))
+    False
+    """
+    options = options or BlurredOptions(polarity=design.polarity)
+    if pose is not None:
+        return _described(BlurredFrame(_measured(frame, design, camera, pose, options), pose, np.nan))
+    first = measurer_of(design)(frame)
+    if isinstance(first, Failure):
+        return replace(first, reason=f"no approximate positions: {first.reason}")
+    points, before = first.points, np.full((len(design.ids), 2), np.inf)
+    for k in range(_ROUNDS):
+        oriented = orient_by_rays(camera, design, points)
+        if isinstance(oriented, Failure):
+            return oriented
+        found = BlurredFrame(_measured(frame, design, camera, oriented[0], options), *oriented)
+        if found.measured.found < _FEWEST:
+            return Failure(
+                f"{found.measured.found} of {len(design.ids)} targets are like their images by rays",
+                Code.TOO_FEW_POINTS,
+            )
+        change = np.abs(found.measured.predicted - before)
+        if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
+            break
+        points, before = found.measured.points, found.measured.predicted
+    return _described(found)
+
+
+def _described(found: BlurredFrame) -> BlurredFrame:
+    """Add notes for the user: how large the blur is, what it does to centres, how the orientation fits."""
+    measured = found.measured
+    good = measured.ok
+    if not good.any():
+        return found
+    offset = np.hypot(*measured.offset[good].T)
+    notes = [
+        Remark(
+            f"blur of {np.nanmin(measured.blur_px[good]):.2g} to {np.nanmax(measured.blur_px[good]):.2g} px "
+            f"(rms radius); centres of density lie up to {offset.max():.2g} px beside the corresponding rays",
+            Code.BLURRED,
+        )
+    ]
+    sigma = float(np.sqrt(np.mean(measured.points.sigma**2)))
+    if found.rms_px > _MISFIT * sigma and found.rms_px > _LEAST_MISFIT_PX:
+        notes.append(
+            Remark(
+                f"the orientation by rays of this lens leaves {found.rms_px:.2g} px (rms), where sigmas are "
+                f"{sigma:.2g} px: distortion, focus or principal point differ from those of the lens file",
+                Code.INCONSISTENT,
+            )
+        )
+    return replace(found, measured=replace(measured, notes=(*measured.notes, *notes)))
+
+
+def pose_in_network(network: Network, image: str, design: Design) -> Pose:
+    """Pose from the plane of a design to the camera axes of an image of a network.
+
+    Parameters
+    ----------
+    network : Network
+        With the orientation of the image and the object points, such as the result of a bundle adjustment.
+    image : str
+        Its name, or that of its file.
+    design : ReseauDesign or TestfieldDesign
+        Its points are found among those of the network by their names; the plane is fitted to them.
+
+    Raises
+    ------
+    UsageError
+        When the image or its orientation is missing, fewer than three points are known, or scales disagree.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> from reseau.designs import coded_testfield
+    >>> pose_in_network(example_network(), "nowhere.png", coded_testfield())
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: nowhere.png: is not an image of the network
+    """
+    names = [name for name in (image, Path(image).name, Path(image).stem) if name in network.images]
+    rows = [network.images.index(name) for name in names]
+    rows += [k for k, file in enumerate(network.files) if file and Path(file).name == Path(image).name]
+    if not rows:
+        raise UsageError("is not an image of the network", where=image)
+    rotation, x0 = network.rotation[rows[0]], network.x0[rows[0]]
+    if not np.isfinite([*rotation, *x0]).all():
+        raise UsageError(
+            "has no orientation in the network", where=image, do="use the result of `reseau bundle`"
+        )
+    at = {name: k for k, name in enumerate(network.points)}
+    both = [(k, at[name]) for k, name in enumerate(design.ids) if name in at]
+    both = [(k, p) for k, p in both if np.isfinite(network.xyz[p]).all()]
+    if len(both) < 3:
+        raise UsageError(
+            f"{len(both)} points of the design {design.name} have coordinates in the network", where=image
+        )
+    scale = {"mm": 1.0, "m": 1000.0}.get(network.unit)
+    if scale is None:
+        raise UsageError(f"the network is in {network.unit!r}, lenses are in mm", where=image)
+    k, p = (np.array(column) for column in zip(*both, strict=True))
+    plane = np.concatenate([design.xy[k], np.zeros((len(k), 1))], axis=1)
+    space = scale * network.xyz[p]
+    # Rotation between two sets of points (Kabsch 1976).
+    u, _, vt = np.linalg.svd((plane - plane.mean(axis=0)).T @ (space - space.mean(axis=0)))
+    turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    shift = space.mean(axis=0) - turn @ plane.mean(axis=0)
+    misfit = float(np.abs(plane @ turn.T + shift - space).max())
+    extent = float(np.ptp(plane, axis=0).max())
+    if misfit > _FLAT * extent:
+        raise UsageError(
+            f"the points of the network differ by {misfit:.2g} mm from the design {design.name}", where=image
+        )
+    matrix = rotation_matrix(rotation) @ turn
+    return Pose(matrix_to_vector(matrix), turn.T @ (scale * x0 - shift))
+
+
+def _measured(
+    frame: Frame, design: Design, camera: RayMap, pose: Pose, options: BlurredOptions
+) -> BlurredResult:
+    names, targets = targets_of(design, pose, camera)
+    return measure_blurred(frame, camera, names, targets, options)
