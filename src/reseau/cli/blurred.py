@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, Out, SensorFile, corrected, read_frame
+from .common import AsJson, MaxRotation, Mirrored, Out, SensorFile, corrected, orientation, read_frame, seen
 from .measure import Overlay, Task
+
+if TYPE_CHECKING:
+    from ..core.data import Frame
+    from ..measure.blurred import BlurredResult
 
 __all__ = ["blurred"]
 
@@ -55,6 +60,8 @@ def blurred(
     search: Annotated[
         float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
     ] = 6.0,
+    mirrored: Mirrored = None,
+    max_rotation: MaxRotation = None,
     out: Out = None,
     overlay: Overlay = None,
     sensor: SensorFile = None,
@@ -66,7 +73,9 @@ def blurred(
     """
     from ..core.failure import Failure
     from ..exchange import read_lens, read_network
+    from ..io import ReseauDesign
     from ..io.reading import read_design
+    from ..measure import ReseauOptions, measure_reseau
     from ..measure.blurred import BlurredOptions
     from ..procedures.blurred import lens_camera, measure_blurred_frame, pose_in_network
 
@@ -75,16 +84,24 @@ def blurred(
     frame = corrected(read_frame(image), sensor)
     size = frame.width, frame.height
     camera = lens_camera(optics, size, pitch_um=pitch, distance=focus, f_number=f_number)
-    pose = None if network is None else pose_in_network(read_network(network), image.name, target)
     options = BlurredOptions(
         polarity=target.polarity,
         psf_px=psf,
         search_px=search,
         fill=1.0 if optics.sensor is None else optics.sensor.fill,
     )
+    pose, sharp = None, None
+    if network is not None:  # it determines the orientation; names need no help
+        pose = pose_in_network(read_network(network), image.name, target)
+    elif isinstance(target, ReseauDesign):
+        target = seen(target, mirrored)
+        turned = ReseauOptions(**orientation(mirrored, max_rotation))
+        sharp = partial(measure_reseau, design=target, options=turned)
+    elif mirrored:
+        target = target.from_behind()
 
-    def measured(_: object) -> object:
-        found = measure_blurred_frame(frame, target, camera, pose, options)
+    def measured(_: Frame) -> BlurredResult | Failure:
+        found = measure_blurred_frame(frame, target, camera, pose, options, sharp=sharp)
         return found if isinstance(found, Failure) else found.measured
 
     task.run(lambda: frame, measured)

@@ -26,7 +26,7 @@ from ..optics.formation import mark_outline
 from ..optics.lenses import LensCamera, Paraxial, PlaneTarget, Prescription, RayMap, SensorPlane
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
-from .target_measurement import measurer_of
+from .target_measurement import Measurer, measurer_of
 
 __all__ = [
     "BlurredFrame",
@@ -303,6 +303,8 @@ def measure_blurred_frame(
     camera: RayMap,
     pose: Pose | None = None,
     options: BlurredOptions | None = None,
+    *,
+    sharp: Measurer | None = None,
 ) -> BlurredFrame | Failure:
     """Measure the blurred targets of a plane design in a frame.
 
@@ -319,6 +321,8 @@ def measure_blurred_frame(
     pose : Pose, optional
         From the plane of the design to camera axes, from a bundle adjustment; it is not changed.
     options : BlurredOptions, optional
+    sharp : callable, optional
+        Measures the targets as if they were sharp; by default as :func:`measurer_of` does.
 
     Returns
     -------
@@ -336,7 +340,7 @@ def measure_blurred_frame(
     options = options or BlurredOptions(polarity=design.polarity)
     if pose is not None:
         return _described(BlurredFrame(_measured(frame, design, camera, pose, options), pose, np.nan))
-    first = measurer_of(design)(frame)
+    first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
     points, before = first.points, np.full((len(design.ids), 2), np.inf)
@@ -354,7 +358,7 @@ def measure_blurred_frame(
         if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
             break
         points, before = found.measured.points, found.measured.predicted
-    return _described(found)
+    return _described(replace(found, measured=replace(found.measured, notes=first.remarks)))
 
 
 def _described(found: BlurredFrame) -> BlurredFrame:

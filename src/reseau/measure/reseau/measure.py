@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from ...core.data import Array, Frame, Mask, Rows
@@ -28,7 +29,7 @@ from ..matching import Matches
 from ..points import Measured, Reason, deviating
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .orientation import misfit, rival_orientations
-from .placement import GridOptions, Placement, PlacingOptions, place, spacing
+from .placement import GridOptions, Placement, PlacingOptions, grid_steps, in_sight, place, spacing
 from .sheet import measure_sheet
 from .wires import cover, grid_wires
 
@@ -40,6 +41,8 @@ _ORIENTATIONS = 3
 """Largest number of orientations that are tried one after the other; the second is the best of all."""
 _UNEVEN = 0.5
 """Ratio of the deviations from a smooth mapping below which an uneven grid shows its orientation."""
+_FEW, _SAME = 10, 0.2
+"""Marks that predict a further row of the grid; distance, in pitches, of two marks at one place."""
 _CLEARLY = 0.6
 """Share of the visible marks from which nobody doubts that they are those of the design."""
 _BY_CHANCE = 1e-5
@@ -216,6 +219,11 @@ def measure_reseau(
             break
         measurement = MarkMeasurement(frame, design, source[known], placed, options)
         at, found, judged = measurement.result()
+    if not use_nominal:
+        measurement, (at, found, judged), stepped = _stepped(
+            measurement, (at, found, judged), design, options
+        )
+        notes += stepped
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
@@ -277,6 +285,75 @@ def _oriented(
         "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned)"
     )
     return placed, (Remark(text, Code.AMBIGUOUS),)
+
+
+Result = tuple[Rows, Matches, Verdict]
+
+
+def _stepped(
+    measurement: MarkMeasurement, result: Result, design: ReseauDesign, options: ReseauOptions
+) -> tuple[MarkMeasurement, Result, tuple[Remark, ...]]:
+    """Move the design by steps of its grid if the frame then shows more of its marks.
+
+    A regular grid shifted by a step fits all its marks but those of one row, and perspective may keep the
+    search among candidates from reaching that row. A note is added if names stay open.
+    """
+    source, valid = measurement.source, measurement.placed.screened.valid
+    tried: list[tuple[float, ...]] = []
+    for _ in range(len(source)):
+        judged = result[2]
+        good = judged.why == ""
+        total = int(good.sum())
+        if total < _FEW or total == len(source):
+            break
+        field = SmoothField.fit(source[good], judged.xy[good], local=False)
+        now = int(in_sight(field(source), valid).sum())
+        ahead = [(int(in_sight(field(source + step), valid).sum()), step) for step in grid_steps(source)]
+        seen, step = max(ahead, key=lambda pair: pair[0], default=(0, np.zeros(2)))
+        if seen <= now or tuple(step) in tried:
+            break
+        tried.append(tuple(-step))
+        nearby = PlacingOptions(
+            field(source + step),
+            0.2 * spacing(field(source)),
+            options.mark_px or measurement.placed.mark_px,
+            options.psf_px,
+            GridOptions(),
+        )
+        placed = place(measurement.frame, design, source, nearby)
+        if isinstance(placed, Failure):
+            break
+        other = MarkMeasurement(measurement.frame, design, source, placed, options)
+        moved = other.result()
+        if (moved[2].why == "").sum() <= total:
+            break
+        measurement, result = other, moved
+    return measurement, result, _open_names(source, result[2], valid)
+
+
+def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ...]:
+    """A note where the frame shows a part of a regular grid, and it may be another part."""
+    good = judged.why == ""
+    if good.sum() < _FEW or good.all():
+        return ()
+    chosen = misfit(source, judged.xy, good)
+    tree, pitch = KDTree(source), spacing(source)
+    for step in grid_steps(source):
+        distance, row = tree.query(source[good] - step)
+        if (distance > _SAME * pitch).any():
+            continue  # a measured mark would have no name
+        renamed = np.full_like(judged.xy, np.nan)
+        renamed[row] = judged.xy[good]
+        known: Mask = np.asarray(np.isfinite(renamed).all(axis=1))
+        field = SmoothField.fit(source[known], renamed[known], local=False)
+        missing = int((in_sight(field(source), valid) & ~known).sum())
+        if missing <= _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
+            text = (
+                f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
+                "a step they fit as well: names may be off by a row or column (give nominal positions)"
+            )
+            return (Remark(text, Code.AMBIGUOUS),)
+    return ()
 
 
 def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:

@@ -33,6 +33,8 @@ __all__ = [
     "PlacingOptions",
     "assign",
     "climbed",
+    "grid_steps",
+    "in_sight",
     "place",
     "place_grid",
 ]
@@ -200,12 +202,12 @@ def _assigned(
     if field is None:
         return None
     rows = _nearest(tree, candidates, predicted, gate, np.ones(len(start), dtype=bool))
-    missed = (rows < 0) & _in_sight(predicted, valid)
+    missed = (rows < 0) & in_sight(predicted, valid)
     at = np.where(rows[:, None] >= 0, candidates.xy[rows], np.nan)
     return Assignment(field, predicted, rows, at, int(missed.sum()))
 
 
-def _in_sight(xy: Array, valid: Mask) -> Mask:
+def in_sight(xy: Array, valid: Mask) -> Mask:
     """Mask of positions on pixels that carry an image, at least two pixels from the border."""
     limits = np.array(valid.shape[::-1])
     inside = ((xy > 1) & (xy < limits - 2)).all(axis=1)
@@ -373,10 +375,7 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
 
     A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
     """
-    offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
-    grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
-    steps, count = np.unique(np.round(offset.reshape(-1, 2) / grain), axis=0, return_counts=True)
-    steps = steps[count > 0.2 * len(source)] * grain
+    steps = grid_steps(source)
     for _ in range(len(source)):
         moved = (assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps)
         better = max((m for m in moved if m is not None), key=lambda m: m.score, default=found)
@@ -384,6 +383,14 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
             break
         found = better
     return found
+
+
+def grid_steps(source: Array) -> Array:
+    """Steps (k, 2) from many marks of a design to a neighbour."""
+    offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
+    grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
+    steps, count = np.unique(np.round(offset.reshape(-1, 2) / grain), axis=0, return_counts=True)
+    return np.asarray(steps[count > 0.2 * len(source)] * grain)
 
 
 def _strongest(candidates: Candidates, count: int) -> Candidates:
