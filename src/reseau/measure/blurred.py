@@ -34,13 +34,23 @@ __all__ = ["BlurredOptions", "BlurredResult", "Moving", "measure_blurred"]
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
 """Half sides of windows: targets of similar size are matched together."""
-_RINGS = (4, 6, 8, 11, 16)
+_RINGS = (4, 6, 8, 11)
 """Rings of elements of the stop: each step doubles the number of rays."""
 _SETTLED = 0.1
 """More rays no longer matter if they shift the match by less than this many of its standard deviations."""
 _LEAST_SHIFT = 0.002
 """… or by less than this many pixels."""
+_TAPS = 8
+"""Values between which images at half pixels are interpolated; exact to 1e-5 of the light."""
+_LEVEL = 0.06
+"""Step of the logarithm of the widths for which images are formed."""
+_SMALL_PX = 0.05
+"""Motion of the nodes for the derivative by the focus."""
+_KEPT = 60
+"""Images of other focus that are kept."""
 _SEEN = 0.95
+_BEGINNING = 0.75
+"""Least correlation at whole pixels."""
 _ALIKE = 0.8
 """Least correlation of a target with its formed image."""
 _DISTURBED = 2.5
@@ -150,13 +160,24 @@ class Moving:
         )
 
 
-@dataclass(frozen=True, eq=False)
 class _RayShapes:
-    """Images by rays as a shape of the matcher; its only parameter of form is the focus."""
+    """Images by rays as a shape of the matcher; its only parameter of form is the focus.
 
-    images: tuple[RayImage, ...]
-    motions: tuple[Array, ...] = ()
-    """Motions (j, 2) of the nodes with the focus, one array for each image, or none."""
+    A shift moves the formed image as it is. Each image is therefore formed once, at half the distance of the
+    pixels, and interpolated; the width of the point-spread function follows by the heat equation from the
+    nearest of some widths for which it is formed.
+
+    Parameters
+    ----------
+    images : tuple of RayImage
+    motions : tuple of ndarray (j, 2)
+        Motions of the nodes with the focus, one array for each image, or none. Images with another focus are
+        formed anew.
+    """
+
+    def __init__(self, images: tuple[RayImage, ...], motions: tuple[Array, ...] = ()) -> None:
+        self.images, self.motions = images, motions
+        self._formed: dict[tuple[int, int, tuple[int, int], float], Array] = {}
 
     @property
     def parameters(self) -> int:
@@ -165,42 +186,109 @@ class _RayShapes:
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.measure.matching.Shape`."""
-        return np.stack([self._one(k, xy, width, form, at, window, False)[0] for k in range(len(at))])
+        return np.stack([self._one(k, xy, width, form, at, window)[0] for k in range(len(at))])
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`reseau.measure.matching.Shape`."""
-        found = [self._one(k, xy, width, form, at, window, True) for k in range(len(at))]
-        return np.stack([share for share, _ in found]), np.stack([slopes for _, slopes in found])
+        found = np.stack([self._one(k, xy, width, form, at, window) for k in range(len(at))])
+        return found[:, 0], found[:, 1:]
 
-    def _one(
-        self, k: int, xy: Array, width: Array, form: Array, at: Rows, window: Window, slopes: bool
-    ) -> tuple[Array, Array]:
-        """Image (r, c) of the target at row `k`, and its derivatives (3 + p, r, c)."""
-        nodes = self.images[at[k]].outline
-
-        def formed(focus: float, with_slopes: bool) -> tuple[Array, Array]:
-            moved = nodes if not focus else Outline(nodes.xy + focus * self.motions[at[k]], nodes.dxy)
-            one = Outline(moved.xy[None], moved.dxy[None]).single()
-            shape = GrownOutline(one, np.zeros((0, 2, 2)))
-            here = xy[k : k + 1], width[k : k + 1], np.zeros((1, 0)), np.zeros(1, np.intp)
-            view = window.select(np.array([k]))
-            if not with_slopes:
-                return shape.image(*here, view)[0], np.zeros(0)
-            share, found = shape.derivatives(*here, view)
-            return share[0], found[0]
-
+    def _one(self, k: int, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """Image of the target at row `k` and its derivatives, (4 + p, r, c)."""
+        target, place, sigma = int(at[k]), xy[k], float(width[k])
+        columns, rows = window.columns[k], window.rows[k]
         if not self.parameters:
-            return formed(0.0, slopes)
-        at_focus = float(form[k, 0])
-        share, found = formed(at_focus, slopes)
-        if not slopes:
-            return share, found
-        reach = float(np.abs(self.motions[at[k]]).max())
-        step = 0.05 / max(reach, 1e-9)  # moves no node by more than 0.05 px
-        change = (formed(at_focus + step, False)[0] - formed(at_focus - step, False)[0]) / (2 * step)
-        return share, np.concatenate([found, change[None]])
+            return self._interpolated(target, place, sigma, 0.0, columns, rows, window.response)
+        focus = float(form[k, 0])
+        step = _SMALL_PX / max(float(np.abs(self.motions[target]).max()), 1e-9)
+        here, *beside = (
+            self._interpolated(target, place, sigma, focus + by, columns, rows, window.response)
+            for by in (0.0, step, -step)
+        )
+        return np.concatenate([here, (beside[0][:1] - beside[1][:1]) / (2 * step)])
+
+    def _interpolated(
+        self,
+        target: int,
+        place: Array,
+        sigma: float,
+        focus: float,
+        columns: Array,
+        rows: Array,
+        response: PixelResponse,
+    ) -> Array:
+        """Image, its derivatives along x and y and by the width, (4, r, c)."""
+        level = round(np.log(sigma) / _LEVEL)
+        formed_at = float(np.exp(level * _LEVEL))
+        # Places of the pixels relative to the target: whole half pixels, and a common rest.
+        across, down = (2 * (pixels[0] - at) for pixels, at in zip((columns, rows), place, strict=True))
+        left, top = int(np.floor(across)), int(np.floor(down))
+        reach = max(abs(left), abs(top), abs(left + 2 * len(columns)), abs(top + 2 * len(rows))) + 2 * _TAPS
+        reach = -(-reach // 32) * 32  # a little more than needed, so that a shift finds it again
+        grid = self._grid(target, level, (reach, round(2 * response.fill * 1000)), focus, formed_at, response)
+        by_x, by_y = _taps(across - left), _taps(down - top)
+        x, y = (
+            reach + start + 1 - _TAPS // 2 + np.arange(2 * count + _TAPS)
+            for start, count in ((left, len(columns)), (top, len(rows)))
+        )
+        part = grid[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        part = sum(w * part[:, :, j : j + 2 * len(columns) : 2] for j, w in enumerate(by_x))
+        part = sum(w * part[:, j : j + 2 * len(rows) : 2] for j, w in enumerate(by_y))
+        share, along_x, along_y, heat = part
+        spread = (sigma**2 - formed_at**2) / 2
+        return np.stack([share + spread * heat, along_x, along_y, sigma * heat])
+
+    def _grid(
+        self,
+        target: int,
+        level: int,
+        size: tuple[int, int],
+        focus: float,
+        sigma: float,
+        response: PixelResponse,
+    ) -> Array:
+        """Image, derivatives by a shift along x and y, and Laplacian (4, r, c), at half pixels."""
+        key = target, level, size, focus
+        if key not in self._formed:
+            if focus and len(self._formed) > _KEPT:
+                self._formed.clear()
+            nodes = self.images[target].outline
+            if focus:
+                nodes = Outline(nodes.xy + focus * self.motions[target], nodes.dxy)
+            at = np.arange(-size[0], size[0] + 1) / 2
+            shape, origin = _shape_of(nodes), (np.zeros((1, 2)), np.array([sigma]), *_ALONE)
+            grid = np.empty((4, len(at), len(at)))
+            for odd_y in (0, 1):  # pixels are adjacent in each of four rasters
+                for odd_x in (0, 1):
+                    window = Window(at[None, odd_x::2], at[None, odd_y::2], response)
+                    share, slopes = shape.derivatives(*origin, window)
+                    grid[0, odd_y::2, odd_x::2] = share[0]
+                    grid[1:, odd_y::2, odd_x::2] = slopes[0]
+            grid[3] /= sigma
+            self._formed[key] = grid
+        return self._formed[key]
+
+
+_ALONE = np.zeros((1, 0)), np.zeros(1, np.intp)
+"""Form and row of a single shape."""
+
+
+def _shape_of(outline: Outline) -> GrownOutline:
+    """One outline (j, 2) as a shape of the matcher, in single precision."""
+    return GrownOutline(Outline(outline.xy[None], outline.dxy[None]).single(), np.zeros((0, 2, 2)))
+
+
+def _taps(share: float) -> Array:
+    """Weights (_TAPS,) of Lagrange's interpolation between the middle two of so many equidistant values."""
+    nodes = np.arange(_TAPS) - (_TAPS // 2 - 1)
+    weights = np.ones(_TAPS)
+    for j in range(_TAPS):
+        for m in range(_TAPS):
+            if m != j:
+                weights[j] *= (share - nodes[m]) / (nodes[j] - nodes[m])
+    return weights
 
 
 def measure_blurred(
@@ -337,9 +425,7 @@ class _Run:
         across: Array = np.rint(xy) + np.arange(-half, half + 1.0)[:, None]
         window = Window(across[None, :, 0], across[None, :, 1], PixelResponse(self.options.fill))
         width = np.array([self.options.psf_px])
-        first = np.zeros(1, np.intp)
-        formed = _RayShapes((image,)).image(xy[None], width, np.zeros((1, 0)), first, window)
-        return np.asarray(formed[0])
+        return np.asarray(_shape_of(image.outline).image(xy[None], width, *_ALONE, window)[0])
 
     def _found(self, k: int, image: RayImage) -> Array:
         """Approximate position of a target by correlation within the range of search; NaN if not found."""
@@ -357,7 +443,7 @@ class _Run:
         around = np.ascontiguousarray(self.screened.grey[np.ix_(rows, columns)], np.float32)
         score = cv2.matchTemplate(around, (sign * formed).astype(np.float32), cv2.TM_CCOEFF_NORMED)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-        if not score[row, column] > _ALIKE / 2:
+        if not score[row, column] > _BEGINNING:
             self.why[k] = Reason(
                 f"nothing like its image within {self.options.search_px:g} px of the predicted position",
                 Code.NOT_FOUND,

@@ -1,0 +1,156 @@
+"""Blurred targets: places of the corresponding rays in photographs drawn with other rays."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array, Frame
+from reseau.core.errors import UsageError
+from reseau.core.failure import Code
+from reseau.measure.blurred import BlurredOptions, Moving, measure_blurred
+from reseau.optics.formation import Outline
+from reseau.optics.lenses import (
+    AIR,
+    Cauchy,
+    LensCamera,
+    PlaneTarget,
+    Prescription,
+    PupilElements,
+    RaySurrogate,
+    SensorPlane,
+    Surface,
+    ThinLens,
+)
+
+from . import blurs
+
+CENTRE = np.array([66.0, 41.0, 700.0])
+AXES = np.array([[0.9, 0.0], [0.0, 1.0], [np.sqrt(1 - 0.81), 0.0]])
+DIAMETER = 2.4
+SIGMA = 0.5
+
+
+def camera(focus: float = blurs.FOCUS) -> LensCamera:
+    wavelengths = tuple(w for w, _ in blurs.INDICES)
+    terms = np.array([[1, 1e6 / w**2, 1e12 / w**4] for w in wavelengths])
+    glass = Cauchy(tuple(np.linalg.solve(terms, [n for _, n in blurs.INDICES])), "glass")
+    surfaces = (
+        Surface(kind="plain", name="stop"),
+        Surface(blurs.CURVATURES[0], medium=glass, vertex=np.array([0, 0, blurs.LENS_Z])),
+        Surface(blurs.CURVATURES[1], medium=AIR, vertex=np.array([0, 0, blurs.LENS_Z + blurs.THICKNESS])),
+        Surface(kind="plain", vertex=np.array([0, 0, focus])),
+    )
+    lens = Prescription(surfaces, 0, blurs.STOP_RADIUS, wavelengths, (1.0, 1.0, 1.0), 1, name="singlet")
+    return LensCamera(lens, SensorPlane((blurs.PITCH, blurs.PITCH), blurs.PRINCIPAL))
+
+
+def target(centre: Array = CENTRE, diameter: float = DIAMETER) -> PlaneTarget:
+    return PlaneTarget(centre, AXES, Outline.circle(diameter / 2, 0.05))
+
+
+@cache
+def drawn(focus: float = blurs.FOCUS) -> Array:
+    return blurs.drawn(CENTRE, AXES, DIAMETER, SIGMA, focus)
+
+
+def photograph(noise: float = 1.0, seed: int = 0, focus: float = blurs.FOCUS) -> Frame:
+    image = drawn(focus)
+    return Frame(image + np.random.default_rng(seed).normal(0.0, noise, image.shape), 255.0)
+
+
+def test_the_place_of_the_corresponding_ray_is_found_where_the_centre_of_density_is_not() -> None:
+    found = measure_blurred(photograph(), camera(), ["1"], [target()])
+    error = found.xy[0] - blurs.principal_pixel(CENTRE)
+    sigma = np.sqrt(np.diagonal(found.cov[0]))
+    assert (np.abs(error) < 4 * sigma + 0.003).all()  # the drawing is exact to 0.003 px
+    assert sigma.max() < 0.02
+    assert np.hypot(*found.offset[0]) > 0.5
+
+
+def test_pixels_of_principal_rays_agree_with_those_of_other_rays() -> None:
+    points = CENTRE + np.array([[0, 0, 0], [10, 0, 50], [-60, -40, 300], [5, 30, -200.0]])
+    other = [blurs.principal_pixel(point) for point in points]
+    assert np.abs(camera().corresponding(points) - other).max() < 1e-8
+
+
+def test_a_surrogate_gives_the_same_places() -> None:
+    traced = measure_blurred(photograph(), camera(), ["1"], [target()])
+    slopes = ((0.06, 0.13), (0.02, 0.1))
+    fast = RaySurrogate.of(camera(), PupilElements.gauss(8), slopes, (600.0, 800.0))
+    assert fast.error_px < 1e-3
+    found = measure_blurred(photograph(), fast, ["1"], [target()])
+    assert np.abs(found.xy - traced.xy).max() < 1 / 200
+
+
+def test_the_focus_is_estimated_with_the_place() -> None:
+    frame = photograph(focus=blurs.FOCUS + 0.15)
+    options = BlurredOptions(focus=lambda by: camera(blurs.FOCUS + by))
+    found = measure_blurred(frame, camera(), ["1"], [target()], options)
+    assert found.ok.all()
+    assert abs(found.focus_mm[0] - 0.15) < 4 * found.focus_sigma_mm[0] + 0.005
+
+
+def test_motion_is_another_cause_of_blur() -> None:
+    still = drawn()
+    steps = np.arange(-3, 4)
+    moved = np.mean([np.roll(still, step, axis=1) for step in steps], axis=0)
+    frame = Frame(moved + np.random.default_rng(1).normal(0, 1.0, moved.shape), 255.0)
+    path = np.stack([steps, 0 * steps], axis=1).astype(float)
+    found = measure_blurred(frame, Moving(camera(), path), ["1"], [target()])
+    error = found.xy[0] - blurs.principal_pixel(CENTRE)
+    assert np.abs(error).max() < 0.02
+    without = measure_blurred(frame, camera(), ["1"], [target()], BlurredOptions(psf_log_sigma=1.0))
+    assert not without.ok.any() or without.noise[0] > 1.2 * found.noise[0]
+
+
+def test_a_thin_lens_in_place_of_the_true_one_misses_the_place() -> None:
+    true = camera()
+    centre = true.corresponding(CENTRE[None])[0]
+    thin = ThinLens(65.0, 2 * blurs.STOP_RADIUS, blurs.FOCUS, true.sensor)
+    shift = CENTRE.copy()
+    for _ in range(5):  # seen in the same direction through the other lens
+        off = thin.corresponding(shift[None])[0] - centre
+        shift[:2] -= off * blurs.PITCH * CENTRE[2] / blurs.FOCUS
+    found = measure_blurred(photograph(), thin, ["1"], [target(shift)], BlurredOptions(psf_log_sigma=1.0))
+    error = found.xy[0] - blurs.principal_pixel(CENTRE)
+    assert not found.ok[0] or np.hypot(*error) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("centre", "code"),
+    [
+        (CENTRE + np.array([30.0, 0, 0]), Code.OUTSIDE),
+        (CENTRE + np.array([4.0, 2.0, 0]), Code.NOT_FOUND),
+    ],
+)
+def test_what_is_not_there_is_declined_with_the_reason(centre: Array, code: Code) -> None:
+    found = measure_blurred(photograph(), camera(), ["1"], [target(centre)])
+    assert not found.ok.any()
+    assert found.codes == (code,)
+
+
+def test_another_target_is_declined() -> None:
+    found = measure_blurred(photograph(), camera(), ["1"], [target(diameter=2.2 * DIAMETER)])
+    assert not found.ok.any()
+
+
+def test_a_target_behind_the_lens_is_one_line() -> None:
+    found = measure_blurred(photograph(), camera(), ["1"], [target(np.array([0.0, 0.0, -100.0]))])
+    assert "behind" in found.why[0]
+
+
+def test_names_and_targets_must_be_as_many() -> None:
+    with pytest.raises(UsageError, match="2 names were given for 1 targets"):
+        measure_blurred(photograph(), camera(), ["1", "2"], [target()])
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_sigmas_say() -> None:
+    errors = []
+    for seed in range(60):
+        found = measure_blurred(photograph(2.0, seed), camera(), ["1"], [target()])
+        errors.append((found.xy[0] - blurs.principal_pixel(CENTRE)) / np.sqrt(np.diagonal(found.cov[0])))
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
