@@ -1,0 +1,137 @@
+"""`reseau measure blurred`: from a lens file, a design and a photograph to places of corresponding rays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.designs import regular_reseau
+from reseau.io import LensDocument, Mark, ReseauDesign
+from reseau.io.images import write_image
+from reseau.io.lens import LensSensor
+from reseau.optics import Pose
+from reseau.optics.formation import Outline, coverage
+from reseau.optics.lenses import AIR, LensCamera, Prescription, PupilElements, glass, in_order, ray_image
+from reseau.procedures.blurred import focused, targets_of
+
+Run = Callable[..., tuple[int, str, str]]
+
+SIZE = (640, 480)
+DESIGN = regular_reseau(6, 4, 20.0, Mark(shape="disk", size=5.0))
+POSE = Pose.from_angles(0.25, -0.2, 0.05, [50.0 - 60, 30.0 + 110, 480.0])
+SENSOR = LensSensor(pitch_um=(10.0, 10.0), size_px=SIZE)
+
+
+def lens() -> Prescription:
+    rows = [(0.03, 3.0, glass("N-BK7")), (-0.03, 2.0, AIR), (0.0, 34.0, AIR)]
+    surfaces = list(in_order(rows))
+    surfaces[2] = replace(surfaces[2], kind="plain", name="stop")
+    wavelengths = (486.1, 546.1, 632.8)
+    return focused(
+        Prescription(tuple(surfaces), 2, 2.0, wavelengths, (0.5, 1.0, 0.5), 1, name="singlet"), 470.0
+    )
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Photograph, design, lens, and the true places."""
+    folder = tmp_path_factory.mktemp("blurred")
+    camera = LensCamera(lens(), SENSOR.plane())
+    names, targets = targets_of(DESIGN, POSE, camera)
+    image, truth = np.full(SIZE[::-1], 200.0), {}
+    for name, target in zip(names, targets, strict=True):
+        formed = ray_image(camera, target, PupilElements.gauss(4))
+        placed = Outline(formed.outline.xy + formed.point, formed.outline.dxy)
+        left, top = np.rint(formed.point).astype(int) - 25
+        share = coverage(placed, left + np.arange(51.0), top + np.arange(51.0), 0.5)
+        image[top : top + 51, left : left + 51] -= 150 * share
+        truth[name] = formed.point.tolist()
+    image += np.random.default_rng(0).normal(0, 1.0, image.shape)
+    paths = {name: folder / name for name in ("photo.png", "design.json", "lens.toml", "truth.json")}
+    write_image(paths["photo.png"], np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    DESIGN.write(paths["design.json"])
+    LensDocument.of(lens(), SENSOR).write(paths["lens.toml"])
+    paths["truth.json"].write_text(json.dumps(truth))
+    return paths
+
+
+def measured(files: dict[str, Path], document: str) -> float:
+    """Largest error of the measured places, pixels."""
+    truth = json.loads(files["truth.json"].read_text())
+    points = [point for point in json.loads(document)["points"] if point["ok"]]
+    assert len(points) >= 22
+    return float(max(np.hypot(p["x"] - truth[p["id"]][0], p["y"] - truth[p["id"]][1]) for p in points))
+
+
+def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path: Path, reseau: Run) -> None:
+    status, out, _ = reseau(
+        "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
+        "--not-mirrored", "--max-rotation", 40, "-o", tmp_path / "m.json", "--overlay", tmp_path / "o.png",
+    )  # fmt: skip
+    assert status == 0
+    assert "of 24 targets measured" in out
+    assert "centres of density lie up to" in out
+    assert (tmp_path / "o.png").exists()
+    assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
+
+
+def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> None:
+    plane = np.concatenate([DESIGN.xy, np.zeros((24, 1))], axis=1)
+    network = {
+        "schema": "reseau-network/1",
+        "unit": "mm",
+        "cameras": [
+            {
+                "id": "c", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [0.01, 0.01], "model": "brown",
+                "side": "image", "parameters": {"c": 34.0}, "free": [],
+            }
+        ],
+        "images": {
+            "id": ["photo"], "camera": ["c"], "X0": [POSE.x0.tolist()], "rotation": [POSE.rotation.tolist()],
+        },
+        "points": {
+            "id": list(DESIGN.ids), "xyz": plane.tolist(), "sigma": [[0.0, 0.0, 0.0]] * 24,
+            "role": ["control"] * 24,
+        },
+        "observations": {
+            "image": ["photo"] * 4, "point": list(DESIGN.ids[:4]), "x": [1.0, 2.0, 3.0, 4.0],
+            "y": [1.0, 2.0, 3.0, 4.0], "sx": [0.1] * 4, "sy": [0.1] * 4,
+        },
+        "datum": "control",
+    }  # fmt: skip
+    (tmp_path / "network.json").write_text(json.dumps(network))
+    status, out, err = reseau(
+        "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
+        "--network", tmp_path / "network.json", "--json",
+    )  # fmt: skip
+    assert (status, err) == (0, "")
+    assert measured(files, out) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--pitch", "10"], "has a sensor; its pitch is not needed"),
+        (["--focus", "5"], "forms no real image of an object at 5 mm"),
+    ],
+)
+def test_contradictory_options_are_one_line(files, reseau: Run, options: list[str], said: str) -> None:
+    image, design, lens_file = (files[name] for name in ("photo.png", "design.json", "lens.toml"))
+    status, _, err = reseau("measure", "blurred", image, "-d", design, "-l", lens_file, *options)
+    assert status == 2
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_a_file_that_is_no_lens_is_one_line(files, reseau: Run) -> None:
+    status, _, err = reseau(
+        "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["design.json"]
+    )
+    assert status == 2
+    assert "is not a lens" in err
+    assert ReseauDesign.read(files["design.json"]).ids == DESIGN.ids
