@@ -23,8 +23,9 @@ Run = Callable[..., tuple[int, str, str]]
 
 SIZE = (640, 480)
 DESIGN = regular_reseau(6, 4, 20.0, Mark(shape="disk", size=5.0))
-POSE = Pose.from_angles(0.25, -0.2, 0.05, [50.0 - 60, 30.0 + 110, 480.0])
-SENSOR = LensSensor(pitch_um=(10.0, 10.0), size_px=SIZE)
+TURN = Pose.from_angles(0.25, -0.2, 0.05, np.zeros(3))
+POSE = Pose(TURN.rotation, np.append(DESIGN.xy.mean(axis=0), 0.0) - 480.0 * TURN.matrix[2])
+SENSOR = LensSensor(pitch_um=(13.0, 13.0), size_px=SIZE)
 
 
 def lens() -> Prescription:
