@@ -1,0 +1,216 @@
+"""First-order optics against a printed listing, rays through given points of the stop, images by rays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
+from reseau.measure.matching import GrownOutline, Window
+from reseau.optics.formation import Outline, PixelResponse, coverage, mark_outline
+from reseau.optics.lenses import (
+    AIR,
+    Aperture,
+    LensCamera,
+    Paraxial,
+    PlaneTarget,
+    Prescription,
+    PupilElements,
+    RayMap,
+    RaySurrogate,
+    SensorPlane,
+    Surface,
+    ThinLens,
+    Tracer,
+    aim,
+    counted_image,
+    glass,
+    in_order,
+    labels,
+    ray_image,
+)
+
+ROWS = (
+    (0.01779284094091543, 8.75, "N-SSK2"),
+    (0.006566600536925569, 0.5, ""),
+    (0.02653743294670983, 12.5, "N-SK2"),
+    (0.0, 3.8, "F5"),
+    (0.04126892878570084, 16.36944492653564, ""),
+    (0.0, 13.74795696388906, ""),
+    (-0.03523942654429074, 3.8, "F5"),
+    (0.0, 11.0, "N-SK16"),
+    (-0.02636750828657709, 0.5, ""),
+    (0.005636604951748545, 7.0, "N-SK16"),
+    (-0.0125926458590576, 61.4875364179821, ""),
+)
+"""A double Gauss f/2 for 100 mm: curvature, distance, glass."""
+
+
+def double_gauss(scale: float = 1.0, radius: float | None = None) -> Prescription:
+    surfaces = list(in_order([(c / scale, d * scale, glass(g) if g else AIR) for c, d, g in ROWS]))
+    surfaces[5] = replace(surfaces[5], kind="plain", name="stop")
+    lens = Prescription(
+        tuple(surfaces), 5, 1.0, (656.3, 587.6, 486.1), (0.5, 1.0, 0.5), 1, name="double Gauss"
+    )
+    return replace(lens, stop_radius=radius or 25 * scale / Paraxial(lens).entrance_pupil[1])
+
+
+def camera(shift: float = 0.0, radius: float | None = None) -> LensCamera:
+    """A camera of 25 mm, focused at 600 mm; the image plane is shifted from there."""
+    lens = double_gauss(0.25, radius)
+    behind = Paraxial(lens).image_distance(600.0) - Paraxial(lens).back_focus
+    return LensCamera(lens.moved((0, 0, behind + shift)), SensorPlane((0.006, 0.006), (799.5, 599.5)))
+
+
+def test_first_order_optics_are_those_of_the_listing_of_code_v() -> None:
+    first = Paraxial(double_gauss())
+    printed = {
+        "EFL": 100.0038,
+        "BFL": 61.4875,
+        "FNO": 2.0001,
+        "entrance": 57.9120,
+        "exit": -53.1569,
+        "DIA": 57.3201,
+    }
+    found = {
+        "EFL": first.focal_length,
+        "BFL": first.back_focus,
+        "FNO": first.f_number,
+        "entrance": first.entrance_pupil[0],
+        "exit": first.exit_pupil[0],
+        "DIA": 2 * first.exit_pupil[1] * (first.lens.stop_radius or 0.0),
+    }
+    assert found == pytest.approx(printed, abs=6e-5)
+
+
+def test_lagranges_invariant_is_the_same_at_all_surfaces() -> None:
+    for distance in (np.inf, 400.0):
+        invariant = Paraxial(double_gauss()).invariant(0.2, distance)
+        assert np.ptp(invariant) < 1e-12 * abs(invariant[0])
+
+
+def test_a_mirror_has_half_its_radius_as_focal_length() -> None:
+    surfaces = (Surface(-0.01, kind="mirror"), Surface(kind="plain", vertex=np.array([0, 0, -50.0])))
+    first = Paraxial(Prescription(surfaces, 0, 5.0))
+    assert abs(first.focal_length) == pytest.approx(50.0)
+
+
+def test_aimed_rays_pass_the_real_stop_at_their_points() -> None:
+    lens = double_gauss()
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(-200, 200, 50), rng.uniform(-200, 200, 50), np.full(50, -900.0)], axis=1)
+    pupil = rng.uniform(-0.7, 0.7, (50, 2))
+    aimed = aim(lens, points, pupil)
+    assert aimed.found.all()
+    hit = Tracer(lens, last=5).trace(aimed.rays).xy
+    assert np.abs(hit - pupil * lens.stop_radius).max() < 1e-8
+
+
+def test_rays_are_labelled_by_their_place_in_the_pupil() -> None:
+    at = np.array([[0, 0], [0, 1.0], [0, -0.4], [0.6, 0], [0.2, 0.3]])
+    assert labels(at, np.array([0.0, 5.0])).tolist() == [
+        "principal",
+        "marginal",
+        "meridional",
+        "sagittal",
+        "skew",
+    ]
+    assert labels(at, np.zeros(2)).tolist() == ["principal", "marginal", *["meridional"] * 3]
+
+
+def test_elements_of_the_stop_have_equal_areas_and_quadrature_is_exact() -> None:
+    equal, gauss = PupilElements.equal_areas(8), PupilElements.gauss(5)
+    assert len(equal.xy) == 169
+    for elements in (equal, gauss):
+        assert elements.weights.sum() == pytest.approx(1.0)
+    radius = np.hypot(*gauss.xy.T)
+    for power in (2, 4, 6, 8):
+        assert gauss.weights @ radius**power == pytest.approx(2 / (power + 2), rel=1e-12)
+
+
+def target(x: float, y: float, z: float, pixels: float, shape: str = "disk") -> PlaneTarget:
+    c, s = np.cos(0.4), np.sin(0.4)
+    size = pixels * 0.006 * z / 25.7
+    axes = np.array([[c, 0.0], [0.0, 1.0], [s, 0.0]])
+    return PlaneTarget(np.array([x, y, z]), axes, mark_outline(shape, size, None, size / pixels * 0.6))
+
+
+def shift_between(one: Array, other: Array) -> Array:
+    """Shift (2,) by which the first image is matched with the second, with contrast and background."""
+    down, right = np.gradient(other)
+    design = np.stack([right.ravel(), down.ravel(), other.ravel(), np.ones(other.size)], axis=1)
+    return np.linalg.lstsq(design, (other - one).ravel(), rcond=None)[0][:2]
+
+
+def formed(view: RayMap, at: PlaneTarget, elements: PupilElements, half: int) -> Array:
+    image = ray_image(view, at, elements)
+    middle = np.rint(image.point)
+    across = middle + np.arange(-half, half + 1.0)[:, None]
+    nodes = Outline(image.outline.xy[None], image.outline.dxy[None]).single()
+    window = Window(across[None, :, 0], across[None, :, 1], PixelResponse())
+    place = image.point[None], np.array([0.45]), np.zeros((1, 0)), np.zeros(1, np.intp)
+    return GrownOutline(nodes, np.zeros((0, 2, 2))).image(*place, window)[0]
+
+
+def test_the_formed_image_is_that_of_counted_rays() -> None:
+    view, small = camera(0.05), target(30.0, -20.0, 600.0, 10.0)
+    image = ray_image(view, small, PupilElements.gauss(8))
+    middle = np.rint(image.point)
+    pixels = middle + np.arange(-16, 17.0)[:, None]
+    counted = counted_image(view, small, PupilElements.equal_areas(10), 50, pixels[:, 0], pixels[:, 1])
+    placed = Outline(image.outline.xy + image.point, image.outline.dxy)
+    exact = coverage(placed, pixels[:, 0], pixels[:, 1], 0.03)
+    # 271 elements of the stop and 2000 of the target leave 0.01 px.
+    assert np.abs(shift_between(counted / counted.sum(), exact / exact.sum())).max() < 0.012
+
+
+@cache
+def surrogate(shift: float) -> RaySurrogate:
+    slopes = ((-0.2, 0.2), (-0.15, 0.15))
+    return RaySurrogate.of(camera(shift), PupilElements.gauss(8), slopes, (560.0, 640.0))
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (60.0, 40.0), (-95.0, 60.0)])
+@pytest.mark.parametrize("shift", [0.0, 0.06, -0.1])
+def test_the_fast_image_is_matched_with_many_rays_to_a_two_hundredth_of_a_pixel(
+    place: tuple[float, float], shift: float
+) -> None:
+    at, fast = target(*place, 600.0, 20.0), surrogate(shift)
+    assert fast.error_px < 1e-3
+    one, many = formed(fast, at, fast.elements, 34), formed(camera(shift), at, PupilElements.gauss(16), 34)
+    assert np.abs(shift_between(one, many)).max() < 1 / 200
+
+
+def test_a_thin_lens_is_the_limit_of_a_slow_lens_near_the_axis() -> None:
+    view = camera(0.02, radius=0.4)
+    first = Paraxial(view.lens)
+    pupil = 2 * first.entrance_pupil_radius
+    at = target(0.5, 0.3, 600.0 + first.entrance_pupil[0], 12.0)
+    true = ray_image(view, at, PupilElements.gauss(6))
+    principal = first.focal_length * (1 + first.focal_length / (600.0 - first.focal_length))
+    thin = ThinLens(first.focal_length, pupil, principal, view.sensor)
+    other = ray_image(thin, at, PupilElements.gauss(6))
+    assert abs(true.blur - other.blur) < 0.1
+    assert np.abs(true.point - other.point).max() < 0.5
+
+
+def test_light_that_an_aperture_stops_is_missing_from_the_image() -> None:
+    view = camera(0.1)
+    surfaces = list(view.lens.surfaces)
+    rim = Aperture("circle", (5.2, 0.0))
+    surfaces[0] = replace(surfaces[0], apertures=(rim,))
+    surfaces[10] = replace(surfaces[10], apertures=(Aperture("circle", (4.4, 0.0)),))
+    vignetted = replace(view, lens=replace(view.lens, surfaces=tuple(surfaces)))
+    at = target(-110.0, 70.0, 600.0, 12.0)
+    whole, part = (ray_image(each, at, PupilElements.gauss(8)) for each in (view, vignetted))
+    assert part.blur < 0.97 * whole.blur
+    assert np.hypot(*(part.centroid - whole.centroid)) > 0.05
+
+
+def test_a_target_out_of_the_field_is_said() -> None:
+    with pytest.raises(UsageError, match=r"no light of the target reaches the sensor|lies behind"):
+        ray_image(camera(), target(9000.0, 0.0, 600.0, 10.0), PupilElements.gauss(3))
