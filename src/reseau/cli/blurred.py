@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, MaxRotation, Mirrored, Out, SensorFile, corrected, orientation, read_frame, seen
+from .common import (
+    AsJson,
+    MaxRotation,
+    Mirrored,
+    Out,
+    SensorFile,
+    corrected,
+    orientation,
+    read_frame,
+    seen,
+    suffix_of,
+    writable,
+)
 from .measure import Overlay, Task
 
 if TYPE_CHECKING:
@@ -64,6 +76,13 @@ def blurred(
     max_rotation: MaxRotation = None,
     out: Out = None,
     overlay: Overlay = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            help="Figure of the most blurred target to write (.svg, .png, .pdf): rays, formed image, "
+            "photograph, residuals."
+        ),
+    ] = None,
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -78,7 +97,10 @@ def blurred(
     from ..measure import ReseauOptions, measure_reseau
     from ..measure.blurred import BlurredOptions
     from ..procedures.blurred import lens_camera, measure_blurred_frame, pose_in_network
+    from ..report.blurred import blurred_figure
 
+    if figure is not None:
+        suffix_of(writable(figure), (".svg", ".png", ".pdf"))
     task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
     target, optics = read_design(design), read_lens(lens)
     frame = corrected(read_frame(image), sensor)
@@ -102,6 +124,10 @@ def blurred(
 
     def measured(_: Frame) -> BlurredResult | Failure:
         found = measure_blurred_frame(frame, target, camera, pose, options, sharp=sharp)
-        return found if isinstance(found, Failure) else found.measured
+        if isinstance(found, Failure):
+            return found
+        if figure is not None:
+            blurred_figure(frame, camera, found.targets, found.measured).savefig(figure, dpi=150)
+        return found.measured
 
     task.run(lambda: frame, measured)

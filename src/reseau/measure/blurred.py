@@ -42,7 +42,7 @@ _LEAST_SHIFT = 0.002
 """… or by less than this many pixels."""
 _TAPS = 8
 """Values between which images at half pixels are interpolated; exact to 1e-5 of the light."""
-_LEVEL = 0.06
+_LEVEL = 0.12
 """Step of the logarithm of the widths for which images are formed."""
 _SMALL_PX = 0.05
 """Motion of the nodes for the derivative by the focus."""
@@ -108,6 +108,8 @@ class BlurredResult(Measured):
 
     Parameters
     ----------
+    psf_px : ndarray (n,)
+        Estimated width (one sigma) of what blurs beside the rays.
     blur_px : ndarray (n,)
         Root mean square distance of the rays of a point from their mean.
     offset : ndarray (n, 2)
@@ -118,6 +120,7 @@ class BlurredResult(Measured):
         Rings of elements of the stop that were used; 0 for those of a surrogate.
     """
 
+    psf_px: Array = field(default_factory=lambda: np.zeros(0))
     blur_px: Array = field(default_factory=lambda: np.zeros(0))
     offset: Array = field(default_factory=lambda: np.zeros((0, 2)))
     focus_mm: Array = field(default_factory=lambda: np.zeros(0))
@@ -165,7 +168,7 @@ class _RayShapes:
 
     A shift moves the formed image as it is. Each image is therefore formed once, at half the distance of the
     pixels, and interpolated; the width of the point-spread function follows by the heat equation from the
-    nearest of some widths for which it is formed.
+    two nearest of some widths for which it is formed.
 
     Parameters
     ----------
@@ -177,7 +180,7 @@ class _RayShapes:
 
     def __init__(self, images: tuple[RayImage, ...], motions: tuple[Array, ...] = ()) -> None:
         self.images, self.motions = images, motions
-        self._formed: dict[tuple[int, int, tuple[int, int], float], Array] = {}
+        self._formed: dict[tuple[int, int, int, float], Array] = {}
 
     @property
     def parameters(self) -> int:
@@ -220,44 +223,48 @@ class _RayShapes:
         response: PixelResponse,
     ) -> Array:
         """Image, its derivatives along x and y and by the width, (4, r, c)."""
-        level = round(np.log(sigma) / _LEVEL)
-        formed_at = float(np.exp(level * _LEVEL))
+        below, along = divmod(np.log(sigma) / _LEVEL, 1.0)
         # Places of the pixels relative to the target: whole half pixels, and a common rest.
         across, down = (2 * (pixels[0] - at) for pixels, at in zip((columns, rows), place, strict=True))
         left, top = int(np.floor(across)), int(np.floor(down))
         reach = max(abs(left), abs(top), abs(left + 2 * len(columns)), abs(top + 2 * len(rows))) + 2 * _TAPS
         reach = -(-reach // 32) * 32  # a little more than needed, so that a shift finds it again
-        grid = self._grid(target, level, (reach, round(2 * response.fill * 1000)), focus, formed_at, response)
         by_x, by_y = _taps(across - left), _taps(down - top)
         x, y = (
             reach + start + 1 - _TAPS // 2 + np.arange(2 * count + _TAPS)
             for start, count in ((left, len(columns)), (top, len(rows)))
         )
-        part = grid[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        # Between two widths, so that the image is a continuous function of the width.
+        part: Array = np.zeros((4, y[-1] + 1 - y[0], x[-1] + 1 - x[0]))
+        for level, share in ((int(below), 1 - along), (int(below) + 1, along)):
+            formed_at = float(np.exp(level * _LEVEL))
+            grid = self._grid(target, level, reach, focus, formed_at, response)
+            grid = grid[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+            part += share * grid
+            part[0] += share * (sigma**2 - formed_at**2) / 2 * grid[3]
         part = sum(w * part[:, :, j : j + 2 * len(columns) : 2] for j, w in enumerate(by_x))
         part = sum(w * part[:, j : j + 2 * len(rows) : 2] for j, w in enumerate(by_y))
-        share, along_x, along_y, heat = part
-        spread = (sigma**2 - formed_at**2) / 2
-        return np.stack([share + spread * heat, along_x, along_y, sigma * heat])
+        part[3] *= sigma
+        return part
 
     def _grid(
         self,
         target: int,
         level: int,
-        size: tuple[int, int],
+        reach: int,
         focus: float,
         sigma: float,
         response: PixelResponse,
     ) -> Array:
         """Image, derivatives by a shift along x and y, and Laplacian (4, r, c), at half pixels."""
-        key = target, level, size, focus
+        key = target, level, reach, focus
         if key not in self._formed:
             if focus and len(self._formed) > _KEPT:
                 self._formed.clear()
             nodes = self.images[target].outline
             if focus:
                 nodes = Outline(nodes.xy + focus * self.motions[target], nodes.dxy)
-            at = np.arange(-size[0], size[0] + 1) / 2
+            at = np.arange(-reach, reach + 1) / 2
             shape, origin = _shape_of(nodes), (np.zeros((1, 2)), np.array([sigma]), *_ALONE)
             grid = np.empty((4, len(at), len(at)))
             for odd_y in (0, 1):  # pixels are adjacent in each of four rasters
@@ -360,7 +367,7 @@ class _Run:
         self.predicted = np.full((n, 2), np.nan)
         self.columns: dict[str, Array] = {
             name: np.full(n, np.nan)
-            for name in ("contrast", "t", "noise", "blur_px", "focus_mm", "focus_sigma_mm")
+            for name in ("contrast", "t", "noise", "psf_px", "blur_px", "focus_mm", "focus_sigma_mm")
         }
         self.columns |= {name: np.full((n, 2), np.nan) for name in ("xy", "offset")}
         self.columns["cov"] = np.full((n, 2, 2), np.nan)
@@ -527,7 +534,7 @@ class _Run:
             self.ok[rows] = good
             self.columns["xy"][rows[good]] = found.xy[good]
             self.columns["cov"][rows[good]] = found.cov[good]
-            for name in ("contrast", "t", "noise"):
+            for name in ("contrast", "t", "noise", "psf_px"):
                 self.columns[name][rows] = getattr(found, name)
             if self.options.focus is not None:
                 self.columns["focus_mm"][rows] = found.form[:, 0]

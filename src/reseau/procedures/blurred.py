@@ -62,6 +62,8 @@ class BlurredFrame:
     measured : BlurredResult
     pose : Pose
         From the plane of the design to camera axes, millimetres.
+    targets : tuple of PlaneTarget (n,)
+        The targets in camera axes.
     rms_px : float
         Root mean square of the residuals of the orientation; NaN where it was given.
 
@@ -76,6 +78,7 @@ class BlurredFrame:
 
     measured: BlurredResult
     pose: Pose
+    targets: tuple[PlaneTarget, ...]
     rms_px: float
 
 
@@ -339,7 +342,7 @@ def measure_blurred_frame(
     """
     options = options or BlurredOptions(polarity=design.polarity)
     if pose is not None:
-        return _described(BlurredFrame(_measured(frame, design, camera, pose, options), pose, np.nan))
+        return _described(_measured(frame, design, camera, pose, options, np.nan))
     first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
@@ -348,7 +351,7 @@ def measure_blurred_frame(
         oriented = orient_by_rays(camera, design, points)
         if isinstance(oriented, Failure):
             return oriented
-        found = BlurredFrame(_measured(frame, design, camera, oriented[0], options), *oriented)
+        found = _measured(frame, design, camera, oriented[0], options, oriented[1])
         if found.measured.found < _FEWEST:
             return Failure(
                 f"{found.measured.found} of {len(design.ids)} targets are like their images by rays",
@@ -451,7 +454,8 @@ def pose_in_network(network: Network, image: str, design: Design) -> Pose:
 
 
 def _measured(
-    frame: Frame, design: Design, camera: RayMap, pose: Pose, options: BlurredOptions
-) -> BlurredResult:
+    frame: Frame, design: Design, camera: RayMap, pose: Pose, options: BlurredOptions, rms_px: float
+) -> BlurredFrame:
     names, targets = targets_of(design, pose, camera)
-    return measure_blurred(frame, camera, names, targets, options)
+    measured = measure_blurred(frame, camera, names, targets, options)
+    return BlurredFrame(measured, pose, tuple(targets), rms_px)
