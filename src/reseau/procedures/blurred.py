@@ -354,8 +354,8 @@ def measure_blurred_frame(
         found = _measured(frame, design, camera, oriented[0], options, oriented[1])
         if found.measured.found < _FEWEST:
             return Failure(
-                f"{found.measured.found} of {len(design.ids)} targets are like their images by rays: check the "
-                "lens, its focus and its aperture",
+                f"{found.measured.found} of {len(design.ids)} targets are like their images by rays: "
+                "check the lens, its focus and its aperture",
                 Code.TOO_FEW_POINTS,
             )
         change = np.abs(found.measured.predicted - before)
