@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -110,6 +112,31 @@ def test_lines_beside_two_edges_are_not_taken_for_a_scan_that_is_less_sharp_ther
 def test_a_line_beside_an_edge_is_suspected_where_another_line_crosses_its_end() -> None:
     result = oriented(FilmFrame(320035, beside=Beside(lines=2)))  # it was wrong by 1.1 px at 14 sigma
     assert result.code is Code.UNCERTAIN, result.why
+
+
+@pytest.mark.parametrize(
+    "frame", [FilmFrame(320035, contrast=0.3), FilmFrame(320035, contrast=0.3, colour=True)]
+)
+@pytest.mark.parametrize("lines", [0, 1, 2])
+def test_a_line_all_along_an_edge_is_suspected_in_a_picture_of_little_contrast(
+    frame: FilmFrame, lines: int
+) -> None:
+    result = oriented(replace(frame, beside=Beside(lines=lines)))  # they were wrong by 1 px at 14 to 30 sigma
+    if lines:
+        assert result.code is Code.UNCERTAIN, result.why
+    else:
+        assert np.abs(errors(result, frame)).max() < 0.2
+
+
+@pytest.mark.parametrize("fade", [0.0, 0.75])
+def test_a_trunk_as_dark_as_film_at_one_end_of_an_edge_is_not_its_bow(fade: float) -> None:
+    frame = FilmFrame(700011, scene="trees", fade=fade)  # a corner was wrong by 2.2 px at 13 sigma
+    result = oriented(frame)
+    if result:
+        sigma = np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)  # type: ignore[union-attr]
+        assert (np.abs(errors(result, frame)) < 2 * sigma + 0.1).all()
+    else:
+        assert result.code is Code.UNCERTAIN, result.why
 
 
 @pytest.mark.parametrize("lines", [1, 2])

@@ -40,6 +40,7 @@ __all__ = [
     "displaced_by_lines",
     "edge_beside_line",
     "ends_with_line",
+    "is_one_step",
     "sharp_steps",
 ]
 
@@ -269,6 +270,16 @@ def ends_with_line(
     """
     two = _two_lines(grey, band, line, level, noise, width)
     return None if two is None else two.adjacent_edge(band, line)
+
+
+def is_one_step(grey: Array, band: Band, line: Array, level: Array, noise: float, width: float) -> bool:
+    """Whether one straight step describes all sections of an edge; arguments as in :func:`edge_beside_line`.
+
+    Then widened steps do not show where the edge is visible by itself: a line may run beside all of it. Not
+    so if too few pixels are visible.
+    """
+    two = _two_lines(grey, band, line, level, noise, width)
+    return two is not None and two.without < _MOST_MISFIT
 
 
 class _TwoLines(NamedTuple):

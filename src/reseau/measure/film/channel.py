@@ -17,6 +17,7 @@ from .adjacent_lines import (
     common_forms,
     displaced_by_lines,
     edge_beside_line,
+    is_one_step,
     sharp_steps,
 )
 from .border import Band, Border, Film
@@ -40,16 +41,22 @@ _UNEVEN = 0.45
 """Share of its own tone by which film may differ between edges, because the scanner's light is uneven."""
 _CLEAR = 0.6
 """Usual share of profiles that show a step on an undisturbed edge."""
-_ENDS = 2.0
-"""Standard deviation, in widths of the step, of an end of an edge that is completely displaced by a line."""
+_ENDS, _HIDDEN = 2.0, 1.0
+"""Standard deviations, in widths of the step, of an end of an edge that is completely displaced by a line,
+and of one that may be, although most steps do not show it."""
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, share of half an edge that the
 corner may take, and additional margin."""
 _LEAST_AGREE = 0.45
 """Minimum share of an edge's profiles that agree with a line."""
 _BOWED, _OUTWARDS = 0.6, 0.1
-"""Inward bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
-outwards of a straight edge."""
+"""Bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
+outwards of an edge without it."""
+_WITHOUT_END, _BETTER, _AGREES, _CONTINUED = 0.3, 0.6, 5.0, 0.3
+"""End of the part of an edge without the other end, which a dark structure may hide; misfit of this part
+relative to that of the whole from which there is such a structure; standard deviations, times the misfit,
+within which a profile agrees; and standard deviation of an end continued from this part, as a share of the
+structure's distance."""
 _PARTS, _MOST_PARTS = 20, 0.4
 """Parts of an edge, and share of them in which undisturbed profiles determine it."""
 _CHORD = 30
@@ -204,7 +211,7 @@ def _edge(
     rejected = int((~found.good).sum())
     if line is None:
         return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
-    (start, stop, bow), agree = line
+    (start, stop, bow), agree, doubt = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
@@ -214,24 +221,33 @@ def _edge(
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
     hidden, untouched = False, place[drawn[found.good] == 0]
-    if _spans(untouched):
+    spans, few = _spans(untouched), FEW_DISPLACED
+    if spans:
         # The edge is seen by itself beside the structures that displace some of its steps.
         agree &= drawn[found.good] == 0
-    elif part > (FEW_DISPLACED if found.good.mean() > _CLEAR else FEW_DISPLACED / 5):
+        few /= 2
+    elif found.good.mean() <= _CLEAR:
+        few /= 5
+    if part > few:
         grey = band.grey[:, :, channel].astype(np.float64) * polarity
         # A line displaces an edge by at most its width; a larger bow is real.
         own = bow if abs(bow) > 2 * found.width else 0.0
         fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
-        two, hidden = edge_beside_line(grey, band, fitted, border.level, border.noise, sharp.width)
-        if two is not None:
-            return _along_chord(band, two, own + two.bow, common), rejected, ""
-    residuals = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+        shown = grey, band, fitted, border.level, border.noise, sharp.width
+        if spans:
+            # Of a line that nothing separates from the edge, noise lets few steps show the width.
+            doubt = max(doubt, _HIDDEN * sharp.width * is_one_step(*shown))
+        else:
+            two, hidden = edge_beside_line(*shown)
+            if two is not None:
+                return _along_chord(band, two, own + two.bow, common), rejected, ""
+    residuals = _inward(line[0], place, offset)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     scale = shared_error(place[agree], residuals[agree], total[agree])
     # Steps that are too sharp belong to a scratch and are equally uninformative.
     hidden |= sharp.beyond(found)
-    ends = _ENDS * sharp.width * part if hidden else 0.0
+    ends = max(doubt, _ENDS * sharp.width * part if hidden else 0.0)
     data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
     return data, rejected + int((~agree).sum()), ""
 
@@ -246,23 +262,56 @@ def _spans(place: Array) -> bool:
     return bool(seen.mean() > _MOST_PARTS and seen[:third].any() and seen[-third:].any())
 
 
-def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask] | None:
-    """Chord and bow of an edge, and the profiles that agree; `own` sigmas exclude displacement by lines.
+def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array, Mask, float] | None:
+    """Chord and bow of an edge, the profiles that agree, and the sigma of an end that it continues.
 
-    A structure in the picture that bends away from a dark edge must not appear as a bow: in that case the
-    profiles that disagree with a straight edge all lie inwards.
+    `own` sigmas exclude displacement by lines.
+
+    A structure in the picture that bends away from a dark edge, or is as dark as film along one end of it,
+    must not appear as a bow: the profiles that disagree with the edge without it all lie inwards.
     """
     found = robust_line(place, offset, sigma, _NEIGHBOURHOOD_PX)
-    if found is None or found[0][2] > -_BOWED:
-        return found
-    straight = robust_line(place, offset, own, _NEIGHBOURHOOD_PX, bow=_BOWED / 3)
-    if straight is None:
-        return found
-    (start, stop, bow), agree = straight
-    inward = offset - (start * (1 - place) + stop * (1 + place)) / 2 + bow * (1 - place**2)
+    if found is None:
+        return None
+    if abs(found[0][2]) < _BOWED:
+        return *found, 0.0
+    if found[0][2] < 0:
+        other = robust_line(place, offset, own, _NEIGHBOURHOOD_PX, bow=_BOWED / 3)
+        if other is not None and _only_inwards(_inward(other[0], place, offset), other[1]):
+            return *other, 0.0
+        return *found, 0.0
+    total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
+    best, doubt, least = found, 0.0, _BETTER * _misfit(found, place, offset, total)
+    for end in (-1.0, 1.0):
+        part = place * end < _WITHOUT_END
+        other = robust_line(place[part], offset[part], sigma[part], _NEIGHBOURHOOD_PX)
+        if other is None:
+            continue
+        misfit = _misfit(other, place[part], offset[part], total[part])
+        inward = _inward(other[0], place, offset)
+        agree = np.abs(inward) < _AGREES * misfit * total
+        # A real bow fits all profiles as well as those without one end.
+        if misfit < least and _only_inwards(inward, agree):
+            best, least = (other[0], agree), misfit
+            doubt = _CONTINUED * float(np.abs(other[0][:2] - found[0][:2]).max())
+    return *best, doubt
+
+
+def _misfit(line: tuple[Array, Mask], place: Array, offset: Array, total: Array) -> float:
+    """Factor on the standard deviations of the profiles that agree with a line."""
+    values, agree = line
+    return shared_error(place[agree], _inward(values, place, offset)[agree], total[agree])
+
+
+def _inward(line: Array, place: Array, offset: Array) -> Array:
+    """Distances of profiles from a line [start, stop, bow], positive inwards."""
+    return np.asarray(offset - (line[0] * (1 - place) + line[1] * (1 + place)) / 2 + line[2] * (1 - place**2))
+
+
+def _only_inwards(inward: Array, agree: Mask) -> bool:
+    """Whether most profiles agree with a line, and nearly all others lie inwards of it."""
     outside = np.count_nonzero(inward[~agree] < 0)
-    alone = agree.mean() > _LEAST_AGREE and outside < _OUTWARDS * np.count_nonzero(~agree)
-    return straight if alone else found
+    return bool(agree.mean() > _LEAST_AGREE and outside < _OUTWARDS * np.count_nonzero(~agree))
 
 
 def _straight(place: Array, inward: Array) -> Mask:
