@@ -236,15 +236,18 @@ class _RayShapes:
         )
         # Between two widths, so that the image is a continuous function of the width.
         part: Array = np.zeros((4, y[-1] + 1 - y[0], x[-1] + 1 - x[0]))
-        for level, share in ((int(below), 1 - along), (int(below) + 1, along)):
+        by_width: Array = np.zeros(part.shape[1:])
+        for level, share, rise in ((int(below), 1 - along, -1.0), (int(below) + 1, along, 1.0)):
             formed_at = float(np.exp(level * _LEVEL))
             grid = self._grid(target, level, reach, focus, formed_at, response)
             grid = grid[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-            part += share * grid
-            part[0] += share * (sigma**2 - formed_at**2) / 2 * grid[3]
+            widened = grid[0] + (sigma**2 - formed_at**2) / 2 * grid[3]
+            part[0] += share * widened
+            part[1:3] += share * grid[1:3]
+            by_width += share * sigma * grid[3] + rise / (sigma * _LEVEL) * widened
+        part[3] = by_width
         part = sum(w * part[:, :, j : j + 2 * len(columns) : 2] for j, w in enumerate(by_x))
         part = sum(w * part[:, j : j + 2 * len(rows) : 2] for j, w in enumerate(by_y))
-        part[3] *= sigma
         return part
 
     def _grid(

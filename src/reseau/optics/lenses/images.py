@@ -49,6 +49,7 @@ def _powers(uv: Array) -> Array:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
+_GOLDEN = np.pi * (3 - np.sqrt(5.0))
 _FIT = np.linalg.pinv(_powers(_GRID))
 
 
@@ -98,9 +99,12 @@ class _ByRays(ABC):
     def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
         """See :class:`RayMap`."""
         shape = len(points), len(elements.xy)
-        starts, through = np.repeat(points, shape[1], axis=0), np.tile(elements.xy, (shape[0], 1))
+        starts = np.repeat(points, shape[1], axis=0)
         xy, light = [], []
-        for wavelength, weight in self.wavelengths:
+        for k, (wavelength, weight) in enumerate(self.wavelengths):
+            # Other points of the stop for each wavelength: the spots of all together are denser.
+            c, s = np.cos(k * _GOLDEN), np.sin(k * _GOLDEN)
+            through = np.tile(elements.xy @ np.array([[c, s], [-s, c]]), (shape[0], 1))
             arrived, carried = self.rays(starts, through, wavelength)
             xy.append(arrived.reshape(*shape, 2))
             light.append(carried.reshape(*shape, 3) * (elements.weights * weight)[:, None])
