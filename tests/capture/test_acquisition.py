@@ -201,11 +201,18 @@ def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, session
     assert session.status == "done"
 
 
+def _end_by_signal(rig: FieldRig, number: signal.Signals) -> None:
+    """Send the signal, and expose no further before the run has taken it: it then stops the table."""
+    os.kill(os.getpid(), number)
+    until = time.monotonic() + 10
+    while not rig.table.stops and time.monotonic() < until:
+        time.sleep(0.01)
+
+
 def test_a_stopped_session_is_resumed_with_the_same_result(
     rig: FieldRig, session: Session, tmp_path: Path
 ) -> None:
-    pid = os.getpid()
-    rig.camera.during = lambda number: os.kill(pid, signal.SIGTERM) if number == 3 else None
+    rig.camera.during = lambda number: _end_by_signal(rig, signal.SIGTERM) if number == 3 else None
     run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
     assert session.status == "stopped"
@@ -249,8 +256,7 @@ def test_ctrl_c_at_the_prompt_stops_the_session(rig: FieldRig, session: Session)
 def test_closing_the_terminal_stops_the_session_and_the_instruments(
     rig: FieldRig, session: Session, number: int
 ) -> None:
-    pid = os.getpid()
-    rig.camera.during = lambda count: os.kill(pid, number) if count == 2 else None
+    rig.camera.during = lambda count: _end_by_signal(rig, number) if count == 2 else None
     run = rig.acquisition(session)
     carry_out(run, plans.poses(run, FEW))
     assert session.status == "stopped"
