@@ -14,6 +14,7 @@ import numpy as np
 
 from ..adjust import GaussMarkov, Options, Parameters, adjust
 from ..bundle import Network
+from ..bundle.solver.datum import similarity_onto
 from ..bundle.solver.spatial import resect
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import UsageError
@@ -24,6 +25,7 @@ from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import LensCamera, Paraxial, PlaneTarget, Prescription, RayMap, SensorPlane
+from ..optics.newton import newton
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
 from .target_measurement import Measurer, measurer_of
@@ -287,17 +289,15 @@ def orient_by_rays(camera: RayMap, design: Design, points: ImagePoints) -> tuple
 def _approximate_slopes(camera: RayMap, xy: Array) -> Array:
     """X/Z and Y/Z (n, 2) of points of the image, by Newton's method for objects far away."""
     far, h = 1e5, 1e-3
-    slopes = np.zeros_like(xy)
 
-    def pixels(s: Array) -> Array:
-        return camera.corresponding(far * np.concatenate([s, np.ones((len(s), 1))], axis=1))
+    def pixels(slopes: Array) -> Array:
+        return camera.corresponding(far * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1))
 
-    for _ in range(6):
+    def slope_at(slopes: Array) -> tuple[Array, Array]:
         here = pixels(slopes)
-        by = np.stack([(pixels(slopes + step) - here) / h for step in h * np.eye(2)], axis=2)
-        change = np.linalg.solve(by, (xy - here)[..., None])[..., 0]
-        slopes = slopes + np.clip(change, -0.3, 0.3)
-    return slopes
+        return here, np.stack([(pixels(slopes + step) - here) / h for step in h * np.eye(2)], axis=2)
+
+    return newton(slope_at, xy, np.zeros_like(xy), np.zeros((1, 2)))
 
 
 def measure_blurred_frame(
@@ -440,10 +440,7 @@ def pose_in_network(network: Network, image: str, design: Design) -> Pose:
     k, p = (np.array(column) for column in zip(*both, strict=True))
     plane = np.concatenate([design.xy[k], np.zeros((len(k), 1))], axis=1)
     space = scale * network.xyz[p]
-    # Rotation between two sets of points (Kabsch 1976).
-    u, _, vt = np.linalg.svd((plane - plane.mean(axis=0)).T @ (space - space.mean(axis=0)))
-    turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
-    shift = space.mean(axis=0) - turn @ plane.mean(axis=0)
+    _, turn, shift = similarity_onto(plane, space, scaled=False)
     misfit = float(np.abs(plane @ turn.T + shift - space).max())
     extent = float(np.ptp(plane, axis=0).max())
     if misfit > _FLAT * extent:

@@ -115,7 +115,7 @@ def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
     """Return which points agree with the similarity of the chosen ones."""
     nothing = np.zeros((1, 12))
     values = Values(np.zeros((0, 3, 3)), np.zeros((0, 3)), found, nothing, nothing)
-    moved = similarity_onto(values, given, chosen, scaled=True)(values).xyz
+    moved = similarity_onto(values.xyz[chosen], given[chosen], scaled=True)(values).xyz
     return np.asarray(np.linalg.norm(moved - given, axis=1) < limit)
 
 

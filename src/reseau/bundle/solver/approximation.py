@@ -251,7 +251,7 @@ class _Block:
             return [Remark(text, Code.TOO_FEW_POINTS)] if known.any() else []
         nothing = np.zeros((1, 12))
         values = Values(self.rotation, self.x0, self.xyz, nothing, nothing)
-        moved = similarity_onto(values, control, common, scaled=True)(values)
+        moved = similarity_onto(values.xyz[common], control[common], scaled=True)(values)
         self.rotation, self.x0, self.xyz = moved.rotation, moved.x0, moved.xyz
         self.xyz[known], self.known = control[known], known
         return []

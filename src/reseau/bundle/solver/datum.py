@@ -147,19 +147,16 @@ def held_for(freedom: Freedom, unknowns: Unknowns, diagonal: Array) -> Rows:
     return np.sort(order[: freedom.defect]).astype(np.intp)
 
 
-def similarity_onto(values: Values, reference: Array, chosen: Mask, *, scaled: bool) -> Similarity:
-    """Compute the least-squares similarity from the points (p, 3) to others (Horn 1987; Umeyama 1991).
+def similarity_onto(a: Array, b: Array, *, scaled: bool) -> Similarity:
+    """Compute the least-squares similarity from points to others (Horn 1987; Umeyama 1991).
 
     Parameters
     ----------
-    reference : ndarray (p, 3)
-        Target coordinates.
-    chosen : ndarray of bool (p,)
-        Points to use.
+    a, b : ndarray (p, 3)
+        Coordinates, and those to which they are transformed.
     scaled : bool
         Whether the scale is free.
     """
-    a, b = values.xyz[chosen], reference[chosen]
     centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
     u, s, vt = np.linalg.svd((b - centre_b).T @ (a - centre_a))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

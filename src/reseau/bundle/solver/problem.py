@@ -416,7 +416,7 @@ class _Run:
         reference = self.problem.reference - self.problem.centre
         chosen = chosen & finite(reference)
         scaled = freedom.defect == 7
-        return similarity_onto(values, np.nan_to_num(reference), chosen, scaled=scaled)(values)
+        return similarity_onto(values.xyz[chosen], reference[chosen], scaled=scaled)(values)
 
     def _fit(
         self,
