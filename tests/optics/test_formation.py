@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from scipy.special import erf
+from scipy.special import erf, ndtr
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -327,3 +327,17 @@ def test_wires_in_another_order_or_without_a_crossing_are_refused() -> None:
         wire_grid(turned, level, 2.4, SPACING)
     with pytest.raises(UsageError, match="no crossing"):
         wire_grid(upright, level, 2.4, SPACING, broken=np.ones((2, 3), dtype=bool))
+
+
+def test_responses_of_adjacent_pixels_are_those_of_a_blurred_step():
+    rng = np.random.default_rng(5)
+    pixels = np.arange(27.0) + rng.integers(0, 900, (40, 1))
+    points = pixels[:, :1] + rng.uniform(-12, 40, (40, 30))
+    sigma = rng.uniform(0.05, 2.5, 40)[:, None, None]
+    found = PixelResponse().orders(pixels, points, sigma, 1)
+    far, near = (pixels[:, None] + end - points[..., None] for end in (0.5, -0.5))
+    steps = [ndtr(t / sigma) for t in (far, near)]
+    bells = [np.exp(-0.5 * (t / sigma) ** 2) / np.sqrt(2 * np.pi) for t in (far, near)]
+    whole = [t * step + sigma * bell for t, step, bell in zip((far, near), steps, bells, strict=True)]
+    for part, (after, before) in zip(found, (whole, steps, [b / sigma for b in bells]), strict=True):
+        assert np.abs(part - (after - before)).max() < 3e-14 / sigma.min()

@@ -239,6 +239,8 @@ class PixelResponse:
         """
         half = max(self.fill, 1e-6) / 2
         if self.fill == 1.0 and (np.diff(pixels) == 1.0).all():
+            if highest <= 1 and pixels.ndim == points.ndim == 2 and points.dtype == np.float64:
+                return _compiled_orders(pixels, points, sigma)[0 if integral else 1 : 2 + highest]
             # Adjacent pixels share an edge, which halves the work.
             edges = np.concatenate([pixels[..., :1] - half, pixels + half], axis=-1)
             found = _steps(edges[..., None, :] - points[..., None], sigma, highest, integral)
@@ -246,6 +248,18 @@ class PixelResponse:
         offset = pixels[..., None, :] - points[..., None]
         ends = [_steps(offset + edge, sigma, highest, integral) for edge in (half, -half)]
         return [(right - left) / (2 * half) for right, left in zip(*ends, strict=True)]
+
+
+def _compiled_orders(pixels: Array, points: Array, sigma: Array | float) -> list[Array]:
+    """Integral, value and derivative of the response of adjacent pixels (k, c) to light at points (k, j)."""
+    from .compiled import responses  # takes half a second to import; not every command needs it
+
+    count = np.broadcast_shapes(pixels.shape[:1], points.shape[:1])[0]
+    width = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (count, 1, 1))[:, 0, 0]
+    out = np.empty((3, count, points.shape[1], pixels.shape[1]))
+    first = np.broadcast_to(pixels[:, 0].astype(np.float64), (count,))
+    responses(np.broadcast_to(points, (count, points.shape[1])), first, width, out)
+    return list(out)
 
 
 def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
