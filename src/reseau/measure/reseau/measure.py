@@ -220,10 +220,7 @@ def measure_reseau(
         measurement = MarkMeasurement(frame, design, source[known], placed, options)
         at, found, judged = measurement.result()
     if not use_nominal:
-        measurement, (at, found, judged), stepped = _stepped(
-            measurement, (at, found, judged), design, options
-        )
-        notes += stepped
+        notes += _open_names(source[known], judged, placed.screened.valid)
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
@@ -285,50 +282,6 @@ def _oriented(
         "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned)"
     )
     return placed, (Remark(text, Code.AMBIGUOUS),)
-
-
-Result = tuple[Rows, Matches, Verdict]
-
-
-def _stepped(
-    measurement: MarkMeasurement, result: Result, design: ReseauDesign, options: ReseauOptions
-) -> tuple[MarkMeasurement, Result, tuple[Remark, ...]]:
-    """Move the design by steps of its grid if the frame then shows more of its marks.
-
-    A regular grid shifted by a step fits all its marks but those of one row, and perspective may keep the
-    search among candidates from reaching that row. A note is added if names stay open.
-    """
-    source, valid = measurement.source, measurement.placed.screened.valid
-    tried: list[tuple[float, ...]] = []
-    for _ in range(len(source)):
-        judged = result[2]
-        good = judged.why == ""
-        total = int(good.sum())
-        if total < _FEW or total == len(source):
-            break
-        field = SmoothField.fit(source[good], judged.xy[good], local=False)
-        now = int(in_sight(field(source), valid).sum())
-        ahead = [(int(in_sight(field(source + step), valid).sum()), step) for step in grid_steps(source)]
-        seen, step = max(ahead, key=lambda pair: pair[0], default=(0, np.zeros(2)))
-        if seen <= now or tuple(step) in tried:
-            break
-        tried.append(tuple(-step))
-        nearby = PlacingOptions(
-            field(source + step),
-            0.2 * spacing(field(source)),
-            options.mark_px or measurement.placed.mark_px,
-            options.psf_px,
-            GridOptions(),
-        )
-        placed = place(measurement.frame, design, source, nearby)
-        if isinstance(placed, Failure):
-            break
-        other = MarkMeasurement(measurement.frame, design, source, placed, options)
-        moved = other.result()
-        if (moved[2].why == "").sum() <= total:
-            break
-        measurement, result = other, moved
-    return measurement, result, _open_names(source, result[2], valid)
 
 
 def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ...]:

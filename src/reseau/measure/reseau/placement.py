@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -48,6 +49,8 @@ _TRIED = 8
 """Number of start positions without prior knowledge that are followed."""
 _NEARLY = 0.75
 """Share of the marks from which a layout is correct except for a shift by steps of the grid."""
+_PROJECTED, _FEWEST_PROJECTED = 4, 10
+"""Rounds of assigning marks of a plane in perspective; fewest marks that show a perspective."""
 
 
 @dataclass(frozen=True)
@@ -357,7 +360,7 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
                     break
         if best is not None and best.support(strong.t) > _NEARLY * len(source):
             break
-    return best
+    return best if best is None or best.missed == 0 else climbed(best, source, strong, valid)
 
 
 def _supported(starts: list[Array], candidates: Candidates, usual: float, count: int) -> list[Array]:
@@ -374,15 +377,55 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
     """Move the design by steps of its grid as long as that assigns more marks.
 
     A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
+    Beyond the marks found so far a polynomial does not follow perspective; a projective mapping does.
     """
     steps = grid_steps(source)
     for _ in range(len(source)):
-        moved = (assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps)
+        moved = [assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps]
+        plane = _homography(source, found.at)
+        if plane is not None:
+            moved += [
+                _projected(source, _on_plane(plane, source + step), candidates, valid)
+                for step in (np.zeros(2), *steps)
+            ]
         better = max((m for m in moved if m is not None), key=lambda m: m.score, default=found)
         if better.score <= found.score:
             break
         found = better
     return found
+
+
+def _projected(source: Array, start: Array, candidates: Candidates, valid: Mask) -> Assignment | None:
+    """Assign candidates to marks of a plane in perspective, starting from approximate positions."""
+    tree, pitch, predicted = KDTree(candidates.xy), spacing(start), start
+    every = np.ones(len(source), dtype=bool)
+    for _ in range(_PROJECTED):
+        rows = _nearest(tree, candidates, predicted, 0.2 * pitch, every)
+        at = np.where(rows[:, None] >= 0, candidates.xy[rows], np.nan)
+        plane = _homography(source, at)
+        if plane is None:
+            return None
+        predicted = _on_plane(plane, source)
+    has = rows >= 0
+    missed = ~has & in_sight(predicted, valid)
+    field = SmoothField.fit(source[has], at[has], local=False)
+    return Assignment(field, predicted, rows, at, int(missed.sum()))
+
+
+def _homography(source: Array, at: Array) -> Array | None:
+    """Projective mapping (3, 3) of the plane of the design to marks at (n, 2), NaN where there is none."""
+    has = np.isfinite(at).all(axis=1)
+    if has.sum() < _FEWEST_PROJECTED:
+        return None
+    plane, used = cv2.findHomography(source[has], at[has], cv2.RANSAC, max(2.0, 0.1 * spacing(at[has])))
+    if plane is None or used.sum() < _FEWEST_PROJECTED:
+        return None
+    return np.asarray(plane, dtype=np.float64)
+
+
+def _on_plane(plane: Array, source: Array) -> Array:
+    """Points (n, 2) mapped by a homography (3, 3)."""
+    return np.asarray(cv2.perspectiveTransform(source[None], plane)[0])
 
 
 def grid_steps(source: Array) -> Array:
