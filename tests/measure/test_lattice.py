@@ -9,7 +9,8 @@ from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.measure.screening import quiet_noise
 from reseau.measure.testfield.lattice import find_lattices, ridge_points
-from reseau.measure.testfield.lattice_fit import LatticeFit, lattices, refit, second_order
+from reseau.measure.testfield.lattice_fit import LatticeFit, lattices, refit
+from reseau.measure.testfield.lattice_mapping import lattice_coordinates, second_order, slope_of
 from reseau.measure.testfield.line_profiles import blur_of
 from reseau_sims import FieldBench, Station
 
@@ -65,7 +66,21 @@ def test_second_order_is_the_derivative_of_the_mapping() -> None:
     expected = value + slope @ step[0] + 0.5 * np.einsum("kabc,b,c->ka", bend, step[0], step[0])
     np.testing.assert_allclose(fit.mapping(at + step), expected, rtol=0, atol=2e-3)  # px; the third order
     analytic = fit.mapping.derivatives(at).d_xy
-    np.testing.assert_allclose(slope, analytic, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(slope, analytic, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(value, fit.mapping(at), rtol=0, atol=1e-9)
+    h = 1e-4
+    for axis in (0, 1):
+        forwards, backwards = (slope_of(fit.mapping, at + sign * h * np.eye(2)[axis]) for sign in (1, -1))
+        np.testing.assert_allclose(bend[..., axis], (forwards - backwards) / (2 * h), rtol=0, atol=1e-5)
+
+
+def test_a_mapping_is_inverted() -> None:
+    fit = fitted(FieldBench().distorted(10), Station(30))
+    at = np.random.default_rng(0).uniform(
+        [fit.across[0], fit.along[0]], [fit.across[-1], fit.along[-1]], (50, 2)
+    )
+    # A step of Newton's method below 1e-3 is the last.
+    np.testing.assert_allclose(lattice_coordinates(fit.mapping, fit.mapping(at)), at, rtol=0, atol=1e-3)
 
 
 def test_a_mapping_passes_through_its_points() -> None:

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
+from ...core.threads import one_thread
 from ...io import ReseauDesign, Rings
 from ...optics import Chain
 from ...optics.field import SmoothField
@@ -32,7 +33,7 @@ from ..matching import (
 from ..points import Reason
 from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
 from ..screening import Screened, screen
-from ..testfield.lattice_fit import second_order
+from ..testfield.lattice_mapping import second_order
 from ..testfield.targets import merged, replaced
 from ..testfield.tone import ToneCurve
 from .disks import Disks, find_disks
@@ -120,6 +121,11 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
     dict or Failure
         Columns of :class:`reseau.measure.reseau.ReseauResult`.
     """
+    with one_thread():
+        return _measured(frame, design, options)
+
+
+def _measured(frame: Frame, design: ReseauDesign, options: ReseauOptions) -> dict[str, Any] | Failure:
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     placed, disks = _placed(grey, screened, design, options.mirrored)

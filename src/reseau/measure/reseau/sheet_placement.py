@@ -23,7 +23,8 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain, RationalPolynomial
-from ..testfield.lattice_fit import refit, second_order
+from ..testfield.lattice_fit import refit
+from ..testfield.lattice_mapping import second_order
 from .disks import Disks
 from .placement import spacing
 

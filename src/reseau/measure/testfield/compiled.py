@@ -16,7 +16,6 @@ __all__ = [
     "curved",
     "line_through",
     "ridges",
-    "shade",
     "supported",
     "voted",
 ]
@@ -80,60 +79,6 @@ def supported(
                 best = total
                 ends[k, 0], ends[k, 1] = begin * step - reach, (j + 1) * step - reach
     return ends
-
-
-@numba.njit(cache=True, nogil=True)
-def _normal(z: float) -> float:
-    """Distribution function of the normal distribution."""
-    return 0.5 * math.erfc(-0.7071067811865476 * z)
-
-
-@numba.njit(cache=True, nogil=True)
-def shade(
-    free: NDArray[Any],
-    axis: int,
-    step: NDArray[Any],
-    place: NDArray[Any],
-    normal: NDArray[Any],
-    half: NDArray[Any],
-    ends: NDArray[Any],
-    path: tuple[NDArray[Any], NDArray[Any]],
-    blur: float,
-    reach: int,
-) -> None:
-    """Multiply the free share of pixels by that which a blurred line leaves.
-
-    Parameters
-    ----------
-    free : ndarray (h, w)
-        Share of each pixel that is not covered, changed in place.
-    axis, step, place, normal
-        As in :class:`reseau.measure.testfield.line_profiles.Crossings`.
-    half : ndarray (n,)
-        Half the width of the line at each crossing, pixels.
-    ends : ndarray (2,)
-        First and last place of the line, in steps.
-    path : (ndarray (s, 2), ndarray (s,))
-        Places along the path of the camera, and their weights.
-    blur : float
-        Width (one sigma) of a blurred edge.
-    reach : int
-        Pixels to either side of the line.
-    """
-    places, weights = path
-    size = free.shape[axis]
-    for i in range(len(step)):
-        end = _normal((step[i] - ends[0]) / blur) * _normal((ends[1] - step[i]) / blur)
-        middle, across = int(np.rint(place[i])), normal[i, 1 - axis]
-        for k in range(max(middle - reach, 0), min(middle + reach + 1, size)):
-            distance, share = (k - place[i]) * across, 0.0
-            for m in range(len(weights)):
-                off = distance - normal[i, 0] * places[m, 0] - normal[i, 1] * places[m, 1]
-                share += weights[m] * (_normal((off + half[i]) / blur) - _normal((off - half[i]) / blur))
-            if axis == 0:
-                free[k, step[i]] *= 1 - share * end
-            else:
-                free[step[i], k] *= 1 - share * end
 
 
 @numba.njit(cache=True, nogil=True)

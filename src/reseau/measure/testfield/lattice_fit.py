@@ -19,22 +19,27 @@ from scipy.spatial import KDTree
 
 from ...adjust import BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
-from ...optics import Chain, PlaneMapping, RationalPolynomial
+from ...core.threads import one_thread
+from ...optics import Chain
 from ...optics.field import trend_degree
-from ...optics.newton import solve_2x2
 from .lattice import BETWEEN_SIDES, Lattice, Ridges, quantile, rms
-from .line_profiles import crossings, located
+from .lattice_mapping import (
+    degree_of,
+    images_of,
+    lattice_coordinates,
+    numbers_of,
+    of_degree,
+    started,
+    with_coefficients,
+)
+from .line_profiles import line_nodes
 
 __all__ = [
     "LatticeFit",
     "common_part",
     "fit_lattice",
     "lattices",
-    "reduced",
     "refit",
-    "second_order",
-    "slope_of",
-    "straightened",
 ]
 
 _DEGREE = 3
@@ -50,8 +55,6 @@ _MOST_TURNS = 16
 _RADIAL_TIMES = 4
 _DISTORTED, _MOST_DISTORTED = 0.1, 0.3
 """Prior standard deviation and largest value of the radial distortion at the edge of the frame."""
-_LONGEST = 0.5
-"""Longest step, in lattice coordinates, of the inversion of a mapping."""
 _ABOUT = 0.02
 """Distance from its predicted place, in steps, within which a line is looked for."""
 _BESIDE = 0.07
@@ -103,29 +106,6 @@ class LatticeFit:
     along: Rows
     rms_px: float
     points: int
-
-
-def second_order(mapping: PlaneMapping, at: Array) -> tuple[Array, Array, Array]:
-    """A mapping at points (n, 2) with its first (n, 2, 2) and second derivatives (n, 2, 2, 2).
-
-    Numerical differences, accurate to 1e-6 for lattice coordinates.
-    """
-    step = 0.01
-    offset = step * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    around = mapping((at[:, None] + offset).reshape(-1, 2)).reshape(-1, 3, 3, 2)
-    middle = around[:, 1, 1]
-    slope = np.stack([around[:, 2, 1] - around[:, 0, 1], around[:, 1, 2] - around[:, 1, 0]], axis=-1) / (
-        2 * step
-    )
-    mixed = (around[:, 2, 2] - around[:, 2, 0] - around[:, 0, 2] + around[:, 0, 0]) / 4
-    bend = np.stack(
-        [
-            np.stack([around[:, 2, 1] - 2 * middle + around[:, 0, 1], mixed], axis=-1),
-            np.stack([mixed, around[:, 1, 2] - 2 * middle + around[:, 1, 0]], axis=-1),
-        ],
-        axis=-2,
-    )
-    return middle, slope, bend / step**2
 
 
 def lattices(
@@ -185,13 +165,13 @@ def _divided(ridges: Ridges, found: Iterable[Lattice]) -> Iterator[tuple[Lattice
 def _moved(before: LatticeFit, after: LatticeFit) -> float:
     """Largest movement of the crossings of the lines, in pixels."""
     at = np.stack(np.meshgrid(before.across, before.along), axis=-1).reshape(-1, 2).astype(np.float64)
-    return float(np.abs(after.mapping(at) - before.mapping(at)).max())
+    return float(np.abs(images_of(after.mapping, at) - images_of(before.mapping, at)).max())
 
 
 def _parts(ridges: Ridges, found: Lattice, axis: int) -> int:
     """The greatest number of parts into which lines divide the distance between those found."""
     numbers = (found.across, found.along)
-    mapping = _start(found, ridges.darkness.shape)
+    mapping = started(found.homography, _DEGREE, ridges.darkness.shape)
     dark, inside = _darkness_along(mapping, ridges, axis, numbers[axis].astype(float), numbers[1 - axis])
     if not inside.any():
         return 1
@@ -217,13 +197,13 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
     LatticeFit or None
         None if the lines do not form one lattice, or enclose no square.
     """
-    mapping = _start(lattice, ridges.darkness.shape)
+    mapping = started(lattice.homography, _DEGREE, ridges.darkness.shape)
     each = max(1, len(ridges.xy) // _SOME)
     all_xy, all_normal = ridges.xy[::each], ridges.normal[::each]
     numbers = [lattice.across, lattice.along]
     for turn in range(_MOST_TURNS):
         gate, degrees = _GATES[min(turn, len(_GATES) - 1)]
-        at = _coordinates(mapping, all_xy)
+        at = lattice_coordinates(mapping, all_xy)
         row, axis = _assigned(mapping, all_normal, at, gate, degrees, numbers)
         if len(row) < _LEAST_POINTS:
             return None
@@ -231,7 +211,7 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
         if turn + 1 < len(_GATES):
             continue
         wider = [np.arange(lines.min() - 1, lines.max() + 2) for lines in numbers]
-        at = _coordinates(mapping, all_xy)
+        at = lattice_coordinates(mapping, all_xy)
         row, axis = _assigned(mapping, all_normal, at, gate, degrees, wider)
         support = [np.repeat(at[row[axis == k], k], each) for k in (0, 1)]
         before, numbers = (
@@ -242,7 +222,7 @@ def fit_lattice(ridges: Ridges, lattice: Lattice) -> LatticeFit | None:
             return None
         if all(map(np.array_equal, before, numbers)):
             break
-    at = _coordinates(mapping, all_xy)
+    at = lattice_coordinates(mapping, all_xy)
     row, axis = _assigned(mapping, all_normal, at, *_GATES[-1], numbers)
     if len(row) < _LEAST_POINTS:
         return None
@@ -264,131 +244,43 @@ def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -
 
     With u the image of the projectivity from the middle of the frame, the image is u (1 + k u²).
     """
-    assert isinstance(mapping.second, RationalPolynomial)
-    offset, scale = np.array(mapping.second.offset), mapping.second.scale
+    from .compiled_lattice import radially  # takes half a second to import; not every command needs it
+
     on, each = at.copy(), np.arange(len(at))
     on[each, axis] = np.rint(on[each, axis])
-    matrix = np.append(mapping.first.values, 1.0)
-    k = float(mapping.second.value_of("X_30")) / scale if "X_30" in mapping.second.names else 0.0
-    place = np.column_stack([on, np.ones(len(on))])
+    matrix, coefficients, middle = numbers_of(mapping)
+    scale = float(middle[2])
+    curved = of_degree(mapping, _DEGREE)
+    # x³ of the image is the seventh of the monomials.
+    k = float(coefficients[0, 6]) / scale if coefficients.shape[1] > 6 else 0.0
     lines = min(len(np.unique(on[axis == i, i])) for i in (0, 1))
-    prior = np.zeros(9)
     # Two lines in each direction do not determine the distortion.
-    prior[8] = (_POINT_PX / scale / (_DISTORTED if lines > 2 else 1e-9)) ** 2
-    for _ in range(_RADIAL_TIMES):
-        seen = place @ matrix.reshape(3, 3).T
-        u = (seen[:, :2] / seen[:, 2:] - offset) / scale
-        r2 = (u**2).sum(axis=1)
-        off = (normal * (xy - offset - scale * u * (1 + k * r2)[:, None])).sum(axis=1)
-        # nᵀ dF/du, and du/dH.
-        by_u = scale * ((1 + k * r2)[:, None] * normal + 2 * k * (normal * u).sum(axis=1)[:, None] * u)
-        by_seen = by_u / (scale * seen[:, 2:])
-        third = -(by_seen * (seen[:, :2] / seen[:, 2:])).sum(axis=1, keepdims=True)
-        by_matrix = (np.concatenate([by_seen, third], axis=1)[:, :, None] * place[:, None]).reshape(-1, 9)
-        design = np.column_stack([by_matrix[:, :8], scale * (normal * u).sum(axis=1) * r2])
-        limit = max(4.0 * 1.4826 * float(np.median(np.abs(off))), 3 * _POINT_PX)
-        weight = np.clip(1 - (off / limit) ** 2, 0, None) ** 2
-        size = np.sqrt((design**2).sum(axis=0)) + 1e-12
-        scaled = design / size
-        cofactor = (scaled * weight[:, None]).T @ scaled + np.diag(prior / size**2 + 1e-9)
-        pull = (scaled * weight[:, None]).T @ off - np.append(np.zeros(8), prior[8] * k / size[8])
-        step = np.linalg.solve(cofactor, pull) / size
-        matrix[:8] += step[:8]
-        k = float(np.clip(k + step[8], -_MOST_DISTORTED, _MOST_DISTORTED))
-        if np.abs(design @ step).max() < 0.1 * _POINT_PX:
-            break
-    curved = RationalPolynomial.polynomial(3, offset=mapping.second.offset, scale=scale)
-    terms = dict.fromkeys(("X_30", "X_12", "Y_21", "Y_03"), k * scale)
-    return Chain(mapping.first.with_values(matrix[:8]), curved.with_values(terms))
+    prior = (_POINT_PX / scale / (_DISTORTED if lines > 2 else 1e-9)) ** 2
+    with one_thread():
+        k = radially(matrix, k, middle, xy, normal, on, prior, _POINT_PX, _MOST_DISTORTED, _RADIAL_TIMES)
+    added = np.zeros((2, 10))
+    added[0, [6, 8]] = added[1, [7, 9]] = k * scale
+    return with_coefficients(Chain(mapping.first.with_values(matrix.ravel()[:8]), curved.second), added)
 
 
 def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
     """The lattice adjusted to the profiles of its lines, which are ten times as accurate as ridge points."""
-    xy, normal, at = [], [], []
+    from .compiled_lattice import profiles  # takes half a second to import; not every command needs it
+
+    columns = []
     for axis, (numbers, others) in enumerate(((fit.across, fit.along), (fit.along, fit.across))):
         along = np.linspace(others.min(), others.max(), max(grey.shape) // 4)
-        on = np.empty((len(numbers), 2, len(along), 2))
-        on[..., 1 - axis] = along
-        on[..., axis] = numbers[:, None, None] + np.array([0.0, width])[:, None]
-        images = fit.mapping(on.reshape(-1, 2)).reshape(on.shape)
-        for number, (middle, beside) in zip(numbers, images, strict=True):
-            line = crossings(middle, np.arange(float(len(along))), grey.shape)
-            if line is None:
-                continue
-            side = (beside - middle)[np.rint(line.along).astype(np.intp)]
-            shift, measured = located(grey, line, 0.5 * np.abs((side * line.normal).sum(axis=1)), blur)
-            place = np.full((len(measured), 2), float(number))
-            place[:, 1 - axis] = np.interp(line.along, np.arange(len(along)), along)
-            xy.append(line.xy(shift)[measured])
-            normal.append(line.normal[measured])
-            at.append(place[measured])
-    points = [np.concatenate(column) for column in (xy, normal, at)]
+        nodes, beside = line_nodes(fit.mapping, axis, numbers.astype(np.float64), width, along)
+        line, node, xy, normal = profiles(grey, nodes, beside, blur)
+        at = np.empty(xy.shape)
+        at[:, axis], at[:, 1 - axis] = numbers[line], np.interp(node, np.arange(len(along)), along)
+        columns.append((xy, normal, at))
+    points = [np.concatenate(column) for column in zip(*columns, strict=True)]
     if len(points[0]) < _LEAST_POINTS:
         return fit
     degree = _degree_of([fit.across, fit.along])
     mapping, residuals = _adjusted(fit.mapping, degree, *points)
     return replace(fit, mapping=mapping, rms_px=rms(residuals), points=len(residuals))
-
-
-def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:
-    """A mapping to an enlarged image as one to the original; the point x is at factor · x + shift there."""
-    assert isinstance(mapping.second, RationalPolynomial)
-    matrix = np.append(mapping.first.values, 1.0).reshape(3, 3)
-    matrix[:2] = (matrix[:2] - np.outer(shift, matrix[2])) / factor
-    curved = mapping.second
-    values = dict(zip(curved.names, curved.values.tolist(), strict=True))
-    values |= {name: values[name] - float(by) for name, by in zip(("X_00", "Y_00"), shift, strict=True)}
-    offset = (np.array(curved.offset) - shift) / factor
-    moved = replace(
-        curved, offset=(float(offset[0]), float(offset[1])), scale=curved.scale / factor
-    ).with_values({name: value / factor for name, value in values.items()})
-    return Chain(mapping.first.with_values(matrix.ravel()[:8]), moved)
-
-
-def _start(lattice: Lattice, shape: tuple[int, ...]) -> Chain:
-    """The projectivity of a lattice, followed by a polynomial that is still zero."""
-    h, w = shape
-    straight = RationalPolynomial.projective()
-    matrix = lattice.homography / lattice.homography[2, 2]
-    curved = RationalPolynomial.polynomial(_DEGREE, offset=((w - 1) / 2, (h - 1) / 2), scale=max(h, w) / 2)
-    return Chain(straight.with_values(dict(zip(straight.names, matrix.ravel(), strict=False))), curved)
-
-
-def straightened(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points by the projectivity alone."""
-    h = np.append(mapping.first.values, 1.0).reshape(3, 3)
-    back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
-    at: Array = back[:, :2] / back[:, 2:]
-    return at
-
-
-def _coordinates(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points; a few Newton steps are accurate enough here."""
-    at = straightened(mapping, xy)
-    if np.array_equal(mapping(at[:1]), mapping.first(at[:1])):
-        return at  # the polynomial is still zero
-    slope = _straight_slope(mapping, at)
-    for _ in range(6):
-        step = solve_2x2(slope, xy - mapping(at))
-        at = at + step.clip(-_LONGEST, _LONGEST)
-        if np.abs(step).max(initial=0.0) < 1e-3:
-            break
-    return at
-
-
-def _straight_slope(mapping: Chain, at: Array) -> Array:
-    """Derivatives (n, 2, 2) of the projectivity alone, accurate enough for directions."""
-    h = np.append(mapping.first.values, 1.0).reshape(3, 3)
-    image = np.column_stack([at, np.ones(len(at))]) @ h.T
-    xy, depth = image[:, :2] / image[:, 2:], image[:, 2, None, None]
-    slope: Array = (h[:2, :2] - xy[:, :, None] * h[2, :2]) / depth
-    return slope
-
-
-def slope_of(mapping: PlaneMapping, at: Array) -> Array:
-    """Derivatives (n, 2, 2) of a mapping at points (n, 2), by differences."""
-    step = 1e-4
-    return np.stack([(mapping(at + d) - mapping(at - d)) / (2 * step) for d in step * np.eye(2)], axis=-1)
 
 
 def _assigned(
@@ -398,27 +290,24 @@ def _assigned(
 
     Only the lines of these numbers count, and points between the outermost of them and half a step beyond.
     """
-    rows, axes = [], []
-    low, high = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
-    within = ((at > low - 0.5) & (at < high + 0.5)).all(axis=1)
+    from .compiled_lattice import assigned  # takes half a second to import; not every command needs it
+
+    first, last = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
+    count = last - first + 1
+    there = np.zeros((2, count.max()), dtype=bool)
     for axis in (0, 1):
-        whole = np.rint(at[:, axis])
-        near = np.flatnonzero(within & (np.abs(at[:, axis] - whole) < gate) & np.isin(whole, numbers[axis]))
-        # Along a line the other coordinate changes.
-        along = _straight_slope(mapping, at[near])[:, :, 1 - axis]
-        sine = (along * normal[near]).sum(axis=1) / np.maximum(np.hypot(*along.T), 1e-12)
-        found = near[np.abs(sine) < np.sin(np.deg2rad(degrees))]
-        rows.append(found)
-        axes.append(np.full(len(found), axis))
-    return np.concatenate(rows), np.concatenate(axes)
+        there[axis, numbers[axis] - first[axis]] = True
+    sine = float(np.sin(np.deg2rad(degrees)))
+    row, axes = assigned(numbers_of(mapping)[0], normal, at, gate, sine, first, count, there)
+    return row, axes
 
 
 def _adjusted(mapping: Chain, degree: int, xy: Array, normal: Array, at: Array) -> tuple[Chain, Array]:
     """The mapping that minimizes the distances of ridge points from their lines, and the distances (n,)."""
-    mapping = _of_degree(mapping, degree)
-    monomials = _monomials(mapping, at)
+    mapping = of_degree(mapping, degree)
+    monomials, straight = _monomials(mapping, at)
     design = np.concatenate([normal[:, :1] * monomials, normal[:, 1:] * monomials], axis=1)
-    observed = (normal * (xy - mapping.first(at))).sum(axis=1)
+    observed = (normal * (xy - straight)).sum(axis=1)
     mapping, residuals = _solved(mapping, design, observed[None], _POINT_PX)
     return mapping, residuals[0]
 
@@ -434,10 +323,10 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
         Standard deviation of the images.
     """
     # At least the degree already determined by the lines.
-    powers = _powers(mapping)
-    before = max(i + j for i, j in powers) if len(at) > len(powers) else 1
-    mapping = _of_degree(mapping, max(before, trend_degree(len(at))))
-    monomials, observed = _monomials(mapping, at), (xy - mapping.first(at)).T
+    before = degree_of(mapping) if len(at) > len(mapping.second.values) // 2 else 1
+    mapping = of_degree(mapping, max(before, trend_degree(len(at))))
+    monomials, straight = _monomials(mapping, at)
+    observed = (xy - straight).T
     fit, residuals = _solved(mapping, monomials, observed, sigma_px)
     common = common_part(at, residuals.T)
     if common is None:
@@ -449,11 +338,7 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
         return fit
     size = np.maximum(np.linalg.norm(monomials, axis=0), 1e-12)
     values: Array = np.linalg.lstsq((monomials / size)[agree], observed.T[agree], rcond=1e-10)[0]
-    names = mapping.second.names
-    curved = mapping.second.with_values(
-        dict(zip(names, mapping.second.values + (values / size[:, None]).T.ravel(), strict=True))
-    )
-    return Chain(mapping.first, curved)
+    return with_coefficients(mapping, (values / size[:, None]).T)
 
 
 def common_part(at: Array, residuals: Array) -> Array | None:
@@ -470,23 +355,12 @@ def common_part(at: Array, residuals: Array) -> Array | None:
     return common if ((size > _TOGETHER_PX) & (scatter < _SCATTER * size)).any() else None
 
 
-def _monomials(mapping: Chain, at: Array) -> Array:
-    """Monomials (n, m) of the polynomial at lattice coordinates (n, 2)."""
-    assert isinstance(mapping.second, RationalPolynomial)
-    u, v = ((mapping.first(at) - mapping.second.offset) / mapping.second.scale).T
-    return np.stack([u**i * v**j for i, j in _powers(mapping)], axis=1)
+def _monomials(mapping: Chain, at: Array) -> tuple[Array, Array]:
+    """Monomials (n, m) of the polynomial at lattice coordinates (n, 2), and images by the projectivity."""
+    from .compiled_lattice import monomials  # takes half a second to import; not every command needs it
 
-
-def _powers(mapping: Chain) -> list[tuple[int, int]]:
-    """Exponents of the monomials of the polynomial."""
-    return [(int(name[2]), int(name[3])) for name in mapping.second.names if name[0] == "X"]
-
-
-def _of_degree(mapping: Chain, degree: int) -> Chain:
-    """The mapping with a zero polynomial of a given degree."""
-    assert isinstance(mapping.second, RationalPolynomial)
-    offset, scale = mapping.second.offset, mapping.second.scale
-    return Chain(mapping.first, RationalPolynomial.polynomial(degree, offset=offset, scale=scale))
+    found: tuple[Array, Array] = monomials(numbers_of(mapping), np.ascontiguousarray(at), degree_of(mapping))
+    return found
 
 
 def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> tuple[Chain, Array]:
@@ -503,11 +377,7 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
         prior=(none, np.full(design.shape[1], _MOST_PX / sigma_px)),
         options=BatchOptions(reweight=weight_function("tukey"), max_iterations=5, tolerance=0.1 * sigma_px),
     )
-    names = mapping.second.names
-    curved = mapping.second.with_values(
-        dict(zip(names, mapping.second.values + fit.estimates.ravel(), strict=True))
-    )
-    return Chain(mapping.first, curved), fit.residuals
+    return with_coefficients(mapping, fit.estimates), fit.residuals
 
 
 def _darkness_along(
@@ -518,7 +388,7 @@ def _darkness_along(
     along = np.linspace(others.min(), others.max(), max(_LEAST_SAMPLES, max(h, w) // _EACH_PX))
     at = np.empty((len(lines), len(along), 2))
     at[..., 1 - axis], at[..., axis] = along, lines[:, None]
-    xy = mapping(at.reshape(-1, 2)).reshape(at.shape)
+    xy = images_of(mapping, at.reshape(-1, 2)).reshape(at.shape)
     inside: Mask = np.asarray(((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=2))
     x, y = np.moveaxis(xy.astype(np.float32), 2, 0)
     dark = cv2.remap(ridges.darkness, x, y, cv2.INTER_LINEAR) if x.size else x
@@ -537,7 +407,7 @@ def _lines(mapping: Chain, ridges: Ridges, number: Array, axis: int, lines: Rows
     dark, there = seen[2:].max(axis=0), np.asarray(inside[2:].all(axis=0))
     ends = np.empty((2, len(lines), 2))
     ends[..., axis], ends[..., 1 - axis] = lines, np.array([[others.min()], [others.max()]])
-    first, last = mapping(ends.reshape(-1, 2)).reshape(ends.shape)
+    first, last = images_of(mapping, ends.reshape(-1, 2)).reshape(ends.shape)
     size, count = max(ridges.darkness.shape), there.shape[1]
     # Samples are as many for all lines; ridge points are one for each pixel of their length.
     part = there.sum(axis=1) / count

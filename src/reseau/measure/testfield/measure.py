@@ -15,12 +15,14 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
+from ...core.threads import one_thread
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches, Window
 from ..points import Measured, Reason
 from ..screening import quiet_noise, screen
-from .lattice_fit import LatticeFit, common_part, refit, slope_of
+from .lattice_fit import LatticeFit, common_part, refit
+from .lattice_mapping import images_of, slope_of
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
@@ -194,7 +196,11 @@ def measure_testfield(
     >>> found.found, found.squares, bool(abs(found.xy - centres).max() < 0.02)
     (16, 1, True)
     """
-    options = options or TestfieldOptions()
+    with one_thread():
+        return _measured(frame, design, options or TestfieldOptions())
+
+
+def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) -> TestfieldResult | Failure:
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     noise = quiet_noise(grey)
@@ -274,7 +280,7 @@ class _Measurement:
     def _place(self) -> None:
         """Predict the positions of the targets, and select those in the frame."""
         scene = self.scene
-        self.predicted = scene.mapping(self.at)
+        self.predicted = images_of(scene.mapping, self.at)
         h, w = scene.grey.shape
         size = np.array([w, h])
         margin = 3 * scene.psf_px
@@ -557,7 +563,7 @@ class _Measurement:
         mapping, good = scene.mapping, why == ""
         if good.sum() >= _LEAST_FIRST:
             mapping = refit(mapping, self.at[wanted[good]], found.xy[good], _UNMODELLED_PX)
-        predicted = mapping(self.at)
+        predicted = images_of(mapping, self.at)
         off = np.hypot(*(found.xy - predicted[wanted]).T)
         # The median distance in a plane is 1.18 standard deviations of a coordinate.
         ordinary = float(np.median(off[good])) / 1.18 if good.any() else 0.0

@@ -30,7 +30,8 @@ from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
 from .lattice import Ridges, find_lattices, ridge_points
-from .lattice_fit import LatticeFit, lattices, reduced, straightened
+from .lattice_fit import LatticeFit, lattices
+from .lattice_mapping import images_of, reduced, slope_of, straightened
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 
@@ -190,9 +191,11 @@ class _Clusters:
         order = np.lexsort((relative[:, 0], -relative[:, 1]))
         self.step = float(np.ptp(relative[:, 0]) / 3)
         # Only squares that are in the frame and large enough to be read; a wrong lattice may have any size.
-        xy = fit.mapping((self.cell[:, None] + 0.5 + relative[order] / design.pitch).reshape(-1, 2))
+        xy = images_of(
+            fit.mapping, (self.cell[:, None] + 0.5 + relative[order] / design.pitch).reshape(-1, 2)
+        )
         xy, (h, w) = xy.reshape(-1, 16, 2), grey.shape
-        frames = fit.mapping.derivatives(self.cell + 0.5).d_xy / design.pitch
+        frames = slope_of(fit.mapping, self.cell + 0.5) / design.pitch
         seen: Mask = np.asarray(((xy > 1) & (xy < [w - 2, h - 2])).all(axis=2))
         sides = np.linalg.svd(np.nan_to_num(frames), compute_uv=False) * self.step
         legible = seen.any(axis=1) & (sides[:, 1] > _LEAST_STEP_PX) & (sides[:, 0] < max(h, w) / 2)

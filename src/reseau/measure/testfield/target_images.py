@@ -13,7 +13,7 @@ from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
 from ..matching import SIZE, GrownOutline
-from .lattice_fit import second_order
+from .lattice_mapping import second_order
 
 __all__ = ["flat_outline", "form_targets", "stacked"]
 

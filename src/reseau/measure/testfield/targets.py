@@ -22,8 +22,8 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
-from .lattice_fit import slope_of
-from .line_profiles import blur_of, crossings
+from .lattice_mapping import images_of, slope_of
+from .line_profiles import blur_of
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
@@ -369,35 +369,21 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> Array:
     """Grey values that the lines attenuate or add, (h, w)."""
-    from .compiled import attenuate, shade  # takes half a second to import; not every command needs it
+    from .compiled import attenuate  # takes half a second to import; not every command needs it
+    from .compiled_lattice import shade_lines
 
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones((h, w))
     x0, y0, x1, y1 = lines.extent
     blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
-    steps = steps_of(scene.path)
-    longest = float(np.hypot(*scene.path)) / 2
+    steps, longest = steps_of(scene.path), float(np.hypot(*scene.path)) / 2
     for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
-        along = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
-        on = np.empty((len(places), 2, count, 2))
-        on[..., 1 - axis] = along
-        on[..., axis] = np.array(places)[:, None, None] + np.array([0.0, lines.width])[:, None]
-        images = scene.mapping(scene.lattice(on.reshape(-1, 2))).reshape(on.shape)
-        for middle, beside in images:
-            line = crossings(middle, np.arange(count, dtype=float), (h, w), 4 * blur)
-            if line is None:
-                continue
-            line = line.within(int(5 * blur + longest + 3), (h, w))
-            if not len(line.step):
-                continue
-            width = (beside - middle)[np.rint(line.along).astype(np.intp)]
-            half = 0.5 * np.abs((width * line.normal).sum(axis=1))
-            # A line may run at 45° to the rows or columns along which it is followed.
-            reach = int(
-                np.ceil((3.5 * blur + longest + half.max()) / np.abs(line.normal[:, 1 - line.axis]).min())
-            )
-            ends = np.sort(middle[[0, -1], line.axis])  # they are blurred, too
-            shade(free, line.axis, line.step, line.place, line.normal, half, ends, steps, blur, reach)
+        # Points of the board on every line, and beside it.
+        on = np.empty((2, len(places), count, 2))
+        on[..., 1 - axis] = np.linspace(*((y0, y1) if axis == 0 else (x0, x1)), count)
+        on[..., axis] = np.array(places)[:, None] + np.array([0.0, lines.width])[:, None, None]
+        nodes, beside = images_of(scene.mapping, scene.lattice(on.reshape(-1, 2))).reshape(on.shape)
+        shade_lines(free, nodes, beside, steps, longest, blur)
     attenuate(free, scene.light.contrast, np.array(scene.light.size))
     return free
 

@@ -1,0 +1,512 @@
+"""The mapping of a lattice and the profiles of its lines, compiled.
+
+A mapping is given as `(matrix, coefficients, normal)`: the projectivity (3, 3); the polynomials of x and y
+(2, m) of the monomials 1, u, v, u², u v, v², … up to a degree; and the offset and scale (3,) that give u and
+v. See :mod:`reseau.measure.testfield.lattice_mapping`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["assigned", "images", "lattice_coordinates", "monomials", "profiles", "radially", "shade_lines"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+Floats = NDArray[Any]
+Mapped = tuple[Floats, Floats, Floats]
+
+_STEPS, _SHORT = 6, 1e-3
+"""Most steps of the inversion of a mapping, and the longest step, in lattice coordinates, that ends it."""
+_REACH = 2
+"""Pixels to either side of a line that are looked at."""
+_MOST_PX = 0.7
+"""How far a line may be off its approximate place."""
+
+
+def _compiled(function: F) -> F:
+    """Compile with Numba, cached on disk, releasing the GIL."""
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+    return cast(F, numba.njit(**options)(function))
+
+
+@_compiled
+def _degree(coefficients: Floats) -> int:
+    degree = 0
+    while (degree + 1) * (degree + 2) // 2 < coefficients.shape[1]:
+        degree += 1
+    return degree
+
+
+@_compiled
+def _powers(u: float, degree: int, table: Floats) -> None:
+    """Powers of u, their first and their second derivatives (3, degree + 1)."""
+    table[0, 0], table[1, 0], table[2, 0] = 1.0, 0.0, 0.0
+    for i in range(1, degree + 1):
+        table[0, i] = u * table[0, i - 1]
+        table[1, i] = i * table[0, i - 1]
+        table[2, i] = i * table[1, i - 1]
+
+
+@_compiled
+def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floats) -> None:
+    """Images of lattice coordinates `at` (n, 2), and derivatives.
+
+    Parameters
+    ----------
+    value, slope, bend : ndarray (n, 2), (n, 2, 2), (n, 2, 2, 2)
+        Filled: images, and first and second derivatives; a derivative of length 0 is not computed.
+    """
+    matrix, coefficients, normal = mapping
+    degree, order = _degree(coefficients), (len(slope) > 0) + (len(bend) > 0)
+    x, y, first, second = (
+        np.empty((3, degree + 1)),
+        np.empty((3, degree + 1)),
+        np.empty((2, 2)),
+        np.empty(4),
+    )
+    by_u, by_uu = np.empty(2), np.empty(3)
+    for k in range(len(at)):
+        a, b = at[k]
+        depth = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2])
+        u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) * depth
+        v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) * depth
+        if order:
+            for i in range(2):
+                first[0, i] = (matrix[0, i] - u * matrix[2, i]) * depth / normal[2]
+                first[1, i] = (matrix[1, i] - v * matrix[2, i]) * depth / normal[2]
+        _powers((u - normal[0]) / normal[2], degree, x)
+        _powers((v - normal[1]) / normal[2], degree, y)
+        for c in range(2):
+            total, m = 0.0, 0
+            by_u[:], by_uu[:] = 0.0, 0.0
+            for n in range(degree + 1):
+                for j in range(n + 1):
+                    factor, i = coefficients[c, m], n - j
+                    m += 1
+                    total += factor * x[0, i] * y[0, j]
+                    if order:
+                        by_u[0] += factor * x[1, i] * y[0, j]
+                        by_u[1] += factor * x[0, i] * y[1, j]
+                    if order > 1:
+                        by_uu[0] += factor * x[2, i] * y[0, j]
+                        by_uu[1] += factor * x[1, i] * y[1, j]
+                        by_uu[2] += factor * x[0, i] * y[2, j]
+            value[k, c] = total
+            if order:
+                for i in range(2):
+                    slope[k, c, i] = by_u[0] * first[0, i] + by_u[1] * first[1, i]
+            if order > 1:
+                for i in range(2):
+                    for j in range(2):
+                        second[0] = by_uu[0] * first[0, i] * first[0, j]
+                        second[1] = by_uu[1] * (first[0, i] * first[1, j] + first[0, j] * first[1, i])
+                        second[2] = by_uu[2] * first[1, i] * first[1, j]
+                        # The second derivative of a quotient of linear functions.
+                        second[3] = 0.0
+                        for d in range(2):
+                            bent = first[d, i] * matrix[2, j] + first[d, j] * matrix[2, i]
+                            second[3] -= by_u[d] * bent * depth
+                        bend[k, c, i, j] = second[0] + second[1] + second[2] + second[3]
+
+
+@_compiled
+def lattice_coordinates(mapping: Mapped, back: Floats, curved: bool, xy: Floats, longest: float) -> Floats:
+    """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity.
+
+    Parameters
+    ----------
+    back : ndarray (3, 3)
+        Inverse of the projectivity, which gives the first values.
+    curved : bool
+        Whether there is a polynomial beside the projectivity.
+    longest : float
+        Longest step along each lattice coordinate.
+    """
+    matrix, none = mapping[0], np.empty((0, 2, 2))
+    at, inverse = np.empty(xy.shape), np.empty((len(xy), 2, 2))
+    for k in range(len(xy)):
+        x, y = xy[k]
+        depth = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+        a = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / depth
+        b = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / depth
+        at[k, 0], at[k, 1] = a, b
+        if curved:
+            depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
+            u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
+            v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
+            p, q = matrix[0, 0] - u * matrix[2, 0], matrix[0, 1] - u * matrix[2, 1]
+            r, s = matrix[1, 0] - v * matrix[2, 0], matrix[1, 1] - v * matrix[2, 1]
+            scale = depth / (p * s - q * r)
+            inverse[k, 0, 0], inverse[k, 0, 1] = s * scale, -q * scale
+            inverse[k, 1, 0], inverse[k, 1, 1] = -r * scale, p * scale
+    if not curved:
+        return at
+    seen = np.empty(xy.shape)
+    for _ in range(_STEPS):
+        images(mapping, at, seen, none, none.reshape(0, 2, 2, 1))
+        most = 0.0
+        for k in range(len(xy)):
+            x, y = xy[k, 0] - seen[k, 0], xy[k, 1] - seen[k, 1]
+            for i in range(2):
+                step = inverse[k, i, 0] * x + inverse[k, i, 1] * y
+                if not abs(step) <= most:
+                    most = abs(step)
+                at[k, i] += min(max(step, -longest), longest)
+        if most < _SHORT:
+            break
+    return at
+
+
+@_compiled
+def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]:
+    """Monomials (n, m) of the polynomial, and images (n, 2) of the projectivity alone."""
+    matrix, _, normal = mapping
+    found, straight = np.empty((len(at), (degree + 1) * (degree + 2) // 2)), np.empty(at.shape)
+    x, y = np.empty((3, degree + 1)), np.empty((3, degree + 1))
+    for k in range(len(at)):
+        a, b = at[k]
+        depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
+        straight[k, 0] = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
+        straight[k, 1] = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
+        _powers((straight[k, 0] - normal[0]) / normal[2], degree, x)
+        _powers((straight[k, 1] - normal[1]) / normal[2], degree, y)
+        m = 0
+        for n in range(degree + 1):
+            for j in range(n + 1):
+                found[k, m] = x[0, n - j] * y[0, j]
+                m += 1
+    return found, straight
+
+
+@_compiled
+def assigned(
+    matrix: Floats,
+    normal: Floats,
+    at: Floats,
+    gate: float,
+    sine: float,
+    first: Floats,
+    count: Floats,
+    there: Floats,
+) -> tuple[Floats, Floats]:
+    """Points on a lattice line and parallel to it: their indices, and the axis that numbers the line.
+
+    Parameters
+    ----------
+    matrix : ndarray (3, 3)
+        Projectivity of the mapping.
+    normal, at : ndarray (n, 2)
+        Normals and lattice coordinates of the points.
+    gate, sine : float
+        Largest distance from a line, in steps; largest sine of the angle between them.
+    first, count : ndarray of int (2,)
+        First line of either family, and number of lines up to the last.
+    there : ndarray (2, l) of bool
+        Which of these lines count.
+    """
+    rows, axes, found = np.empty(2 * len(at), np.intp), np.empty(2 * len(at), np.intp), 0
+    for axis in range(2):
+        other = 1 - axis
+        for k in range(len(at)):
+            outside = False
+            for i in range(2):
+                place = at[k, i] - first[i]
+                outside = outside or not (place > -0.5 and place < count[i] - 0.5)
+            if outside:
+                continue
+            line = np.rint(at[k, axis])
+            if not (abs(at[k, axis] - line) < gate and there[axis, int(line) - first[axis]]):
+                continue
+            # Along a line the other coordinate changes.
+            a, b = at[k]
+            depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
+            u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
+            v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
+            p = (matrix[0, other] - u * matrix[2, other]) / depth
+            q = (matrix[1, other] - v * matrix[2, other]) / depth
+            if abs(p * normal[k, 0] + q * normal[k, 1]) < sine * max(math.hypot(p, q), 1e-12):
+                rows[found], axes[found] = k, axis
+                found += 1
+    return rows[:found].copy(), axes[:found].copy()
+
+
+@_compiled
+def radially(
+    matrix: Floats,
+    distortion: float,
+    normal: Floats,
+    xy: Floats,
+    across: Floats,
+    on: Floats,
+    prior: float,
+    point_px: float,
+    most: float,
+    times: int,
+) -> float:
+    """Adjust a projectivity (3, 3), in place, and a radial distortion, robustly to points on lines.
+
+    With u the image of the projectivity from the middle of the frame, the image is u (1 + k u²).
+
+    Parameters
+    ----------
+    distortion : float
+        Initial value of k.
+    normal : ndarray (3,)
+        Middle of the frame, and scale of u.
+    xy, across, on : ndarray (n, 2)
+        Points, normals of their lines, and lattice coordinates on these.
+    prior : float
+        Weight of k = 0.
+    point_px : float
+        Usual distance of a point from its line.
+    most : float
+        Largest k.
+    times : int
+        Most iterations.
+
+    Returns
+    -------
+    float
+        The distortion.
+    """
+    n, k, scale = len(xy), distortion, normal[2]
+    off, design, seen = np.empty(n), np.empty((n, 9)), np.empty(3)
+    for _ in range(times):
+        size, equations, right = np.zeros(9), np.zeros((9, 9)), np.zeros(9)
+        for i in range(n):
+            a, b = on[i]
+            for c in range(3):
+                seen[c] = matrix[c, 0] * a + matrix[c, 1] * b + matrix[c, 2]
+            x, y = seen[0] / seen[2], seen[1] / seen[2]
+            u, v = (x - normal[0]) / scale, (y - normal[1]) / scale
+            r2 = u * u + v * v
+            grown, radial = 1 + k * r2, across[i, 0] * u + across[i, 1] * v
+            off[i] = across[i, 0] * (xy[i, 0] - normal[0] - scale * u * grown)
+            off[i] += across[i, 1] * (xy[i, 1] - normal[1] - scale * v * grown)
+            # nᵀ dF/du, and du/dH.
+            p = (grown * across[i, 0] + 2 * k * radial * u) / seen[2]
+            q = (grown * across[i, 1] + 2 * k * radial * v) / seen[2]
+            r = -(p * x + q * y)
+            row = design[i]
+            row[0], row[1], row[2], row[3], row[4], row[5] = p * a, p * b, p, q * a, q * b, q
+            row[6], row[7], row[8] = r * a, r * b, scale * radial * r2
+            for c in range(9):
+                size[c] += row[c] * row[c]
+        for c in range(9):
+            size[c] = math.sqrt(size[c]) + 1e-12
+        limit = max(4.0 * 1.4826 * np.median(np.abs(off)), 3 * point_px)
+        for i in range(n):
+            weight = max(1 - (off[i] / limit) ** 2, 0.0) ** 2
+            if weight > 0:
+                row = design[i]
+                for c in range(9):
+                    part = weight * row[c]
+                    right[c] += part * off[i]
+                    for d in range(c + 1):
+                        equations[c, d] += part * row[d]
+        right[8] -= prior * k
+        for c in range(9):
+            right[c] /= size[c]
+            for d in range(c + 1):
+                equations[c, d] /= size[c] * size[d]
+                equations[d, c] = equations[c, d]
+            equations[c, c] += 1e-9
+        equations[8, 8] += prior / size[8] ** 2
+        step = np.linalg.solve(equations, right) / size
+        for c in range(8):
+            matrix[c // 3, c % 3] += step[c]
+        k = min(max(k + step[8], -most), most)
+        moved = 0.0
+        for i in range(n):
+            total = 0.0
+            for c in range(9):
+                total += design[i, c] * step[c]
+            moved = max(moved, abs(total))
+        if moved < 0.1 * point_px:
+            break
+    return k
+
+
+@_compiled
+def _normal(z: float) -> float:
+    """Distribution function of the normal distribution."""
+    return 0.5 * math.erfc(-0.7071067811865476 * z)
+
+
+@_compiled
+def _crossings(nodes: Floats, high: int, wide: int, beyond: float) -> tuple[int, int, Floats, Floats, Floats]:
+    """Crossings of a line, of which `nodes` (m, 2) were computed, with the rows or columns of a frame.
+
+    Returns
+    -------
+    axis : int
+        0 where it crosses columns, 1 where it crosses rows.
+    first : int
+        The first of them; the others follow, up to `beyond` pixels from the ends of the line.
+    place, normal, along : ndarray (n,), (n, 2), (n,)
+        The other coordinate there, the unit vector across, and the index of the node, not rounded.
+    """
+    m, right, down = len(nodes), 0.0, 0.0
+    across = np.empty((m, 2))
+    for i in range(m):
+        low, up = max(i - 1, 0), min(i + 1, m - 1)
+        x, y = nodes[up, 0] - nodes[low, 0], nodes[up, 1] - nodes[low, 1]
+        right, down = right + abs(x), down + abs(y)
+        length = max(math.hypot(x, y), 1e-12)
+        across[i, 0], across[i, 1] = -y / length, x / length
+    axis = int(down > right)
+    backwards = nodes[m - 1, axis] < nodes[0, axis]
+    begin, end = nodes[0, axis], nodes[m - 1, axis]
+    if backwards:
+        begin, end = end, begin
+    size = high if axis else wide
+    lowest, highest = max(0.0, math.ceil(begin - beyond)), min(size - 1.0, math.floor(end + beyond))
+    count = int(highest - lowest) + 1 if lowest <= highest else 0
+    place, normal, along = np.empty(count), np.empty((count, 2)), np.empty(count)
+    for k in range(count):
+        at, low, up = lowest + k, 0, m - 1
+        while up - low > 1:
+            middle = (low + up) // 2
+            if nodes[m - 1 - middle if backwards else middle, axis] <= at:
+                low = middle
+            else:
+                up = middle
+        one, two = (m - 1 - low, m - 1 - up) if backwards else (low, up)
+        length = nodes[two, axis] - nodes[one, axis]
+        part = min(max((at - nodes[one, axis]) / length, 0.0), 1.0) if length > 0 else 0.0
+        place[k] = nodes[one, 1 - axis] + part * (nodes[two, 1 - axis] - nodes[one, 1 - axis])
+        for c in range(2):
+            normal[k, c] = across[one, c] + part * (across[two, c] - across[one, c])
+        along[k] = one + part * (two - one)
+    return axis, int(lowest), place, normal, along
+
+
+@_compiled
+def profiles(
+    grey: Floats, nodes: Floats, beside: Floats, blur: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Places of dark lines from their profiles in rows or columns.
+
+    Level, depth and shift of a profile are adjusted to the pixels around each crossing.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w)
+        Grey values.
+    nodes, beside : ndarray (l, m, 2)
+        Points on the lines, and beside them at the distance of their width.
+    blur : float
+        Width (one sigma) of a blurred edge.
+
+    Returns
+    -------
+    line, along, xy, normal : ndarray (n,), (n,), (n, 2), (n, 2)
+        For each place that is determined: the line, the index of the node, not rounded, the place, and the
+        unit vector across.
+    """
+    high, wide = grey.shape
+    most = len(nodes) * max(high, wide)
+    lines, params = np.empty(most, np.intp), np.empty(most)
+    xy, normals, found = np.empty((most, 2)), np.empty((most, 2)), 0
+    design, equations, x = np.empty(3), np.empty((3, 3)), np.empty(3)
+    for line in range(len(nodes)):
+        axis, first, place, normal, along = _crossings(nodes[line], high, wide, 0.0)
+        size = high if axis == 0 else wide
+        for k in range(len(place)):
+            if not (place[k] > 0 and place[k] < size):
+                continue
+            middle, at = int(np.rint(place[k])), first + k
+            if middle < _REACH or middle + _REACH >= size:
+                continue
+            node = int(np.rint(along[k]))
+            half = (beside[line, node, 0] - nodes[line, node, 0]) * normal[k, 0]
+            half = 0.5 * abs(half + (beside[line, node, 1] - nodes[line, node, 1]) * normal[k, 1])
+            equations[:], x[:] = 0.0, 0.0
+            for i in range(middle - _REACH, middle + _REACH + 1):
+                distance = (i - place[k]) * normal[k, 1 - axis]
+                seen = float(grey[i, at] if axis == 0 else grey[at, i])
+                far, near = (distance + half) / blur, (distance - half) / blur
+                design[0], design[1] = 1.0, _normal(far) - _normal(near)
+                design[2] = math.exp(-0.5 * near * near) - math.exp(-0.5 * far * far)
+                design[2] /= math.sqrt(2 * math.pi) * blur
+                for c in range(3):
+                    x[c] += design[c] * seen
+                    for d in range(3):
+                        equations[c, d] += design[c] * design[d]
+            for c in range(3):
+                equations[c, c] += 1e-9  # regularizes where the pixels do not determine the profile
+            for c in range(3):
+                for d in range(c + 1, 3):
+                    factor = equations[d, c] / equations[c, c]
+                    x[d] -= factor * x[c]
+                    for e in range(c, 3):
+                        equations[d, e] -= factor * equations[c, e]
+            depth = (x[1] - equations[1, 2] * x[2] / equations[2, 2]) / equations[1, 1]
+            shift = x[2] / equations[2, 2] / depth
+            if not (depth < 0 and abs(shift) < _MOST_PX):
+                continue
+            lines[found], params[found], normals[found] = line, along[k], normal[k]
+            xy[found, axis], xy[found, 1 - axis] = at, place[k]
+            xy[found] += shift * normal[k]
+            found += 1
+    return lines[:found].copy(), params[:found].copy(), xy[:found].copy(), normals[:found].copy()
+
+
+@_compiled
+def shade_lines(
+    free: Floats, nodes: Floats, beside: Floats, path: tuple[Floats, Floats], longest: float, blur: float
+) -> None:
+    """Multiply the free share of pixels by that which blurred lines leave.
+
+    Parameters
+    ----------
+    free : ndarray (h, w)
+        Share of each pixel that is not covered, changed in place.
+    nodes, beside
+        As in :func:`profiles`.
+    path : (ndarray (s, 2), ndarray (s,))
+        Places along the path of the camera, and their weights.
+    longest : float
+        Largest distance of these places from their middle.
+    blur : float
+        Width (one sigma) of a blurred edge.
+    """
+    (high, wide), (places, weights) = free.shape, path
+    margin = int(5 * blur + longest + 3)
+    for line in range(len(nodes)):
+        axis, first, place, normal, along = _crossings(nodes[line], high, wide, 4 * blur)
+        size, half = free.shape[axis], np.zeros(len(place))
+        ends = np.array([nodes[line, 0, axis], nodes[line, -1, axis]])  # they are blurred, too
+        ends.sort()
+        steepest, widest = 1.0, 0.0
+        for k in range(len(place)):
+            if not (place[k] > -margin and place[k] < size + margin):
+                continue
+            node = int(np.rint(along[k]))
+            half[k] = (beside[line, node, 0] - nodes[line, node, 0]) * normal[k, 0]
+            half[k] += (beside[line, node, 1] - nodes[line, node, 1]) * normal[k, 1]
+            half[k] = 0.5 * abs(half[k])
+            steepest = min(steepest, abs(normal[k, 1 - axis]))
+            widest = max(widest, half[k])
+        # A line may run at 45° to the rows or columns along which it is followed.
+        reach = int(min(math.ceil((3.5 * blur + longest + widest) / max(steepest, 1e-3)), size))
+        for k in range(len(place)):
+            if not (place[k] > -margin and place[k] < size + margin):
+                continue
+            end = _normal((first + k - ends[0]) / blur) * _normal((ends[1] - first - k) / blur)
+            middle = int(np.rint(place[k]))
+            for i in range(max(middle - reach, 0), min(middle + reach + 1, size)):
+                distance, share = (i - place[k]) * normal[k, 1 - axis], 0.0
+                for m in range(len(weights)):
+                    off = distance - normal[k, 0] * places[m, 0] - normal[k, 1] * places[m, 1]
+                    share += weights[m] * (_normal((off + half[k]) / blur) - _normal((off - half[k]) / blur))
+                if axis == 0:
+                    free[i, first + k] *= 1 - share * end
+                else:
+                    free[first + k, i] *= 1 - share * end

@@ -1,0 +1,144 @@
+"""The mapping of a lattice to an image, a projectivity followed by a polynomial; derivatives and inverse.
+
+Both are :class:`reseau.optics.RationalPolynomial`; here they are evaluated by compiled code, for the many
+small sets of points of a search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from math import isqrt
+
+import numpy as np
+
+from ...core.data import Array
+from ...optics import Chain, RationalPolynomial
+
+__all__ = [
+    "degree_of",
+    "images_of",
+    "lattice_coordinates",
+    "numbers_of",
+    "of_degree",
+    "reduced",
+    "second_order",
+    "slope_of",
+    "started",
+    "straightened",
+    "with_coefficients",
+]
+
+_LONGEST = 0.5
+"""Longest step, in lattice coordinates, of the inversion of a mapping."""
+
+
+@lru_cache(maxsize=64)
+def _polynomial(degree: int, offset: tuple[float, float], scale: float) -> RationalPolynomial:
+    """The polynomial that is the identity; reading its table of terms takes longer than using it."""
+    return RationalPolynomial.polynomial(degree, offset=offset, scale=scale)
+
+
+def started(matrix: Array, degree: int, shape: tuple[int, ...]) -> Chain:
+    """A projectivity (3, 3) to a frame of this height and width, followed by a polynomial that is zero."""
+    h, w = shape
+    curved = _polynomial(degree, ((w - 1) / 2, (h - 1) / 2), max(h, w) / 2)
+    return Chain(RationalPolynomial.projective().with_values((matrix / matrix[2, 2]).ravel()[:8]), curved)
+
+
+def of_degree(mapping: Chain, degree: int) -> Chain:
+    """The mapping with a zero polynomial of a given degree."""
+    assert isinstance(mapping.second, RationalPolynomial)
+    return Chain(mapping.first, _polynomial(degree, mapping.second.offset, mapping.second.scale))
+
+
+def with_coefficients(mapping: Chain, added: Array) -> Chain:
+    """The mapping with values (2, m) added to the coefficients of its polynomial."""
+    curved = mapping.second
+    assert isinstance(curved, RationalPolynomial)
+    return Chain(mapping.first, replace(curved, values=curved.values + added.ravel()))
+
+
+def numbers_of(mapping: Chain) -> tuple[Array, Array, Array]:
+    """Projectivity (3, 3), coefficients (2, m) of the polynomial, and offset and scale (3,) of its arguments.
+
+    The monomials are 1, u, v, u², u v, v², … as :meth:`reseau.optics.RationalPolynomial.polynomial` orders
+    them.
+    """
+    curved = mapping.second
+    assert isinstance(curved, RationalPolynomial)
+    normal = np.array([*curved.offset, curved.scale])
+    return np.append(mapping.first.values, 1.0).reshape(3, 3), curved.values.reshape(2, -1), normal
+
+
+def degree_of(mapping: Chain) -> int:
+    """Degree of the polynomial; one of degree d has (d + 1)(d + 2) coefficients."""
+    return isqrt(len(mapping.second.values)) - 1
+
+
+_NONE: tuple[Array, Array] = np.empty((0, 2, 2)), np.empty((0, 2, 2, 2))
+
+
+def images_of(mapping: Chain, at: Array) -> Array:
+    """Images (n, 2) of lattice coordinates (n, 2)."""
+    from .compiled_lattice import images  # takes half a second to import; not every command needs it
+
+    value = np.empty((len(at), 2))
+    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, *_NONE)
+    return value
+
+
+def slope_of(mapping: Chain, at: Array) -> Array:
+    """Derivatives (n, 2, 2) of a mapping at lattice coordinates (n, 2)."""
+    from .compiled_lattice import images  # takes half a second to import; not every command needs it
+
+    value, slope = np.empty((len(at), 2)), np.empty((len(at), 2, 2))
+    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, slope, _NONE[1])
+    return slope
+
+
+def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
+    """A mapping at points (n, 2) with its first (n, 2, 2) and second derivatives (n, 2, 2, 2)."""
+    from .compiled_lattice import images  # takes half a second to import; not every command needs it
+
+    n = len(at)
+    found = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
+    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), *found)
+    return found
+
+
+def straightened(mapping: Chain, xy: Array) -> Array:
+    """Lattice coordinates (n, 2) of image points by the projectivity alone."""
+    h = np.append(mapping.first.values, 1.0).reshape(3, 3)
+    back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
+    at: Array = back[:, :2] / back[:, 2:]
+    return at
+
+
+def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
+    """Lattice coordinates (n, 2) of image points; a few Newton steps are accurate enough here."""
+    from .compiled_lattice import lattice_coordinates as inverted  # takes half a second to import
+
+    numbers = numbers_of(mapping)
+    zero = of_degree(mapping, degree_of(mapping)).second
+    bent = not np.array_equal(mapping.second.values, zero.values)
+    back = np.linalg.inv(numbers[0])
+    return np.asarray(inverted(numbers, back, bent, np.ascontiguousarray(xy), _LONGEST))
+
+
+def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:
+    """A mapping to an enlarged image as one to the original; the point x is at factor · x + shift there."""
+    curved = mapping.second
+    assert isinstance(curved, RationalPolynomial)
+    matrix, coefficients, _ = numbers_of(mapping)
+    matrix[:2] = (matrix[:2] - np.outer(shift, matrix[2])) / factor
+    coefficients = coefficients.copy()
+    coefficients[:, 0] -= shift
+    offset = (np.array(curved.offset) - shift) / factor
+    moved = replace(
+        curved,
+        values=(coefficients / factor).ravel(),
+        offset=(float(offset[0]), float(offset[1])),
+        scale=curved.scale / factor,
+    )
+    return Chain(mapping.first.with_values(matrix.ravel()[:8]), moved)
