@@ -14,7 +14,7 @@ __all__ = [
     "attenuate",
     "bends",
     "curved",
-    "line_through",
+    "distinct_lines",
     "ridges",
     "supported",
     "voted",
@@ -82,7 +82,7 @@ def supported(
 
 
 @numba.njit(cache=True, nogil=True)
-def line_through(
+def _line_through(
     xy: NDArray[Any],
     normal: NDArray[Any],
     across: NDArray[Any],
@@ -131,6 +131,62 @@ def line_through(
         t = at[int(np.rint((0.02, 0.98)[k] * (count - 1)))]
         ends[k] = t * along + (distance + level + slope * (t - middle)) * across
     return (across - slope * along) / scale, (distance + level - slope * middle) / scale, ends, rows
+
+
+@numba.njit(cache=True, nogil=True)
+def distinct_lines(
+    xy: NDArray[Any],
+    normal: NDArray[Any],
+    across: NDArray[Any],
+    distance: NDArray[Any],
+    near: tuple[float, float, int],
+    own: float,
+    most: int,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Lines adjusted to the ridge points along them, without those that repeat a stronger one.
+
+    A line is skipped that nearly coincides with one before it, or consists of points of such.
+
+    Parameters
+    ----------
+    xy, normal : ndarray (n, 2)
+        Ridge points and their normals.
+    across, distance : ndarray (k, 2), (k,)
+        Normals of the approximate lines, the strongest first, and their distances from the origin.
+    near : tuple
+        Largest distance of a point from its line, half that of different lines; least cosine of the angle
+        between the normals; number of points from which a line is adjusted.
+    own : float
+        Minimum share of points of a line that are not those of a stronger one.
+    most : int
+        Most lines.
+
+    Returns
+    -------
+    ndarray of int (m,), ndarray (m, 2), (m,), (m, 2, 2)
+        Which of the lines are kept, their normals, distances and ends.
+    """
+    kept, normals, places = np.empty(most, np.intp), np.empty((most, 2)), np.empty(most)
+    ends, free, count = np.empty((most, 2, 2)), np.ones(len(xy), np.bool_), 0
+    for k in range(len(across)):
+        if count == most:
+            break
+        turned, place, end, rows = _line_through(xy, normal, across[k], distance[k], *near)
+        mine = 0
+        for i in rows:
+            mine += free[i]
+        apart = not (len(rows) and mine < own * len(rows))
+        for j in range(count):
+            off = 0.0
+            for e in range(2):
+                off = max(off, abs(end[e, 0] * normals[j, 0] + end[e, 1] * normals[j, 1] - places[j]))
+            apart = apart and off > 2 * near[0]
+        if apart:
+            kept[count], normals[count], places[count], ends[count] = k, turned, place, end
+            count += 1
+            for i in rows:
+                free[i] = False
+    return kept[:count].copy(), normals[:count].copy(), places[:count].copy(), ends[:count].copy()
 
 
 @numba.njit(cache=True, nogil=True)

@@ -244,25 +244,13 @@ def _candidates(ridges: Ridges) -> _Lines:
     weight = votes[turn, distance] * share
     order = np.argsort(-weight, kind="stable")
     order = order[share[order] > _LEAST_SHARE]
-    kept: list[tuple[Array, float, Array, float]] = []
-    free = np.ones(len(xy), dtype=bool)
-    from .compiled import line_through  # takes half a second to import; not every command needs it
+    from .compiled import distinct_lines  # takes half a second to import; not every command needs it
 
-    for k in order:
-        across = np.array([np.cos(angle[k]), np.sin(angle[k])])
-        normal_k, place, ends, near = line_through(
-            xy, normal, across, float(rho[k] + across @ centre), _APART_PX / 2, _PARALLEL, _FEW_POINTS
-        )
-        # A line that nearly coincides with a stronger one, or consists of points of such, is skipped.
-        if len(near) and np.count_nonzero(free[near]) < _OWN * len(near):
-            continue
-        if all(np.abs(ends @ n - d).max() > _APART_PX for n, d, _, _ in kept):
-            kept.append((normal_k, place, ends, float(weight[k])))
-            free[near] = False
-        if len(kept) == _MOST_LINES:
-            break
-    columns = [np.array(column) for column in zip(*kept, strict=True)] if kept else [np.zeros(0)] * 4
-    return _Lines(*columns)
+    across = np.stack([np.cos(angle), np.sin(angle)], axis=1)[order]
+    place = rho[order] + across @ centre
+    near = _APART_PX / 2, _PARALLEL, _FEW_POINTS
+    kept, normals, distances, ends = distinct_lines(xy, normal, across, place, near, _OWN, _MOST_LINES)
+    return _Lines(normals, distances, ends, weight[order[kept]])
 
 
 def _centre(shape: tuple[int, ...]) -> Array:

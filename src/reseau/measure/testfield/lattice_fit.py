@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...adjust import BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
@@ -369,15 +368,12 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
     The projectivity is kept. The coefficients of the polynomial are linear: all of them in one problem, or
     those of x and those of y, which share a design matrix (n, u), in two.
     """
-    none = np.zeros((len(observed), design.shape[1]))
-    fit = adjust_batch(
-        lambda x, rows: (x @ design.T, np.broadcast_to(design, (len(rows), *design.shape))),
-        none,
-        observed,
-        prior=(none, np.full(design.shape[1], _MOST_PX / sigma_px)),
-        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=5, tolerance=0.1 * sigma_px),
-    )
-    return with_coefficients(mapping, fit.estimates), fit.residuals
+    from ...adjust.compiled import reweighted  # takes half a second to import; not every command needs it
+
+    with one_thread():
+        given = np.ascontiguousarray(design), np.ascontiguousarray(observed)
+        added, residuals = reweighted(*given, (sigma_px / _MOST_PX) ** 2, 0.1 * sigma_px, 5)
+    return with_coefficients(mapping, added), residuals
 
 
 def _darkness_along(

@@ -26,6 +26,7 @@ __all__ = [
     "slope_of",
     "started",
     "straightened",
+    "stretches",
     "with_coefficients",
 ]
 
@@ -95,6 +96,14 @@ def slope_of(mapping: Chain, at: Array) -> Array:
     value, slope = np.empty((len(at), 2)), np.empty((len(at), 2, 2))
     images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, slope, _NONE[1])
     return slope
+
+
+def stretches(slope: Array) -> tuple[Array, Array]:
+    """Largest and smallest scale (n,) of linear mappings (n, 2, 2): their singular values, in closed form."""
+    (a, b), (c, d) = np.moveaxis(slope, 0, 2)
+    # (s₁ ± s₂)² is the sum of the squares, plus or minus twice the determinant.
+    total, apart = np.hypot(a + d, b - c), np.hypot(a - d, b + c)
+    return (total + apart) / 2, np.abs(total - apart) / 2
 
 
 def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:

@@ -20,9 +20,9 @@ from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches, Window
 from ..points import Measured, Reason
-from ..screening import quiet_noise, screen
+from ..screening import screen
 from .lattice_fit import LatticeFit, common_part, refit
-from .lattice_mapping import images_of, slope_of
+from .lattice_mapping import images_of, slope_of, stretches
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
@@ -203,13 +203,12 @@ def measure_testfield(
 def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) -> TestfieldResult | Failure:
     screened = screen(frame, None)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
-    noise = quiet_noise(grey)
-    seen = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
-    read = seen.read()
+    original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
+    seen, read = original, original.read()
     if isinstance(read, Failure) and read.code != Code.MIRRORED:
         # Lines of one pixel width may be recovered from a blurred frame by sharpening, lines and targets of a
         # few pixels in a small part of it by interpolation.
-        for other in (seen.sharpened(noise), seen.enlarged()):
+        for other in (original.sharpened(), original.enlarged()):
             again = read if other is None else other.read()
             if other is not None and (not isinstance(again, Failure) or again.code == Code.MIRRORED):
                 seen, read = other, again
@@ -230,7 +229,7 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     scene = Scene(
         screened.grey,
         valid,
-        noise,
+        original.noise,
         design,
         lattice.mapping,
         placed.frame,
@@ -361,7 +360,7 @@ class _Measurement:
         mapping = refit(scene.mapping, at[good], found.xy[good], _UNMODELLED_PX)
         change = (slope_of(mapping, at) - slope_of(scene.mapping, at)) @ scene.frame
         size = np.array(scene.design.targets.size)[wanted]
-        displaced = np.linalg.norm(change, ord=2, axis=(1, 2)) * _REACH * size > _RESHAPED_PX
+        displaced = stretches(change)[0] * _REACH * size > _RESHAPED_PX
         if not displaced.any():
             return found, why, predicted
         self._learn_from(found, good, wanted)

@@ -22,7 +22,7 @@ _LONG_PX = 2.5
 """Path from which more images are averaged."""
 
 _DIFFERENCE_PX = 0.5
-"""Step of the second differences of images."""
+"""Step of the second differences of images; half a pixel, so that neighbouring pixels are both sides."""
 
 
 def steps_of(path: Array) -> tuple[Array, Array]:
@@ -108,13 +108,21 @@ def anisotropy(shape: Shape, xy: Array, width: Array, window: Window, left: Arra
         Observed minus formed images, as shares; NaN where a pixel was not used.
     """
     every, none = np.arange(len(xy)), np.zeros((len(xy), shape.parameters))
+    h = _DIFFERENCE_PX
 
     def at(x: float, y: float) -> Array:
-        return shape.image(xy + np.array([x, y]), width, none, every, window).astype(np.float64)
+        """Images displaced by both signs of x and y: a window shifted by half a pixel, and its neighbours."""
+        wider = Window(_begun(window.columns, x), _begun(window.rows, y), window.response)
+        return shape.image(xy, width, none, every, wider).astype(np.float64)
 
-    h = _DIFFERENCE_PX
-    sides = at(h, 0) + at(-h, 0) - at(0, h) - at(0, -h)
-    corners = (at(h, h) + at(-h, -h) - at(h, -h) - at(-h, h)) / 4
+    across, down, both = at(h, 0), at(0, h), at(h, h)
+    sides = across[:, :, 1:] + across[:, :, :-1] - down[:, 1:] - down[:, :-1]
+    corners = (both[:, 1:, 1:] + both[:, :-1, :-1] - both[:, 1:, :-1] - both[:, :-1, 1:]) / 4
     design = np.stack([sides / 2, corners], axis=-1) / h**2
     used = np.isfinite(left)
     return np.asarray(np.linalg.lstsq(design[used], left[used], rcond=None)[0], dtype=np.float64)
+
+
+def _begun(axis: Array, before: float) -> Array:
+    """Coordinates (k, n + 1) that begin by so much before those given (k, n); unchanged if by nothing."""
+    return np.concatenate([axis - before, axis[:, -1:] + before], axis=1) if before else axis

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -31,7 +31,7 @@ from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
 from .lattice import Ridges, find_lattices, ridge_points
 from .lattice_fit import LatticeFit, lattices
-from .lattice_mapping import images_of, reduced, slope_of, straightened
+from .lattice_mapping import images_of, reduced, slope_of, straightened, stretches
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
 
@@ -197,8 +197,8 @@ class _Clusters:
         xy, (h, w) = xy.reshape(-1, 16, 2), grey.shape
         frames = slope_of(fit.mapping, self.cell + 0.5) / design.pitch
         seen: Mask = np.asarray(((xy > 1) & (xy < [w - 2, h - 2])).all(axis=2))
-        sides = np.linalg.svd(np.nan_to_num(frames), compute_uv=False) * self.step
-        legible = seen.any(axis=1) & (sides[:, 1] > _LEAST_STEP_PX) & (sides[:, 0] < max(h, w) / 2)
+        longest, shortest = (self.step * scale for scale in stretches(np.nan_to_num(frames)))
+        legible = seen.any(axis=1) & (shortest > _LEAST_STEP_PX) & (longest < max(h, w) / 2)
         legible &= legible.sum() <= _MOST_SQUARES * len(design.centres)
         self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
         if not legible.any():
@@ -269,7 +269,7 @@ class _Clusters:
 
     def _design(self, psf_px: float) -> Array:
         """Design matrices (g, k, n, 5): level, contrast, shifts, width."""
-        scale = float(np.linalg.norm(self.frames, ord=2, axis=(1, 2)).max())
+        scale = float(stretches(self.frames)[0].max())
         outline = self.kinds.outline(float(f"{psf_px / scale:.2g}"))
         turned = np.swapaxes(self.frames, 1, 2)[:, None]
         nodes = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()
@@ -418,9 +418,14 @@ class SearchedFrame:
     factor: int = 1
     corner: tuple[int, int] = (0, 0)
 
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the noise."""
+        return quiet_noise(self.dark)
+
     def enlarged(self) -> SearchedFrame | None:
         """The part of the frame with the most lines and edges, enlarged; None if it is large already."""
-        points = ridge_points(self.dark, quiet_noise(self.dark)).xy
+        points = ridge_points(self.dark, self.noise).xy
         h, w = self.dark.shape
         blocks = np.zeros((h // _BLOCK_PX + 1, w // _BLOCK_PX + 1), np.float32)
         column, row = ((points + 0.5) / _BLOCK_PX).astype(np.intp).clip(0).T
@@ -472,9 +477,9 @@ class SearchedFrame:
             read, ridges=replace(read.ridges, xy=xy(read.ridges.xy)), lattice=lattice, reading=reading
         )
 
-    def sharpened(self, noise: float) -> SearchedFrame:
-        """The frame sharpened by removing most of an assumed blur; `noise` is its noise."""
-        power = max(_LEAST_POWER, (noise / max(float(self.grey.std()), 1e-9)) ** 2)
+    def sharpened(self) -> SearchedFrame:
+        """The frame sharpened by removing most of an assumed blur."""
+        power = max(_LEAST_POWER, (self.noise / max(float(self.grey.std()), 1e-9)) ** 2)
         grey, dark = (_sharpened(image, power) for image in (self.grey, self.dark))
         return replace(self, grey=grey, dark=dark, psf_px=1.0, taken_px2=_BLURRED_PX**2 - _SHARP_PX**2)
 
@@ -490,7 +495,7 @@ class SearchedFrame:
         ridges : Ridges, optional
             Ridge points in which lines are searched; all of the frame by default.
         """
-        ridges = ridges or ridge_points(self.dark, quiet_noise(self.dark))
+        ridges = ridges or ridge_points(self.dark, self.noise)
         found = find_lattices(ridges)
         if isinstance(found, Failure):
             return found

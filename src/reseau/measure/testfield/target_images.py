@@ -13,7 +13,7 @@ from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
 from ..matching import SIZE, GrownOutline
-from .lattice_mapping import second_order
+from .lattice_mapping import second_order, stretches
 
 __all__ = ["flat_outline", "form_targets", "stacked"]
 
@@ -56,7 +56,7 @@ def form_targets(
 
     value, slope, bend = second_order(mapping, at)
     # The spacing of nodes is determined where a millimetre is largest in the image.
-    scale = float(np.linalg.norm(slope @ frame, ord=2, axis=(1, 2)).max())
+    scale = float(stretches(slope @ frame)[0].max())
     targets = design.targets
     keys = [(targets.shape[k], targets.size[k], targets.angle[k]) for k in rows]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
