@@ -13,6 +13,7 @@ from reseau.bundle.solver.values import Values
 from reseau.core.data import Array
 from reseau.optics import Chain, OpenCV, RationalPolynomial, Similarity, wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
+from reseau.optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window, window_parameters
 
 BROWN = (8.0, 0.03, -0.02, 2e-3, -3e-5, 0.0, 4e-5, -3e-5, 2e-4, -1e-4)
 OPENCV = (810.0, 805.0, 321.0, 238.0, -0.2, 0.05, 4e-4, -3e-4, 0.01, 0.0, 0.0, 0.0)
@@ -181,6 +182,77 @@ def polynomial() -> Camera:
 def with_ebner(per: Any, base_mm: float = 1.2) -> Camera:
     """A camera with Ebner's parameters beside c, x0, y0."""
     return camera(free=(), additional=Additional(base_mm, True, per))
+
+
+# The cameras of :func:`world` are some 4 m from points within 1 m of the origin; all windows are between.
+WINDOWS: dict[str, tuple[Window, ...]] = {
+    "plane port": (
+        Window("port", "plane", "camera", {"distance": 0.05, "thickness": 0.025}, ("air", "glass", "water")),
+    ),
+    "dome": (
+        Window("dome", "sphere", "camera", {"X": 0.004, "Z": 0.006, "radius": 0.1, "thickness": 0.01},
+               ("air", "glass", "water")),
+    ),
+    "surface of the water": (
+        Window("surface", "plane", "object", {"distance": -1.3}, ("air", "water"), direction=(0, 0, -1)),
+    ),
+    "tank wall": (
+        Window("wall", "plane", "object", {"distance": -1.3, "thickness": 0.02}, ("air", "glass", "water"),
+               direction=(0, 0, -1)),
+    ),
+    "round tank": (
+        Window("tank", "cylinder", "object", {"radius": 1.8, "thickness": 0.02}, ("air", "glass", "water"),
+               camera_side="outside"),
+    ),
+    "port before a round tank": (
+        Window("port", "plane", "camera", {"distance": 0.05, "thickness": 0.025}, ("air", "glass", "air")),
+        Window("tank", "cylinder", "object", {"radius": 1.8, "thickness": 0.02}, ("air", "glass", "water"),
+               camera_side="outside"),
+    ),
+}  # fmt: skip
+
+
+def refracted(
+    base: World, kind: str, free: tuple[str, ...] | None = None, sigma: dict[str, float] | None = None
+) -> World:
+    """The same world seen through windows; `free` are the unknowns, by default all of windows and media."""
+    media = {"air": 1.0, "glass": 1.52, "water": 1.333}
+    sigma = sigma or {}
+
+    def chosen(label: str) -> bool:
+        return free is None or label in free
+
+    windows = tuple(
+        replace(
+            window,
+            free=tuple(
+                n for n in window_parameters(window.shape, pane=window.is_pane)
+                if chosen(f"{n} of {window.name}")
+            ),
+            sigma={
+                n: sigma[label] for n, label in zip(window.names, window.labels, strict=True)
+                if label in sigma
+            },
+        )
+        for window in WINDOWS[kind]
+    )  # fmt: skip
+    indices = tuple(
+        RefractiveIndex(name, value, chosen(f"index of {name}"), sigma.get(f"index of {name}"))
+        for name, value in media.items()
+    )
+    network = base.network
+    path = tuple(range(len(windows)))
+    refraction = Refraction(indices, windows, (path,), np.zeros(len(network.images), np.intp))
+    rays = RefractedRays.of(
+        refraction.columns(refraction.values), refraction.path_of, base.rotation, base.x0, base.xyz,
+        network.image_of, network.point_of,
+    )  # fmt: skip
+    assert rays.reached.all()
+    xy = network.xy.copy()
+    for c, cam in enumerate(network.cameras):
+        rows = network.camera_of[network.image_of] == c
+        xy[rows] = mapping_of(cam)(rays.uv[rows])
+    return replace(base, network=replace(network, xy=xy, refraction=refraction))
 
 
 def normalised_errors(world: World, fit: Any) -> dict[str, float]:

@@ -31,6 +31,7 @@ def system_of(world: networks.World) -> tuple[System, Values]:
         Weighting([network.cov]),
         np.ones(len(others.value)),
         np.zeros(unknowns.size, bool),
+        np.zeros(3),
     )
     return system, Values.of_cameras(unknowns, world.rotation, world.x0, world.xyz)
 
@@ -125,6 +126,40 @@ def test_derivatives_by_every_unknown_agree_with_differences(name: str) -> None:
     analytic, numeric = dense(system.linearise(values)), by_differences(system, values)
     size = np.maximum(np.abs(numeric).max(axis=0), 1e-30)
     assert np.abs((analytic - numeric) / size).max() < 1e-8
+
+
+BEHIND_WINDOWS = {
+    **{f"opencv behind: {kind}": ((networks.camera("opencv"),), kind) for kind in networks.WINDOWS},
+    "brown on the image side behind a port": ((networks.camera("brown-image"),), "plane port"),
+    "ebner behind a dome": ((networks.with_ebner("group"),), "dome"),
+    "a mapping beside a compiled camera behind a port": (
+        (networks.mapped(networks.camera("opencv")), networks.camera()),
+        "plane port",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BEHIND_WINDOWS)
+def test_derivatives_through_windows_agree_with_differences(name: str) -> None:
+    cameras, kind = BEHIND_WINDOWS[name]
+    world = networks.refracted(networks.world(images=4, points=8, cameras=cameras), kind)
+    # One image in air beside the others.
+    refraction = world.network.refraction
+    assert refraction is not None
+    refraction = replace(refraction, path_of=np.array([0, -1, 0, 0]))
+    system, values = system_of(replace(world, network=replace(world.network, refraction=refraction)))
+    analytic, numeric = dense(system.linearise(values)), by_differences(system, values)
+    # A plate in one medium may be at any distance: that derivative is zero but for rounding.
+    size = np.maximum(np.abs(numeric).max(axis=0), 1.0)
+    assert np.abs((analytic - numeric) / size).max() < 1e-7
+
+
+@pytest.mark.parametrize("kind", networks.WINDOWS)
+def test_image_points_through_windows_have_no_residual_in_the_truth(kind: str) -> None:
+    world = networks.refracted(networks.world(), kind)
+    system, values = system_of(world)
+    rows = np.arange(len(world.network.xy))
+    assert np.abs(residuals(world.network, system.unknowns, rows, values)).max() < 1e-9
 
 
 def test_ebner_is_orthogonal_over_its_grid_and_as_defined() -> None:

@@ -16,6 +16,7 @@ from ...core.errors import UsageError
 from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
 from ...optics.cameras import distortion_names
+from ...optics.refraction import Refraction
 from .stage import Stage
 
 __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
@@ -297,6 +298,8 @@ class Network(Display):
     stage : Stage, optional
         Stage that moved the field between images with the same exterior orientation; requires the datum
         ``control``.
+    refraction : Refraction, optional
+        Windows and media that the rays pass; without it, and for images without a path, all is in air.
 
     Examples
     --------
@@ -329,6 +332,7 @@ class Network(Display):
     files: tuple[str | None, ...]
     unit: str = "mm"
     stage: Stage | None = None
+    refraction: Refraction | None = None
 
     def __post_init__(self) -> None:
         m, p, n = len(self.images), len(self.points), len(self.image_of)
@@ -346,6 +350,17 @@ class Network(Display):
             raise UsageError("columns differ in length", where="Network")
         if self.stage is not None and (self.datum != "control" or len(self.stage.pose) != m):
             raise UsageError("requires the datum `control` and a pose for each image", where="Network.stage")
+        if self.refraction is not None:
+            self._check_refraction(self.refraction)
+
+    def _check_refraction(self, refraction: Refraction) -> None:
+        if len(refraction.path_of) != len(self.images):
+            raise UsageError("requires a path, or −1, for each image", where="Network.refraction")
+        if self.stage is not None and any(window.on == "object" for window in refraction.windows):
+            raise UsageError(
+                "a window on the object cannot be combined with a stage that moves the object",
+                where="Network.refraction",
+            )
 
     @classmethod
     def from_document(cls, document: Network1, calibrated: Mapping[str, Camera] | None = None) -> Self:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +29,17 @@ class Similarity(NamedTuple):
 
     def __call__(self, values: Values) -> Values:
         """Transform poses and points; image coordinates do not change."""
-        return Values(
-            values.rotation @ self.turn.T,
-            self.scale * values.x0 @ self.turn.T + self.shift,
-            self.scale * values.xyz @ self.turn.T + self.shift,
-            values.cameras,
-            values.extra,
-            None if values.stage is None else values.stage.turned(self.turn),
+        return replace(
+            values,
+            rotation=values.rotation @ self.turn.T,
+            x0=self.scale * values.x0 @ self.turn.T + self.shift,
+            xyz=self.scale * values.xyz @ self.turn.T + self.shift,
+            stage=None if values.stage is None else values.stage.turned(self.turn),
         )
+
+    def about(self, origin: Array) -> Similarity:
+        """Return the same similarity for coordinates that are larger by `origin` (3,)."""
+        return Similarity(self.scale, self.turn, self.shift + origin - self.scale * self.turn @ origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +66,12 @@ class Freedom:
         return int(self.reduced.shape[1])
 
 
-def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -> tuple[Array, Array]:
+def _similarity_changes(
+    unknowns: Unknowns, values: Values, taking_part: Mask, windows: Array
+) -> tuple[Array, Array]:
     """Changes of reduced unknowns (u, 7) and points (p, 3, 7) by a small similarity: shift, rotation, scale.
+
+    `windows` (r, 7) are those of all parameters of windows and media.
 
     X' = X + t + ω × X + μX; a camera rotates by −R ω about its own axes.
     """
@@ -83,6 +90,7 @@ def _similarity_changes(unknowns: Unknowns, values: Values, taking_part: Mask) -
     at = unknowns.pose[images, None] + np.arange(3)
     reduced[at, 3:6] = -values.rotation[images]
     reduced[at + 3] = moved(values.x0[images])
+    reduced[unknowns.refraction_columns] = windows[unknowns.refracting]
     points = moved(values.xyz)
     points[~taking_part] = 0.0
     kept = np.flatnonzero(unknowns.kept >= 0)
@@ -100,7 +108,9 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
         Points that are adjusted.
     """
     unknowns, network = system.unknowns, system.unknowns.network
-    reduced, points = _similarity_changes(unknowns, values, taking_part)
+    bent = network.refraction
+    windows = np.zeros((0, 7)) if bent is None else bent.changes(values.refraction, system.origin)
+    reduced, points = _similarity_changes(unknowns, values, taking_part, windows)
     whole = points.copy()
     kept = np.flatnonzero(unknowns.kept >= 0)
     whole[kept] = reduced[unknowns.kept[kept, None] + np.arange(3)]
@@ -112,6 +122,10 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
     for a, b in system.others.ends[system.sigma_root[system.others.slices[0]] > 0]:
         along = values.xyz[b] - values.xyz[a]
         rows.append(along[None] @ (whole[b] - whole[a]))
+    if bent is not None:
+        known = bent.used & ~bent.free
+        known[system.others.refraction[system.sigma_root[system.others.windows] > 0]] = True
+        rows.append(windows[known])
     if network.stage is not None:
         rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0

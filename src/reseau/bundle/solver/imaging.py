@@ -1,9 +1,11 @@
 """Image points and their derivatives by pose, point and camera, in compiled loops over the observations.
 
 For every observation: the misfit v (px) and its derivatives by the pose (rotation about the axes of the
-camera, projection centre), by the parameters of the camera and by the object point. The cameras are the
-registered models of :mod:`reseau.optics.cameras`. For each model with a kernel the loops are compiled with
-this kernel; all other cameras are evaluated by their mappings in :func:`mapped`.
+camera, projection centre), by the parameters of the camera, of windows and media, and by the object point.
+Rays through windows are computed before, by :mod:`reseau.optics.refraction`; the loops then begin with their
+directions. The cameras are the registered models of :mod:`reseau.optics.cameras`. For each model with a
+kernel the loops are compiled with this kernel; all other cameras are evaluated by their mappings in
+:func:`mapped`.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from ...optics import PlaneMapping
 from ...optics.cameras.kernels import CameraColumns, Kernel, camera, compiled, kernel
 from ...optics.cameras.registry import additional_model, camera_model
 from ...optics.poses import Pose, matrix_to_vector, project
+from ...optics.refraction import RefractedRays
 from ..network.network import Network
 
 __all__ = ["Imaging", "Orientation", "Seen", "mapped"]
@@ -49,10 +52,18 @@ class Orientation(NamedTuple):
     xyz: Array
 
 
+class Bent(NamedTuple):
+    """Rays through windows: path of each image (m,), −1 in air; see RefractedRays for the other columns."""
+
+    path: Rows
+    uv: Array
+    by: Array
+
+
 @kernel
 def _image(
-    k: int, seen: Seen, at: Orientation, cameras: CameraColumns, x: Array, by_uv: Array, d: Array,
-    more: Array, off: Array,
+    k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, x: Array, by_uv: Array,
+    d: Array, more: Array, off: Array,
 ) -> None:  # fmt: skip
     """Write the point in the camera system to `x`; compute misfit and derivatives with the camera kernel."""
     i, j, c = seen.image[k], seen.point[k], seen.camera[k]
@@ -60,6 +71,8 @@ def _image(
     for q in range(3):
         x[q] = at.rotation[i, q, 0] * dx + at.rotation[i, q, 1] * dy + at.rotation[i, q, 2] * dz
     u, v = x[0] / x[2], x[1] / x[2]
+    if bent.path[i] >= 0:
+        u, v = bent.uv[k, 0], bent.uv[k, 1]
     camera(k, c, seen.extra[k], u, v, seen.xy, cameras, by_uv, d, more, off)
 
 
@@ -71,6 +84,7 @@ def _misfit(
     kind: Rows,
     seen: Seen,
     at: Orientation,
+    bent: Bent,
     cameras: CameraColumns,
     out: Array,
 ) -> None:
@@ -81,39 +95,55 @@ def _misfit(
     for k in range(begin, end):
         if kind[seen.camera[k]] != own:
             continue
-        _image(k, seen, at, cameras, x, by_uv, d, more, off)
+        _image(k, seen, at, bent, cameras, x, by_uv, d, more, off)
         out[k, 0] = root[k, 0, 0] * off[0]
         out[k, 1] = root[k, 1, 0] * off[0] + root[k, 1, 1] * off[1]
 
 
 @kernel
 def _derive(
-    begin: int, end: int, own: int, kind: Rows, seen: Seen, at: Orientation, cameras: CameraColumns,
-    free: Rows, count: Rows, width: Rows, movable: Array, r_out: Array, a_out: Array, b_out: Array,
+    begin: int, end: int, own: int, kind: Rows, seen: Seen, at: Orientation, bent: Bent,
+    cameras: CameraColumns, free: Rows, count: Rows, width: Rows, movable: Array, r_out: Array, a_out: Array,
+    b_out: Array,
 ) -> None:  # fmt: skip
     """Compute weighted misfits (n, 2) and derivatives of observations begin…end by cameras of kind `own`.
 
     Derivatives by the pose are written to a_out[:, :, :6], those by the `count` (c,) parameters `free`
     (c, p) of the camera to the columns after it, those by the `width` (e,) additional parameters to the last
-    columns, those by the point to b_out (n, 2, 3); `movable` (p, 3) is 0 for held coordinates and 1 for
-    others.
+    columns, those by windows and media to the columns before these, those by the point to b_out (n, 2, 3);
+    `movable` (p, 3) is 0 for held coordinates and 1 for others.
     """
     by_uv, off, x = np.empty((2, 2)), np.empty(2), np.empty(3)
     d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
     g, root, turn = np.empty((2, 3)), seen.root, at.rotation
     last = a_out.shape[2] - cameras.extra.shape[1]
+    windows = max(bent.by.shape[2] - 9, 0)
     for k in range(begin, end):
         if kind[seen.camera[k]] != own:
             continue
-        _image(k, seen, at, cameras, x, by_uv, d, more, off)
+        _image(k, seen, at, bent, cameras, x, by_uv, d, more, off)
         w0, w1, w2 = root[k, 0, 0], root[k, 1, 0], root[k, 1, 1]
         for q in range(2):
-            g[0, q] = w0 * by_uv[0, q] / x[2]
-            g[1, q] = (w1 * by_uv[0, q] + w2 * by_uv[1, q]) / x[2]
+            g[0, q] = w0 * by_uv[0, q]
+            g[1, q] = w1 * by_uv[0, q] + w2 * by_uv[1, q]
         i, j, c, e = seen.image[k], seen.point[k], seen.camera[k], seen.extra[k]
         r_out[k, 0] = w0 * off[0]
         r_out[k, 1] = w1 * off[0] + w2 * off[1]
+        through = bent.path[i] >= 0
         for q in range(2):
+            if through:
+                for s in range(6):
+                    a_out[k, q, s] = g[q, 0] * bent.by[k, 0, s] + g[q, 1] * bent.by[k, 1, s]
+                for s in range(3):
+                    along = g[q, 0] * bent.by[k, 0, 6 + s] + g[q, 1] * bent.by[k, 1, 6 + s]
+                    b_out[k, q, s] = along * movable[j, s]
+                for s in range(windows):
+                    a_out[k, q, last - windows + s] = (
+                        g[q, 0] * bent.by[k, 0, 9 + s] + g[q, 1] * bent.by[k, 1, 9 + s]
+                    )
+                continue
+            g[q, 0] /= x[2]
+            g[q, 1] /= x[2]
             g[q, 2] = -(g[q, 0] * x[0] + g[q, 1] * x[1]) / x[2]
             a_out[k, q, 0] = g[q, 2] * x[1] - g[q, 1] * x[2]
             a_out[k, q, 1] = g[q, 0] * x[2] - g[q, 2] * x[0]
@@ -159,9 +189,13 @@ class Imaging:
         Network with the cameras.
     sets : tuple of (int, str)
         Camera and label of each set of additional parameters.
+    origin : ndarray (3,)
+        Point of object space from which the coordinates of points are counted.
     """
 
-    def __init__(self, network: Network, sets: tuple[tuple[int, str], ...]) -> None:
+    def __init__(self, network: Network, sets: tuple[tuple[int, str], ...], origin: Array) -> None:
+        self.refraction, self.origin = network.refraction, origin
+        self._air = np.full(len(network.images), -1, dtype=np.intp)
         kinds = [entry.compiled_kind for entry in network.cameras]
         known = list(dict.fromkeys(kind for kind in kinds if kind is not None))
         extras = [entry.additional for entry in (network.cameras[c] for c, _ in sets) if entry.additional]
@@ -184,9 +218,34 @@ class Imaging:
         """Return which observations by these cameras (n,) use the compiled loops."""
         return np.asarray(self.kind[camera_of] != _NO_KERNEL)
 
+    def bent(
+        self, seen: Seen, at: Orientation, values: Array, *, derivatives: bool
+    ) -> tuple[Bent, Callable[[int, int], None]]:
+        """Return room for the rays through windows, and a function that computes them for a part of `seen`.
+
+        Parameters
+        ----------
+        seen : Seen
+            Observations.
+        at : Orientation
+            Poses and points.
+        values : ndarray (r,)
+            Parameters of windows and media.
+        derivatives : bool
+            Whether derivatives are needed.
+        """
+        if self.refraction is None:
+            return Bent(self._air, np.zeros((0, 2)), np.zeros((0, 2, 0))), lambda begin, end: None
+        columns = self.refraction.columns(values, self.origin)
+        width = 9 + columns.by_parameters.shape[3] if derivatives else 0
+        rays = RefractedRays.empty(len(seen.image), width)
+        work = RefractedRays.worker(columns, self.refraction.path_of, *at, seen.image, seen.point, rays)
+        return Bent(self.refraction.path_of, rays.uv, rays.by), work
+
     def misfit(
-        self, begin: int, end: int, seen: Seen, at: Orientation, values: Array, extra: Array, out: Array
-    ) -> None:
+        self, begin: int, end: int, seen: Seen, at: Orientation, bent: Bent, values: Array, extra: Array,
+        out: Array,
+    ) -> None:  # fmt: skip
         """Write weighted misfits of observations begin…end to `out` (n, 2), for cameras with a kernel.
 
         Parameters
@@ -197,6 +256,8 @@ class Imaging:
             Observations.
         at : Orientation
             Poses and points.
+        bent : Bent
+            Rays through windows.
         values, extra : ndarray (c, p), (e, a)
             Parameters of the cameras and additional parameters, padded.
         out : ndarray (n, 2)
@@ -204,30 +265,30 @@ class Imaging:
         """
         cameras = self._columns._replace(values=values, extra=extra)
         for own, loops in enumerate(self._loops):
-            loops.misfit(begin, end, own, self.kind, seen, at, cameras, out)
+            loops.misfit(begin, end, own, self.kind, seen, at, bent, cameras, out)
 
     def derive(
-        self, begin: int, end: int, seen: Seen, at: Orientation, values: Array, extra: Array, free: Rows,
-        count: Rows, movable: Array, r_out: Array, a_out: Array, b_out: Array,
+        self, begin: int, end: int, seen: Seen, at: Orientation, bent: Bent, values: Array, extra: Array,
+        free: Rows, count: Rows, movable: Array, r_out: Array, a_out: Array, b_out: Array,
     ) -> None:  # fmt: skip
         """Write weighted misfits to r_out (n, 2) and compute derivatives, for cameras with a kernel.
 
         Derivatives by the pose are written to a_out[:, :, :6], those by the `count` (c,) parameters `free`
         (c, p) of the camera to the columns after it, those by additional parameters to the last columns,
-        those by the point to b_out (n, 2, 3); `movable` (p, 3) is 0 for held coordinates and 1 for others.
-        Other parameters as in :meth:`misfit`.
+        those by windows and media to the columns before these, those by the point to b_out (n, 2, 3);
+        `movable` (p, 3) is 0 for held coordinates and 1 for others. Other parameters as in :meth:`misfit`.
         """
         cameras = self._columns._replace(values=values, extra=extra)
         for own, loops in enumerate(self._loops):
             loops.derive(
-                begin, end, own, self.kind, seen, at, cameras, free, count, self.width, movable, r_out, a_out,
-                b_out,
+                begin, end, own, self.kind, seen, at, bent, cameras, free, count, self.width, movable, r_out,
+                a_out, b_out,
             )  # fmt: skip
 
 
 def mapped(
-    camera: PlaneMapping, at: Orientation, image: Rows, point: Rows
-) -> tuple[Array, Array, Array, Array]:
+    camera: PlaneMapping, at: Orientation, image: Rows, point: Rows, bent: Bent, rows: Rows
+) -> tuple[Array, Array, Array, Array, Array]:
     """Compute image points of any camera and their derivatives, in NumPy.
 
     Parameters
@@ -238,12 +299,16 @@ def mapped(
         Poses and points.
     image, point : ndarray of int (n,)
         Rows of poses and points.
+    bent : Bent
+        Rays through windows.
+    rows : ndarray of int (n,)
+        Their rows.
 
     Returns
     -------
-    ndarray (n, 2), ndarray (n, 2, 6), ndarray (n, 2, u), ndarray (n, 2, 3)
+    ndarray (n, 2), ndarray (n, 2, 6), ndarray (n, 2, u), ndarray (n, 2, 3), ndarray (n, 2, f)
         Pixels, and derivatives by the pose (rotation about the axes of the camera, projection centre), by the
-        parameters of the camera, and by the point.
+        parameters of the camera, by the point, and by the free parameters of windows and media.
     """
     turn, x0, xyz = at.rotation[image], at.x0[image], at.xyz[point]
     seen = project(camera, Pose(matrix_to_vector(turn), x0), xyz)
@@ -251,4 +316,15 @@ def mapped(
     x = np.einsum("nij,nj->ni", turn, xyz - x0)
     # g·(δ × x) = δ·(x × g)
     by_turn = np.cross(x[:, None, :], by_x)
-    return seen.xy, np.concatenate([by_turn, -seen.d_point], axis=2), seen.d_camera, seen.d_point
+    xy, by_camera, by_point = seen.xy.copy(), seen.d_camera.copy(), seen.d_point.copy()
+    by_pose = np.concatenate([by_turn, -seen.d_point], axis=2)
+    by_windows = np.zeros((len(image), 2, max(bent.by.shape[2] - 9, 0)))
+    through = np.flatnonzero(bent.path[image] >= 0)
+    if len(through):
+        behind = rows[through]
+        xy[through], by_uv, by_camera[through] = camera.derivatives(bent.uv[behind])
+        if bent.by.shape[2]:
+            along = by_uv @ bent.by[behind]
+            by_pose[through], by_point[through] = along[:, :, :6], along[:, :, 6:9]
+            by_windows[through] = along[:, :, 9:]
+    return xy, by_pose, by_camera, by_point, by_windows

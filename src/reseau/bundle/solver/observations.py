@@ -1,4 +1,4 @@
-"""Observations other than image coordinates: distances, coordinates, interior orientation, stage."""
+"""Observations other than image coordinates: distances, coordinates, parameters, stage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["OtherObservations"]
 
 @dataclass(frozen=True, eq=False)
 class OtherObservations:
-    """Observations other than image coordinates: distances, coordinates, interior orientation, stage.
+    """Observations other than image coordinates: distances, coordinates, parameters, stage.
 
     Parameters
     ----------
@@ -33,12 +33,14 @@ class OtherObservations:
         Camera of each parameter observed with a joint covariance C = L Lᵀ.
     combination : ndarray (k, w)
         Rows of L⁻¹: the observations are the uncorrelated combinations L⁻¹ p of the parameters p.
+    refraction : ndarray of int (w,)
+        Rows of the observed parameters of windows and media.
     reading : ndarray of int (r,)
         Images of the stage readings.
     across : ndarray (3, t)
         Two directions perpendicular to the nominal axis of a stage; the components of the axis along them are
         observed as zero. Empty without a stage.
-    value, sigma : ndarray (d + q + i + k + r + t,)
+    value, sigma : ndarray (d + q + i + k + w + r + t,)
         Observed values and their standard deviations, in this order.
     """
 
@@ -47,6 +49,7 @@ class OtherObservations:
     interior: Rows
     joint: Rows
     combination: Array
+    refraction: Rows
     reading: Rows
     across: Array
     value: Array
@@ -64,6 +67,8 @@ class OtherObservations:
         coordinate = np.argwhere(network.observed & active[:, None]).astype(np.intp)
         at = np.array([(c, row) for c, row, _ in interior], dtype=np.intp).reshape(-1, 2)
         joint, combination, observed = _combinations(network.cameras)
+        bent = network.refraction
+        windows = np.zeros(0, np.intp) if bent is None else np.flatnonzero(bent.free & (bent.sigma > 0))
         j, axis = coordinate.T
         stage = network.stage
         read = np.zeros(0) if stage is None else stage.reading
@@ -75,6 +80,7 @@ class OtherObservations:
             at,
             joint,
             combination,
+            windows.astype(np.intp),
             np.arange(len(read), dtype=np.intp),
             across_axis,
             np.concatenate(
@@ -83,6 +89,7 @@ class OtherObservations:
                     xyz[j, axis],
                     [network.cameras[c].values[row] for c, row in at],
                     observed,
+                    [] if bent is None else bent.values[windows],
                     read,
                     np.zeros(tilts),
                 ]
@@ -93,6 +100,7 @@ class OtherObservations:
                     network.sigma[j, axis],
                     [s for *_, s in interior],
                     np.ones(len(joint)),
+                    [] if bent is None else bent.sigma[windows],
                     np.full(len(read), 0.0 if stage is None else stage.sigma),
                     np.full(tilts, 0.0 if stage is None else stage.axis_sigma),
                 ]
@@ -112,9 +120,15 @@ class OtherObservations:
         return slice(start, start + len(self.joint))
 
     @property
+    def windows(self) -> slice:
+        """Positions of the parameters of windows and media in `value`."""
+        start = self.combinations.stop
+        return slice(start, start + len(self.refraction))
+
+    @property
     def readings(self) -> slice:
         """Positions of the stage readings in `value`."""
-        start = self.combinations.stop
+        start = self.windows.stop
         return slice(start, start + len(self.reading))
 
     @property
@@ -132,6 +146,7 @@ class OtherObservations:
                 values.xyz[self.coordinate[:, 0], self.coordinate[:, 1]],
                 values.cameras[self.interior[:, 0], self.interior[:, 1]],
                 (self.combination * values.cameras[self.joint, :width]).sum(axis=1),
+                values.refraction[self.refraction],
                 [] if values.stage is None else values.stage.reading[self.reading],
                 [] if values.stage is None else values.stage.axis @ self.across,
             ]

@@ -48,7 +48,7 @@ class BundleProblem(Display):
     """All observations of a network in one column, with approximate values.
 
     Image coordinates come first, x and y alternating, then distances, observed coordinates, observed interior
-    orientation (single parameters, then joint), readings and axis of a stage. It is an
+    orientation (single parameters, then joint), windows and media, readings and axis of a stage. It is an
     :class:`~reseau.adjust.fitted.Adjustable`: robust estimation, data snooping and variance components of
     :mod:`reseau.adjust` apply to it as to any other problem.
 
@@ -285,9 +285,10 @@ class _Run:
         used = np.bincount(whole.camera_of[self.usable.images], minlength=len(whole.cameras)) > 0
         coordinate, interior = part[more.coordinate[:, 0]], used[more.interior[:, 0]]
         joint = used[more.joint]
+        windows = np.ones(len(more.refraction), dtype=bool)
         read = self.usable.images[more.reading]
         axis = np.ones(more.across.shape[1], dtype=bool)
-        self.in_others = np.concatenate([bars, coordinate, interior, joint, read, axis])
+        self.in_others = np.concatenate([bars, coordinate, interior, joint, windows, read, axis])
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
@@ -302,6 +303,7 @@ class _Run:
             more.interior[interior],
             more.joint[joint],
             more.combination[joint],
+            more.refraction,
             more.reading[read],
             more.across,
             more.value[self.in_others],
@@ -311,7 +313,9 @@ class _Run:
             [self.network.cov], self.weights[: 2 * n].reshape(n, 2)[self.usable.observations].ravel()
         )
         factors = self.weights[2 * n :][self.in_others]
-        self.system = System(self.unknowns, others, mine, factors, self.unknowns.dropped.copy())
+        self.system = System(
+            self.unknowns, others, mine, factors, self.unknowns.dropped.copy(), problem.centre
+        )
 
     def adjust(self) -> BundleFit | Failure:
         problem, network = self.problem, self.network
@@ -416,7 +420,13 @@ class _Run:
         reference = self.problem.reference - self.problem.centre
         chosen = chosen & finite(reference)
         scaled = freedom.defect == 7
-        return similarity_onto(values.xyz[chosen], reference[chosen], scaled=scaled)(values)
+        similarity = similarity_onto(values.xyz[chosen], reference[chosen], scaled=scaled)
+        moved, bent = similarity(values), self.network.refraction
+        if bent is None:
+            return moved
+        # Windows count from the origin of the network.
+        whole = similarity.about(self.problem.centre)
+        return replace(moved, refraction=bent.transformed(values.refraction, *whole))
 
     def _fit(
         self,
@@ -472,7 +482,7 @@ class _Run:
         whole = self.problem.network
         rows = np.flatnonzero(self.usable.images[whole.image_of] & self.usable.points[whole.point_of])
         v = np.full((len(whole.xy), 2), np.nan)
-        v[rows] = residuals(whole, self.unknowns, rows, values)
+        v[rows] = residuals(whole, self.unknowns, rows, values, self.problem.centre)
         more = self.problem.others
         others = np.where(self.in_others, more.computed(values) - more.value, np.nan)
         return np.concatenate([v.ravel(), others])

@@ -42,13 +42,16 @@ class System:
         Factors on the weights of the other observations.
     held : ndarray of bool (u,)
         Held reduced unknowns.
+    origin : ndarray (3,)
+        Point of object space from which the coordinates of points are counted.
     """
 
     def __init__(
-        self, unknowns: Unknowns, others: OtherObservations, weighting: Weighting, factors: Array, held: Mask
-    ) -> None:
+        self, unknowns: Unknowns, others: OtherObservations, weighting: Weighting, factors: Array, held: Mask,
+        origin: Array,
+    ) -> None:  # fmt: skip
         network, order = unknowns.network, unknowns.order
-        self.unknowns, self.others, self.held = unknowns, others, held
+        self.unknowns, self.others, self.held, self.origin = unknowns, others, held, origin
         image = network.image_of[order]
         extra = unknowns.extra_of[image]
         roots = weighting.roots[0].matrices
@@ -61,7 +64,7 @@ class System:
         self.pattern = unknowns.pattern
         self.constraints = None if network.stage is None else StageConstraints(unknowns, network.stage)
         self.chunks = chunks_of(unknowns.first)
-        self.imaging = Imaging(network, unknowns.extra_names)
+        self.imaging = Imaging(network, unknowns.extra_names, origin)
 
     @cached_property
     def floor(self) -> float:
@@ -74,13 +77,16 @@ class System:
         out = np.empty((len(self.seen.image), 2))
         at, first = values.orientation, self.unknowns.first
 
+        bent, bend = self.imaging.bent(self.seen, at, values.refraction, derivatives=False)
+
         def work(_: int, a: int, b: int) -> None:
             begin, end = int(first[a]), int(first[b])
-            self.imaging.misfit(begin, end, self.seen, at, values.cameras, values.extra, out)
+            bend(begin, end)
+            self.imaging.misfit(begin, end, self.seen, at, bent, values.cameras, values.extra, out)
 
         in_parallel(work, self.chunks)
         for mapping, _, rows in self.mappings(values):
-            xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows])
+            xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows], bent, rows)
             out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
         return out, (self.others.computed(values) - self.others.value) * self.sigma_root
 
@@ -99,21 +105,27 @@ class System:
         at, first = values.orientation, unknowns.first
         a_out, b_out = rows[:, :, :-3], rows[:, :, -3:]
 
+        bent, bend = self.imaging.bent(self.seen, at, values.refraction, derivatives=True)
+
         def work(_: int, a: int, b: int) -> None:
+            begin, end = int(first[a]), int(first[b])
+            bend(begin, end)
             self.imaging.derive(
-                int(first[a]), int(first[b]), self.seen, at, values.cameras, values.extra, unknowns.free,
-                unknowns.count, self.movable, out, a_out, b_out,
+                begin, end, self.seen, at, bent, values.cameras, values.extra, unknowns.free, unknowns.count,
+                self.movable, out, a_out, b_out,
             )  # fmt: skip
 
         in_parallel(work, self.chunks)
         for mapping, c, own in self.mappings(values):
             image, point, count = self.seen.image[own], self.seen.point[own], unknowns.count[c]
-            xy, by_pose, by_camera, by_point = mapped(mapping, at, image, point)
+            xy, by_pose, by_camera, by_point, by_windows = mapped(mapping, at, image, point, bent, own)
             free = by_camera[:, :, unknowns.free[c, :count]]
             b = by_point * self.movable[point][:, None, :]
             out[own] = self._weighted(own, (xy - self.seen.xy[own])[:, :, None])[:, :, 0]
             rows[own, :, : 6 + count] = self._weighted(own, np.concatenate([by_pose, free], axis=2))
             rows[own, :, -3:] = self._weighted(own, b)
+            place = unknowns.width - 3 - unknowns.extra_width - by_windows.shape[2]
+            rows[own, :, place : place + by_windows.shape[2]] = self._weighted(own, by_windows)
         others = (self.others.computed(values) - self.others.value) * self.sigma_root
         return Linear(self, values, rows, out, others)
 
@@ -122,7 +134,7 @@ class System:
         """Columns of other observations of single reduced unknowns.
 
         Rows and columns of observed coordinates of kept points, then rows and columns of observed interior
-        orientation.
+        orientation and of observed parameters of windows and media.
         """
         unknowns, (_, coordinates, interior) = self.unknowns, self.others.slices
         kept = unknowns.kept[self.others.coordinate[:, 0]]
@@ -130,11 +142,17 @@ class System:
         c, parameter = self.others.interior.T
         place = [int(np.flatnonzero(unknowns.free[i] == p)[0]) for i, p in zip(c, parameter, strict=True)]
         used = unknowns.camera[c] >= 0
+        windows, bent = self.others.windows, self.others.refraction
         return (
             coordinates.start + rows,
             kept[rows] + self.others.coordinate[rows, 1],
-            interior.start + np.flatnonzero(used),
-            (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
+            np.concatenate([interior.start + np.flatnonzero(used), windows.start + np.arange(len(bent))]),
+            np.concatenate(
+                [
+                    (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
+                    unknowns.refraction + np.searchsorted(unknowns.refracting, bent),
+                ]
+            ),
         )
 
 
@@ -362,8 +380,14 @@ def _hold(sums: Sums, column: int) -> None:
     sums.gradient[column] = sums.reduced[column] = sums.diagonal[column] = 0.0
 
 
-def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) -> Array:
-    """Compute v (px) of selected image observations of a network, (len(rows), 2)."""
+def residuals(
+    network: Network, unknowns: Unknowns, rows: Rows, values: Values, origin: Array | None = None
+) -> Array:
+    """Compute v (px) of selected image observations of a network, (len(rows), 2).
+
+    `origin` (3,) is the point from which the coordinates of the values are counted, by default that of the
+    network.
+    """
     image = network.image_of[rows]
     unit = np.tile(np.eye(2), (len(rows), 1, 1))
     seen = Seen(
@@ -374,10 +398,13 @@ def residuals(network: Network, unknowns: Unknowns, rows: Rows, values: Values) 
         network.xy[rows],
         unit,
     )
-    imaging, out = Imaging(network, unknowns.extra_names), np.empty((len(rows), 2))
-    imaging.misfit(0, len(rows), seen, values.orientation, values.cameras, values.extra, out)
+    out, at = np.empty((len(rows), 2)), values.orientation
+    imaging = Imaging(network, unknowns.extra_names, np.zeros(3) if origin is None else origin)
+    bent, bend = imaging.bent(seen, at, values.refraction, derivatives=False)
+    bend(0, len(rows))
+    imaging.misfit(0, len(rows), seen, at, bent, values.cameras, values.extra, out)
     for mapping, _, own in _mappings(network, seen.camera, values):
-        xy, *_ = mapped(mapping, values.orientation, image[own], seen.point[own])
+        xy, *_ = mapped(mapping, at, image[own], seen.point[own], bent, own)
         out[own] = xy - seen.xy[own]
     return out
 

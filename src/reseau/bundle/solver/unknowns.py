@@ -41,6 +41,8 @@ class Unknowns:
         Set of each image, −1 for none.
     extra_names : tuple of (int, str) (e,)
         Camera and label of each set.
+    refraction : int
+        First column of the free parameters of windows and media; −1 without any.
     kept : ndarray of int (p,)
         First of three columns of points that are not eliminated, −1 for the others.
     size, bands, bandwidth : int
@@ -54,6 +56,7 @@ class Unknowns:
     extra: Rows
     extra_of: Rows
     extra_names: tuple[tuple[int, str], ...]
+    refraction: int
     kept: Rows
     size: int
     bands: int
@@ -93,13 +96,15 @@ class Unknowns:
         for e in np.flatnonzero((extra_users > 1) & free_extra):
             extra[e] = at
             at += widths[e]
+        bent = 0 if network.refraction is None else int(network.refraction.free.sum())
+        refraction, at = at if bent else -1, at + bent
         kept = np.full(len(network.points), -1)
         for j in np.unique(network.distance_of):
             kept[j] = at
             at += 3
         return cls(
-            network, active, pose, camera, extra, extra_of, extra_names, kept, int(at), int(bands),
-            bandwidth if bands else 0,
+            network, active, pose, camera, extra, extra_of, extra_names, refraction, kept, int(at),
+            int(bands), bandwidth if bands else 0,
         )  # fmt: skip
 
     @cached_property
@@ -138,6 +143,17 @@ class Unknowns:
         return int(self.extra_count.max(initial=0))
 
     @cached_property
+    def refracting(self) -> Rows:
+        """Rows of the free parameters of windows and media (f,)."""
+        bent = self.network.refraction
+        return np.flatnonzero(np.zeros(0) if bent is None else bent.free).astype(np.intp)
+
+    @property
+    def refraction_columns(self) -> slice:
+        """Columns of the free parameters of windows and media."""
+        return slice(max(self.refraction, 0), max(self.refraction, 0) + len(self.refracting))
+
+    @cached_property
     def dropped(self) -> Mask:
         """Mask of the columns (u,) of additional parameters held at zero."""
         held = np.zeros(self.size, dtype=bool)
@@ -151,7 +167,7 @@ class Unknowns:
     @property
     def width(self) -> int:
         """Number of derivatives of a ray."""
-        return 6 + int(self.count.max()) + self.extra_width + 3
+        return 6 + int(self.count.max()) + len(self.refracting) + self.extra_width + 3
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -167,8 +183,13 @@ class Unknowns:
             start[:, 2] = np.where(extra >= 0, self.extra[extra], -1)
             width[:, 2] = np.where(start[:, 2] >= 0, self.extra_count[extra], 0)
             column[:, 2] = self.width - 3 - self.extra_width
-        start[:, 3] = self.kept[point]
-        width[:, 3], column[:, 3] = np.where(start[:, 3] >= 0, 3, 0), self.width - 3
+        bent = self.network.refraction
+        if bent is not None and self.refraction >= 0:
+            start[:, 3] = np.where(bent.path_of[image] >= 0, self.refraction, -1)
+            width[:, 3] = np.where(start[:, 3] >= 0, len(self.refracting), 0)
+            column[:, 3] = self.width - 3 - self.extra_width - len(self.refracting)
+        start[:, 4] = self.kept[point]
+        width[:, 4], column[:, 4] = np.where(start[:, 4] >= 0, 3, 0), self.width - 3
         place = np.zeros_like(start)
         table = np.zeros((n * SEGMENTS, 3), dtype=np.intp)
         number = np.zeros(len(self.first) - 1, dtype=np.intp)
@@ -193,6 +214,9 @@ class Unknowns:
             if at >= 0 and additional is not None:
                 own = [f"{name} of {label}" for name in additional.names]
                 names[at : at + len(own)] = own
+        if self.network.refraction is not None:
+            own = [self.network.refraction.names[row] for row in self.refracting]
+            names[self.refraction_columns] = own
         for j in np.flatnonzero(self.kept >= 0):
             at = self.kept[j]
             names[at : at + 3] = [f"{name} of point {self.network.points[j]}" for name in _POINT]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class Values:
         Sets of additional parameters; at least one row.
     stage : StageValues, optional
         Readings and axis of a stage.
+    refraction : ndarray (r,)
+        Parameters of all windows and media.
     """
 
     rotation: Array
@@ -64,15 +66,19 @@ class Values:
     cameras: Array
     extra: Array
     stage: StageValues | None = None
+    refraction: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
-        """Create values with the camera parameters of the network."""
+        """Create values with the parameters of cameras, windows and media of the network."""
         network = unknowns.network
         cameras = np.zeros(unknowns.free.shape)
         for row, camera in zip(cameras, network.cameras, strict=True):
             row[: len(camera.values)] = camera.values
-        return cls(rotation, x0, xyz, cameras, np.zeros((max(1, len(unknowns.extra)), unknowns.extra_width)))
+        extra = np.zeros((max(1, len(unknowns.extra)), unknowns.extra_width))
+        bent = network.refraction
+        refraction = np.zeros(0) if bent is None else bent.values
+        return cls(rotation, x0, xyz, cameras, extra, refraction=refraction)
 
     @property
     def orientation(self) -> Orientation:
@@ -111,4 +117,6 @@ class Values:
         x0, stage = self.x0 + pose[:, 3:], self.stage
         if constraints is not None and stage is not None and step.independent is not None:
             stage, x0 = constraints.stepped(stage, self.x0, y, step.independent)
-        return Values(rotation, x0, xyz, cameras, extra, stage)
+        refraction = self.refraction.copy()
+        refraction[unknowns.refracting] += y[unknowns.refraction_columns]
+        return Values(rotation, x0, xyz, cameras, extra, stage, refraction)
