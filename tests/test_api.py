@@ -33,7 +33,7 @@ mpl.use("agg")
 NAMES = {
     "Archive", "Bench", "Calibration", "Code", "Failure", "Frame", "ImagePoints", "Network", "ReseauError",
     "__version__", "adjust_network", "calibrate", "measure", "orient", "read_calibration", "read_design",
-    "read_image", "refine",
+    "read_image", "read_lens", "refine",
 }  # fmt: skip
 
 
@@ -83,6 +83,7 @@ def test_packages_that_share_a_name_with_a_function_are_callable_and_stay_packag
         (lambda: reseau.read_image(np.zeros((4, 4), complex)), "source: has grey values of type complex128"),
         (lambda: reseau.read_design(None), "source: is None"),  # type: ignore[arg-type]
         (lambda: reseau.read_calibration(3.0), "source: is of type float"),  # type: ignore[arg-type]
+        (lambda: reseau.read_lens(5), "source: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.measure([], GRID), "source: is of type list"),  # type: ignore[arg-type]
         (lambda: reseau.measure(GREY, GRID, options=3), "options: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.calibrate("photo.jpg", GRID), "images: is of type str"),

@@ -6,7 +6,8 @@
 
 The names below are imported when they are first used, so that ``import reseau`` takes milliseconds:
 
-- read files: :func:`read_image`, :func:`read_design`, :func:`read_calibration`
+- read files: :func:`read_image`, :func:`read_design`, :func:`read_calibration`,
+  :func:`read_lens`
 - compute: :func:`measure`, :func:`calibrate`, :func:`orient`, :func:`refine`, :func:`adjust_network`
 - exchange: :class:`Frame`, :class:`ImagePoints`, :class:`Network`, :class:`Calibration`, :class:`Failure`
 - instruments and their recordings: :class:`Bench`, :class:`Archive`
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         read_calibration,
         read_design,
         read_image,
+        read_lens,
         refine,
     )
     from .archive import Archive
@@ -60,6 +62,7 @@ __all__ = [
     "read_calibration",
     "read_design",
     "read_image",
+    "read_lens",
     "refine",
 ]
 

@@ -24,7 +24,8 @@ from .core.data import Frame, ImagePoints
 from .core.display import Display
 from .core.errors import UsageError
 from .core.failure import Failure
-from .exchange import read_network
+from .exchange import Lens, read_network
+from .exchange import read_lens as _read_lens
 from .io import ReseauDesign, TestfieldDesign, is_points, read_measurement
 from .io import read_design as _read_design
 from .io.images import Channel, open_scan
@@ -58,6 +59,7 @@ __all__ = [
     "read_calibration",
     "read_design",
     "read_image",
+    "read_lens",
     "refine",
 ]
 
@@ -68,6 +70,7 @@ ImageLike = PathLike | NDArray[Any] | Frame
 PhotoLike = ImageLike | ImagePoints
 DesignLike = PathLike | ReseauDesign | TestfieldDesign
 CalibrationLike = PathLike | Calibration
+LensLike = PathLike | Lens
 
 
 def read_image(source: ImageLike, channel: Channel = "luma") -> Frame:
@@ -169,6 +172,48 @@ def read_calibration(source: CalibrationLike) -> Calibration:
     if isinstance(source, Calibration):
         return source
     return _read_calibration(_path(source, "source", "a path or a Calibration"))
+
+
+def read_lens(source: LensLike) -> Lens:
+    """Read the design of a lens: ``lens/1`` (TOML), Zemax ``.zmx``, CODE V ``.seq``.
+
+    Parameters
+    ----------
+    source : str, Path or Lens
+        A file, or a lens, which is returned as it is.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no lens, or has something that is not supported, which is named.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import reseau
+    >>> text = '''
+    ... schema = "lens/1"
+    ... name = "singlet"
+    ... wavelengths_nm = [587.5618]
+    ... stop_radius = 5.0
+    ... surface = [
+    ...     {radius = 50.0, distance = 5.0, medium = "N-BK7", stop = true},
+    ...     {distance = 93.45, medium = "air"},
+    ...     {},
+    ... ]
+    ... '''
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "lens.toml").write_text(text)
+    ...     lens = reseau.read_lens(f"{folder}/lens.toml")
+    >>> lens.prescription.name, lens.sensor
+    ('singlet', None)
+    """
+    if isinstance(source, Lens):
+        return source
+    return _read_lens(_path(source, "source", "a path or a Lens"))
 
 
 def measure(

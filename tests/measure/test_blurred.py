@@ -10,7 +10,7 @@ import pytest
 from reseau.core.data import Array, Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code
-from reseau.measure.blurred import BlurredOptions, Moving, measure_blurred
+from reseau.measure.blurred import BlurredOptions, Moving, Varied, measure_blurred
 from reseau.optics.formation import Outline
 from reseau.optics.lenses import (
     AIR,
@@ -87,10 +87,11 @@ def test_a_surrogate_gives_the_same_places() -> None:
 
 def test_the_focus_is_estimated_with_the_place() -> None:
     frame = photograph(focus=blurs.FOCUS + 0.15)
-    options = BlurredOptions(focus=lambda by: camera(blurs.FOCUS + by))
+    focus = Varied(("focus_mm",), (0.2,), lambda by: camera(blurs.FOCUS + by[0]))
+    options = BlurredOptions(varied=focus)
     found = measure_blurred(frame, camera(), ["1"], [target()], options)
     assert found.ok.all()
-    assert abs(found.focus_mm[0] - 0.15) < 4 * found.focus_sigma_mm[0] + 0.005
+    assert abs(found.varied[0, 0] - 0.15) < 4 * found.varied_sigma[0, 0] + 0.005
 
 
 def test_motion_is_another_cause_of_blur() -> None:

@@ -97,10 +97,8 @@ def blurred(
     from ..measure import ReseauOptions, measure_reseau
     from ..measure.blurred import BlurredOptions
     from ..procedures.blurred import lens_camera, measure_blurred_frame, pose_in_network
-    from ..report.blurred import blurred_figure
 
-    if figure is not None:
-        suffix_of(writable(figure), (".svg", ".png", ".pdf"))
+    kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
     task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
     target, optics = read_design(design), read_lens(lens)
     frame = corrected(read_frame(image), sensor)
@@ -127,7 +125,12 @@ def blurred(
         if isinstance(found, Failure):
             return found
         if figure is not None:
-            blurred_figure(frame, camera, found.targets, found.measured).savefig(figure, dpi=150)
+            from ..core.figures import to_bytes
+            from ..core.files import write_whole
+            from ..report.blurred import blurred_figure
+
+            drawn = blurred_figure(frame, camera, found.targets, found.measured, fill=options.fill)
+            write_whole(figure, to_bytes(drawn, kind[1:], dpi=150))
         return found.measured
 
     task.run(lambda: frame, measured)

@@ -37,6 +37,7 @@ __all__ = [
     "nice",
     "over_picture",
     "plane_axes",
+    "to_bytes",
     "to_svg",
     "typical_pitch",
 ]
@@ -83,11 +84,27 @@ def drawing() -> Iterator[None]:
         yield
 
 
+def to_bytes(figure: Figure, kind: str, **options: Any) -> bytes:
+    """Return the file of a figure, without dates: the same figure, the same bytes.
+
+    Parameters
+    ----------
+    figure : Figure
+    kind : {"png", "pdf", "svg"}
+    options
+        Of :meth:`matplotlib.figure.Figure.savefig`; `metadata` in addition to those that make it repeatable.
+    """
+    dated = {"png": ("Software",), "pdf": ("CreationDate", "Creator"), "svg": ("Date", "Creator")}[kind]
+    metadata = dict.fromkeys(dated) | options.pop("metadata", {})
+    stream = io.BytesIO()
+    with drawing():
+        figure.savefig(stream, format=kind, metadata=metadata, **options)
+    return stream.getvalue()
+
+
 def to_svg(figure: Figure) -> str:
     """Return the figure as an SVG element, without date and declaration."""
-    stream = io.StringIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    text = stream.getvalue()
+    text = to_bytes(figure, "svg").decode()
     return text[text.index("<svg") :]
 
 

@@ -5,7 +5,6 @@ Both formats are written from one list of filled polygons, circles and texts in 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
@@ -15,6 +14,7 @@ import numpy as np
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.figures import drawing as house_style
+from ..core.figures import to_bytes
 from ..io import ReseauDesign, TestfieldDesign
 from ..optics.targets import target_corners
 
@@ -321,8 +321,4 @@ def design_pdf(design: ReseauDesign | TestfieldDesign) -> bytes:
         sides = {"start": "left", "middle": "center"}
         for x, y, anchor, text in sheet.texts:
             axes.text(x, y, text, ha=sides[anchor], va="baseline", fontsize=2.6 / 25.4 * 72, color=_GREY)
-        stream = io.BytesIO()
-        figure.savefig(
-            stream, format="pdf", metadata={"CreationDate": None, "Creator": None, "Title": design.name}
-        )
-    return stream.getvalue()
+        return to_bytes(figure, "pdf", metadata={"Title": design.name})

@@ -4,15 +4,15 @@ In a blurred image the centre of density is not the image of the target's point:
 shift it, and it may be the image of another point at each place of the field. The image of the target is
 formed by rays (:mod:`reseau.optics.lenses.images`) and matched with the frame; the result is the place of the
 corresponding ray, the principal ray of one wavelength (Meid 1992, sections 2.2 and 3.2). The matcher is that
-of all other marks: two shifts, contrast and background, the width of the remaining blur, and, if wanted, the
-focus.
+of all other marks: two shifts, contrast and background, the width of the remaining blur, and, if wanted,
+parameters of the optics such as focus and media.
 
 Motion during the exposure is another physical cause: :class:`Moving` smears the images of any lens.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal, cast
@@ -25,12 +25,13 @@ from ..core.data import Array, Frame, Mask, Rows
 from ..core.errors import UsageError
 from ..core.failure import Code, Remark
 from ..optics.formation import Outline, PixelResponse
+from ..optics.gridded import GriddedOutline
 from ..optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image
-from .matching import GrownOutline, Matches, MatchOptions, Window, grey_variance, match, with_alike_errors
+from .matching import Matches, MatchOptions, Window, grey_variance, match, with_alike_errors
 from .points import Measured, Reason
 from .screening import screen
 
-__all__ = ["BlurredOptions", "BlurredResult", "Moving", "measure_blurred"]
+__all__ = ["BlurredOptions", "BlurredResult", "Moving", "Varied", "measure_blurred"]
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
 """Half sides of windows: targets of similar size are matched together."""
@@ -40,14 +41,8 @@ _SETTLED = 0.1
 """More rays no longer matter if they shift the match by less than this many of its standard deviations."""
 _LEAST_SHIFT = 0.002
 """… or by less than this many pixels."""
-_TAPS = 8
-"""Values between which images at half pixels are interpolated; exact to 1e-5 of the light."""
-_LEVEL = 0.12
-"""Step of the logarithm of the widths for which images are formed."""
-_SMALL_PX = 0.05
-"""Motion of the nodes for the derivative by the focus."""
-_KEPT = 60
-"""Images of other focus that are kept."""
+_STEP = 0.05
+"""Step of a varied parameter for the motion of the nodes, in its standard deviations."""
 _SEEN = 0.95
 _BEGINNING = 0.75
 """Least correlation at whole pixels."""
@@ -57,6 +52,44 @@ _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
 _FEWEST = 8
 """Targets from which the noise as a function of the grey value is estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """Parameters of the optics that are estimated with each target: focus, media.
+
+    A shift of the whole image is not among their effects: the result is the place of the corresponding ray,
+    wherever that lies; what they change is the form of the image around it.
+
+    Parameters
+    ----------
+    names : tuple of str (p,)
+        With their units, as `focus_mm`.
+    sigma : tuple of float (p,)
+        Prior standard deviations around 0.
+    camera : callable
+        Function of changes (p,) of the parameters that returns the map of rays with them.
+
+    Examples
+    --------
+    The distance of the sensor from a thin lens:
+
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> sensor = SensorPlane((0.01, 0.01), (0.0, 0.0))
+    >>> focus = Varied(("focus_mm",), (0.2,), lambda by: ThinLens(50.0, 12.5, 52.0 + by[0], sensor))
+    >>> focus.camera(np.array([0.1])).corresponding(np.array([[10.0, 0.0, 1000.0]])).round(3) + 0.0
+    array([[52.1,  0. ]])
+    """
+
+    names: tuple[str, ...]
+    sigma: tuple[float, ...]
+    camera: Callable[[Array], RayMap]
+
+    def __post_init__(self) -> None:
+        if len(self.names) != len(self.sigma):
+            raise UsageError(f"{len(self.names)} parameters need as many standard deviations")
+        if not all(0 < value < np.inf for value in self.sigma):
+            raise UsageError("standard deviations of varied parameters must be positive")
 
 
 @dataclass(frozen=True)
@@ -73,11 +106,8 @@ class BlurredOptions:
         Uncertainty of that width: standard deviation of its logarithm.
     search_px : float
         Largest distance of a target from where the orientation predicts it.
-    focus : callable, optional
-        Function of a displacement of the image surface (mm) that returns the map of rays with it; the
-        displacement is then estimated for each target.
-    focus_sigma_mm : float
-        Prior standard deviation of the displacement.
+    varied : Varied, optional
+        Parameters of the optics, such as focus and media, that are estimated with each target.
     fill : float
         Light-sensitive share of the pitch of a pixel.
     rings : int, optional
@@ -95,8 +125,7 @@ class BlurredOptions:
     psf_px: float = 0.5
     psf_log_sigma: float = 0.3
     search_px: float = 6.0
-    focus: Any = None
-    focus_sigma_mm: float = 0.2
+    varied: Varied | None = None
     fill: float = 1.0
     rings: int | None = None
     background: int = 1
@@ -114,8 +143,8 @@ class BlurredResult(Measured):
         Root mean square distance of the rays of a point from their mean.
     offset : ndarray (n, 2)
         Centre of density minus corresponding point, pixels: the error of a centre of gravity.
-    focus_mm, focus_sigma_mm : ndarray (n,)
-        Estimated displacement of the image surface; NaN if it was not wanted.
+    varied, varied_sigma : ndarray (n, p)
+        Estimates of varied parameters of the optics, and their standard deviations.
     rings : int
         Rings of elements of the stop that were used; 0 for those of a surrogate.
     """
@@ -123,8 +152,8 @@ class BlurredResult(Measured):
     psf_px: Array = field(default_factory=lambda: np.zeros(0))
     blur_px: Array = field(default_factory=lambda: np.zeros(0))
     offset: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    focus_mm: Array = field(default_factory=lambda: np.zeros(0))
-    focus_sigma_mm: Array = field(default_factory=lambda: np.zeros(0))
+    varied: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    varied_sigma: Array = field(default_factory=lambda: np.zeros((0, 0)))
     rings: int = 0
     notes: tuple[Remark, ...] = ()
 
@@ -164,141 +193,58 @@ class Moving:
 
 
 class _RayShapes:
-    """Images by rays as a shape of the matcher; its only parameter of form is the focus.
-
-    A shift moves the formed image as it is. Each image is therefore formed once, at half the distance of the
-    pixels, and interpolated; the width of the point-spread function follows by the heat equation from the
-    two nearest of some widths for which it is formed.
+    """Images by rays as a shape of the matcher; its parameters of form are those of the optics.
 
     Parameters
     ----------
     images : tuple of RayImage
-    motions : tuple of ndarray (j, 2)
-        Motions of the nodes with the focus, one array for each image, or none. Images with another focus are
-        formed anew.
+    motions : tuple of Outline (p, j)
+        Changes of the nodes and tangents of each image with each varied parameter; or none.
     """
 
-    def __init__(self, images: tuple[RayImage, ...], motions: tuple[Array, ...] = ()) -> None:
+    def __init__(self, images: tuple[RayImage, ...], motions: tuple[Outline, ...] = ()) -> None:
         self.images, self.motions = images, motions
-        self._formed: dict[tuple[int, int, int, float], Array] = {}
+        self._last: dict[int, tuple[Array, GriddedOutline]] = {}
 
     @property
     def parameters(self) -> int:
         """See :class:`reseau.measure.matching.Shape`."""
-        return 1 if self.motions else 0
+        return len(self.motions[0].xy) if self.motions else 0
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.measure.matching.Shape`."""
-        return np.stack([self._one(k, xy, width, form, at, window)[0] for k in range(len(at))])
+        return np.stack(
+            [self._gridded(k, f).image(*each) for k, f, *each in _each(xy, width, form, at, window)]
+        )
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`reseau.measure.matching.Shape`."""
-        found = np.stack([self._one(k, xy, width, form, at, window) for k in range(len(at))])
+        found = np.stack(
+            [self._gridded(k, f).derivatives(*each) for k, f, *each in _each(xy, width, form, at, window)]
+        )
         return found[:, 0], found[:, 1:]
 
-    def _one(self, k: int, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
-        """Image of the target at row `k` and its derivatives, (4 + p, r, c)."""
-        target, place, sigma = int(at[k]), xy[k], float(width[k])
-        columns, rows = window.columns[k], window.rows[k]
-        if not self.parameters:
-            return self._interpolated(target, place, sigma, 0.0, columns, rows, window.response)
-        focus = float(form[k, 0])
-        step = _SMALL_PX / max(float(np.abs(self.motions[target]).max()), 1e-9)
-        here, *beside = (
-            self._interpolated(target, place, sigma, focus + by, columns, rows, window.response)
-            for by in (0.0, step, -step)
+    def _gridded(self, k: int, form: Array) -> GriddedOutline:
+        """The image `k` with changed parameters of the optics."""
+        image = self.images[k]
+        if not self.motions:
+            return image.gridded
+        if k in self._last and np.array_equal(self._last[k][0], form):
+            return self._last[k][1]
+        nodes, motion = image.outline, self.motions[k]
+        moved = Outline(
+            nodes.xy + np.tensordot(form, motion.xy, 1), nodes.dxy + np.tensordot(form, motion.dxy, 1)
         )
-        return np.concatenate([here, (beside[0][:1] - beside[1][:1]) / (2 * step)])
-
-    def _interpolated(
-        self,
-        target: int,
-        place: Array,
-        sigma: float,
-        focus: float,
-        columns: Array,
-        rows: Array,
-        response: PixelResponse,
-    ) -> Array:
-        """Image, its derivatives along x and y and by the width, (4, r, c)."""
-        below, along = divmod(np.log(sigma) / _LEVEL, 1.0)
-        # Places of the pixels relative to the target: whole half pixels, and a common rest.
-        across, down = (2 * (pixels[0] - at) for pixels, at in zip((columns, rows), place, strict=True))
-        left, top = int(np.floor(across)), int(np.floor(down))
-        reach = max(abs(left), abs(top), abs(left + 2 * len(columns)), abs(top + 2 * len(rows))) + 2 * _TAPS
-        reach = -(-reach // 32) * 32  # a little more than needed, so that a shift finds it again
-        by_x, by_y = _taps(across - left), _taps(down - top)
-        x, y = (
-            reach + start + 1 - _TAPS // 2 + np.arange(2 * count + _TAPS)
-            for start, count in ((left, len(columns)), (top, len(rows)))
-        )
-        # Between two widths, so that the image is a continuous function of the width.
-        part: Array = np.zeros((4, y[-1] + 1 - y[0], x[-1] + 1 - x[0]))
-        by_width: Array = np.zeros(part.shape[1:])
-        for level, share, rise in ((int(below), 1 - along, -1.0), (int(below) + 1, along, 1.0)):
-            formed_at = float(np.exp(level * _LEVEL))
-            grid = self._grid(target, level, reach, focus, formed_at, response)
-            grid = grid[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-            widened = grid[0] + (sigma**2 - formed_at**2) / 2 * grid[3]
-            part[0] += share * widened
-            part[1:3] += share * grid[1:3]
-            by_width += share * sigma * grid[3] + rise / (sigma * _LEVEL) * widened
-        part[3] = by_width
-        part = sum(w * part[:, :, j : j + 2 * len(columns) : 2] for j, w in enumerate(by_x))
-        part = sum(w * part[:, j : j + 2 * len(rows) : 2] for j, w in enumerate(by_y))
-        return part
-
-    def _grid(
-        self,
-        target: int,
-        level: int,
-        reach: int,
-        focus: float,
-        sigma: float,
-        response: PixelResponse,
-    ) -> Array:
-        """Image, derivatives by a shift along x and y, and Laplacian (4, r, c), at half pixels."""
-        key = target, level, reach, focus
-        if key not in self._formed:
-            if focus and len(self._formed) > _KEPT:
-                self._formed.clear()
-            nodes = self.images[target].outline
-            if focus:
-                nodes = Outline(nodes.xy + focus * self.motions[target], nodes.dxy)
-            at = np.arange(-reach, reach + 1) / 2
-            shape, origin = _shape_of(nodes), (np.zeros((1, 2)), np.array([sigma]), *_ALONE)
-            grid = np.empty((4, len(at), len(at)))
-            for odd_y in (0, 1):  # pixels are adjacent in each of four rasters
-                for odd_x in (0, 1):
-                    window = Window(at[None, odd_x::2], at[None, odd_y::2], response)
-                    share, slopes = shape.derivatives(*origin, window)
-                    grid[0, odd_y::2, odd_x::2] = share[0]
-                    grid[1:, odd_y::2, odd_x::2] = slopes[0]
-            grid[3] /= sigma
-            self._formed[key] = grid
-        return self._formed[key]
+        self._last[k] = form.copy(), GriddedOutline.of(moved, motion.xy)
+        return self._last[k][1]
 
 
-_ALONE = np.zeros((1, 0)), np.zeros(1, np.intp)
-"""Form and row of a single shape."""
-
-
-def _shape_of(outline: Outline) -> GrownOutline:
-    """One outline (j, 2) as a shape of the matcher, in single precision."""
-    return GrownOutline(Outline(outline.xy[None], outline.dxy[None]).single(), np.zeros((0, 2, 2)))
-
-
-def _taps(share: float) -> Array:
-    """Weights (_TAPS,) of Lagrange's interpolation between the middle two of so many equidistant values."""
-    nodes = np.arange(_TAPS) - (_TAPS // 2 - 1)
-    weights = np.ones(_TAPS)
-    for j in range(_TAPS):
-        for m in range(_TAPS):
-            if m != j:
-                weights[j] *= (share - nodes[m]) / (nodes[j] - nodes[m])
-    return weights
+def _each(xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Iterator[tuple[Any, ...]]:
+    """Rows of the arguments of a shape: number, form, place, width, columns, rows, response."""
+    for k, row in enumerate(at):
+        yield int(row), form[k], xy[k], float(width[k]), window.columns[k], window.rows[k], window.response
 
 
 def measure_blurred(
@@ -369,20 +315,16 @@ class _Run:
         self.why = Reason("", Code.DECLINED).repeated(n)
         self.predicted = np.full((n, 2), np.nan)
         self.columns: dict[str, Array] = {
-            name: np.full(n, np.nan)
-            for name in ("contrast", "t", "noise", "psf_px", "blur_px", "focus_mm", "focus_sigma_mm")
+            name: np.full(n, np.nan) for name in ("contrast", "t", "noise", "psf_px", "blur_px")
         }
+        count = 0 if options.varied is None else len(options.varied.names)
+        self.columns |= {name: np.full((n, count), np.nan) for name in ("varied", "varied_sigma")}
         self.columns |= {name: np.full((n, 2), np.nan) for name in ("xy", "offset")}
         self.columns["cov"] = np.full((n, 2, 2), np.nan)
         self.ok = np.zeros(n, dtype=np.bool_)
 
     def result(self) -> BlurredResult:
-        if isinstance(self.camera, RaySurrogate):
-            rings, elements = 0, self.camera.elements
-        else:
-            rings = self.options.rings or self._rings()
-            elements = PupilElements.gauss(rings)
-        images = [self._imaged(k, elements) for k in range(len(self.ids))]
+        rings, elements, images = self._images()
         seen = np.array([k for k, image in enumerate(images) if image is not None], dtype=np.intp)
         start = np.full((len(self.ids), 2), np.nan)
         for k in seen:
@@ -433,9 +375,8 @@ class _Run:
     def _formed(self, image: RayImage, half: int, xy: Array) -> NDArray[Any]:
         """Image (r, c) of a target at a place, in a window around the nearest pixel."""
         across: Array = np.rint(xy) + np.arange(-half, half + 1.0)[:, None]
-        window = Window(across[None, :, 0], across[None, :, 1], PixelResponse(self.options.fill))
-        width = np.array([self.options.psf_px])
-        return np.asarray(_shape_of(image.outline).image(xy[None], width, *_ALONE, window)[0])
+        response = PixelResponse(self.options.fill)
+        return image.gridded.image(xy, self.options.psf_px, across[:, 0], across[:, 1], response)
 
     def _found(self, k: int, image: RayImage) -> Array:
         """Approximate position of a target by correlation within the range of search; NaN if not found."""
@@ -462,13 +403,21 @@ class _Run:
         return np.asarray(centre + np.array([column - reach, row - reach]))
 
     def _shape(self, rows: Rows, images: list[RayImage], elements: PupilElements) -> _RayShapes:
-        if self.options.focus is None:
+        varied = self.options.varied
+        if varied is None:
             return _RayShapes(tuple(images))
-        step, motions = 0.01, []
+        steps = _STEP * np.diag(varied.sigma)
+        beside = [(varied.camera(step), varied.camera(-step), 2 * float(step.sum())) for step in steps]
+        motions = []
         for k in rows:
-            near, far = (ray_image(self.options.focus(by), self.targets[k], elements) for by in (step, -step))
-            # Relative to the corresponding ray, whose place is the result, at whatever focus.
-            motions.append((near.outline.xy - far.outline.xy) / (2 * step))
+            # Relative to the corresponding ray, whose place is the result, whatever the parameters are.
+            changes = []
+            for far, near, by in beside:
+                a, b = (ray_image(camera, self.targets[k], elements).outline for camera in (far, near))
+                # Elements that are stopped on one side do not move.
+                lit = np.asarray(a.dxy.any(axis=1) & b.dxy.any(axis=1))[:, None] / by
+                changes.append((lit * (a.xy - b.xy), lit * (a.dxy - b.dxy)))
+            motions.append(Outline(*(np.stack(part) for part in zip(*changes, strict=True))))
         return _RayShapes(tuple(images), tuple(motions))
 
     def _matched(self, shape: _RayShapes, start: Array, half: int) -> Matches:
@@ -485,7 +434,7 @@ class _Run:
         )
 
         def run(options: MatchOptions) -> Matches:
-            prior = np.array([o.focus_sigma_mm]) if shape.parameters else None
+            prior = None if o.varied is None else np.array(o.varied.sigma)
             return match(
                 self.screened.grey,
                 self.screened.valid,
@@ -539,28 +488,40 @@ class _Run:
             self.columns["cov"][rows[good]] = found.cov[good]
             for name in ("contrast", "t", "noise", "psf_px"):
                 self.columns[name][rows] = getattr(found, name)
-            if self.options.focus is not None:
-                self.columns["focus_mm"][rows] = found.form[:, 0]
-                self.columns["focus_sigma_mm"][rows] = found.form_sigma[:, 0]
+            self.columns["varied"][rows], self.columns["varied_sigma"][rows] = found.form, found.form_sigma
 
-    def _rings(self) -> int:
-        """As many rings that more of them no longer change the most blurred image within the noise."""
-        coarse = PupilElements.gauss(_RINGS[0])
-        images = [(k, image) for k in range(len(self.ids)) if (image := self._imaged(k, coarse)) is not None]
-        if not images:
-            return _RINGS[0]
-        k, before = max(images, key=lambda pair: pair[1].blur)
+    def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
+        """Rings of elements of the stop (0: of a surrogate), these elements, and images of all targets.
+
+        As many rings that more of them no longer change the most blurred image within the noise.
+        """
+
+        def images(elements: PupilElements) -> list[RayImage | None]:
+            return [self._imaged(k, elements) for k in range(len(self.ids))]
+
+        if isinstance(self.camera, RaySurrogate):
+            return 0, self.camera.elements, images(self.camera.elements)
+        rings = self.options.rings or _RINGS[0]
+        elements = PupilElements.gauss(rings)
+        found = images(elements)
+        seen = [(k, image) for k, image in enumerate(found) if image is not None]
+        if self.options.rings or not seen:
+            return rings, elements, found
+        k, before = max(seen, key=lambda pair: pair[1].blur)
         half, xy = self._half(before), np.rint(before.point)
         formed = self._formed(before, half, xy)
         for few, many in pairwise(_RINGS):
-            image = self._imaged(k, PupilElements.gauss(many))
-            if image is None:
-                return many
-            finer = self._formed(image, half, xy)
-            if self._alike(formed, finer):
-                return few
-            formed = finer
-        return _RINGS[-1]
+            rings, finer = few, self._imaged(k, PupilElements.gauss(many))
+            if finer is None:
+                break
+            coarser, formed = formed, self._formed(finer, half, xy)
+            if self._alike(coarser, formed):
+                break
+            rings = many
+        if rings == _RINGS[0]:
+            return rings, elements, found
+        elements = PupilElements.gauss(rings)
+        return rings, elements, images(elements)
 
     def _alike(self, formed: NDArray[Any], finer: NDArray[Any]) -> bool:
         """Whether two formed images differ by an insignificant shift under the noise of the frame."""

@@ -1,4 +1,4 @@
-"""Images of many small shapes in single precision, and responses of pixels in double precision, compiled.
+"""Images of many small shapes in single precision; in double precision responses, and gridded images.
 
 The sums are those of :mod:`reseau.optics.formation`; here they are computed shape by shape, so that they fit
 into a cache, the normal distribution comes from a table, and a node of an outline is evaluated only in the
@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-__all__ = ["formed", "responses"]
+__all__ = ["filtered", "formed", "gathered", "responses"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
+Double = NDArray[Any]
 
 _SIDE = 5.5
 """End of the table of the normal distribution in standard deviations; 2e-8 of the light is outside."""
@@ -313,3 +314,52 @@ def responses(points: Single, first: Single, sigma: Single, out: Single) -> None
                 out[1, k, j, c] = step[c + 1] - step[c]
             for c in range(count):
                 out[2, k, j, c] = (bell[c + 1] - bell[c]) * inverse
+
+
+@_compiled
+def _basis(t: float, out: Double) -> None:
+    """Values (6,) of the B-spline of fifth degree around a point, at t ∈ [0, 1) of its cell."""
+    for side in range(2):
+        u = t if side == 0 else 1.0 - t
+        # Fifth powers of the distances from the ends of the spline's pieces, over 5!.
+        a, b, c = (1.0 - u) ** 5 / 120, (2.0 - u) ** 5 / 120, (3.0 - u) ** 5 / 120
+        out[5 * side] = a
+        out[1 + 3 * side] = b - 6 * a
+        out[2 + side] = c - 6 * b + 15 * a
+
+
+@_compiled
+def gathered(at: Double, weights: Double, cells: Double) -> None:
+    """Add the weights (q, j) of nodes at (2, j), in cells, to the cells (q, r, c) around them."""
+    of_x, of_y = np.empty(6), np.empty(6)
+    for j in range(at.shape[1]):
+        column, row = int(np.floor(at[0, j])), int(np.floor(at[1, j]))
+        _basis(at[0, j] - column, of_x)
+        _basis(at[1, j] - row, of_y)
+        for q in range(len(weights)):
+            for m in range(6):
+                factor = weights[q, j] * of_y[m]
+                line = cells[q, row - 2 + m, column - 2 : column + 4]
+                for k in range(6):
+                    line[k] += factor * of_x[k]
+
+
+@_compiled
+def filtered(cells: Double, taps: Double, low: int, per_px: int, summed: Double, out: Double) -> None:
+    """Filter cells (g, m) with taps (q, t): out[i, q] = Σ taps[q, k] cells[per_px i − low − k].
+
+    The first filter goes on with the value 1 to the left: sums (g + 1, m) of the cells there are added.
+    """
+    count, width = len(cells), taps.shape[1]
+    backwards = np.ascontiguousarray(taps[:, ::-1])
+    for i in range(len(out)):
+        last = per_px * i - low + 1
+        first = last - width
+        a, b = min(max(first, 0), count), min(max(last, 0), count)
+        if b > a:
+            part = np.ascontiguousarray(backwards[:, a - first : b - first])
+            out[i] = np.dot(part, cells[a:b])
+        else:
+            out[i] = 0.0
+        if len(summed):
+            out[i, 0] += summed[a]

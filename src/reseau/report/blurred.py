@@ -10,7 +10,7 @@ from ..core.data import Array, Frame
 from ..core.errors import UsageError
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing
 from ..measure.blurred import BlurredResult
-from ..optics.formation import Outline, PixelResponse, coverage
+from ..optics.formation import PixelResponse
 from ..optics.lenses import PlaneTarget, PupilElements, RayMap, RaySurrogate, ray_image
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def blurred_figure(
     targets: tuple[PlaneTarget, ...],
     found: BlurredResult,
     name: str | None = None,
+    fill: float = 1.0,
 ) -> Figure:
     """Draw a target: spot diagram of its centre, formed image, photograph, residuals.
 
@@ -40,6 +41,8 @@ def blurred_figure(
         What was measured of them.
     name : str, optional
         The target; by default the most blurred one that was measured.
+    fill : float
+        Light-sensitive share of the pitch of a pixel.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def blurred_figure(
     columns, rows = (np.rint(at) + np.arange(-half, half + 1.0) for at in xy)
     inside_x, inside_y = (columns >= 0) & (columns < frame.width), (rows >= 0) & (rows < frame.height)
     columns, rows = columns[inside_x], rows[inside_y]
-    share = _share(image.outline, xy, columns, rows, float(found.psf_px[k]))
+    share = image.gridded.image(xy, float(found.psf_px[k]), columns, rows, PixelResponse(fill))
     photograph = frame.pixels[np.ix_(rows.astype(np.intp), columns.astype(np.intp))].astype(float)
     design = np.stack([share.ravel(), np.ones(share.size)], axis=1)
     formed = (design @ np.linalg.lstsq(design, photograph.ravel(), rcond=None)[0]).reshape(share.shape)
@@ -70,12 +73,6 @@ def blurred_figure(
     return _drawn(
         found, k, (spots[:, 0] - image.point, weight), image.centroid, (columns, rows), formed, photograph
     )
-
-
-def _share(outline: Outline, xy: Array, columns: Array, rows: Array, sigma: float) -> Array:
-    """Share (r, c) of the light of each pixel that the target takes at its place."""
-    placed = Outline(outline.xy + xy, outline.dxy)
-    return coverage(placed, columns, rows, sigma, PixelResponse())
 
 
 def _drawn(

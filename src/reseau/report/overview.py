@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, drawing, length
+from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, drawing, length, to_bytes
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import CorrectionFit
@@ -75,9 +74,7 @@ def overview_png(
             "distortion of the instrument",
         )
         _body(results[2], third, test_object, truth)
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=120, metadata={"Software": None})
-    return stream.getvalue()
+        return to_bytes(figure, "png", dpi=120)
 
 
 def _photo(axes: Axes, frame: Frame, at: Array, title: str) -> None:

@@ -26,13 +26,14 @@ from .media import (
 )
 from .paraxial import Paraxial
 from .prescription import Aperture, Layout, Prescription, Surface, in_order
-from .pupils import Aimed, PupilElements, RayKind, aim, labels, principal_rays
+from .pupils import Aimed, Aiming, PupilElements, RayKind, aim, labels
 from .trace import SURFACE_PARAMETERS, RayDerivatives, Rays, Traced, Tracer
 
 __all__ = [
     "AIR",
     "SURFACE_PARAMETERS",
     "Aimed",
+    "Aiming",
     "Air",
     "Aperture",
     "Cauchy",
@@ -65,6 +66,5 @@ __all__ = [
     "in_order",
     "labels",
     "model_glass",
-    "principal_rays",
     "ray_image",
 ]

@@ -23,9 +23,10 @@ import numpy as np
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..formation import Outline
+from ..gridded import GriddedOutline
 from .paraxial import Paraxial
 from .prescription import Prescription
-from .pupils import PupilElements, aim
+from .pupils import Aiming, PupilElements
 from .trace import Tracer
 
 __all__ = [
@@ -103,8 +104,7 @@ class _ByRays(ABC):
         xy, light = [], []
         for k, (wavelength, weight) in enumerate(self.wavelengths):
             # Other points of the stop for each wavelength: the spots of all together are denser.
-            c, s = np.cos(k * _GOLDEN), np.sin(k * _GOLDEN)
-            through = np.tile(elements.xy @ np.array([[c, s], [-s, c]]), (shape[0], 1))
+            through = np.tile(elements.turned(k * _GOLDEN).xy, (shape[0], 1))
             arrived, carried = self.rays(starts, through, wavelength)
             xy.append(arrived.reshape(*shape, 2))
             light.append(carried.reshape(*shape, 3) * (elements.weights * weight)[:, None])
@@ -208,13 +208,25 @@ class LensCamera(_ByRays):
         front = self.lens.surfaces[0]
         return np.asarray(front.vertex + position * front.axes[:, 2])
 
+    @cached_property
+    def _ready(self) -> dict[float, tuple[Aiming, Tracer, Tracer | None]]:
+        """By wavelength: what aims rays, traces them, and traces them with apertures, where it has any."""
+        return {}
+
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays by ray tracing."""
-        aimed = aim(self.lens, points @ self.rotation.T + self._centre, pupil, wavelength_nm)
-        free = Tracer(self.lens, wavelength_nm, apertures=False).trace(aimed.rays)
-        weight = aimed.solid_angle
-        if any(surface.apertures for surface in self.lens.surfaces):
-            weight = weight * Tracer(self.lens, wavelength_nm).trace(aimed.rays).arrived
+        if wavelength_nm not in self._ready:
+            limited = any(surface.apertures for surface in self.lens.surfaces)
+            self._ready[wavelength_nm] = (
+                Aiming(self.lens, wavelength_nm),
+                Tracer(self.lens, wavelength_nm, apertures=False),
+                Tracer(self.lens, wavelength_nm) if limited else None,
+            )
+        aiming, tracer, limits = self._ready[wavelength_nm]
+        aimed = aiming(points @ self.rotation.T + self._centre, pupil)
+        free, weight = tracer.trace(aimed.rays), aimed.solid_angle
+        if limits is not None:
+            weight = weight * limits.trace(aimed.rays).arrived
         flux = np.where(free.arrived, weight, 0.0)[:, None] * np.nan_to_num(aimed.rays.directions)
         return self.sensor.to_pixels(free.xy), flux @ self.rotation
 
@@ -337,6 +349,11 @@ class RayImage:
     point: Array
     blur: float
 
+    @cached_property
+    def gridded(self) -> GriddedOutline:
+        """The outline, gridded for the formation of images."""
+        return GriddedOutline.of(self.outline)
+
     @property
     def centroid(self) -> Array:
         """Centre of density, in pixels from the corresponding point."""
@@ -376,8 +393,10 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, emitted, 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
         raise UsageError("no light of the target reaches the sensor", do="is it in the field of the lens?")
-    coefficients, share = coefficients[share > 0], share[share > 0] / share.sum()
-    return _assembled(coefficients, share, target, point)
+    # Elements without light remain, as points: images with other parameters have the same nodes.
+    coefficients[share == 0] = 0.0
+    coefficients[share == 0, 0] = point
+    return _assembled(coefficients, share / share.sum(), target, point)
 
 
 def _assembled(coefficients: Array, share: Array, target: PlaneTarget, point: Array) -> RayImage:

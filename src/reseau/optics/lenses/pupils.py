@@ -7,7 +7,6 @@ gives the solid angle of an element of the stop, and with it the light that pass
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,11 +15,12 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
+from ..newton import determinant, solve_2x2
 from .paraxial import Paraxial
 from .prescription import Prescription
-from .trace import Rays, Traced, Tracer
+from .trace import Rays, Tracer
 
-__all__ = ["Aimed", "PupilElements", "RayKind", "aim", "labels", "principal_rays"]
+__all__ = ["Aimed", "Aiming", "PupilElements", "RayKind", "aim", "labels"]
 
 RayKind = Literal["principal", "marginal", "meridional", "sagittal", "skew"]
 
@@ -74,6 +74,11 @@ class PupilElements:
             found.append(_ring(np.sqrt(square), count, (k * 0.618034) % 1.0))
             weights.append(np.full(count, w / count))
         return cls(np.concatenate(found), np.concatenate(weights))
+
+    def turned(self, angle: float) -> PupilElements:
+        """The same elements turned about the centre of the stop, radians."""
+        c, s = np.cos(angle), np.sin(angle)
+        return PupilElements(self.xy @ np.array([[c, s], [-s, c]]), self.weights)
 
 
 def _ring(radius: float, count: int, offset: float) -> Array:
@@ -170,42 +175,109 @@ def aim(lens: Prescription, points: Array, pupil: Array, wavelength_nm: float | 
     >>> Tracer(lens, last=2).trace(rays).xy.round(9)
     array([[2., 2.]])
     """
-    points, pupil = np.atleast_2d(points), np.atleast_2d(pupil)
-    _checked(lens, points)
-    first = Paraxial(lens, wavelength_nm)
-    position, scale = first.entrance_pupil
-    radius = lens.stop_radius
-    if radius is None:
-        raise UsageError("the radius of its stop is not known", where=lens.name, do="give `stop_radius`")
-    front = lens.surfaces[0]
-    # A plane in which rays are aimed: that of the entrance pupil unless it is far away.
-    depth = position if np.isfinite(position) and abs(position) < 1e3 * radius else 0.0
-    to_stop = Tracer(lens, wavelength_nm, last=lens.stop, apertures=False)
-    wanted = radius * pupil
+    return Aiming(lens, wavelength_nm)(points, pupil)
 
-    def through(targets: Array, start: Array) -> tuple[Array, Rays]:
-        on_plane = np.concatenate([targets, np.full((len(targets), 1), depth)], axis=1)
-        rays = Rays.between(start, on_plane @ front.axes.T + front.vertex)
-        # The direction of the light also where the pupil lies in front of the object.
-        rays = Rays(rays.xyz, rays.directions * np.sign(rays.directions @ front.axes[:, 2])[:, None])
-        return to_stop.trace(rays).xy, rays
 
-    guess = scale * wanted if np.isfinite(scale) and depth == position else wanted
-    targets, det, ok = _newton(through, points, guess, wanted, radius)
-    if not ok.all():  # wide angles: approach the point from the axis
-        targets, det, ok = _approached(
-            through, points, front.vertex, guess, wanted, radius, (targets, det, ok)
-        )
-    rays = through(targets, points)[1]
-    on_plane = (
-        np.concatenate([targets, np.full((len(targets), 1), depth)], axis=1) @ front.axes.T + front.vertex
-    )
-    away = on_plane - points
-    distance = np.linalg.norm(away, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        angle = np.abs(away @ front.axes[:, 2]) / distance**3 / np.abs(det)
-    directions = np.where(ok[:, None], rays.directions, np.nan)
-    return Aimed(Rays(np.where(ok[:, None], rays.xyz, np.nan), directions), np.where(ok, angle, 0.0), ok)
+class Aiming:
+    """A lens at one wavelength, ready to aim rays at its stop; see :func:`aim`.
+
+    Parameters
+    ----------
+    lens : Prescription
+    wavelength_nm : float, optional
+        By default that of the corresponding rays.
+
+    Raises
+    ------
+    UsageError
+        When the radius of the stop is not known.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
+    >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 3.0, AIR), (0.0, 60.0, AIR)]
+    >>> aiming = Aiming(Prescription(in_order(rows), stop=2, stop_radius=4.0))
+    >>> aiming(np.array([[0.0, 0.0, -200.0]]), np.zeros((1, 2))).rays.directions
+    array([[0., 0., 1.]])
+    """
+
+    def __init__(self, lens: Prescription, wavelength_nm: float | None = None) -> None:
+        if lens.stop_radius is None:
+            raise UsageError("the radius of its stop is not known", where=lens.name, do="give `stop_radius`")
+        self.lens, self.radius, self.front = lens, lens.stop_radius, lens.surfaces[0]
+        position, scale = Paraxial(lens, wavelength_nm).entrance_pupil
+        # A plane at which rays are aimed: that of the entrance pupil unless it is far away.
+        near = np.isfinite(position) and abs(position) < 1e3 * self.radius
+        self._plane = self.front.vertex + (position if near else 0.0) * self.front.axes[:, 2]
+        self._scale = scale if near and np.isfinite(scale) else 1.0
+        self._to_stop = Tracer(lens, wavelength_nm, last=lens.stop, apertures=False)
+
+    def __call__(self, points: Array, pupil: Array) -> Aimed:
+        """Rays from points (n, 3) of the object through points (n, 2) of the stop; see :func:`aim`."""
+        points, wanted = np.atleast_2d(points), self.radius * np.atleast_2d(pupil)
+        _checked(self.lens, points)
+        found = self._newton(points, self._scale * wanted, wanted)
+        if not found[2].all():  # wide angles: approach the point from the axis
+            found = self._approached(points, self._scale * wanted, wanted, found)
+        targets, det, ok = found
+        away = self._away(targets, points)
+        distance = np.linalg.norm(away, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            angle = np.abs(away @ self.front.axes[:, 2]) / distance**3 / np.abs(det)
+        rays = Rays(np.where(ok[:, None], points, np.nan), self._along(away))
+        rays = Rays(rays.xyz, np.where(ok[:, None], rays.directions, np.nan))
+        return Aimed(rays, np.where(ok, angle, 0.0), ok)
+
+    def _away(self, targets: Array, start: Array) -> Array:
+        """Vectors (n, 3) from points (n, 3) to targets (n, 2) in the plane at which rays are aimed."""
+        return np.asarray(self._plane + targets @ self.front.axes[:, :2].T - start)
+
+    def _along(self, away: Array) -> Array:
+        """Directions (n, 3) of the light, also where the pupil lies in front of the object."""
+        length = np.linalg.norm(away, axis=1) * np.sign(away @ self.front.axes[:, 2])
+        return np.asarray(away / length[:, None])
+
+    def _newton(self, points: Array, targets: Array, wanted: Array) -> tuple[Array, Array, Mask]:
+        """Targets for rays through the wanted points of the stop, determinants, and which were found."""
+        targets = targets.copy()
+        det, ok = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.bool_)
+        h = 1e-6 * self.radius
+        todo = np.arange(len(points))
+        for _ in range(_STEPS):
+            at, start = targets[todo], np.tile(points[todo], (3, 1))
+            three = np.concatenate([at, at + np.array([h, 0]), at + np.array([0, h])])
+            rays = Rays(start, self._along(self._away(three, start)))
+            hit = self._to_stop.trace(rays).xy.reshape(3, -1, 2)
+            miss = hit[0] - wanted[todo]
+            slope = np.stack([hit[1] - hit[0], hit[2] - hit[0]], axis=2) / h
+            det[todo] = determinant(slope)
+            done = np.hypot(miss[:, 0], miss[:, 1]) < _NEAR * self.radius
+            ok[todo[done]] = True
+            step = solve_2x2(slope, miss)
+            usable = ~done & np.isfinite(step).all(axis=1)
+            targets[todo[usable]] -= step[usable]
+            todo = todo[usable]
+            if not len(todo):
+                break
+        return targets, det, ok
+
+    def _approached(
+        self, points: Array, guess: Array, wanted: Array, found: tuple[Array, Array, Mask]
+    ) -> tuple[Array, Array, Mask]:
+        """Aim again what was not found, from points nearer to the axis outwards."""
+        targets, det, ok = found
+        rest = np.flatnonzero(~ok)
+        axis, current = points[rest].copy(), guess[rest]
+        axis[:, :2] = self.front.vertex[:2]
+        alive = np.ones(len(rest), dtype=np.bool_)
+        for share in np.linspace(0, 1, 9):
+            near = axis + share * (points[rest] - axis)
+            new, d, good = self._newton(near, current, wanted[rest])
+            alive &= good
+            current = np.where(good[:, None], new, current)
+            det[rest], targets[rest] = d, current
+        ok[rest] = alive
+        return targets, det, ok
 
 
 def _checked(lens: Prescription, points: Array) -> None:
@@ -221,77 +293,3 @@ def _checked(lens: Prescription, points: Array) -> None:
             where=lens.name,
             do="objects are in front of the lens, at negative z",
         )
-
-
-Through = Callable[[Array, Array], tuple[Array, Rays]]
-
-
-def _newton(
-    through: Through, points: Array, targets: Array, wanted: Array, radius: float
-) -> tuple[Array, Array, Mask]:
-    """Targets for rays through the wanted points of the stop, determinants, and which were found."""
-    targets = targets.copy()
-    det, ok = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.bool_)
-    h = 1e-6 * radius
-    todo = np.arange(len(points))
-    for _ in range(_STEPS):
-        at, start = targets[todo], points[todo]
-        three = np.concatenate([at, at + np.array([h, 0]), at + np.array([0, h])])
-        hit = through(three, np.tile(start, (3, 1)))[0].reshape(3, -1, 2)
-        miss = hit[0] - wanted[todo]
-        j = np.stack([(hit[1] - hit[0]) / h, (hit[2] - hit[0]) / h], axis=2)
-        d = j[:, 0, 0] * j[:, 1, 1] - j[:, 0, 1] * j[:, 1, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = j[:, 1, 1] * miss[:, 0] - j[:, 0, 1] * miss[:, 1]
-            y = j[:, 0, 0] * miss[:, 1] - j[:, 1, 0] * miss[:, 0]
-            step = np.stack([x, y], axis=1) / d[:, None]
-        det[todo] = d
-        done = np.hypot(miss[:, 0], miss[:, 1]) < _NEAR * radius
-        ok[todo[done]] = True
-        usable = ~done & np.isfinite(step).all(axis=1)
-        targets[todo[usable]] -= step[usable]
-        todo = todo[usable]
-        if not len(todo):
-            break
-    return targets, det, ok
-
-
-def _approached(
-    through: Through,
-    points: Array,
-    vertex: Array,
-    guess: Array,
-    wanted: Array,
-    radius: float,
-    found: tuple[Array, Array, Mask],
-) -> tuple[Array, Array, Mask]:
-    """Aim again what was not found, from points nearer to the axis outwards."""
-    targets, det, ok = found[0].copy(), found[1].copy(), found[2].copy()
-    rest = np.flatnonzero(~ok)
-    axis, current = points[rest].copy(), guess[rest]
-    axis[:, :2] = vertex[:2]
-    alive = np.ones(len(rest), dtype=np.bool_)
-    for share in np.linspace(0, 1, 9):
-        near = axis + share * (points[rest] - axis)
-        new, d, good = _newton(through, near, current, wanted[rest], radius)
-        alive &= good
-        current = np.where(good[:, None], new, current)
-        det[rest], targets[rest] = d, current
-    ok[rest] = alive
-    return targets, det, ok
-
-
-def principal_rays(lens: Prescription, points: Array, wavelength_nm: float | None = None) -> Traced:
-    """Corresponding rays: principal rays of points (n, 3), traced to the image; lost rays are NaN.
-
-    Examples
-    --------
-    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
-    >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 3.0, AIR), (0.0, 60.0, AIR)]
-    >>> lens = Prescription(in_order(rows), stop=2, stop_radius=4.0)
-    >>> principal_rays(lens, np.array([[0.0, 10.0, -200.0]])).xy.round(3)
-    array([[ 0.   , -3.207]])
-    """
-    points = np.atleast_2d(points)
-    aimed = aim(lens, points, np.zeros((len(points), 2)), wavelength_nm)
-    return Tracer(lens, wavelength_nm).trace(aimed.rays)
