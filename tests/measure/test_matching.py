@@ -7,7 +7,8 @@ import pytest
 
 from reseau.measure import MatchOptions, match
 from reseau.measure.matching import matcher
-from reseau.measure.matching.matcher import SIZE, Patches
+from reseau.measure.matching.matcher import SIZE
+from reseau.measure.matching.patches import Patches
 from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.optics.formation import Outline, PixelResponse, draw, mark_outline
 

@@ -1,8 +1,10 @@
 """Least-squares matching: windows of a frame are adjusted to formed images of marks."""
 
 from .correlation import displaced, with_alike_errors
-from .matcher import SIZE, Matches, MatchOptions, match
+from .matcher import SIZE, match
+from .matches import Matches
 from .noise import grey_variance
+from .patches import MatchOptions
 from .shapes import FormedShape, GrownOutline, Shape, ShapeSubset, Window
 
 __all__ = [

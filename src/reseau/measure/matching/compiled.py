@@ -1,6 +1,6 @@
 """Least-squares matching of many windows from good start values, compiled.
 
-The equations are those of :class:`reseau.measure.matching.matcher.Patches` (grey values, derivatives, common
+The equations are those of :class:`reseau.measure.matching.patches.Patches` (grey values, derivatives, common
 errors of rows) and of the chord method of :func:`reseau.adjust.adjust_batch`; here they are computed window
 by window, so that they fit into a cache. Windows that need more than the chord method's first Jacobian (a
 refused step, slow convergence, singular normal equations) are marked, and left to the general adjustment.
@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ACTIVE", "DONE", "LEFT", "advanced", "linearised"]
+__all__ = ["ACTIVE", "DONE", "LEFT", "advanced", "compared", "cut", "linearised"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
@@ -33,6 +33,71 @@ def _compiled(function: F) -> F:
     """Compile with Numba, cached on disk, releasing the GIL."""
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
     return cast(F, numba.njit(**options)(function))
+
+
+@_compiled
+def cut(
+    pixels: Floats, valid: Floats, centre: Floats, half: tuple[int, int], grey: Floats, weights: Floats
+) -> None:
+    """Fill grey values and weights (k, n) of windows around pixels `centre` (k, 2).
+
+    Beyond the frame, those of its border continue; there, and where they are not valid, the weight is 0.
+    """
+    (h, w), (right, down) = pixels.shape, half
+    for k in range(len(centre)):
+        left, top, i = centre[k, 0] - right, centre[k, 1] - down, 0
+        for row in range(top, top + 2 * down + 1):
+            r = min(max(row, 0), h - 1)
+            for column in range(left, left + 2 * right + 1):
+                c = min(max(column, 0), w - 1)
+                grey[k, i] = pixels[r, c]
+                weights[k, i] = 1.0 if r == row and c == column and valid[r, c] else 0.0
+                i += 1
+
+
+@_compiled
+def compared(
+    grey: Floats, plane: Floats, share: Floats, weights: Floats, used: Floats, near: Floats, dark: bool
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Windows compared with what was formed in them.
+
+    Parameters
+    ----------
+    grey, plane, share : ndarray (k, n)
+        Grey values, background, and share of the pixels covered by the mark.
+    weights : ndarray (k, n)
+        Ones where a pixel may be used.
+    used, near : ndarray of bool (k, n)
+        Pixels that were used, and those that belong to the window.
+
+    Returns
+    -------
+    ndarray (k,), four
+        Correlation without the background; number of pixels used; shares of the mark on pixels that may be
+        used, and on those of them that were not.
+    """
+    count, seen, rejected = np.zeros(len(grey)), np.zeros(len(grey)), np.zeros(len(grey))
+    correlation = np.zeros(len(grey))
+    for k in range(len(grey)):
+        whole, a, b = 0.0, 0.0, 0.0
+        for i in range(grey.shape[1]):
+            covered = share[k, i]
+            whole += covered * near[k, i]
+            seen[k] += covered * weights[k, i]
+            rejected[k] += covered * (weights[k, i] - used[k, i])
+            if used[k, i]:
+                count[k] += 1
+                a += grey[k, i] - plane[k, i]
+                b += -plane[k, i] * covered if dark else covered
+        seen[k], rejected[k] = seen[k] / max(whole, 1e-12), rejected[k] / max(whole, 1e-12)
+        a, b, ab, aa, bb = a / count[k], b / count[k], 0.0, 0.0, 0.0
+        for i in range(grey.shape[1]):
+            if used[k, i]:
+                u = grey[k, i] - plane[k, i] - a
+                v = (-plane[k, i] * share[k, i] if dark else np.float64(share[k, i])) - b
+                ab, aa, bb = ab + u * v, aa + u * u, bb + v * v
+        correlation[k] = ab / math.sqrt(aa * bb)
+    return correlation, count, seen, rejected
 
 
 @_compiled

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from ...core.data import Array, Mask
-from .matcher import Matches
+from .matches import Matches
 
 __all__ = ["displaced", "with_alike_errors"]
 

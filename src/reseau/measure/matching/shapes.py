@@ -242,7 +242,9 @@ class FormedShape:
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`Shape`."""
-        same = np.array_equal(xy, self.xy[at]) and not form.any()
-        if same and np.allclose(width, self.width[at], rtol=1e-9, atol=0):
-            return self.share[at], self.slopes[at]
+        every = np.array_equal(at, np.arange(len(self.xy)))
+        some: Any = slice(None) if every else at  # no copy of all
+        same = np.array_equal(xy, self.xy[some]) and not form.any()
+        if same and np.allclose(width, self.width[some], rtol=1e-9, atol=0):
+            return self.share[some], self.slopes[some]
         return self.shape.derivatives(xy, width, form, at, window)

@@ -1,0 +1,142 @@
+"""Results of matching, in columns over the marks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+
+from ...adjust import BatchAdjustment
+from ...core.data import Array, Mask, Rows
+from .patches import CONTRAST, LEVEL, Patches
+
+__all__ = ["Matches", "matches_of", "with_rows"]
+
+Columns = TypeVar("Columns", "Matches", BatchAdjustment)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Results of matching, in columns over the k marks.
+
+    Parameters
+    ----------
+    xy : ndarray (k, 2)
+        Positions in pixels.
+    cov : ndarray (k, 2, 2)
+        Covariances of the positions, from the residuals of each patch.
+    psf_px : ndarray (k,)
+        Widths of the point-spread function.
+    contrast : ndarray (k,)
+        Share of the light that a dark mark attenuates; grey values that a bright mark adds.
+    level : ndarray (k,)
+        Grey value of the background at the mark.
+    t : ndarray (k,)
+        Contrast over its standard deviation, for given width and form.
+    form : ndarray (k, m)
+        Parameters of the form.
+    noise : ndarray (k,)
+        Standard deviation of the residuals, grey values.
+    correlation : ndarray (k,)
+        Correlation of the patch with the formed image after subtraction of the background.
+    seen : ndarray (k,)
+        Share of the mark on valid pixels.
+    rejected : ndarray (k,)
+        Share of the mark on pixels rejected as blunders.
+    converged : ndarray of bool (k,)
+        Whether the adjustment converged.
+    residuals : ndarray (k, rows, columns)
+        Adjusted minus observed, NaN where a pixel was not used.
+    form_sigma : ndarray (k, m)
+        Standard deviations of `form`.
+    influence : ndarray (k, 2, rows, columns)
+        Change of the position with the grey value of each pixel; (k, 2, 0, 0) if it was not wanted.
+    leverage : ndarray (k, rows, columns)
+        Share of the error of each pixel that the adjustment takes from its residual; empty as `influence`.
+
+    Examples
+    --------
+    >>> one, none = np.ones(2), np.zeros((2, 0))
+    >>> xy, cov = np.array([[10.3, 9.6], [40.1, 9.8]]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
+    >>> seen = np.array([1.0, 0.4])
+    >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
+    ...                 one > 0, np.zeros((2, 17, 17)), none, np.zeros((2, 2, 17, 17)), np.zeros((2, 17, 17)))
+    >>> len(marks.select(marks.seen > 0.5))
+    1
+    """
+
+    xy: Array
+    cov: Array
+    psf_px: Array
+    contrast: Array
+    level: Array
+    t: Array
+    form: Array
+    noise: Array
+    correlation: Array
+    seen: Array
+    rejected: Array
+    converged: Mask
+    residuals: Array
+    form_sigma: Array
+    influence: Array
+    leverage: Array
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, keep: Mask) -> Matches:
+        """Matches selected by a mask (k,)."""
+        return Matches(**{column.name: getattr(self, column.name)[keep] for column in fields(self)})
+
+    def replaced(self, rows: Rows, others: Matches) -> Matches:
+        """These matches with `rows` replaced by others from windows of the same size."""
+        return with_rows(self, rows, others)
+
+
+def with_rows(whole: Columns, rows: Rows, part: Columns) -> Columns:
+    """A dataclass of columns with some rows replaced by those of another."""
+    columns = {}
+    for column in fields(whole):
+        columns[column.name] = getattr(whole, column.name).copy()
+        columns[column.name][rows] = getattr(part, column.name)
+    return replace(whole, **columns)
+
+
+def matches_of(
+    patch: Patches, found: BatchAdjustment, used: Mask, scale: Array, share: Array | None = None
+) -> Matches:
+    """Columns of results from the adjusted batch; `share` as formed last, if it is known."""
+    x, k = found.estimates, len(patch.xy)
+    flat = (patch.share(x) if share is None else share).reshape(k, -1)
+    plane, dark = patch.background(x).reshape(k, -1), patch.options.polarity == "dark"
+    from .compiled import compared  # takes half a second to import; not every command needs it
+
+    correlation, count, seen, rejected = compared(
+        patch.grey, plane, flat, patch.weights, used, patch.near, dark
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cov = found.covariance
+        t = correlation * np.sqrt(np.maximum(count - patch.form_at, 1) / (1 - correlation**2))
+    influence, leverage = np.zeros((k, 2, 0, 0)), np.zeros((k, 0, 0))
+    if patch.options.influence:
+        influence, leverage = patch.influence(x, found.cofactor, used, scale)
+    return Matches(
+        xy=patch.xy + x[:, :2],
+        cov=cov[:, :2, :2],
+        psf_px=patch.width(x, np.arange(k)),
+        contrast=x[:, CONTRAST],
+        level=x[:, LEVEL],
+        t=np.nan_to_num(t),
+        form=x[:, patch.form_at :],
+        noise=found.sigma0 * scale,
+        correlation=np.nan_to_num(correlation),
+        seen=seen,
+        rejected=rejected,
+        converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
+        residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
+        form_sigma=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, patch.form_at :]),
+        influence=influence,
+        leverage=leverage,
+    )
