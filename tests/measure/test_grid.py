@@ -102,6 +102,22 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
     assert (found.candidate[~there] >= 0).mean() < 0.2
 
 
+@pytest.mark.parametrize("row", [0, 8])
+def test_the_places_of_an_uneven_design_tell_which_row_at_the_border_is_not_seen(row):
+    """Shifted by a row, as many marks are found, and one row lies largely beyond the frame."""
+    rng = np.random.default_rng(9)
+    x, y = np.meshgrid(np.arange(11) - 5.0 + rng.normal(0, 0.01, 11), 4.0 - np.arange(9))
+    xy = 9.0 * np.stack([x, y + rng.normal(0, 0.01, (9, 1))], axis=-1).reshape(-1, 2)
+    image = seen(xy, 8.6, 0.08)
+    there = np.arange(99) // 11 != row
+    found = place_grid(
+        xy, candidates(image[there], rng, noise_px=0.03), VALID[:640], GridOptions(mirrored=True)
+    )
+    assert found is not None
+    assert share_right(found, image) == 1.0
+    assert (found.candidate[there] >= 0).all()
+
+
 def test_a_known_handedness_is_kept():
     rng, xy = np.random.default_rng(7), design()
     image = seen(xy)

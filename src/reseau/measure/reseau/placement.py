@@ -51,6 +51,14 @@ _NEARLY = 0.75
 """Share of the marks from which a layout is correct except for a shift by steps of the grid."""
 _PROJECTED, _FEWEST_PROJECTED = 4, 10
 """Rounds of assigning marks of a plane in perspective; fewest marks that show a perspective."""
+_FINEST_PX = 0.05
+"""Error of the place of a candidate, pixels."""
+_MOST_RIGHT = 0.85
+"""Share of the marks whose candidates are taken to be right."""
+_UNLIKE = 0.4
+"""Difference of scatters that contradicts a position, as a share of that of the design shifted by a step."""
+_FEWER = 0.1
+"""Share of all marks by which the score of a position may be lower that fits their places."""
 
 
 @dataclass(frozen=True)
@@ -342,6 +350,7 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
     if 8 <= alike < len(source):
         electorates.insert(0, _strongest(candidates, alike))
     best: Assignment | None = None
+    uneven = _unevenness(source)
     for turned in options.rotations():
         # Hypotheses with y up come first: of two that explain the image equally, the first is kept.
         for mirrored in (True, False) if options.mirrored is None else (options.mirrored,):
@@ -353,7 +362,9 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
                     continue
                 if found.score > _NEARLY * len(source):
                     found = climbed(found, source, strong, valid)
-                if best is None or found.support(strong.t) > best.support(strong.t) + 0.75:
+                if best is None or _is_better(
+                    found, best, source, uneven, found.support(strong.t) > best.support(strong.t) + 0.75
+                ):
                     best = found
                 # If no grid step improves it and nearly all marks support it, no other hypothesis is better.
                 if found.support(strong.t) > _NEARLY * len(source):
@@ -377,9 +388,10 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
     """Move the design by steps of its grid as long as that assigns more marks.
 
     A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
-    Beyond the marks found so far a polynomial does not follow perspective; a projective mapping does.
+    Beyond the marks found so far a polynomial does not follow perspective; a projective mapping does. The
+    places of an uneven design tell which of two positions is right where a row at the border is not seen.
     """
-    steps = grid_steps(source)
+    steps, uneven = grid_steps(source), _unevenness(source)
     for _ in range(len(source)):
         moved = [assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps]
         plane = _homography(source, found.at)
@@ -388,11 +400,50 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
                 _projected(source, _on_plane(plane, source + step), candidates, valid)
                 for step in (np.zeros(2), *steps)
             ]
-        better = max((m for m in moved if m is not None), key=lambda m: m.score, default=found)
-        if better.score <= found.score:
+        better = [
+            m for m in moved if m is not None and _is_better(m, found, source, uneven, m.score > found.score)
+        ]
+        if not better:
             break
-        found = better
+        found = max(better, key=lambda m: m.score)
     return found
+
+
+def _is_better(other: Assignment, found: Assignment, source: Array, uneven: float, more: bool) -> bool:
+    """Whether another position, which finds more marks or not, fits an uneven design better."""
+    if other.score < found.score - _FEWER * len(source):
+        return False
+    expected = uneven * spacing(found.predicted) / spacing(source)
+    here, there = (max(_FINEST_PX, _scatter(source, m.at)) for m in (found, other))
+    if expected < 2 * min(here, there) or abs(there - here) < _UNLIKE * expected:
+        return more
+    return there < here
+
+
+def _scatter(source: Array, at: Array) -> float:
+    """Scatter of marks at (n, 2), NaN where there is none, about a smooth mapping of their design."""
+    has = np.isfinite(at).all(axis=1)
+    degree = trend_degree(int(has.sum()), most=3)
+    off = source[has] - source[has].mean(axis=0)
+    x, y = off.T / np.abs(off).max()
+    design = monomials(x, y, degree)
+    distance, image = np.zeros(len(x)), at[has]
+    for share in (1.0, _MOST_RIGHT):  # some candidates are false
+        kept = distance <= np.quantile(distance, share)
+        trend = np.linalg.lstsq(design[kept], image[kept], rcond=None)[0]
+        distance = np.hypot(*(design @ trend - image).T)
+    return float(np.sqrt(np.mean(distance[distance <= np.quantile(distance, _MOST_RIGHT)] ** 2)))
+
+
+def _unevenness(source: Array) -> float:
+    """Scatter of the steps between neighbours of a design, beyond a smooth mapping of it."""
+    tree, pitch, found = KDTree(source), spacing(source), [0.0]
+    for step in grid_steps(source):
+        distance, row = tree.query(source + step)
+        neighbour = np.where((distance < 0.3 * pitch)[:, None], source[row], np.nan)
+        if np.isfinite(neighbour).all(axis=1).sum() >= _FEWEST_PROJECTED:
+            found.append(_scatter(source, neighbour))
+    return min((s for s in found if s > 0), default=0.0)
 
 
 def _projected(source: Array, start: Array, candidates: Candidates, valid: Mask) -> Assignment | None:
