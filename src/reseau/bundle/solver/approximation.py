@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -11,10 +11,11 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.failure import Code, Remark
 from ...optics.poses import rotation_matrix
+from ...optics.refraction import RefractedRays, Refraction
 from ..network import Network
 from ..network.network import finite
 from .datum import similarity_onto
-from .spatial import directions, intersect, relative_orientation, resect
+from .spatial import behind_ports, directions, intersect, relative_orientation, resect, resect_through
 from .values import Values
 
 __all__ = ["Approximate", "approximate"]
@@ -26,6 +27,12 @@ _LOOSE = 0.03
 _CUT = 0.03
 # Pairs of images tried as the first pair.
 _PAIRS = 12
+# The same while the bend of rays through windows on the object is not known.
+_BENT = 0.3
+# Number of times the bend is computed anew for points that have just been intersected.
+_SETTLING = 6
+# Scales at which a free block is compared with the dimensions of its windows.
+_SCALES = np.geomspace(1e-4, 1e4, 161)
 # A ray with a misfit this many times the median is a gross error.
 _FAR = 20.0
 
@@ -93,7 +100,8 @@ class _Block:
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self.uv = directions(network)
+        self.seen = directions(network)
+        self.uv = self.seen
         self.known = finite(network.xyz)
         self.xyz = network.xyz.copy()
         self.rotation = np.full((len(network.images), 3, 3), np.nan)
@@ -102,6 +110,8 @@ class _Block:
         self.rotation[posed] = rotation_matrix(network.rotation[posed])
         self.x0[~posed] = np.nan
         self.refused: set[int] = set()
+        self.angle = np.where(self.known, np.pi / 2, 0.0)
+        self._straighten()
 
     @property
     def posed(self) -> Mask:
@@ -123,6 +133,8 @@ class _Block:
             else:
                 self.known, self.xyz = known, control
         self._grow()
+        if self.network.refraction is not None and not self.known.any() and not self.network.posed.any():
+            self._scale_to_windows(self.network.refraction)
         given = finite(self.network.xyz)
         xyz = np.where(given[:, None], self.network.xyz, self.xyz)
         return Approximate(self.rotation, self.x0, xyz, tuple(notes))
@@ -131,6 +143,11 @@ class _Block:
         """Intersect points and resect images in turn until nothing is added."""
         while True:
             self._intersect_all()
+            if self.network.refraction is not None:
+                # The straight lines to points that have just been intersected.
+                for _ in range(_SETTLING):
+                    self._straighten()
+                    self._intersect_all()
             if self.posed.all() or not self._resect_all():
                 return
 
@@ -172,11 +189,9 @@ class _Block:
         count = np.bincount(network.image_of[usable[network.point_of]], minlength=len(network.images))
         waiting = np.flatnonzero(~self.posed & (count >= 4))
         waiting = waiting[count[waiting] >= 0.5 * count[waiting].max(initial=0)]
-        for i in waiting:
+        for i in waiting.tolist():
             rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
-            found = resect(self.xyz[network.point_of[rows]], self.uv[rows], _LOOSE)
-            if found is not None and found.agree.sum() >= max(4, 0.5 * rows.sum()):
-                self.rotation[i], self.x0[i] = found.rotation, found.x0
+            self._resect(i, rows)
         if (
             int(self.posed.sum()) == before
             and len(waiting)
@@ -188,13 +203,81 @@ class _Block:
     def _resect_one_by_one(self, usable: Mask, count: Rows) -> bool:
         """Orient one of the other images when those with the most points fail."""
         network = self.network
-        for i in np.flatnonzero(~self.posed & (count >= 4)):
+        for i in np.flatnonzero(~self.posed & (count >= 4)).tolist():
             rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
-            found = resect(self.xyz[network.point_of[rows]], self.uv[rows], _LOOSE)
-            if found is not None and found.agree.sum() >= max(4, 0.5 * rows.sum()):
-                self.rotation[i], self.x0[i] = found.rotation, found.x0
+            if self._resect(i, rows):
                 return True
         return False
+
+    def _resect(self, i: int, rows: Mask) -> bool:
+        """Orient an image by some of its points; return whether it could be oriented."""
+        refraction, xyz = self.network.refraction, self.xyz[self.network.point_of[rows]]
+        bent = refraction is not None and refraction.path_of[i] >= 0
+        found = resect(xyz, self.uv[rows], _BENT if bent else _LOOSE)
+        if found is not None and bent and refraction is not None:
+            # The bend of the rays depends on the pose.
+            only = replace(refraction, path_of=refraction.path_of[[i]])
+            found = resect_through(only, found, xyz, self.seen[rows], _LOOSE)
+        if found is None or found.agree.sum() < max(4, 0.5 * rows.sum()):
+            return False
+        self.rotation[i], self.x0[i] = found.rotation, found.x0
+        return True
+
+    def _scale_to_windows(self, refraction: Refraction) -> None:
+        """Give a free block the scale of its distances, or that with which the rays pass the windows best."""
+        network = self.network
+        rows = self.posed[network.image_of] & finite(self.xyz)[network.point_of] & finite(self.seen)
+        if not rows.any():
+            return
+        image, point = network.image_of[rows], network.point_of[rows]
+        rotation = np.where(self.posed[:, None, None], self.rotation, np.eye(3))
+        x0, xyz = np.nan_to_num(self.x0), np.nan_to_num(self.xyz)
+        columns = refraction.columns(refraction.values)
+
+        def cost(scale: float) -> float:
+            rays = RefractedRays.of(
+                columns, refraction.path_of, rotation, scale * x0, scale * xyz, image, point
+            )
+            square = ((rays.uv - self.seen[rows]) ** 2).sum(axis=1) / _LOOSE**2
+            return float(np.where(rays.reached, np.log1p(square), square + 1.0).sum())
+
+        a, b = network.distance_of.T
+        length = np.linalg.norm(self.xyz[b] - self.xyz[a], axis=1)
+        known = np.isfinite(length) & (length > 0)
+        if known.any():
+            scale = float(np.median(network.distance[known, 0] / length[known]))
+        else:
+            scale = float(_SCALES[np.argmin([cost(scale) for scale in _SCALES])])
+        self.x0, self.xyz = scale * self.x0, scale * self.xyz
+
+    def _bend(self, rows: Rows, rotation: Array, x0: Array, xyz: Array) -> Array:
+        """Directions of rays through windows less those of straight lines (k, 2), for one image."""
+        refraction, network = self.network.refraction, self.network
+        assert refraction is not None
+        every = np.arange(len(rows))
+        rays = RefractedRays.of(
+            refraction.columns(refraction.values), refraction.path_of[network.image_of[rows[:1]]],
+            rotation[None], x0[None], xyz, np.zeros(len(rows), np.intp), every,
+        )  # fmt: skip
+        x = (xyz - x0) @ rotation.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(rays.reached[:, None], rays.uv - x[:, :2] / x[:, 2:], 0.0)
+
+    def _straighten(self) -> None:
+        """Compute the directions of straight lines to the points, as far as poses and points are known.
+
+        For other rays only the windows on the camera are taken into account, for distant points.
+        """
+        refraction, network = self.network.refraction, self.network
+        if refraction is None:
+            return
+        uv = behind_ports(refraction, self.seen, network.image_of)
+        for i in np.flatnonzero(self.posed & (refraction.path_of >= 0)).tolist():
+            rows = np.flatnonzero((network.image_of == i) & finite(self.xyz)[network.point_of])
+            if len(rows):
+                bend = self._bend(rows, self.rotation[i], self.x0[i], self.xyz[network.point_of[rows]])
+                uv[rows] = self.seen[rows] - bend
+        self.uv = uv
 
     def _orient_first_pair(self) -> bool:
         """Orient the pair of images with many common points and the largest intersection angles."""

@@ -13,7 +13,15 @@ from .system import System
 from .unknowns import Unknowns
 from .values import Values
 
-__all__ = ["Freedom", "Similarity", "freedom_of", "held_for", "held_minimally", "similarity_onto"]
+__all__ = [
+    "Freedom",
+    "Similarity",
+    "freedom_of",
+    "held_for",
+    "held_minimally",
+    "similarity_changes",
+    "similarity_onto",
+]
 
 # Names of the seven parameters.
 _NAMES = ("position in X", "position in Y", "position in Z", "rotation about X", "rotation about Y",
@@ -99,18 +107,32 @@ def _similarity_changes(
     return reduced, points
 
 
-def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
+def similarity_changes(system: System, values: Values) -> Array:
+    """Changes of the reduced unknowns (u, 7) by a small shift, rotation and scale of object space."""
+    network = system.unknowns.network
+    windows = _changes_of_windows(system, values)
+    return _similarity_changes(system.unknowns, values, np.ones(len(network.points), dtype=bool), windows)[0]
+
+
+def _changes_of_windows(system: System, values: Values) -> Array:
+    bent = system.unknowns.network.refraction
+    return np.zeros((0, 7)) if bent is None else bent.changes(values.refraction, system.origin)
+
+
+def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bool = True) -> Freedom:
     """Find the similarity transformations not determined by coordinates, distances and stage readings.
 
     Parameters
     ----------
     taking_part : ndarray of bool (p,)
         Points that are adjusted.
+    windows : bool
+        Whether known parameters of windows are counted.
     """
     unknowns, network = system.unknowns, system.unknowns.network
     bent = network.refraction
-    windows = np.zeros((0, 7)) if bent is None else bent.changes(values.refraction, system.origin)
-    reduced, points = _similarity_changes(unknowns, values, taking_part, windows)
+    moving = _changes_of_windows(system, values)
+    reduced, points = _similarity_changes(unknowns, values, taking_part, moving)
     whole = points.copy()
     kept = np.flatnonzero(unknowns.kept >= 0)
     whole[kept] = reduced[unknowns.kept[kept, None] + np.arange(3)]
@@ -122,10 +144,10 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
     for a, b in system.others.ends[system.sigma_root[system.others.slices[0]] > 0]:
         along = values.xyz[b] - values.xyz[a]
         rows.append(along[None] @ (whole[b] - whole[a]))
-    if bent is not None:
+    if bent is not None and windows:
         known = bent.used & ~bent.free
         known[system.others.refraction[system.sigma_root[system.others.windows] > 0]] = True
-        rows.append(windows[known])
+        rows.append(moving[known])
     if network.stage is not None:
         rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
@@ -141,6 +163,12 @@ def freedom_of(system: System, values: Values, taking_part: Mask) -> Freedom:
     basis = scale[:, None] * free
     points *= system.movable[:, :, None]
     return Freedom(reduced @ basis, points @ basis, names)
+
+
+def scaled_by_windows(system: System, values: Values, taking_part: Mask) -> bool:
+    """Whether the scale is determined by the dimensions of windows alone."""
+    one, other = (freedom_of(system, values, taking_part, windows=known) for known in (True, False))
+    return "scale" in other.names and "scale" not in one.names
 
 
 def held_for(freedom: Freedom, unknowns: Unknowns, diagonal: Array) -> Rows:

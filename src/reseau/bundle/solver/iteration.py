@@ -1,9 +1,10 @@
 """Levenberg–Marquardt iteration of the sparse system, with one factorisation per iteration.
 
 The damping decreases where a step reaches the predicted decrease, and otherwise increases after Nielsen
-(1999). Convergence is decided by the relative offset (Bates & Watts 1981), as in
-:mod:`reseau.adjust.engine`; it is computed from the decrease predicted for the damped step and is therefore
-valid only with small damping.
+(1999). In a narrow curved valley the steps follow its curvature to second order (Transtrum & Sethna 2012,
+Improvements to the Levenberg–Marquardt algorithm, arXiv:1201.5885); they then need two factorisations.
+Convergence is decided by the relative offset (Bates & Watts 1981), as in :mod:`reseau.adjust.engine`; it is
+computed from the decrease predicted for the damped step and is therefore valid only with small damping.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ...core.data import Rows
 from ...core.failure import Code, Failure
 from .arrow import Singular
 from .system import Linear, System
-from .values import Values
+from .values import Correction, Values
 
 __all__ = ["Iterated", "iterate"]
 
@@ -30,6 +31,9 @@ _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
 # Points farther away than this many times the extent of the network are at infinity.
 _HORIZON, _NEARLY = 1e8, 0.99
+# A step rejected at a damping below this lies in a curved valley. The second difference of the misfits is
+# taken over this part of a step; an acceleration longer than this part of the step is not trusted.
+_CURVED, _PART, _TRUSTED = 1e-2, 0.1, 0.375
 # The iteration stalls when the sum of squares decreases by at most this fraction in this many iterations.
 _STALL_ITERATIONS, _STALL_DECREASE = 25, 1e-6
 
@@ -108,6 +112,7 @@ def iterate(
             "misfits of image coordinates are not finite at the approximate values", Code.NOT_FINITE
         )
     radius = _HORIZON * _extent(system, start)
+    curved = False
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.other_misfits) - redundancy)
     while tried < max_iterations:
         tried += 1
@@ -129,6 +134,8 @@ def iterate(
         if (offset <= tolerance and settled) or cost <= system.floor or near or stalled:
             away = linear.values.beyond(_NEARLY * radius)
             return Iterated(linear, tuple(costs), tried, float(offset), away)
+        if curved:
+            step = _accelerated(linear, step, damping)
         trial = linear.values.moved(system.unknowns, step, system.constraints)
         away = trial.beyond(radius)
         if len(away):
@@ -145,11 +152,32 @@ def iterate(
             if watch is not None:
                 watch(tried, cost)
             continue
+        curved |= damping < _CURVED
         damping, growth = max(damping, _LEAST_DAMPING) * growth, growth * 2.0
         if damping > _MOST_DAMPING:
             break
     away = linear.values.beyond(_NEARLY * radius)
     return Iterated(linear, tuple(costs), tried, float("nan"), away, converged=False)
+
+
+def _accelerated(linear: Linear, step: Correction, damping: float) -> Correction:
+    """Add the acceleration a = −½ (JᵀPJ + λD)⁻¹ JᵀP v″ to a step; v″ is the second derivative along it."""
+    system, values = linear.system, linear.values
+    ahead, back = (
+        system.misfits(values.moved(system.unknowns, step.times(sign * _PART), system.constraints))
+        for sign in (1.0, -1.0)
+    )
+    second = [
+        (one + other - 2.0 * here) / (2.0 * _PART**2)
+        for one, other, here in zip(ahead, back, (linear.misfits, linear.other_misfits), strict=True)
+    ]
+    if not all(np.isfinite(part).all() for part in second):
+        return step
+    try:
+        bend = Linear(system, values, linear.rows, second[0], second[1]).normal(damping).correction()
+    except Singular:
+        return step
+    return step.plus(bend) if bend.length <= _TRUSTED * step.length else step
 
 
 def _extent(system: System, values: Values) -> float:

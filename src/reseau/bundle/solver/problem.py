@@ -22,11 +22,11 @@ from ...core.threads import one_thread
 from ..network import Network
 from ..network.network import Usable, finite, usable
 from .arrow import Singular
-from .datum import Freedom, freedom_of, held_minimally, similarity_onto
+from .datum import Freedom, freedom_of, held_minimally, scaled_by_windows, similarity_onto
 from .iteration import Iterated, iterate
 from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import poorly_determined_points, steady_points, undetermined, weak_points
+from .rank import SCALE_OF_WINDOWS, poorly_determined_points, steady_points, undetermined, weak_points
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .values import Values
@@ -355,6 +355,8 @@ class _Run:
                 return again
         if not found.converged:
             reason = f"not converged in {found.iterations} iterations"
+            if network.refraction is not None and scaled_by_windows(self.system, start, self.usable.points):
+                reason += f": {SCALE_OF_WINDOWS}"
             return AdjustmentFailure(
                 reason, Code.NOT_CONVERGED, iterations=found.iterations, costs=found.costs
             )

@@ -8,11 +8,22 @@ from ...adjust import AdjustmentFailure
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from .arrow import full
-from .datum import Freedom, held_for
+from .datum import Freedom, held_for, similarity_changes
 from .system import Linear
 
-__all__ = ["PARALLEL", "poorly_determined_points", "steady_points", "undetermined", "weak_points"]
+__all__ = [
+    "PARALLEL",
+    "SCALE_OF_WINDOWS",
+    "poorly_determined_points",
+    "steady_points",
+    "undetermined",
+    "weak_points",
+]
 
+# What is wrong where nothing else gives the scale of a network.
+SCALE_OF_WINDOWS = (
+    "only the dimensions of the windows determine the scale, too weakly; give a distance or control points"
+)
 # Eigenvalues of the scaled normal equations below this count as zero.
 _ZERO = 1e-11
 # Smallest eigenvalue of the scaled normal equations of a point with parallel rays: they intersect at less
@@ -21,6 +32,8 @@ PARALLEL = 1e-9
 _LISTED = 8
 # A point with this many times the median uncertainty is poorly determined.
 _POOR = 50.0
+# Greatest part of a change of the projection centres that is left by a similarity which explains it.
+_LIKE = 0.05
 # Largest uncertainty of a datum point from its own rays, relative to the median of all points.
 _UNSTEADY = 5.0
 
@@ -47,11 +60,31 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
         )
     # Without the constraints of the stage, determined unknowns would appear undetermined.
     vectors = _null_vectors(linear, freedom) if linear.system.constraints is None else []
+    bent = linear.system.unknowns.network.refraction is not None
+    if bent and len(vectors) == 1 and _is_scale(linear, vectors[0]):
+        reason = f"rank defect 1: {SCALE_OF_WINDOWS}"
+        return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
     if not vectors:
         return AdjustmentFailure("the normal equations are numerically singular", Code.SINGULAR, costs=costs)
     listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
     reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
     return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
+
+
+def _is_scale(linear: Linear, vector: dict[str, float]) -> bool:
+    """Whether a change of the reduced unknowns is one of the scale of object space, with any other datum."""
+    unknowns, values = linear.system.unknowns, linear.values
+    row = {name: k for k, name in enumerate(unknowns.names)}
+    change = np.zeros(unknowns.size)
+    change[[row[name] for name in vector]] = list(vector.values())
+    moves = similarity_changes(linear.system, values)
+    # Centres of projection only: all other changes follow from these.
+    at = np.concatenate([unknowns.pose[unknowns.pose >= 0][:, None] + np.arange(3, 6)]).ravel()
+    part, moves = change[at], moves[at]
+    fitted = moves @ np.linalg.lstsq(moves, part, rcond=None)[0]
+    without = moves[:, :6] @ np.linalg.lstsq(moves[:, :6], part, rcond=None)[0]
+    size = float(np.linalg.norm(part))
+    return bool(np.linalg.norm(part - fitted) < _LIKE * size < np.linalg.norm(part - without))
 
 
 def weak_points(linear: Linear) -> Rows:

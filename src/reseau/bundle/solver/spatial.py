@@ -6,6 +6,7 @@ points are those of OpenCV, applied to directions corrected for distortion.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -13,9 +14,29 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
+from ...optics.refraction import RefractedRays, Refraction
 from ..network import Camera, Network
 
-__all__ = ["Pair", "Resection", "directions", "intersect", "relative_orientation", "resect"]
+__all__ = [
+    "Pair",
+    "Resection",
+    "behind_ports",
+    "directions",
+    "intersect",
+    "relative_orientation",
+    "resect",
+    "resect_through",
+]
+
+
+# Distance of points that count as distant, in the largest dimension of a window.
+_DISTANT = 1e4
+# Newton steps to the direction behind a window, and the steps (tangents) at which it is found, and close.
+_STEPS, _SHORT, _ROUGH = 20, 1e-9, 1e-3
+
+
+# Steps of a resection through windows, and its cost of a point that has no ray.
+_POSE_STEPS, _MISSED = 60, 10.0
 
 
 class Resection(NamedTuple):
@@ -51,6 +72,50 @@ def _inverse(camera: Camera, xy: Array) -> Array:
         # Where a roughly known distortion has no inverse, the direction without distortion is close enough.
         beyond = ~np.isfinite(found).all(axis=1)
         found[beyond] = camera.bare_mapping(distorted=False).inverse(xy[beyond])
+    return found
+
+
+def behind_ports(refraction: Refraction, uv: Array, image_of: Rows) -> Array:
+    """Compute the directions of rays behind the windows on the camera.
+
+    Parameters
+    ----------
+    refraction : Refraction
+        Windows.
+    uv : ndarray (n, 2)
+        Ideal directions.
+    image_of : ndarray of int (n,)
+        Image of each ray.
+
+    Returns
+    -------
+    ndarray (n, 2)
+        Directions of distant points that are seen in the directions `uv`.
+    """
+    ports = [tuple(k for k in path if refraction.windows[k].on == "camera") for path in refraction.paths]
+    kept = [p for p, path in enumerate(ports) if path]
+    number = np.array([kept.index(p) if path else -1 for p, path in enumerate(ports)] + [-1], dtype=np.intp)
+    only = replace(
+        refraction, paths=tuple(ports[p] for p in kept), path_of=number[refraction.path_of]
+    )  # air is −1, the last
+    rows = np.flatnonzero((only.path_of[image_of] >= 0) & np.isfinite(uv).all(axis=1))
+    found = uv.copy()
+    if not len(rows):
+        return found
+    values = np.abs(only.values[: only.starts[-1]])
+    far = _DISTANT * float(values.max(initial=1.0))
+    columns, image, every = only.columns(only.values), image_of[rows], np.arange(len(rows))
+    poses = np.tile(np.eye(3), (len(only.path_of), 1, 1)), np.zeros((len(only.path_of), 3))
+    out = uv[rows].copy()
+    for _ in range(_STEPS):
+        xyz = far * np.column_stack([out, np.ones(len(out))])
+        rays = RefractedRays.of(columns, only.path_of, *poses, xyz, image, every, derivatives=True)
+        step = np.linalg.solve(far * rays.by[:, :, 6:8], (uv[rows] - rays.uv)[:, :, None])[:, :, 0]
+        out += np.clip(step, -0.5, 0.5)
+        if np.abs(step).max() < _SHORT:
+            break
+    good = rays.reached & (np.abs(step).max(axis=1) < _ROUGH)
+    found[rows[good]] = out[good]
     return found
 
 
@@ -124,6 +189,67 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
         return None
     rotation, shift, agree = best
     return Resection(rotation, centre - size * rotation.T @ shift, agree)
+
+
+def resect_through(
+    refraction: Refraction, start: Resection, xyz: Array, uv: Array, tolerance: float
+) -> Resection | None:
+    """Refine the pose of an image whose rays pass windows, by robust least squares with the exact rays.
+
+    Parameters
+    ----------
+    refraction : Refraction
+        Windows, with the path of this image only.
+    start : Resection
+        Pose with straight rays.
+    xyz : ndarray (k, 3)
+        Object points.
+    uv : ndarray (k, 2)
+        Ideal directions.
+    tolerance : float
+        Misfit of the ideal direction at which the weight of a point is one half; the largest misfit of a
+        consistent point is three times this.
+
+    Returns
+    -------
+    Resection or None
+        None where rays cannot be computed.
+    """
+    columns, every = refraction.columns(refraction.values), np.arange(len(xyz))
+    image = np.zeros(len(xyz), dtype=np.intp)
+
+    def misfits(rotation: Array, x0: Array) -> tuple[Array, Array, Array, float]:
+        rays = RefractedRays.of(
+            columns, refraction.path_of, rotation[None], x0[None], xyz, image, every, derivatives=True
+        )
+        off = rays.uv - uv
+        square = (off**2).sum(axis=1) / tolerance**2
+        weight = np.where(rays.reached, 1.0 / (1.0 + square), 0.0)
+        cost = float(np.where(rays.reached, np.log1p(square), _MISSED).sum())
+        return off, rays.by[:, :, :6], weight, cost
+
+    rotation, x0, damping = start.rotation, start.x0, 1e-3
+    off, by, weight, cost = misfits(rotation, x0)
+    for _ in range(_POSE_STEPS):
+        normal = np.einsum("k,kia,kib->ab", weight, by, by)
+        right = -np.einsum("k,kia,ki->a", weight, by, off)
+        diagonal = np.diag(normal)
+        if not (np.isfinite(normal).all() and (diagonal > 0).all()):
+            return None
+        step = np.linalg.solve(normal + damping * np.diag(diagonal), right)
+        trial = rotation_matrix(step[:3]) @ rotation, x0 + step[3:]
+        there = misfits(*trial)
+        if there[3] <= cost:
+            settled = cost - there[3] < 1e-9 * cost
+            (rotation, x0), (off, by, weight, cost), damping = trial, there, damping / 5
+            if settled:
+                break
+        else:
+            damping *= 5
+            if damping > 1e8:
+                break
+    agree = (np.linalg.norm(off, axis=1) < 3 * tolerance) & (weight > 0)
+    return Resection(rotation, x0, agree)
 
 
 def _best_pose(xyz: Array, uv: Array, tolerance: float) -> tuple[Array, Array, Mask] | None:

@@ -334,7 +334,7 @@ class Normal:
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
         gradient = self.sums.gradient @ y + float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
-        return Correction(y, points, float(-gradient + self.damping * bent), q)
+        return Correction(y, points, float(-gradient + self.damping * bent), float(np.sqrt(bent)), q)
 
     def points(self, side: Array, y: Array) -> Array:
         """Compute points (p, 3, s) from right-hand sides (p, 3, s) and reduced unknowns (u, s)."""

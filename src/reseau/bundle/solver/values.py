@@ -28,6 +28,8 @@ class Correction:
         Correction of the eliminated points.
     predicted : float
         Decrease of the weighted sum of squares, to first order.
+    length : float
+        Length of the correction, in the metric of the damping.
     independent : ndarray, optional
         Correction of the independent unknowns, with a stage.
     """
@@ -35,7 +37,25 @@ class Correction:
     reduced: Array
     points: Array
     predicted: float
+    length: float = 0.0
     independent: Array | None = None
+
+    def times(self, factor: float) -> Correction:
+        """Return a part of the correction."""
+        own = None if self.independent is None else factor * self.independent
+        return replace(
+            self, reduced=factor * self.reduced, points=factor * self.points, independent=own,
+            length=abs(factor) * self.length,
+        )  # fmt: skip
+
+    def plus(self, other: Correction) -> Correction:
+        """Return the sum of two corrections, with the decrease that the first predicts."""
+        own = None
+        if self.independent is not None and other.independent is not None:
+            own = self.independent + other.independent
+        return replace(
+            self, reduced=self.reduced + other.reduced, points=self.points + other.points, independent=own
+        )
 
 
 @dataclass(frozen=True, eq=False)
