@@ -247,7 +247,6 @@ def refracted(
         refraction.columns(refraction.values), refraction.path_of, base.rotation, base.x0, base.xyz,
         network.image_of, network.point_of,
     )  # fmt: skip
-    assert rays.reached.all()
     xy = network.xy.copy()
     for c, cam in enumerate(network.cameras):
         rows = network.camera_of[network.image_of] == c

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Options
-from reseau.bundle import BundleFit, Stage, problem_of
+from reseau.bundle import BundleFit, Result, Stage, adjust_network, problem_of
 from reseau.core.errors import UsageError
 from reseau.optics.refraction import Refraction, RefractiveIndex, Window
 
@@ -165,6 +165,30 @@ def test_what_images_cannot_determine_is_named() -> None:
     failure = world.problem(network).adjusted()
     assert not failure
     assert "distance of plate" in str(failure)
+
+
+def test_a_point_before_the_window_is_computed_as_in_air_and_named() -> None:
+    base = networks.world(cameras=LENS)
+    base.xyz[24] = [0.1, 0.2, 1.5]
+    world = networks.refracted(base, "surface of the water", ())
+    result = adjust_network(world.noisy(0))
+    assert isinstance(result, Result)
+    assert result.sigma0 < 1.2
+    remarks = [remark.text for remark in result.warnings]
+    assert any("no ray through the windows leads to points p24 in image" in text for text in remarks)
+
+
+def test_correlated_parameters_of_windows_are_told_with_their_partners() -> None:
+    free = ("distance of port", "index of water")
+    world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
+    result = adjust_network(world.noisy(0))
+    assert isinstance(result, Result)
+    assert result.refraction is not None
+    assert result.refraction.parameters == free
+    for k, (partner, r) in enumerate(result.refraction.partners):
+        pair = result.covariance_of(free[k], partner)
+        assert r == pytest.approx(pair[0, 1] / np.sqrt(pair[0, 0] * pair[1, 1]), abs=1e-9)
+    assert not any(test.significant and test.p < 1e-3 for test in result.refraction.tests)
 
 
 def test_a_camera_by_its_mapping_gives_the_same_result_as_the_registered_one() -> None:

@@ -13,6 +13,7 @@ from ..adjust.significance import CoefficientTest
 from ..core.data import Array
 from ..core.provenance import Provenance
 from ..io import Document, Strict
+from ..optics.refraction import Refraction
 from .diagnostics import Result, sigma_between_images
 from .network.network import finite
 
@@ -55,6 +56,19 @@ class CameraResult(Strict):
     sigma_between_images: dict[str, float | None]
     correlation: Correlation
     tests: dict[str, Significance]
+
+
+class RefractionResult(Strict):
+    """Windows and media: all parameters, given values, and tests of the estimates against these.
+
+    `partners` are, for each estimated parameter, the unknown correlated most and the correlation.
+    """
+
+    parameters: dict[str, Estimate]
+    given: dict[str, float]
+    correlation: Correlation
+    tests: dict[str, Significance]
+    partners: dict[str, tuple[str, float]]
 
 
 class ImagesResult(Strict):
@@ -196,6 +210,7 @@ class ResultDocument(Document):
     warning_codes: tuple[str, ...] | None = None
     left_out: LeftOut | None = None
     distances: DistancesResult | None = None
+    refraction: RefractionResult | None = None
     variance_components: ComponentsResult | None = None
     eliminated: tuple[EliminatedParameter, ...] | None = None
     cross_validation: CrossValidation | None = None
@@ -221,6 +236,8 @@ class ResultDocument(Document):
             more["left_out"] = _left_out(result)
         if len(result.network.distance):
             more["distances"] = _distances(result)
+        if result.network.refraction is not None:
+            more["refraction"] = _refraction(result, result.network.refraction)
         if provenance is not None:
             more["provenance"] = provenance.to_dict()
         return cls(
@@ -307,6 +324,24 @@ def _camera(result: Result, c: int) -> CameraResult:
         sigma_between_images=dict(zip(found.parameters, between, strict=True)),
         correlation=Correlation(names=found.parameters, matrix=_matrix(found.correlation)),
         tests={test.name: _significance(test) for test in result.camera_tests(c)},
+    )
+
+
+def _refraction(result: Result, bent: Refraction) -> RefractionResult:
+    values, found = result.fit.values.refraction.tolist(), result.refraction
+    sigma, names = dict.fromkeys(bent.names, 0.0), tuple[str, ...]()
+    if found is not None:
+        names = found.parameters
+        sigma |= dict(zip(names, found.sigma.tolist(), strict=True))
+    return RefractionResult(
+        parameters={
+            name: Estimate(value=value, sigma=sigma[name])
+            for name, value in zip(bent.names, values, strict=True)
+        },
+        given=dict(zip(bent.names, bent.values.tolist(), strict=True)),
+        correlation=Correlation(names=names, matrix=() if found is None else _matrix(found.correlation)),
+        tests={} if found is None else {test.name: _significance(test) for test in found.tests},
+        partners={} if found is None else dict(zip(names, found.partners, strict=True)),
     )
 
 

@@ -20,6 +20,7 @@ from .bundle_options import (
     say_left_out,
     say_model,
     say_parameters,
+    say_refraction,
 )
 from .common import AsJson, Out, progress, required, say
 
@@ -126,6 +127,9 @@ def _say(path: Path, result: Result) -> None:
         if camera.parameters:
             say(f"camera {camera.id}\n")
             say_parameters(camera)
+    if result.refraction is not None:
+        say("windows and media\n")
+        say_refraction(result.refraction)
     say_model(result)
     say_left_out(result)
     for warning in result.warnings:

@@ -11,7 +11,7 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import CameraEstimate, Kind, Result
+    from ..bundle import CameraEstimate, Kind, RefractionEstimate, Result
     from ..calibration import FieldDifference
     from ..core.data import Array
 
@@ -29,6 +29,7 @@ __all__ = [
     "say_left_out",
     "say_model",
     "say_parameters",
+    "say_refraction",
 ]
 
 
@@ -125,6 +126,21 @@ def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None
         if between is not None and math.isfinite(between[k]):
             by_images = f" (from scatter between images: {between[k]:.2g})"
         say(f"  {name:<6} {measured(value, sigma, unit)}{by_images}\n")
+
+
+def say_refraction(found: RefractionEstimate) -> None:
+    """Print the parameters of windows and media, their tests against given values, and their partners."""
+    from ..core.numbers import measured
+
+    width = max(len(name) for name in found.parameters)
+    for k, name in enumerate(found.parameters):
+        test, (partner, r) = found.tests[k], found.partners[k]
+        value = measured(float(found.values[k]), float(found.sigma[k]), found.units[k])
+        differs = "differs" if test.significant else "does not differ"
+        say(
+            f"  {name:<{width}}  {value}: {differs} from {found.given[k]:g} (p = {test.p:.2g}); "
+            f"correlation {r:+.2f} with {partner}\n"
+        )
 
 
 def say_left_out(result: Result) -> None:

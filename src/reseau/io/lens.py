@@ -32,7 +32,15 @@ from ..optics.lenses import (
 from ..optics.lenses.paraxial import Paraxial
 from .document import Document, Strict, write_whole
 
-__all__ = ["LensAperture", "LensBreak", "LensDocument", "LensMedium", "LensSensor", "LensSurface"]
+__all__ = [
+    "LensAperture",
+    "LensBreak",
+    "LensDocument",
+    "LensMedium",
+    "LensSensor",
+    "LensSurface",
+    "medium_of",
+]
 
 Positive = Annotated[float, Field(gt=0)]
 Pair = tuple[float, float]
@@ -376,14 +384,14 @@ class LensDocument(Document):
             When it is no lens: nothing bends rays, a glass is not in the catalogue, radii and distances
             contradict each other or the stated focal length.
         """
-        before = medium = _medium(self.before, "before")
+        before = medium = medium_of(self.before, "before")
         layout, surfaces = Layout(), []
         for k, at in enumerate(self.surface, 1):
             name = at.name or ("image" if k == len(self.surface) else f"surface {k}")
             if at.turned is not None:
                 layout.turn(at.turned.decentre, at.turned.tilt_deg)
             mirror = at.medium == "mirror"
-            behind = medium if mirror or at.medium is None else _medium(at.medium, name)
+            behind = medium if mirror or at.medium is None else medium_of(at.medium, name)
             alone = Rotation.from_euler("XYZ", at.tilt_deg, degrees=True).as_matrix()
             surfaces.append(
                 Surface(
@@ -521,7 +529,19 @@ class LensDocument(Document):
         write_whole(Path(path), self.to_toml())
 
 
-def _medium(part: str | LensMedium, where: str) -> Medium:
+def medium_of(part: str | LensMedium, where: str) -> Medium:
+    """Return the medium of a name or an entry; `where` names it in messages.
+
+    Raises
+    ------
+    UsageError
+        When it is not in the catalogue, or no medium.
+
+    Examples
+    --------
+    >>> round(medium_of("N-BK7", "lens.toml").index(587.56), 4)
+    1.5168
+    """
     if isinstance(part, str):
         if part.lower() == "air":
             return AIR

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, mod
 from ..core.errors import UsageError
 from ..optics.cameras import additional_models, camera_model, camera_models
 from .document import Document, Strict
+from .refraction import RefractionEntry
 
 __all__ = [
     "AdditionalParameters",
@@ -262,6 +263,7 @@ class Network1(Document):
     distances: DistanceColumns | None = None
     datum: Literal["control", "minimal", "free"]
     datum_points: tuple[str, ...] | None = None
+    refraction: RefractionEntry | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -283,6 +285,11 @@ class Network1(Document):
         self._check_points()
         self._check_observations()
         self._check_groups()
+        if self.refraction is not None:
+            try:
+                self.refraction.refraction(self.images.id, self.images.camera)
+            except UsageError as error:
+                raise ValueError(str(error)) from None
         return self
 
     def _check_points(self) -> None:

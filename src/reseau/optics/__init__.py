@@ -28,6 +28,7 @@ from .poses import (
     rotate,
     rotation_matrix,
 )
+from .refraction import RefractedRays, Refraction, RefractiveIndex, Window, window_parameters
 from .sensor import Sensor, illumination, jpeg, sigma_of_snr, snr_db
 
 __all__ = [
@@ -48,8 +49,12 @@ __all__ = [
     "Pose",
     "Projection",
     "RationalPolynomial",
+    "RefractedRays",
+    "Refraction",
+    "RefractiveIndex",
     "Sensor",
     "Similarity",
+    "Window",
     "additional_model",
     "additional_models",
     "angles_to_matrix",
@@ -65,5 +70,6 @@ __all__ = [
     "rotation_matrix",
     "sigma_of_snr",
     "snr_db",
+    "window_parameters",
     "wong_display",
 ]

@@ -65,6 +65,7 @@ def bundle_report(
         components=components_table(result),
         dropped=dropped_table(result),
         cameras=cameras,
+        refraction=_refraction(result),
         more_cameras=max(0, len(_shown(result)) - _CAMERAS),
         images=images_table(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
@@ -157,6 +158,28 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
     }
 
 
+def _refraction(result: Result) -> list[dict[str, Any]]:
+    """Rows of the table of windows and media."""
+    found = result.refraction
+    if found is None:
+        return []
+    return [
+        {
+            "name": name,
+            "estimate": power(float(value), float(sigma)),
+            "unit": unit_text(unit),
+            "given": f"{given:g}",
+            "p": f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
+            "partner": partner,
+            "r": f"{r:+.2f}".replace("-", "−"),
+        }
+        for name, value, sigma, unit, given, test, (partner, r) in zip(
+            found.parameters, found.values, found.sigma, found.units, found.given, found.tests,
+            found.partners, strict=True,
+        )
+    ]  # fmt: skip
+
+
 def _lens(result: Result, c: int) -> CameraMapping | None:
     """The mapping of the camera; None where it has several sets of parameters, or no mapping."""
     return camera_mapping(result, c) if result.network.cameras[c].has_plane_mapping else None
@@ -170,12 +193,15 @@ def _fields(
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     fields = [("directions", projection_field(lens, _PLACES))]
+    bent = network.refraction
+    if bent is not None and (bent.path_of[network.camera_of == c] >= 0).any():
+        distances, usual = [], 0.0
     fields += [
         (
             f"points at {plain(distance, 3)} {network.unit}",
             projection_field_at(result, c, distance, across=_PLACES),
         )
-        for distance in distances or [usual]
+        for distance in distances or ([usual] if usual > 0 else [])
     ]
     return [
         (what, Markup(uncertainty_figure(field, network.xy[rows])))

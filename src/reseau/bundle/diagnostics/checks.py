@@ -129,6 +129,7 @@ def checks(result: Result) -> list[Remark]:
         *_global(result),
         *_large(result),
         *_correlations(result),
+        *_refraction(result),
         *_weak(result),
         *_datum(result),
         *_scatter(result),
@@ -242,6 +243,33 @@ def _correlations(result: Result) -> list[Remark]:
                 f"correlation of position and rotation above {_CORRELATED} in "
                 f"{_plural('image', images)} {names_of}",
                 Code.CORRELATED,
+            )
+        )
+    return found
+
+
+def _refraction(result: Result) -> list[Remark]:
+    """Parameters of windows and media that are hardly determined, and rays that miss windows."""
+    found, named = list[Remark](), result.refraction
+    if named is not None:
+        pairs = [
+            f"{name} with {partner} ({r:.3f})"
+            for name, (partner, r) in zip(named.parameters, named.partners, strict=True)
+            if abs(r) > _CORRELATED
+        ]
+        if pairs:
+            found.append(Remark(f"windows and media: correlated are {listed(pairs)}", Code.CORRELATED))
+    rows, network = result.misses_windows, result.network
+    if len(rows):
+        names = [
+            f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}"
+            for k in rows
+        ]
+        found.append(
+            Remark(
+                f"no ray through the windows leads to {_plural('point', rows)} {listed(names)}: computed as "
+                "in air",
+                Code.INCONSISTENT,
             )
         )
     return found

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...adjust.significance import CoefficientTest
 from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.numbers import measured
 
-__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates"]
+__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates", "RefractionEstimate"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,6 +74,33 @@ class CameraEstimate(Display):
             "sigma": self.sigma.tolist(),
             "unit": list(self.units),
         }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RefractionEstimate(CameraEstimate):
+    """Estimated parameters of windows and media, in the manner of those of a camera.
+
+    Parameters
+    ----------
+    given : ndarray (u,)
+        Values in the network, with which the estimates are compared.
+    tests : tuple of CoefficientTest
+        Test of each estimate against the given value.
+    partners : tuple of (str, float)
+        For each parameter the unknown of a camera, an image, a window or a medium with which it is correlated
+        most, and the correlation.
+
+    Examples
+    --------
+    >>> found = RefractionEstimate("windows and media", ("distance of port",), np.array([40.2]),
+    ...     np.array([[0.01]]), ("mm",), np.array([40.0]), (), (("c of camera cam", -0.97),))
+    >>> found
+    <RefractionEstimate: windows and media, distance of port 40.20 ± 0.10 mm>
+    """
+
+    given: Array
+    tests: tuple[CoefficientTest, ...]
+    partners: tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -91,7 +91,8 @@ def projection_field_at(
     Raises
     ------
     UsageError
-        For a distance that is not positive, a camera without images, or fewer than two positions.
+        For a distance that is not positive, a camera without images or behind windows, or fewer than two
+        positions.
 
     Notes
     -----
@@ -111,6 +112,12 @@ def projection_field_at(
     """
     if not distance > 0:
         raise UsageError(f"{distance:g} is not positive", where="distance")
+    bent = result.network.refraction
+    if bent is not None and (bent.path_of[result.network.camera_of == c] >= 0).any():
+        raise UsageError(
+            "the projection of points through windows is not known at a distance",
+            where=result.network.cameras[c].label,
+        )
     camera = camera_mapping(result, c, additional)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)

@@ -18,9 +18,10 @@ from ...core.errors import UsageError
 from ...core.failure import Remark
 from ...optics.cameras import distortion_names, unit_of
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
+from ...optics.refraction import RefractedRays
 from ..network import Network
 from ..solver import BundleFit
-from .estimates import CameraEstimate, ImageEstimates, PointEstimates
+from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -225,6 +226,57 @@ class Result(Display):
             network.unit,
         )
 
+    @cached_property
+    def refraction(self) -> RefractionEstimate | None:
+        """Estimated parameters of windows and media; None where none is free."""
+        bent, unknowns, fit = self.network.refraction, self.fit.unknowns, self.fit
+        rows = unknowns.refracting
+        if bent is None or not len(rows):
+            return None
+        names = tuple(bent.names[row] for row in rows)
+        at, cofactor = unknowns.refraction_columns, fit.cofactors.reduced
+        values, given = fit.values.refraction[rows], bent.values[rows]
+        own = np.diag(cofactor)[at]
+        observed = bent.sigma[rows] ** 2
+        # The difference from an observed value has the cofactor of its residual.
+        difference = np.where(observed > 0, observed - own, own)
+        ratio = (values - given) / np.sqrt(np.where(difference > 0, difference, np.inf))
+        sigma0 = self.sigma0 if self.redundancy > 0 else None
+        tests = tuple(
+            ratio_test(name, float(r), sigma0, self.redundancy) for name, r in zip(names, ratio, strict=True)
+        )
+        return RefractionEstimate(
+            "windows and media", names, values, cofactor[at, at] * fit.variance,
+            tuple(bent.unit_of(name, self.network.unit) for name in names), given, tests,
+            self._partners(np.arange(at.start, at.stop)),
+        )  # fmt: skip
+
+    def _partners(self, columns: Rows) -> tuple[tuple[str, float], ...]:
+        """Most correlated other reduced unknown of each of these columns, and the correlation."""
+        q, names = self.fit.cofactors.reduced, self.fit.unknowns.names
+        size = np.sqrt(np.maximum(np.diag(q), 0.0))
+        size = np.where(size > 0, size, np.inf)
+        found = []
+        for column in columns:
+            r = q[column] / (size * size[column])
+            r[column] = 0.0
+            best = int(np.argmax(np.abs(r)))
+            found.append((names[best], float(r[best])))
+        return tuple(found)
+
+    @cached_property
+    def misses_windows(self) -> Rows:
+        """Image points (k,) without a ray through the windows of their image; straight rays are used."""
+        bent, network, values = self.network.refraction, self.network, self.fit.values
+        if bent is None:
+            return np.zeros(0, dtype=np.intp)
+        rows = np.flatnonzero(self.fit.usable.observations & (bent.path_of[network.image_of] >= 0))
+        rays = RefractedRays.of(
+            bent.columns(values.refraction), bent.path_of, values.rotation, values.x0, values.xyz,
+            network.image_of[rows], network.point_of[rows],
+        )  # fmt: skip
+        return rows[~rays.reached].astype(np.intp)
+
     # -- cameras
 
     def camera_columns(self, c: int) -> tuple[tuple[str, ...], Rows, Array]:
@@ -340,7 +392,8 @@ class Result(Display):
         ----------
         *names : str
             Names such as ``c of camera C``, ``X0 of image I`` (or Y0, Z0), ``dx of image I`` (or dy, dz:
-            rotations about the camera axes, rad), ``X of point P`` (or Y, Z), ``b1 of group G``.
+            rotations about the camera axes, rad), ``X of point P`` (or Y, Z), ``b1 of group G``,
+            ``distance of W`` for a window, ``index of M`` for a medium.
 
         Returns
         -------

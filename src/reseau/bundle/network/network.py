@@ -420,6 +420,8 @@ class Network(Display):
             groups=images.group or (None,) * len(images.id),
             files=images.file or (None,) * len(images.id),
             unit=document.unit,
+            refraction=None if document.refraction is None
+            else document.refraction.refraction(images.id, images.camera),
         )  # fmt: skip
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -427,7 +429,11 @@ class Network(Display):
             (len(self.cameras), "camera"), (len(self.images), "image"), (len(self.points), "point"),
             (len(self.xy), "image point"),
         )  # fmt: skip
-        return [*((f"{n} {what}{'s' * (n != 1)}", "") for n, what in counts), ("datum", self.datum)]
+        facts = [*((f"{n} {what}{'s' * (n != 1)}", "") for n, what in counts), ("datum", self.datum)]
+        if self.refraction is not None:
+            windows = len(self.refraction.windows)
+            facts.append((f"{windows} window{'s' * (windows != 1)}", ""))
+        return facts
 
     @cached_property
     def rays(self) -> Rows:

@@ -558,6 +558,8 @@ class RefractedRays(NamedTuple):
 
 def _placed(columns: RefractionColumns, path_of: Rows, rotation: Array, x0: Array) -> Array:
     """Surfaces (m, k, 7) of each image in its camera system."""
+    if not len(columns.primitives):
+        return np.zeros((len(path_of), 0, 7))
     rows = np.maximum(path_of, 0)
     placed = columns.primitives[rows].copy()
     moving = columns.on_object[rows]
