@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from reseau.core.data import Array, Mask
 from reseau.measure import find_pins
-from reseau.measure.pins.screenlight import falloff
+from reseau.measure.pins.screenlight import blur_of_wires, falloff
 
 from .test_pins import NOISE, arcs, frame, nearest, picture
 
@@ -80,3 +83,19 @@ def test_without_a_lit_raster_no_light_falloff_is_estimated(glow: float):
     else:
         assert found is not None
         np.testing.assert_allclose(found, ground / ground[300, 400], atol=2e-3)
+
+
+@pytest.mark.parametrize(("blur", "noise", "slope"), [(0.9, 2.0, 0.1), (1.2, 4.0, -0.05)])
+def test_the_blur_of_the_camera_follows_from_the_wires(blur, noise, slope):
+    row, column = np.indices((300, 400)).astype(np.float64)
+    pixels, hidden = np.full(row.shape, 70.0), np.zeros(row.shape, dtype=bool)
+    width, half = np.hypot(blur, np.sqrt(1 / 12)), 2.3 * np.hypot(1, slope)
+    for first, upright in itertools.product(range(40, 400, 90), (True, False)):
+        across, along = (column, row) if upright else (row, -column)
+        off = (across - first - slope * along) / np.hypot(1, slope)
+        pixels -= 48 * (ndtr((off + half) / width) - ndtr((off - half) / width))
+        hidden |= np.abs(off) < half + 2.6 * width
+    pixels += np.random.default_rng(0).normal(0, noise, row.shape)
+    found = blur_of_wires(pixels.astype(np.float32), hidden, noise)
+    assert found is not None
+    assert abs(found[0] - width) < 0.03

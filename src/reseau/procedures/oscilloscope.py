@@ -44,6 +44,7 @@ from ..refine import (
     register,
     still_standard,
 )
+from ..refine.echoes import middles_on_screen
 from ..refine.remarks import ANOTHER_SHAPE_PX, of_the_camera, of_the_change, of_the_object
 
 __all__ = [
@@ -369,6 +370,8 @@ def photo_iii(
         registered = register(marks, reseau, instrument.camera)
         if isinstance(registered, Failure):
             return registered
+        if measured is not None:
+            body = _middles(measured, instrument.camera, registered)
         registration, body = registered, registered.apply(body)
         moves = registration.moves(body.xy)
     notes = of_the_camera(instrument.camera, registration) + _of_the_measurements(shown)
@@ -491,7 +494,20 @@ def _pins_in(
     registration = register(marks, reseau, camera)
     if isinstance(registration, Failure):
         return registration
+    if measured is not None:
+        images = _middles(measured, camera, registration)
     return registration.carry(images), registration, measured, shown
+
+
+def _middles(
+    measured: PinResult | PinDetections, camera: CameraCorrection, registration: Registration
+) -> ImagePoints:
+    """The middles of echoes on the screen, in pixels of their photograph."""
+    points, ok = measured.points, measured.ok
+    if measured.reach is None:
+        return points
+    reach, curvature, tilt = (values[ok] for values in (measured.reach, measured.curvature, measured.tilt))
+    return middles_on_screen(points, reach, curvature, tilt, camera, registration)
 
 
 def _declined(measured: PinResult) -> dict[str, str]:

@@ -28,6 +28,7 @@ __all__ = [
     "Windows",
     "ends_of",
     "lines_with",
+    "reach_of",
 ]
 
 _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
@@ -714,6 +715,18 @@ def ends_of(arcs: Arcs) -> tuple[Array, Array]:
     """Half lengths of lines, and widths of their ends, (k,)."""
     assert arcs.flatness is not None
     return arcs.along * np.sqrt(3 * arcs.flatness), arcs.along * np.sqrt(1 - arcs.flatness)
+
+
+def reach_of(arcs: Arcs) -> Array:
+    """Root mean square distance from the middle of the light that tells an arc's place along it, (k,).
+
+    With the light I along the arc, it is the root of ∫u²I'²du / ∫I'²du.
+    """
+    half, soft = ends_of(arcs)
+    ratio = (half / np.maximum(soft, 1e-12)) ** 2
+    # h²/(1 − exp(−h²/s²)), which is s² for h = 0
+    apart = soft**2 * np.where(ratio > 1e-9, ratio / -np.expm1(-np.maximum(ratio, 1e-9)), 1.0)
+    return np.asarray(np.sqrt(apart + soft**2 / 2))
 
 
 def lines_with(half: Array, soft: Array, arcs: Arcs) -> Arcs:

@@ -23,7 +23,7 @@ from ...core.failure import Code
 from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
-from .arcs import ArcMatches, ends_of
+from .arcs import ArcMatches, ends_of, reach_of
 from .echoes import Echoes, find_echoes, ground_of
 from .forms import match_arcs
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
@@ -131,6 +131,9 @@ class PinDetections:
     centroid : ndarray (m, 2)
         Centroid of the region above one fifth of the height, for comparison with programs that measure it;
         the tail of a reverberation shifts it downwards.
+    reach : ndarray (m,), optional
+        Distance from the middle at which the light tells the place of the echo along the line, pixels: about
+        half the length of a line, and 1.2 times the width along of a beam; NaN where not matched.
 
     Examples
     --------
@@ -159,6 +162,7 @@ class PinDetections:
     noise: Array
     correlation: Array
     centroid: Array
+    reach: Array | None = None
 
     def __len__(self) -> int:
         return len(self.ok)
@@ -421,5 +425,6 @@ class _Judge:
             thickness=spread(4 * arcs.across),
             curvature=spread(arcs.curvature),
             tilt=spread(arcs.tilt),
+            reach=spread(reach_of(arcs)),
             **columns,
         )

@@ -43,6 +43,7 @@ _COLUMNS = (
     "thickness",
     "curvature",
     "tilt",
+    "reach",
 )
 
 
@@ -65,6 +66,8 @@ class PinResult(Measured):
         standard deviation; NaN for others. None for a design without slanted wires.
     segments_px : ndarray (n, 2, 2), optional
         Ends of the slanted wires in the image.
+    reach : ndarray (n,), optional
+        As in :class:`reseau.measure.pins.PinDetections`; NaN where not measured.
 
     Examples
     --------
@@ -88,6 +91,7 @@ class PinResult(Measured):
     share: Array | None = None
     share_sigma: Array | None = None
     segments_px: Array | None = None
+    reach: Array | None = None
 
     def _columns(self) -> dict[str, list[Any]]:
         columns = super()._columns()

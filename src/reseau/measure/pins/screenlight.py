@@ -38,6 +38,12 @@ _ALIKE = 0.15
 _DISTINCT = 6.0
 """Minimum contrast of a wire over the noise."""
 _MOST_BLUR_PX = 4.0
+_ROUNDS = 4
+"""Rounds of adjusting the common profile and the centre of each."""
+_OFF_PX = 2.0
+"""Largest distance of a wire from the middle of the pixels that it hides, pixels."""
+_ALLOWED_PX = 0.02
+"""Error of the blur of what is no even bar, and not blurred by a Gaussian."""
 
 
 def falloff(ground: Grey, hidden: Mask, noise: float) -> Grey | None:
@@ -153,25 +159,31 @@ def _blur_across(grey: Grey, hidden: Mask, noise: float) -> tuple[float, float] 
     slope = np.linspace(0, 1, len(offsets))
     ground = left[flat, None] + (right - left)[flat, None] * slope
     shares = (profiles[flat] - ground) / depth[flat, None]
-    centre = (shares * offsets).sum(axis=1) / shares.sum(axis=1)
-    x = (offsets - centre[:, None]).ravel()
+    centre = np.clip((shares * offsets).sum(axis=1) / np.maximum(shares.sum(axis=1), 1e-3), -_OFF_PX, _OFF_PX)
+    values = np.array([usual / 3, 1.0, 1.0, 0.0])
 
     def rest(values: Array) -> Array:
         half, blur, height, level = values
-        return np.asarray(
-            height * (ndtr((x + half) / blur) - ndtr((x - half) / blur)) + level - shares.ravel()
-        )
+        x = offsets - centre[:, None]
+        bar = ndtr((x + half) / blur) - ndtr((x - half) / blur)
+        return np.asarray((height * bar + level - shares).ravel())
 
-    fit = least_squares(
-        rest,
-        [usual / 3, 1.0, 1.0, 0.0],
-        bounds=([0.3, 0.2, 0.5, -0.5], [usual, _MOST_BLUR_PX, 2.0, 0.5]),
-        loss="soft_l1",
-        f_scale=3 * noise / abs(usual_depth),
-    )
+    # Errors of the centres would blur the mean of the profiles: each is adjusted to its edges.
+    for _ in range(_ROUNDS):
+        fit = least_squares(
+            rest,
+            values,
+            bounds=([0.3, 0.2, 0.5, -0.5], [usual, _MOST_BLUR_PX, 2.0, 0.5]),
+            loss="soft_l1",
+            f_scale=3 * noise / abs(usual_depth),
+        )
+        values = fit.x
+        off, step = rest(values).reshape(shares.shape), 0.05
+        centre += step
+        slope = (rest(values).reshape(shares.shape) - off) / step
+        centre -= step + np.clip(
+            (slope * off).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12), -_OFF_PX, _OFF_PX
+        )
     cofactor = np.linalg.pinv(fit.jac.T @ fit.jac)
     sigma = float(np.sqrt(cofactor[1, 1] * (rest(fit.x) ** 2).mean()))
-    # Errors of the centres blur the mean of the profiles.
-    scatter = (noise / abs(usual_depth)) ** 2 * (offsets**2).sum() / (2 * fit.x[0]) ** 2
-    squared = fit.x[1] ** 2 - scatter
-    return (float(np.sqrt(squared)), sigma + 0.02) if squared > 0 else None
+    return float(values[1]), sigma + _ALLOWED_PX
