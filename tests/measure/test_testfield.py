@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from reseau.core.data import Array, Frame
 from reseau.core.errors import ImageError
 from reseau.core.failure import Failure
+from reseau.core.tone import ToneCurve
 from reseau.designs import coded_testfield
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
@@ -91,6 +92,26 @@ def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
     both = found.ok & first.ok
     error, least = ((each.xy - truth.xy)[both].std() for each in (found, first))
     assert error < 1.15 * least
+
+
+@pytest.mark.parametrize(
+    ("gamma", "says"),
+    [
+        (2.2, "with the file's sRGB tag"),
+        (1.6, "estimated from the edges of targets, a power of 0.6"),
+        (1.0, "proportional to the light; the file's sRGB tag does not describe them"),
+    ],
+)
+def test_the_curve_that_a_file_states_is_used_unless_targets_contradict_it(gamma: float, says: str) -> None:
+    frame, truth = PLAIN.record(STATION), PLAIN.truth(STATION)
+    coded = np.rint(255 * (frame.pixels / 255.0) ** (1 / gamma)).astype(np.uint8)
+    stated = ToneCurve(None, source="sRGB tag")
+    found = measure_testfield(Frame(coded, 255.0, curve=stated), DESIGN, OPTIONS)
+    assert isinstance(found, TestfieldResult)
+    assert says in found.notes[0].text
+    error = (found.xy - truth.xy)[found.ok]
+    assert error.std() < 0.01
+    assert abs(error.mean(axis=0)).max() < 0.002
 
 
 def test_a_field_of_160_by_190_pixels_is_read_in_its_enlarged_part_and_measured_in_the_frame() -> None:

@@ -14,6 +14,7 @@ from .arrays import Array, Mask, Rows
 from .display import Display
 from .errors import ImageError, UsageError
 from .files import write_whole
+from .tone import ToneCurve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +39,8 @@ class Frame(Display):
         Hash of the file, or of the pixels where there is no file.
     notes : tuple of str
         What a user should know about how it was read.
+    curve : ToneCurve, optional
+        Curve between grey values and light that the file states; None if it states none.
 
     Raises
     ------
@@ -56,6 +59,7 @@ class Frame(Display):
     name: str = "frame"
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    curve: ToneCurve | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or min(self.pixels.shape) < 2:

@@ -49,7 +49,7 @@ class Code(StrEnum):
     INSTRUMENT_CHANGED = "instrument-changed"  # the instrument has changed since its calibration
     LOW_CONTRAST = "low-contrast"  # nothing stands out from the noise
     MIRRORED = "mirrored"  # the target is seen from behind or the image is mirrored
-    NONLINEAR = "nonlinear"  # the grey values are not proportional to the light
+    NONLINEAR = "nonlinear"  # grey values are not proportional to the light, or the file says so wrongly
     NOT_CONVERGED = "not-converged"  # the iteration ended before its minimum
     NOT_FINITE = "not-finite"  # the model has no finite value at the approximate values
     NOT_FOUND = "not-found"  # the target or the feature is not in the image

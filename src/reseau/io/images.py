@@ -4,7 +4,8 @@ Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and a page of a TIFF (
 ``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed 16 bit, or floating point,
 uncompressed or in a compression that tifffile decodes; and a frame of a DICOM file, see
 :mod:`reseau.io.dicom`. Other grey values are never rescaled; an
-alpha channel is ignored, and so is an orientation tag: pixel coordinates are those of the sensor.
+alpha channel is ignored, and so is an orientation tag: pixel coordinates are those of the sensor. A colour
+profile does not change grey values: its curve is given beside them.
 
 An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
 are decoded.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,8 +26,10 @@ from ..core.data import Frame
 from ..core.errors import ImageError, InputError, UsageError
 from ..core.files import split_frame
 from ..core.provenance import sha256_of
+from ..core.tone import ToneCurve
 from . import write_whole
 from .dicom import is_dicom, open_dicom
+from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
 __all__ = ["MAX_PIXELS", "Channel", "open_scan", "read_image", "write_image"]
@@ -93,7 +97,7 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
         grey = np.array(pixels[:, :, scan.channels.index(channel)])
     else:
         grey = _luma(pixels, scan.channels)
-    return Frame(grey, scan.full_scale, scan.name, digest, scan.notes)
+    return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve)
 
 
 def _luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
@@ -145,7 +149,7 @@ def open_scan(path: Path | str) -> Scan:
     _check_least(path, pixels.shape[1], pixels.shape[0])
     if pixels.ndim == 3:
         pixels = pixels[:, :, 2::-1] if pixels.shape[2] >= 3 else pixels[:, :, :1]
-    return scan_of(pixels, path.name, _coded_dpi(magic))
+    return replace(scan_of(pixels, path.name, _coded_dpi(magic)), curve=curve_of_file(path, magic))
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
@@ -234,7 +238,7 @@ def _open_tiff(given: Path, path: Path, number: int | None) -> Scan:
             if not ends or max(ends) > path.stat().st_size:
                 raise ImageError("is a truncated TIFF", where=path, do=_AGAIN)
             window = _mapped(page, path) if mapped else _decoding(page, path)
-            dpi = _tiff_dpi(page)
+            dpi, curve = _tiff_dpi(page), _tiff_curve(page)
             notes = _further_pages(tiff, path) if number is None else ()
     except ImageError:
         raise
@@ -251,6 +255,7 @@ def _open_tiff(given: Path, path: Path, number: int | None) -> Scan:
         dtype,
         _as_stored(window, page, path, dtype, full_scale),
         notes,
+        curve,
     )
 
 
@@ -423,6 +428,14 @@ def _tiff_dpi(page: Any) -> float | None:
     over, under = tag.value
     dpi = over / under * (1.0 if int(unit.value) == 2 else 2.54) if under else 0.0
     return float(dpi) if dpi > 1 and dpi not in (72.0, 96.0) else None
+
+
+def _tiff_curve(page: Any) -> ToneCurve | None:
+    profile, exif = page.tags.get("InterColorProfile"), page.tags.get("ExifTag")
+    if profile is not None:
+        return curve_of_profile(bytes(profile.value))
+    is_srgb = exif is not None and isinstance(exif.value, dict) and exif.value.get("ColorSpace") == 1
+    return ToneCurve(None, source="Exif tag of sRGB") if is_srgb else None
 
 
 def write_image(path: Path | str, pixels: NDArray[Any]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import ImageError
+from ..core.tone import ToneCurve
 
 __all__ = ["CHANNELS", "Scan", "full_scale_of", "scan_of"]
 
@@ -47,6 +48,8 @@ class Scan:
         (rows, columns, channels) of type `dtype`. The window must lie within the image.
     notes : tuple of str
         What a user should know about how it was read.
+    curve : ToneCurve, optional
+        Curve between grey values and light that the file states; None if it states none.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class Scan:
     dtype: np.dtype[Any]
     window: Window
     notes: tuple[str, ...] = ()
+    curve: ToneCurve | None = None
 
     def overview(self, longest: int) -> tuple[NDArray[np.float32], float]:
         """Reduce the image so that its longer side has at most `longest` pixels.

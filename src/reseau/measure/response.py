@@ -1,13 +1,10 @@
-"""What a camera has made of the light: its tone curve, and a kernel of motion, defocus or sharpening.
+"""What a camera has made of the light: a kernel of motion, defocus or sharpening.
 
-Both are estimated from marks that have been matched with plain images, Gaussian and linear in the light, by
-what is left in their windows. A mark has its own position, contrast, background and form; what these can
-explain is projected out of each window, and the windows together determine what all have in common:
-
-- A tone curve, grey = F (light / F)^(1/γ), makes the edge of a mark steeper on its dark side than on its
-  bright side. No blur does that.
-- A kernel is even, K(d) = K(−d), with a sum of 1: an odd one would shift all marks. Its values at whole
-  pixels weight shifted images of the mark, to which the residuals are linear.
+It is estimated from marks that have been matched with plain Gaussian images, by what is left in their
+windows. A mark has its own position, contrast, background and form; what these can explain is projected out
+of each window, and the windows together determine what all have in common. A kernel is even, K(d) = K(−d),
+with a sum of 1: an odd one would shift all marks. Its values at whole pixels weight shifted images of the
+mark, to which the residuals are linear.
 """
 
 from __future__ import annotations
@@ -18,9 +15,9 @@ import cv2
 import numpy as np
 
 from ..core.data import Array, Mask, Rows
-from .matching import Shape, Window, displaced
+from .matching import Shape, Window
 
-__all__ = ["Exponent", "FilteredShape", "Samples", "estimate_gamma", "estimate_kernel"]
+__all__ = ["FilteredShape", "Samples", "estimate_kernel", "unexplained"]
 
 _REACH = 5
 """Half the side of a kernel, pixels."""
@@ -32,10 +29,6 @@ _FUTILE = 0.95
 """Ratio of mean square residuals above which no kernel is sought beneath a sharper function."""
 _SMALL = 1e-3
 """Values of a kernel below this are set to zero."""
-_LEAST_GAIN, _STRONG = 0.995, 0.9
-"""Ratios of mean square residuals below which a tone curve matters, and is beyond doubt."""
-_CERTAIN, _CORRELATED = 6.0, 0.12
-"""Least significance of a tone curve; correlation of residuals from which they have another cause."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +140,8 @@ class Samples:
 _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 
-def _left(values: Array, basis: Array, weight: Array) -> Array:
-    """What is left of weighted values (k, n, s) beside a weighted basis (k, n, b)."""
+def unexplained(values: Array, basis: Array, weight: Array) -> Array:
+    """What weighted values (k, n, s) contain beside a weighted basis (k, n, b)."""
     q = np.linalg.qr(basis * weight[..., None])[0]
     scaled = values * weight[..., None]
     return np.asarray(scaled - q @ (np.swapaxes(q, 1, 2) @ scaled))
@@ -210,10 +203,12 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
             * samples.depth[:, None, None, None]
         )
         basis = samples.basis(middle, own)
-        left = _left(np.concatenate([observed, moved.reshape(k, high * wide, -1)], axis=2), basis, weight)
+        left = unexplained(
+            np.concatenate([observed, moved.reshape(k, high * wide, -1)], axis=2), basis, weight
+        )
         if sharper == 1.0:
             wider = samples.basis(middle, slopes[:, :, *inner])
-            plain = float((_left(observed, wider, weight) ** 2).sum())
+            plain = float((unexplained(observed, wider, weight) ** 2).sum())
         rest, taps = left[..., 0].ravel(), left[..., 1:].reshape(-1, len(offsets))
         square, across, cost = taps.T @ taps, taps.T @ rest, plain
         for _ in range(3):
@@ -232,103 +227,3 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
         kernel[_REACH + j, _REACH + i] = kernel[_REACH - j, _REACH - i] = value
     kernel[_REACH, _REACH] = 1 - kernel.sum()
     return kernel, sharper, cost / max(plain, 1e-300)
-
-
-@dataclass(frozen=True)
-class Exponent:
-    """Exponent of a tone curve, grey = F (light / F)^(1/γ), estimated from the residuals of marks.
-
-    Parameters
-    ----------
-    gamma : float
-        The exponent γ.
-    sigma : float
-        Its standard deviation, from the scatter of the marks.
-    gain : float
-        Mean square of the residuals with the exponent over that before.
-    correlation : float
-        Largest correlation of the residuals of neighbouring pixels that remains.
-
-    Examples
-    --------
-    >>> Exponent(2.2, 0.04, 0.97, 0.02).certain, Exponent(2.2, 0.04, 0.97, 0.25).certain
-    (True, False)
-    """
-
-    gamma: float
-    sigma: float
-    gain: float
-    correlation: float
-
-    @property
-    def certain(self) -> bool:
-        """Whether there is a curve; correlated residuals, as of compression, can look like a weak one."""
-        significant = self.gain < _LEAST_GAIN and abs(self.gamma - 1) > _CERTAIN * self.sigma
-        return significant and (self.gain < _STRONG or self.correlation < _CORRELATED)
-
-
-def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: float) -> Exponent:
-    """Correct the exponent of a tone curve by the residuals of marks in linearised grey values.
-
-    Parameters
-    ----------
-    samples : Samples
-        Marks that were matched in grey values linearised with `gamma`.
-    formed : ndarray (k, r, c)
-        Their images as adjusted.
-    gamma : float
-        The exponent so far; 1 at first.
-    full_scale : float
-        Grey value at which the sensor saturates.
-
-    Returns
-    -------
-    Exponent
-        The corrected exponent.
-
-    Examples
-    --------
-    >>> from reseau.measure.matching import GrownOutline
-    >>> from reseau.optics.formation import Outline, PixelResponse
-    >>> disk = Outline.circle(4.0, 0.5)
-    >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
-    >>> window = Window(np.arange(25.0)[None], np.arange(25.0)[None], PixelResponse())
-    >>> place = np.array([[12.2, 11.9]]), np.full(1, 0.8), np.zeros((1, 0)), np.array([0]), window
-    >>> light = 200 - 150 * plain.image(*place)
-    >>> grey = 255 * (light / 255) ** (1 / 1.2) + np.random.default_rng(0).normal(0, 0.1, (1, 25, 25))
-    >>> one = Samples(plain, *place[:3], np.array([-150.0]), window, grey, grey > 0)
-    >>> curve = estimate_gamma(one, grey, 1.0, 255.0)
-    >>> bool(abs(curve.gamma - 1.2) < 0.03), bool(curve.gain < 0.9)
-    (True, True)
-    """
-    k = len(samples.xy)
-    every = np.arange(k)
-    share, slopes = samples.shape.derivatives(samples.xy, samples.psf_px, samples.form, every, samples.window)
-    light = np.clip(np.where(samples.used, formed, full_scale) / full_scale, 1e-3, None)
-    coded = light ** (1 / gamma)
-    # The noise is that of the coded grey values: its slope weights the light.
-    weight = np.where(samples.used, light ** (1 / gamma - 1), 0.0).reshape(k, -1)
-    change = full_scale * light * np.log(coded)
-    both = np.stack([samples.grey, change], axis=-1)
-    both = np.where(samples.used[..., None], both, 0.0).reshape(k, -1, 2)
-    left = _left(both, samples.basis(share.astype(np.float64), slopes), weight)
-    observed, change = left[..., 0], left[..., 1]
-    square = float((change**2).sum())
-    step = -float((change * observed).sum()) / max(square, 1e-300)
-    rest = observed + step * change
-    # Residuals of a window may be correlated, those of different windows are not (White's estimator).
-    scores = (change * rest).sum(axis=1)
-    sigma = np.sqrt(k / max(k - 1, 1) * float((scores**2).sum())) / max(square, 1e-300)
-    before, after = float((observed**2).sum()), float((rest**2).sum())
-    correlation = _correlation(rest.reshape(samples.grey.shape), samples.used)
-    return Exponent(gamma + step, float(sigma), after / max(before, 1e-300), correlation)
-
-
-def _correlation(rest: Array, used: Mask) -> float:
-    """Largest correlation of the residuals (k, r, c) of neighbouring pixels."""
-    square = float((rest**2).sum()) / max(float(used.sum()), 1)
-    found = []
-    for lag in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        (a, b), both = displaced(rest, *lag), np.logical_and(*displaced(used, *lag))
-        found.append(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1))
-    return max(found) / max(square, 1e-300)

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
+from ...core.tone import ToneCurve
 from ...io import ReseauDesign, Rings
 from ...optics import Chain
 from ...optics.field import SmoothField
@@ -31,11 +32,11 @@ from ..matching import (
     with_alike_errors,
 )
 from ..points import Reason
-from ..response import FilteredShape, Samples, estimate_gamma, estimate_kernel
+from ..response import FilteredShape, Samples, estimate_kernel
 from ..screening import Screened, screen
 from ..testfield.lattice_mapping import second_order
 from ..testfield.targets import merged, replaced
-from ..testfield.tone import ToneCurve
+from ..tone import find_curve
 from .disks import Disks, find_disks
 from .marks import ReseauOptions
 from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet, through
@@ -86,10 +87,6 @@ _KERNELS = 2
 """Number of times a kernel is estimated."""
 _FILTERED = 0.85
 """Ratio of mean square residuals below which a kernel is used."""
-_LINEAR = 0.15
-"""Deviation of an exponent from 1 that does no harm."""
-_ATTEMPTS = 6
-"""Iterations of the exponent of a tone curve."""
 _PSF_LOG_SIGMA, _SIZE_SIGMA = 0.2, 0.03
 """Spread of sharpness (logarithm) and relative size over the disks of one frame."""
 _BLURRED, _GROWN, _BENT = 1.8, 0.2, 0.12
@@ -438,31 +435,28 @@ class _Sheet:
                 self._weigh(first, rows)
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             self.notes += (Remark(text, Code.FILTERED),)
-        full_scale, gamma = self.image.full_scale, 1.0
-        before = self.screened, self.look
-        for attempt in range(_ATTEMPTS):
-            samples, formed = self._samples(first, rows)
-            curve = estimate_gamma(samples, formed, gamma, full_scale)
-            if attempt == 0 and not curve.certain:
-                return
-            step, gamma = abs(curve.gamma - gamma), float(np.clip(curve.gamma, 0.3, 4))
-            if attempt and step < curve.sigma:
-                break
-            self.screened = replace(self.screened, grey=self._linear(ToneCurve(gamma)))
-            self.look = replace(
-                self.look, variance=(0.02 * full_scale, 1.0) if gamma > 1 else None, light=None
-            )
-            first = self._settle(self._match(rows))
-            self.screened = replace(self.screened, noise=float(np.median(first.noise)))
-        if not (first.converged.all() and 0.35 < gamma < 3.5 and abs(gamma - 1) > _LINEAR):
-            self.screened, self.look = before
-            return
-        self._weigh(first, rows)
-        text = (
-            f"grey values are not proportional to the light: they follow its power 1/{gamma:.2f} "
-            f"(± {curve.sigma:.2f}), as estimated from the disks, and were linearised"
-        )
-        self.notes += (Remark(text, Code.NONLINEAR),)
+        straight, full_scale = ToneCurve(1.0), self.image.full_scale
+        tried = {straight: (self.screened, self.look, first)}
+
+        def matched(curve: ToneCurve) -> tuple[Samples, Array] | None:
+            if curve not in tried:
+                self.screened = replace(self.screened, grey=self._linear(curve))
+                # The noise of grey values is alike, that of light grows with it where curves are steeper.
+                bent = float(curve.light(np.array(0.5), 1.0)) < 0.5
+                variance = (0.02 * full_scale, 1.0) if bent else None
+                self.look = replace(self.look, variance=variance, light=None)
+                again = self._settle(self._match(rows))
+                self.screened = replace(self.screened, noise=float(np.median(again.noise)))
+                tried[curve] = self.screened, self.look, again
+            self.screened, self.look, again = tried[curve]
+            return self._samples(again, rows) if again.converged.all() else None
+
+        found = find_curve(matched, full_scale, self.image.curve)
+        self.screened, self.look, first = tried[found.curve or straight]
+        if found:
+            self._weigh(first, rows)
+        if (note := found.remark("disks")) is not None:
+            self.notes += (note,)
 
     def _weigh(self, first: Matches, rows: Rows) -> None:
         """Learn noise, contrast and light from some of the disks; those of the others change as much."""

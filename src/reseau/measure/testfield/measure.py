@@ -16,18 +16,20 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
+from ...core.tone import ToneCurve
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..matching import Matches, Window
 from ..points import Measured, Reason
+from ..response import Samples
 from ..screening import screen
+from ..tone import FoundCurve, find_curve
 from .lattice_fit import LatticeFit, common_part, refit
 from .lattice_mapping import images_of, slope_of, stretches
 from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
 from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
-from .tone import SHRUNK, ToneCurve, best_curve
 
 __all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
@@ -56,6 +58,8 @@ _SEEN = 0.6
 """Minimum share of a target on pixels that carry an image and are not saturated."""
 _MOVES, _SAME_SPREAD = 4, 0.03
 """Maximum number of rounds in which motion is estimated; change of the covariance (px²) that ends them."""
+_SHRUNK = 0.015
+"""Apparent shrinking of dark targets (of bright ones growth) from which a tone curve is searched for."""
 _HIGH_RESIDUALS = 1.4
 """Multiple of the usual residuals from which a curved background is tried."""
 _CLEARED, _NEIGHBOURS, _LIKE = 0.9, 6, 0.8
@@ -123,7 +127,7 @@ class TestfieldResult(Measured):
     squares : int
         Number of clusters that were read and agree with each other.
     notes : tuple of Remark
-        How grey values that are not proportional to the light were linearised.
+        How grey values that are not proportional to the light were linearised, and by which curve.
 
     Examples
     --------
@@ -241,9 +245,10 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     )
     work = _Measurement(scene, lattice, options)
     work.learn()
-    curve = work.curve(float(frame.full_scale))
-    if curve is not None:
-        work.linearise(curve, float(frame.full_scale))
+    found = work.curve(float(frame.full_scale), frame.curve)
+    if found.curve is not None:
+        work.linearise(found.curve, float(frame.full_scale))
+    note = found.remark("targets")
     return TestfieldResult(
         image=frame.name,
         sha256=frame.sha256,
@@ -252,16 +257,32 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
         reading=reading,
         squares=placed.squares,
         **work.columns(),
-        notes=() if curve is None else (_curved(curve),),
+        notes=() if note is None else (note,),
     )
 
 
-def _curved(curve: ToneCurve) -> Remark:
-    text = (
-        "grey values are not proportional to the light; they were linearised with a curve estimated from the "
-        f"edges of targets, {curve}"
+def _samples(scene: Scene, rows: Rows, found: Matches) -> tuple[Samples, Array]:
+    """Matched targets of one window size, and all that was formed in their windows."""
+    at = scene.lattice(scene.design.xy[rows])
+    images, xy, _ = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
+    centre, half = np.rint(xy), [n // 2 for n in found.residuals.shape[1:]]
+    down, right = (np.arange(-n, n + 1.0) for n in half)
+    window = Window(centre[:, :1] + right, centre[:, 1:] + down, scene.response)
+    h, w = scene.grey.shape
+    x, y = (axis.clip(0, size - 1).astype(np.intp) for axis, size in ((window.columns, w), (window.rows, h)))
+    grey = scene.grey[y[:, :, None], x[:, None, :]].astype(np.float64)
+    dark = scene.design.polarity == "dark"
+    samples = Samples(
+        MovedShape(images, scene.path) if scene.path.any() else images,
+        found.xy,
+        found.psf_px,
+        found.form,
+        -found.contrast * found.level if dark else found.contrast,
+        window,
+        grey,
+        np.isfinite(found.residuals),
     )
-    return Remark(text, Code.NONLINEAR)
+    return samples, grey + np.nan_to_num(found.residuals)
 
 
 class _Measurement:
@@ -373,24 +394,28 @@ class _Measurement:
         found = replaced(found, keep, again.select(better))
         return found, *self._judged(self.scene, wanted, found)
 
-    def curve(self, full_scale: float) -> ToneCurve | None:
-        """The curve between light and grey values, if the size of the targets suggests that there is one."""
+    def curve(self, full_scale: float, stated: ToneCurve | None) -> FoundCurve:
+        """The curve between light and grey values.
+
+        It is estimated if the size of the targets suggests that there is one.
+        """
         large = self.inside & self.scene.design.large[self.rows]
-        if self.growth is None or not large.any():
-            return None
-        if self.growth * (1 if self.scene.design.polarity == "dark" else -1) > -SHRUNK:
-            return None
+        dark = self.scene.design.polarity == "dark"
+        shrunk = self.growth is not None and self.growth * (1 if dark else -1) < -_SHRUNK
         some = np.zeros(len(self.rows), dtype=bool)
         candidates = np.flatnonzero(large)
         some[candidates[:: max(1, len(candidates) // _MOST_FIRST)]] = True
 
-        def misfit(curve: ToneCurve) -> float:
-            scene = self._linearised(curve, full_scale)
+        def matched(curve: ToneCurve) -> tuple[Samples, Array] | None:
+            scene = self.scene if curve.linear else self._linearised(curve, full_scale)
             found = match_targets(scene, self.rows, some, searching=False)
-            amplitude = found.contrast * (found.level if scene.design.polarity == "dark" else 1.0)
-            return float(np.median(found.noise / np.abs(amplitude)))
+            # Residuals are large, and matches do not count as converged, where the curve is wrong.
+            clear = (found.t > self.options.least_t) & np.isfinite(found.xy).all(axis=1)
+            if clear.sum() < _LEAST_FIRST:
+                return None
+            return _samples(scene, self.rows[some][clear], found.select(clear))
 
-        return best_curve(misfit)
+        return find_curve(matched, full_scale, stated, suspected=shrunk)
 
     def linearise(self, curve: ToneCurve, full_scale: float) -> None:
         """Continue with grey values that are proportional to the light, and learn the scene again."""
@@ -443,19 +468,10 @@ class _Measurement:
 
     def _spread(self, first: Matches, sure: Mask, rows: Rows) -> Array:
         """Anisotropy of the point-spread function, from the residuals of matched targets."""
-        scene, rows = self.scene, rows[sure]
-        formed, xy, _ = form_targets(
-            scene.design, rows, scene.mapping, scene.frame, scene.lattice(scene.design.xy[rows]), scene.psf_px
-        )
-        shape = MovedShape(formed, scene.path) if scene.path.any() else formed
-        centre, half = np.rint(xy), [n // 2 for n in first.residuals.shape[1:]]
-        down, right = (np.arange(-n, n + 1.0) for n in half)
-        window = Window(centre[:, :1] + right, centre[:, 1:] + down, scene.response)
-        dark = scene.design.polarity == "dark"
-        amplitude = -first.contrast[sure] * first.level[sure] if dark else first.contrast[sure]
-        left = -first.residuals[sure] / amplitude[:, None, None]
-        found = anisotropy(shape, first.xy[sure], first.psf_px[sure], window, left)
-        return spread_of(scene.path) + found
+        samples, formed = _samples(self.scene, rows[sure], first.select(sure))
+        left = np.where(samples.used, samples.grey - formed, np.nan) / samples.depth[:, None, None]
+        place = samples.shape, samples.xy, samples.psf_px, samples.window
+        return spread_of(self.scene.path) + anisotropy(*place, left)
 
     def _shifted(self) -> bool:
         """Adopt the motion during the exposure that was found; whether it is another one than before."""

@@ -1,0 +1,277 @@
+"""Curves between light and grey values: taken from the file, or estimated from the edges of marks.
+
+Phones and webcams write grey values that are not proportional to the light (sRGB, or a power). At the edges
+of marks, pixels are mixtures of dark and bright light. A curve, grey = F (light / F)^(1/γ), makes such an
+edge steeper on its dark side than on its bright side. No blur does that: what is left in the windows of marks
+that were matched with images linear in the light determines γ.
+
+Many programs tag files as sRGB whatever they contain. The curve that a file states is used unless a straight
+line fits the marks better, or what is left shows another curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.data import Array, Mask
+from ..core.failure import Code, Remark
+from ..core.tone import ToneCurve
+from .matching import displaced
+from .response import Samples, unexplained
+
+__all__ = ["Exponent", "FoundCurve", "Matched", "estimate_gamma", "find_curve"]
+
+_LEAST_GAIN, _STRONG = 0.995, 0.9
+"""Ratios of mean square residuals below which a curve matters, and is beyond doubt."""
+_CERTAIN, _CORRELATED = 6.0, 0.12
+"""Least significance of a curve; correlation of residuals from which they have another cause."""
+_LINEAR = 0.15
+"""Deviation of an exponent from 1 that does no harm."""
+_ATTEMPTS = 6
+"""Iterations of the exponent."""
+_LEAST, _MOST = 0.35, 3.5
+"""Exponents that cameras have."""
+_LIKE_SRGB = 0.5
+"""Deviation of an exponent from 2.2 within which the curve of sRGB is tried, too."""
+_DOUBTFUL = 1.03
+"""Ratio of the residuals with the curve that the file states to those with a straight line up to which marks
+do not contradict the file; in strongly compressed pictures they do not tell."""
+_LEVELS = 4097
+"""Number of grey values at which a curve is inverted."""
+_STRAIGHT = ToneCurve(1.0)
+
+Matched = Callable[[ToneCurve], "tuple[Samples, Array] | None"]
+"""Marks matched in grey values linearised with a curve, and their images (k, r, c) as adjusted; None if they
+cannot be matched."""
+
+
+@dataclass(frozen=True)
+class Exponent:
+    """Exponent of a tone curve, grey = F (light / F)^(1/γ), estimated from the residuals of marks.
+
+    Parameters
+    ----------
+    gamma : float
+        The exponent γ.
+    sigma : float
+        Its standard deviation, from the scatter of the marks.
+    gain : float
+        Mean square of the residuals with the exponent over that before.
+    correlation : float
+        Largest correlation of the residuals of neighbouring pixels that remains.
+
+    Examples
+    --------
+    >>> Exponent(2.2, 0.04, 0.97, 0.02).certain, Exponent(2.2, 0.04, 0.97, 0.25).certain
+    (True, False)
+    """
+
+    gamma: float
+    sigma: float
+    gain: float
+    correlation: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether there is a curve; correlated residuals, as of compression, can look like a weak one."""
+        significant = self.gain < _LEAST_GAIN and abs(self.gamma - 1) > _CERTAIN * self.sigma
+        return significant and (self.gain < _STRONG or self.correlation < _CORRELATED)
+
+
+@dataclass(frozen=True)
+class FoundCurve:
+    """The curve of a frame, and how it was found; truthy if grey values are to be linearised.
+
+    Parameters
+    ----------
+    curve : ToneCurve or None
+        The curve; None if grey values are proportional to the light.
+    sigma : float or None
+        Standard deviation of its exponent, if that was estimated.
+    stated : str
+        What the file states, if this is not used.
+
+    Examples
+    --------
+    >>> FoundCurve(ToneCurve(None, source="sRGB tag")).remark("disks").text[-24:]
+    "with the file's sRGB tag"
+    >>> bool(FoundCurve(None)), FoundCurve(None).remark("disks")
+    (False, None)
+    """
+
+    curve: ToneCurve | None
+    sigma: float | None = None
+    stated: str = ""
+
+    def __bool__(self) -> bool:
+        return self.curve is not None
+
+    def remark(self, marks: str) -> Remark | None:
+        """What a user should know; None if the file states nothing and nothing was found."""
+        if self.curve is not None and self.curve.source:
+            text = "grey values are not proportional to the light; they were linearised with the file's "
+            return Remark(text + self.curve.source, Code.NONLINEAR)
+        other = f"; the file's {self.stated} does not describe them" if self.stated else ""
+        if self.curve is None:
+            text = f"grey values are proportional to the light{other}"
+            return Remark(text, Code.NONLINEAR) if other else None
+        curve = str(self.curve)
+        if self.sigma is not None and self.curve.exponent is not None:
+            spread = self.sigma / self.curve.exponent**2
+            digits = 2 if spread >= 0.005 else 3
+            curve = f"a power of {1 / self.curve.exponent:.{digits}f} (± {spread:.{digits}f})"
+        text = (
+            "grey values are not proportional to the light; they were linearised with a curve estimated from "
+            f"the edges of {marks}, {curve}{other}"
+        )
+        return Remark(text, Code.NONLINEAR)
+
+
+def find_curve(
+    matched: Matched, full_scale: float, stated: ToneCurve | None, *, suspected: bool = True
+) -> FoundCurve:
+    """Find the curve between light and grey values of a frame.
+
+    Parameters
+    ----------
+    matched : callable
+        Matches marks in linearised grey values.
+    full_scale : float
+        Grey value at which the sensor saturates.
+    stated : ToneCurve, optional
+        The curve that the file states.
+    suspected : bool
+        Whether to search for a curve where the file states none.
+
+    Notes
+    -----
+    Curves are compared by the residuals of marks in grey values as they are in the file, where noise is alike
+    for all curves. The exponent is estimated by Gauss–Newton steps, :func:`estimate_gamma`.
+    """
+    if stated is None and not suspected:
+        return FoundCurve(None)
+    straight = matched(_STRAIGHT)
+    if straight is None:
+        return FoundCurve(None)
+    unused = "" if stated is None else stated.source
+    best, least = FoundCurve(None, stated=unused), _misfit(_STRAIGHT, straight, full_scale)
+    at = straight
+    if stated is not None and (given := matched(stated)) is not None:
+        misfit = _misfit(stated, given, full_scale)
+        if misfit < _DOUBTFUL * least:
+            best, least, at = FoundCurve(stated), misfit, given
+    rest = estimate_gamma(*at, 1.0, full_scale)
+    if not rest.certain or abs(rest.gamma - 1) < _LINEAR:
+        return best
+    power = _estimated(matched, straight, full_scale)
+    if power is None:
+        return best
+    gamma, sigma, there = power
+    tried: list[tuple[FoundCurve, tuple[Samples, Array] | None]]
+    tried = [(FoundCurve(ToneCurve(gamma), sigma, unused), there)]
+    if abs(gamma - 2.2) < _LIKE_SRGB:
+        tried.append((FoundCurve(ToneCurve(None), None, unused), matched(ToneCurve(None))))
+    for found, its in tried:
+        if its is not None and (misfit := _misfit(found.curve or _STRAIGHT, its, full_scale)) < least:
+            best, least = found, misfit
+    return best
+
+
+def _misfit(curve: ToneCurve, at: tuple[Samples, Array], full_scale: float) -> float:
+    """Usual residuals of marks in grey values as they are in the file, as a share of full scale."""
+    samples, formed = at
+    levels = np.linspace(0.0, 1.0, _LEVELS)
+    light = curve.light(levels, 1.0)
+    both = (np.interp(values / full_scale, light, levels) for values in (formed, samples.grey))
+    off = np.where(samples.used, np.subtract(*both), 0.0)
+    square = (off**2).sum(axis=(1, 2)) / np.maximum(samples.used.sum(axis=(1, 2)), 1)
+    return float(np.median(np.sqrt(square)))
+
+
+def _estimated(
+    matched: Matched, at: tuple[Samples, Array], full_scale: float
+) -> tuple[float, float, tuple[Samples, Array]] | None:
+    """Exponent with its standard deviation, and the marks matched with it; None if cameras have no such."""
+    gamma = 1.0
+    for attempt in range(_ATTEMPTS):
+        found = estimate_gamma(*at, gamma, full_scale)
+        if attempt and abs(found.gamma - gamma) < found.sigma:
+            break
+        gamma = float(np.clip(found.gamma, 0.3, 4.0))
+        again = matched(ToneCurve(gamma))
+        if again is None:
+            return None
+        at = again
+    usable = _LEAST < gamma < _MOST and abs(gamma - 1) > _LINEAR
+    return (gamma, found.sigma, at) if usable else None
+
+
+def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: float) -> Exponent:
+    """Correct the exponent of a tone curve by the residuals of marks in linearised grey values.
+
+    Parameters
+    ----------
+    samples : Samples
+        Marks that were matched in grey values linearised with `gamma`.
+    formed : ndarray (k, r, c)
+        Their images as adjusted, with whatever else was formed in their windows.
+    gamma : float
+        The exponent so far; 1 at first.
+    full_scale : float
+        Grey value at which the sensor saturates.
+
+    Returns
+    -------
+    Exponent
+        The corrected exponent.
+
+    Examples
+    --------
+    >>> from reseau.measure.matching import GrownOutline, Window
+    >>> from reseau.optics.formation import Outline, PixelResponse
+    >>> disk = Outline.circle(4.0, 0.5)
+    >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
+    >>> window = Window(np.arange(25.0)[None], np.arange(25.0)[None], PixelResponse())
+    >>> place = np.array([[12.2, 11.9]]), np.full(1, 0.8), np.zeros((1, 0)), np.array([0]), window
+    >>> light = 200 - 150 * plain.image(*place)
+    >>> grey = 255 * (light / 255) ** (1 / 1.2) + np.random.default_rng(0).normal(0, 0.1, (1, 25, 25))
+    >>> one = Samples(plain, *place[:3], np.array([-150.0]), window, grey, grey > 0)
+    >>> adjusted = np.polyval(np.polyfit(light.ravel(), grey.ravel(), 1), light)
+    >>> curve = estimate_gamma(one, adjusted, 1.0, 255.0)
+    >>> bool(abs(curve.gamma - 1.2) < 0.03), bool(curve.gain < 0.9)
+    (True, True)
+    """
+    k = len(samples.xy)
+    every = np.arange(k)
+    share, slopes = samples.shape.derivatives(samples.xy, samples.psf_px, samples.form, every, samples.window)
+    light = np.clip(np.where(samples.used, formed, full_scale) / full_scale, 1e-3, None)
+    coded = light ** (1 / gamma)
+    # The noise is that of the coded grey values: its slope weights the light.
+    weight = np.where(samples.used, light ** (1 / gamma - 1), 0.0).reshape(k, -1)
+    change = full_scale * light * np.log(coded)
+    both = np.stack([samples.grey - formed, change], axis=-1)
+    both = np.where(samples.used[..., None], both, 0.0).reshape(k, -1, 2)
+    left = unexplained(both, samples.basis(share.astype(np.float64), slopes), weight)
+    observed, change = left[..., 0], left[..., 1]
+    square = float((change**2).sum())
+    step = -float((change * observed).sum()) / max(square, 1e-300)
+    rest = observed + step * change
+    # Residuals of a window may be correlated, those of different windows are not (White's estimator).
+    scores = (change * rest).sum(axis=1)
+    sigma = np.sqrt(k / max(k - 1, 1) * float((scores**2).sum())) / max(square, 1e-300)
+    before, after = float((observed**2).sum()), float((rest**2).sum())
+    correlation = _correlation(rest.reshape(samples.grey.shape), samples.used)
+    return Exponent(gamma + step, float(sigma), after / max(before, 1e-300), correlation)
+
+
+def _correlation(rest: Array, used: Mask) -> float:
+    """Largest correlation of the residuals (k, r, c) of neighbouring pixels."""
+    square = float((rest**2).sum()) / max(float(used.sum()), 1)
+    found = []
+    for lag in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        (a, b), both = displaced(rest, *lag), np.logical_and(*displaced(used, *lag))
+        found.append(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1))
+    return max(found) / max(square, 1e-300)
