@@ -1,10 +1,11 @@
 """Blurred targets in photographs drawn with rays of batoid: errors beside bound, sigmas and other methods.
 
-Run from the checkout: ``python benchmarks/blurred.py [--count N] [--first K] [--keep FOLDER]``; needs batoid
-(`pip install batoid`). Each photograph shows twelve targets, disks and squares of 10 to 60 px, tilted to 40°,
-over the field of a double Gauss; its focus gives a blur of about 0, 3, 6, 10 or 15 px (diameter of 80 % of
-the energy), and it is measured with noise of 30, 40 and 50 dB below the contrast. The truth is batoid's
-principal ray of 546.1 nm. Nothing is shared with what draws (``benchmarks/worlds/blurred.py``).
+Run from the checkout: ``python benchmarks/blurred.py [--count N] [--first K] [--keep FOLDER | --speed]``;
+needs batoid (`pip install batoid`). Each photograph shows twelve targets, disks and squares of 10 to 60 px,
+tilted to 40°, over the field of a double Gauss; its focus gives a blur of about 0, 3, 6, 10 or 15 px
+(diameter of 80 % of the energy), and it is measured with noise of 30, 40 and 50 dB below the contrast. The
+truth is batoid's principal ray of 546.1 nm. Nothing is shared with what draws
+(``benchmarks/worlds/blurred.py``).
 
 Reported for each cell: targets, declined, rms error over the rms of the Cramér–Rao bound over all estimated
 parameters, mean error (bias) along and across the direction to the axis, errors over sigmas; the rms errors
@@ -44,6 +45,8 @@ from reseau.optics.lenses import (
     PlaneTarget,
     Prescription,
     PupilElements,
+    RayMap,
+    RaySurrogate,
     SensorPlane,
     glass,
     in_order,
@@ -234,9 +237,8 @@ def kept(seed: int, folder: Path | None) -> World:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"blurred{seed:04d}.npy"
     if not file.exists():
-        np.save(file, np.array([world(seed)], dtype=object), allow_pickle=True)
-    drawn: World = np.load(file, allow_pickle=True)[0]
-    return drawn
+        np.save(file, np.array([vars(world(seed))], dtype=object), allow_pickle=True)
+    return World(**np.load(file, allow_pickle=True)[0])
 
 
 def main() -> None:
@@ -246,7 +248,11 @@ def main() -> None:
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="drawn photographs are kept and reused there"
     )
+    parser.add_argument("--speed", action="store_true", help="time and exactness of one image only")
     chosen = parser.parse_args()
+    if chosen.speed:
+        speed()
+        return
     rows: list[dict[str, object]] = []
     seconds = 0.0
     for seed in range(chosen.first, chosen.first + chosen.count):
@@ -261,6 +267,42 @@ def main() -> None:
             seconds += time.process_time() - start
             rows += _rows(seed, decibels, drawn, camera, planes, found, pixels, sigma)
     _report(rows, seconds)
+
+
+def speed() -> None:
+    """Time of an image once the optics are set up, and its shift against many rays, over the field."""
+    lens = _prescription(0.6 * STOP, _image_distance() + sum(row[1] for row in ROWS[:-1]) * SCALE + 0.1)
+    camera = LensCamera(lens, SensorPlane((PITCH, PITCH), PRINCIPAL))
+    start = time.process_time()
+    elements = PupilElements.gauss(4)
+    fast = RaySurrogate.of(camera, elements, ((-0.2, 0.2), (-0.15, 0.15)), (490.0, 510.0), (6, 2))
+    print(f"set up: {time.process_time() - start:.2f} s, exact to {fast.error_px:.1g} px at the traced rays")
+    rng = np.random.default_rng(0)
+
+    def formed(view: RayMap, target: PlaneTarget, elements: PupilElements, at: Array, half: int) -> Array:
+        pixels = np.arange(-half, half + 1.0)
+        image = ray_image(view, target, elements)
+        return image.gridded.image(image.point, PSF, at[0] + pixels, at[1] + pixels, PixelResponse())
+
+    for size in (10.0, 20.0, 35.0, 60.0):
+        outline = mark_outline("disk", size * PITCH * DISTANCE / 25.7, None, 0.8 * PITCH * DISTANCE / 25.7)
+        seconds, shifts, blurs, half = [], [], [], int(0.6 * size) + 12
+        for x, y in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):
+            target = PlaneTarget(np.array([0.17 * x, 0.125 * y, 1.0]) * DISTANCE, _axes(rng), outline)
+            at = np.rint(fast.corresponding(target.centre[None])[0])
+            for _ in range(5):
+                start = time.process_time()
+                one = formed(fast, target, elements, at, half)
+                seconds.append(time.process_time() - start)
+            many = formed(camera, target, PupilElements.gauss(16), at, half)
+            down, right = np.gradient(many)
+            design = np.stack([right.ravel(), down.ravel(), many.ravel(), np.ones(many.size)], axis=1)
+            shifts.append(np.linalg.lstsq(design, (many - one).ravel(), rcond=None)[0][:2])
+            blurs.append(ray_image(fast, target, elements).blur)
+        print(
+            f"{size:g} px, blurred by {min(blurs):.1f}-{max(blurs):.1f} px (rms radius): "
+            f"{1e3 * np.median(seconds):.1f} ms, shift at most {np.abs(shifts).max():.4f} px"
+        )
 
 
 def _rows(

@@ -9,8 +9,15 @@ import pytest
 
 from reseau.core.data import Array, Frame
 from reseau.core.errors import UsageError
-from reseau.core.failure import Code
-from reseau.measure.blurred import BlurredOptions, Moving, Varied, measure_blurred
+from reseau.core.failure import Code, Failure
+from reseau.measure.blurred import (
+    BlurredOptions,
+    EstimatedOptics,
+    Moving,
+    Varied,
+    estimate_optics,
+    measure_blurred,
+)
 from reseau.optics.formation import Outline
 from reseau.optics.lenses import (
     AIR,
@@ -33,10 +40,11 @@ DIAMETER = 2.4
 SIGMA = 0.5
 
 
-def camera(focus: float = blurs.FOCUS) -> LensCamera:
+def camera(focus: float = blurs.FOCUS, index: float = 0.0) -> LensCamera:
+    """The lens; with another focus, and with a glass of which the index is another one."""
     wavelengths = tuple(w for w, _ in blurs.INDICES)
     terms = np.array([[1, 1e6 / w**2, 1e12 / w**4] for w in wavelengths])
-    glass = Cauchy(tuple(np.linalg.solve(terms, [n for _, n in blurs.INDICES])), "glass")
+    glass = Cauchy(tuple(np.linalg.solve(terms, [n + index for _, n in blurs.INDICES])), "glass")
     surfaces = (
         Surface(kind="plain", name="stop"),
         Surface(blurs.CURVATURES[0], medium=glass, vertex=np.array([0, 0, blurs.LENS_Z])),
@@ -92,6 +100,49 @@ def test_the_focus_is_estimated_with_the_place() -> None:
     found = measure_blurred(frame, camera(), ["1"], [target()], options)
     assert found.ok.all()
     assert abs(found.varied[0, 0] - 0.15) < 4 * found.varied_sigma[0, 0] + 0.005
+
+
+def test_an_index_is_estimated_with_the_place() -> None:
+    glass = Varied(("index",), (0.01,), lambda by: camera(index=0.004 + by[0]))
+    wrong = glass.camera(np.zeros(1))
+    found = measure_blurred(photograph(), wrong, ["1"], [target()], BlurredOptions(varied=glass))
+    assert found.ok.all()
+    assert abs(found.varied[0, 0] + 0.004) < 4 * found.varied_sigma[0, 0] + 1e-4
+    error = found.xy[0] - blurs.principal_pixel(CENTRE)
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(found.cov[0])) + 0.005).all()
+    assert not any("times the noise" in str(note) for note in found.notes)
+    left = measure_blurred(photograph(), wrong, ["1"], [target()])
+    assert any("times the noise" in str(note) for note in left.notes)
+
+
+def test_focus_and_index_are_estimated_from_all_targets_of_a_frame() -> None:
+    both = Varied(
+        ("focus_mm", "index"), (0.3, 0.001), lambda by: camera(blurs.FOCUS - 0.2 + by[0], 0.0005 + by[1])
+    )
+    found = estimate_optics(photograph(), [target()], both)
+    assert isinstance(found, EstimatedOptics)
+    assert found.used == 1
+    # One target tells their sum only; the index is held by what was known of it.
+    sharp = found.values - [0.2, -0.0005]
+    assert (np.abs(sharp) < 3 * found.sigma).all()
+    error = measure_blurred(photograph(), found.camera, ["1"], [target()]).xy[0]
+    assert np.abs(error - blurs.principal_pixel(CENTRE)).max() < 0.02
+
+
+def test_optics_of_which_no_target_is_an_image_are_not_estimated() -> None:
+    focus = Varied(("focus_mm",), (0.1,), lambda by: camera(blurs.FOCUS + by[0]))
+    elsewhere = CENTRE + np.array([4.0, 2.0, 0.0])
+    found = estimate_optics(photograph(), [target(elsewhere)], focus)
+    assert isinstance(found, Failure)
+    assert found.code == Code.NOT_FOUND
+
+
+@pytest.mark.parametrize(("names", "sigma"), [(("a", "b"), (1.0,)), (("a",), (0.0,)), (("a",), (np.inf,))])
+def test_parameters_without_a_standard_deviation_are_refused(
+    names: tuple[str, ...], sigma: tuple[float, ...]
+) -> None:
+    with pytest.raises(UsageError, match="standard deviations"):
+        Varied(names, sigma, lambda by: camera())
 
 
 def test_motion_is_another_cause_of_blur() -> None:

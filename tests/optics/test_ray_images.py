@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -14,6 +15,7 @@ from reseau.measure.matching import GrownOutline, Window
 from reseau.optics.formation import Outline, PixelResponse, coverage, mark_outline
 from reseau.optics.lenses import (
     AIR,
+    AberratedLens,
     Aperture,
     LensCamera,
     Paraxial,
@@ -156,8 +158,11 @@ def formed(view: RayMap, at: PlaneTarget, elements: PupilElements, middle: Array
     return GrownOutline(nodes, np.zeros((0, 2, 2))).image(*place, window)[0]
 
 
-def test_the_formed_image_is_that_of_counted_rays() -> None:
+@pytest.mark.parametrize("colours", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_formed_image_is_that_of_counted_rays(colours: int) -> None:
     view, small = camera(0.05), target(30.0, -20.0, 600.0, 10.0)
+    if colours == 1:
+        view = replace(view, lens=replace(view.lens, wavelengths_nm=(587.6,), weights=(), reference=0))
     image = ray_image(view, small, PupilElements.gauss(8))
     middle = np.rint(image.point)
     pixels = middle + np.arange(-16, 17.0)[:, None]
@@ -171,7 +176,7 @@ def test_the_formed_image_is_that_of_counted_rays() -> None:
 @cache
 def surrogate(shift: float) -> RaySurrogate:
     slopes = ((-0.2, 0.2), (-0.15, 0.15))
-    return RaySurrogate.of(camera(shift), PupilElements.gauss(8), slopes, (560.0, 640.0))
+    return RaySurrogate.of(camera(shift), PupilElements.gauss(5), slopes, (560.0, 640.0), (6, 2))
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (60.0, 40.0), (-95.0, 60.0)])
@@ -198,6 +203,29 @@ def test_a_thin_lens_is_the_limit_of_a_slow_lens_near_the_axis() -> None:
     other = ray_image(thin, at, PupilElements.gauss(6))
     assert abs(true.blur - other.blur) < 0.1
     assert np.abs(true.point - other.point).max() < 0.5
+
+
+def test_a_lens_with_aberrations_follows_the_rays_of_its_design() -> None:
+    view, elements = camera(0.02, radius=0.6), PupilElements.gauss(3)
+    first = Paraxial(view.lens)
+    distance = 600.0 + first.entrance_pupil[0]
+    behind = first.focal_length * (1 + first.focal_length / (600.0 - first.focal_length))
+    focal = 1 / (1 / behind + 1 / distance)
+    thin = AberratedLens(focal, 2 * first.entrance_pupil_radius, behind, view.sensor, ((587.6, 1.0),))
+    # Third order: at a small stop, coefficients from two rays predict all others.
+    at = np.tile([60.0, 40.0, distance], (len(elements.xy), 1))
+    names = ("spherical", "coma", "astigmatism", "curvature")
+
+    def spot(lens: LensCamera | AberratedLens) -> Array:
+        return lens.rays(at, elements.xy, 587.6)[0] - lens.corresponding(at)
+
+    def beside(values: Array) -> Array:
+        moved = replace(thin, **dict(zip(names, values, strict=True)))
+        return (spot(moved) - spot(view)).ravel()
+
+    found = least_squares(beside, np.zeros(4), x_scale=1e-3)
+    assert np.abs(found.fun).max() < 0.05 * np.abs(spot(view)).max()
+    assert np.abs(found.fun).max() < 0.2 * np.abs(beside(np.zeros(4))).max()
 
 
 def test_light_that_an_aperture_stops_is_missing_from_the_image() -> None:

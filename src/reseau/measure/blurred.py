@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal, cast
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, Mask, Rows
 from ..core.errors import UsageError
-from ..core.failure import Code, Remark
+from ..core.failure import Code, Failure, Remark
 from ..optics.formation import Outline, PixelResponse
 from ..optics.gridded import GriddedOutline
 from ..optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image
@@ -31,7 +32,15 @@ from .matching import Matches, MatchOptions, Window, grey_variance, match, with_
 from .points import Measured, Reason
 from .screening import screen
 
-__all__ = ["BlurredOptions", "BlurredResult", "Moving", "Varied", "measure_blurred"]
+__all__ = [
+    "BlurredOptions",
+    "BlurredResult",
+    "EstimatedOptics",
+    "Moving",
+    "Varied",
+    "estimate_optics",
+    "measure_blurred",
+]
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
 """Half sides of windows: targets of similar size are matched together."""
@@ -43,6 +52,12 @@ _LEAST_SHIFT = 0.002
 """… or by less than this many pixels."""
 _STEP = 0.05
 """Step of a varied parameter for the motion of the nodes, in its standard deviations."""
+_ROUNDS = 40
+"""Largest number of corrections of common parameters."""
+_UNCHANGED = 1e-4
+"""Share of the sum of squares below which corrections end."""
+_DAMPING, _STUCK = 1e-2, 1e6
+"""First and largest damping of these corrections (Levenberg and Marquardt)."""
 _SEEN = 0.95
 _BEGINNING = 0.75
 """Least correlation at whole pixels."""
@@ -50,6 +65,8 @@ _ALIKE = 0.8
 """Least correlation of a target with its formed image."""
 _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
+_MISFIT = 1.5
+"""Ratio of the residuals of all targets to the noise from which the user is told."""
 _FEWEST = 8
 """Targets from which the noise as a function of the grey value is estimated."""
 
@@ -213,20 +230,38 @@ class _RayShapes:
 
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.measure.matching.Shape`."""
-        return np.stack(
-            [self._gridded(k, f).image(*each) for k, f, *each in _each(xy, width, form, at, window)]
-        )
+        found = np.full((len(at), window.rows.shape[1], window.columns.shape[1]), np.nan)
+        for k, gridded, *place in self._each(xy, width, form, at, window):
+            found[k] = gridded.image(*place)
+        return found
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`reseau.measure.matching.Shape`."""
-        found = np.stack(
-            [self._gridded(k, f).derivatives(*each) for k, f, *each in _each(xy, width, form, at, window)]
-        )
+        size = window.rows.shape[1], window.columns.shape[1]
+        found = np.full((len(at), 4 + self.parameters, *size), np.nan)
+        for k, gridded, *place in self._each(xy, width, form, at, window):
+            found[k] = gridded.derivatives(*place)
         return found[:, 0], found[:, 1:]
 
-    def _gridded(self, k: int, form: Array) -> GriddedOutline:
+    def _each(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> Iterator[tuple[Any, ...]]:
+        """Number, outline, place, width, columns, rows, response of each image.
+
+        A step of an adjustment may lead to values without an image: these are left out.
+        """
+        for k, row in enumerate(at):
+            if not (np.isfinite(xy[k]).all() and np.isfinite(width[k]) and np.isfinite(form[k]).all()):
+                continue
+            try:
+                gridded = self.at(int(row), form[k])
+            except UsageError:
+                continue
+            yield k, gridded, xy[k], float(width[k]), window.columns[k], window.rows[k], window.response
+
+    def at(self, k: int, form: Array) -> GriddedOutline:
         """The image `k` with changed parameters of the optics."""
         image = self.images[k]
         if not self.motions:
@@ -239,12 +274,6 @@ class _RayShapes:
         )
         self._last[k] = form.copy(), GriddedOutline.of(moved, motion.xy)
         return self._last[k][1]
-
-
-def _each(xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Iterator[tuple[Any, ...]]:
-    """Rows of the arguments of a shape: number, form, place, width, columns, rows, response."""
-    for k, row in enumerate(at):
-        yield int(row), form[k], xy[k], float(width[k]), window.columns[k], window.rows[k], window.response
 
 
 def measure_blurred(
@@ -298,6 +327,149 @@ def measure_blurred(
     return _Run(frame, camera, tuple(ids), tuple(targets), options).result()
 
 
+@dataclass(frozen=True, eq=False)
+class EstimatedOptics:
+    """Parameters of the optics, estimated from all targets of a frame.
+
+    Parameters
+    ----------
+    names : tuple of str (p,)
+    values : ndarray (p,)
+    cov : ndarray (p, p)
+    camera : RayMap
+        With these values.
+    used : int
+        Number of targets.
+
+    Examples
+    --------
+    See :func:`estimate_optics`, which returns it.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    cov: Array
+    camera: RayMap
+    used: int
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (p,)."""
+        sigma: Array = np.sqrt(np.diagonal(self.cov))
+        return sigma
+
+
+def estimate_optics(
+    frame: Frame, targets: Sequence[PlaneTarget], varied: Varied, options: BlurredOptions = BlurredOptions()
+) -> EstimatedOptics | Failure:
+    """Estimate parameters of the optics that all targets of a frame have in common.
+
+    The targets are measured with the present values; the forms of their images, without what position, light
+    and width of the remaining blur of each explain, give corrections of the values, until these no longer
+    change. So focus, an index, or the aberrations of a stand-in (:class:`AberratedLens`) become known.
+
+    Parameters
+    ----------
+    frame : Frame
+    targets : sequence of PlaneTarget (n,)
+        In camera axes. Where the stand-in has another scale or distortion than the lens, they must be
+        predicted within the range of search all the same.
+    varied : Varied
+        The parameters with their prior standard deviations.
+    options : BlurredOptions
+
+    Returns
+    -------
+    EstimatedOptics or Failure
+
+    Examples
+    --------
+    The distance of the sensor, from one disk:
+
+    >>> from reseau.optics.formation import coverage
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> sensor = SensorPlane((0.01, 0.01), (40.0, 40.0))
+    >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
+    >>> image = ray_image(ThinLens(50.0, 12.5, 52.9, sensor), disk, PupilElements.gauss(12))
+    >>> placed, pixels = Outline(image.outline.xy + 40.2, image.outline.dxy), np.arange(81.0)
+    >>> noise = np.random.default_rng(0).normal(0.0, 1.0, (81, 81))
+    >>> frame = Frame(200 - 150 * coverage(placed, pixels, pixels, 0.5) + noise, 255.0)
+    >>> focus = Varied(("focus_mm",), (0.2,), lambda by: ThinLens(50.0, 12.5, 52.8 + by[0], sensor))
+    >>> estimate_optics(frame, [disk], focus).values.round(2)
+    array([0.1])
+    """
+    # The same rays and pixels throughout, so that sums of squares can be compared.
+    options, halves = replace(options, varied=None, rings=options.rings or _RINGS[1]), dict[int, int]()
+    prior, values = np.diag(1 / np.square(varied.sigma)), np.zeros(len(varied.names))
+    equations = partial(_Common.of, frame, tuple(targets), varied, options, halves)
+    at = equations(values)
+    damping = _DAMPING
+    for _ in range(_ROUNDS):
+        if not at.costs:
+            return Failure("no target is like its image: check lens, focus and aperture", Code.NOT_FOUND)
+        normal, right = at.normal + prior, at.right - prior @ values
+        cost = sum(at.costs.values())
+        newton = np.linalg.solve(normal, right)
+        if newton @ right < _UNCHANGED * cost:
+            cov: Array = np.asarray(np.linalg.inv(normal) * max(cost / at.freedom, 1.0), dtype=np.float64)
+            return EstimatedOptics(varied.names, values, cov, varied.camera(values), len(at.costs))
+        step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), right)
+        try:
+            trial = equations(values + step)
+        except UsageError:  # such a lens forms no image
+            damping *= 10
+            continue
+        if trial.better(at, prior, values, values + step):
+            at, values, damping = trial, values + step, damping / 5
+        elif damping > _STUCK:
+            break
+        else:
+            damping *= 10
+    return Failure("the parameters of the optics do not converge", Code.NOT_CONVERGED)
+
+
+@dataclass(frozen=True, eq=False)
+class _Common:
+    """Normal equations of all targets for common parameters, and the sum of squares of each target."""
+
+    normal: Array
+    right: Array
+    costs: dict[int, float]
+    freedom: int
+
+    @classmethod
+    def of(
+        cls,
+        frame: Frame,
+        targets: tuple[PlaneTarget, ...],
+        varied: Varied,
+        options: BlurredOptions,
+        halves: dict[int, int],
+        values: Array,
+    ) -> _Common:
+        around = replace(varied, camera=partial(_moved, varied.camera, values))
+        names = tuple(str(k) for k in range(len(targets)))
+        run = _Run(frame, varied.camera(values), names, targets, options)
+        normal, right, costs, freedom = np.zeros((len(values),) * 2), np.zeros(len(values)), {}, 0
+        for row, part, to_the_right, cost, count in run.equations(run.result(), around, halves):
+            normal, right, freedom = normal + part, right + to_the_right, freedom + count
+            costs[row] = cost
+        return cls(normal, right, costs, freedom)
+
+    def better(self, before: _Common, prior: Array, old: Array, new: Array) -> bool:
+        """Whether more targets are like their images, or the same ones more alike."""
+        if not set(before.costs) <= set(self.costs):
+            return False
+        gain = sum(cost - self.costs[row] for row, cost in before.costs.items())
+        gain += float(old @ prior @ old - new @ prior @ new)
+        return len(self.costs) > len(before.costs) or gain > 0
+
+
+def _moved(camera: Callable[[Array], RayMap], values: Array, by: Array) -> RayMap:
+    """The map of rays with parameters that differ from their present values."""
+    return camera(values + by)
+
+
 class _Run:
     """The measurement of one frame."""
 
@@ -325,6 +497,7 @@ class _Run:
 
     def result(self) -> BlurredResult:
         rings, elements, images = self._images()
+        self.elements, self.images = elements, images
         seen = np.array([k for k, image in enumerate(images) if image is not None], dtype=np.intp)
         start = np.full((len(self.ids), 2), np.nan)
         for k in seen:
@@ -334,9 +507,11 @@ class _Run:
         results: list[tuple[Rows, Matches]] = []
         for half in np.unique(halves):
             those = rows[halves == half]
-            shape = self._shape(those, [cast(RayImage, images[k]) for k in those], elements)
+            shape = self._shape(
+                those, [cast(RayImage, images[k]) for k in those], elements, self.options.varied
+            )
             results.append((those, self._matched(shape, start[those], int(half))))
-        self._judge(results)
+        notes = self._judge(results)
         for k in seen:
             image = cast(RayImage, images[k])
             self.columns["blur_px"][k], self.columns["offset"][k] = image.blur, image.centroid
@@ -349,8 +524,43 @@ class _Run:
             predicted=self.predicted,
             deviation=np.where(self.ok[:, None], self.columns["xy"] - self.predicted, np.nan),
             rings=rings,
+            notes=notes,
             **cast(Any, self.columns),
         )
+
+    def equations(
+        self, found: BlurredResult, varied: Varied, halves: dict[int, int]
+    ) -> Iterator[tuple[int, Array, Array, float, int]]:
+        """Number, normal equations (p, p) and (p,) for varied parameters, cost, freedom of each target."""
+        count, o, noise = len(varied.names), self.options, self.screened.noise
+        rows = np.flatnonzero(found.ok)
+        shape = self._shape(rows, [cast(RayImage, self.images[k]) for k in rows], self.elements, varied)
+        for k, row in enumerate(rows):
+            half = halves.setdefault(int(row), self._half(shape.images[k]))
+            xy, width = found.xy[row], float(found.psf_px[row])
+            columns, lines = (np.rint(at) + np.arange(-half, half + 1.0) for at in xy)
+            columns = columns[(columns >= 0) & (columns < self.frame.width)]
+            lines = lines[(lines >= 0) & (lines < self.frame.height)]
+            inside = np.ix_(lines.astype(np.intp), columns.astype(np.intp))
+            grey, valid = self.screened.grey[inside].ravel(), self.screened.valid[inside].ravel()
+            gridded = shape.at(k, np.zeros(count))
+            parts = gridded.derivatives(xy, width, columns, lines, PixelResponse(o.fill))
+            parts = parts.reshape(len(parts), -1)
+            u, v = (at.ravel() for at in np.meshgrid((columns - xy[0]) / half, (lines - xy[1]) / half))
+            light = np.stack([np.ones_like(u), u, v, parts[0]], axis=1)[valid]
+            fitted = np.linalg.lstsq(light, grey[valid], rcond=None)[0]
+            residuals = grey[valid] - light @ fitted
+            others = fitted[3] * parts[1:, valid].T
+            others[:, 2] *= width
+            design = np.concatenate([light, others], axis=1) / noise
+            normal, right = design.T @ design, design.T @ (residuals / noise)
+            normal[6, 6] += 1 / o.psf_log_sigma**2
+            right[6] -= np.log(width / o.psf_px) / o.psf_log_sigma**2
+            local, common = slice(0, -count), slice(-count, None)
+            factor = np.linalg.solve(normal[local, local], normal[local, common]).T
+            cost = float((residuals**2).sum()) / noise**2
+            reduced = normal[common, common] - factor @ normal[local, common]
+            yield int(row), reduced, right[common] - factor @ right[local], cost, int(valid.sum()) - 7
 
     def _imaged(self, k: int, elements: PupilElements) -> RayImage | None:
         """Image of a target by rays; None, with the reason, where there is none in the frame."""
@@ -402,8 +612,9 @@ class _Run:
             return np.full(2, np.nan)
         return np.asarray(centre + np.array([column - reach, row - reach]))
 
-    def _shape(self, rows: Rows, images: list[RayImage], elements: PupilElements) -> _RayShapes:
-        varied = self.options.varied
+    def _shape(
+        self, rows: Rows, images: list[RayImage], elements: PupilElements, varied: Varied | None
+    ) -> _RayShapes:
         if varied is None:
             return _RayShapes(tuple(images))
         steps = _STEP * np.diag(varied.sigma)
@@ -452,10 +663,10 @@ class _Run:
         variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
         return first if variance is None else run(replace(options, variance=variance))
 
-    def _judge(self, results: list[tuple[Rows, Matches]]) -> None:
-        """Fill in the columns; decline what is not an image of its target."""
+    def _judge(self, results: list[tuple[Rows, Matches]]) -> tuple[Remark, ...]:
+        """Fill in the columns; decline what is not an image of its target; say if all images differ."""
         if not results:
-            return
+            return ()
         usual = float(np.median(np.concatenate([found.noise for _, found in results])))
         for rows, found in results:
             found = with_alike_errors(found)
@@ -489,6 +700,13 @@ class _Run:
             for name in ("contrast", "t", "noise", "psf_px"):
                 self.columns[name][rows] = getattr(found, name)
             self.columns["varied"][rows], self.columns["varied_sigma"][rows] = found.form, found.form_sigma
+        if not (self.ok.any() and usual > _MISFIT * self.screened.noise):
+            return ()
+        text = (
+            f"residuals are {usual / self.screened.noise:.2g} times the noise of the frame: lens, focus or "
+            "aperture are not those of the photograph, and places may be wrong by more than their sigmas"
+        )
+        return (Remark(text, Code.INCONSISTENT),)
 
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
         """Rings of elements of the stop (0: of a surrogate), these elements, and images of all targets.

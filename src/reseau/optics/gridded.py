@@ -21,12 +21,15 @@ import numpy as np
 from scipy.ndimage import spline_filter1d
 
 from ..core.data import Array
+from ..core.errors import UsageError
 from .formation import Outline, PixelResponse
 
 __all__ = ["GriddedOutline"]
 
 _PER_PX = 4
 """Cells of the grid along a pixel."""
+_WIDEST = 1500
+"""Largest extent of an image, pixels."""
 _REACH = 5.5
 """Gaussian widths beyond which a response counts as zero."""
 _TAIL = 1.0
@@ -68,6 +71,11 @@ class GriddedOutline:
             Nodes (j, 2), pixels.
         motions : ndarray (m, j, 2), optional
             Velocities of the nodes for m parameters of the form.
+
+        Raises
+        ------
+        UsageError
+            When the nodes are not near each other.
         """
         from .compiled import gathered  # takes half a second to import; not every command needs it
 
@@ -75,6 +83,8 @@ class GriddedOutline:
         v = none if motions is None else motions
         weights = np.concatenate([dy[None], v[..., 0] * dy - v[..., 1] * dx])
         at = _PER_PX * np.ascontiguousarray(outline.xy.T)
+        if not np.ptp(at, axis=1).max() < _PER_PX * _WIDEST:
+            raise UsageError(f"an image extends over more than {_WIDEST} px")
         corner = np.floor(at.min(axis=1)).astype(np.int64) - 2
         columns, rows = np.floor(at.max(axis=1)).astype(np.int64) + 4 - corner
         cells = np.zeros((len(weights), int(rows), int(columns)))

@@ -1,6 +1,7 @@
 """Lenses: prescriptions, media, rays through them, and the images that rays form."""
 
 from .images import (
+    AberratedLens,
     LensCamera,
     PlaneTarget,
     RayImage,
@@ -32,6 +33,7 @@ from .trace import SURFACE_PARAMETERS, RayDerivatives, Rays, Traced, Tracer
 __all__ = [
     "AIR",
     "SURFACE_PARAMETERS",
+    "AberratedLens",
     "Aimed",
     "Aiming",
     "Air",
