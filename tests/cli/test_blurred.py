@@ -81,9 +81,10 @@ def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path:
     assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
 
 
-def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> None:
+def network(path: Path, x0: list[float]) -> Path:
+    """A file with the orientation of the photograph, and with the points of the design."""
     plane = np.concatenate([DESIGN.xy, np.zeros((24, 1))], axis=1)
-    network = {
+    content = {
         "schema": "reseau-network/1",
         "unit": "mm",
         "cameras": [
@@ -92,9 +93,7 @@ def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> 
                 "side": "image", "parameters": {"c": 34.0}, "free": [],
             }
         ],
-        "images": {
-            "id": ["photo"], "camera": ["c"], "X0": [POSE.x0.tolist()], "rotation": [POSE.rotation.tolist()],
-        },
+        "images": {"id": ["photo"], "camera": ["c"], "X0": [x0], "rotation": [POSE.rotation.tolist()]},
         "points": {
             "id": list(DESIGN.ids), "xyz": plane.tolist(), "sigma": [[0.0, 0.0, 0.0]] * 24,
             "role": ["control"] * 24,
@@ -105,13 +104,55 @@ def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> 
         },
         "datum": "control",
     }  # fmt: skip
-    (tmp_path / "network.json").write_text(json.dumps(network))
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> None:
+    block = network(tmp_path / "network.json", POSE.x0.tolist())
     status, out, err = reseau(
         "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
-        "--network", tmp_path / "network.json", "--json",
+        "--network", block, "--json",
     )  # fmt: skip
     assert (status, err) == (0, "")
     assert measured(files, out) < 0.1
+
+
+SECOND = "curvature = -0.03"
+STOP = 'name = "stop"'
+NAME = 'name = "singlet"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "towards", "said"),
+    [
+        (SECOND, f"{SECOND}\ntilt_deg = [60.0, 0.0, 0.0]", 1.0, "is totally reflected at surface 2"),
+        (STOP, f"{STOP}\ndecentre = [80.0, 0.0, 0.0]", 1.0, "no ray passes the stop"),
+        ("wavelengths_nm = [486.1, 546.1, 632.8]", "wavelengths_nm = []", 1.0, "wavelengths_nm"),
+        (NAME, f"{NAME}\nfocal_length = 50000.0", 1.0, "states a focal length of 50000 mm"),
+        (SECOND, SECOND, -1.0, "a point of the object lies behind surface 1"),
+        (SECOND, SECOND, 30.0, "the design is not in the field of the lens"),
+    ],
+    ids=["total reflection", "no ray", "no wavelength", "50 m", "behind the window", "out of the field"],
+)
+def test_light_that_cannot_reach_the_sensor_is_one_line_and_nothing_is_written(
+    files, tmp_path: Path, reseau: Run, old: str, new: str, towards: float, said: str
+) -> None:
+    text = files["lens.toml"].read_text()
+    assert old in text
+    lens_file = tmp_path / "lens.toml"
+    lens_file.write_text(text.replace(old, new, 1))
+    x0 = POSE.x0 * [1.0, 1.0, np.sign(towards)] + [40.0 * (abs(towards) - 1), 0.0, 0.0]
+    block = network(tmp_path / "network.json", x0.tolist())
+    before = sorted(tmp_path.iterdir())
+    status, out, err = reseau(
+        "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", lens_file,
+        "--network", block, "-o", tmp_path / "m.json", "--figure", tmp_path / "f.svg",
+    )  # fmt: skip
+    assert status in (1, 2), out
+    assert said in err
+    assert err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize(

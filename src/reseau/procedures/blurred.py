@@ -25,7 +25,7 @@ from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import LensCamera, Paraxial, PlaneTarget, Prescription, RayMap, SensorPlane
-from ..optics.newton import newton
+from ..optics.newton import determinant, newton
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
 from .target_measurement import Measurer, measurer_of
@@ -44,6 +44,8 @@ Design = ReseauDesign | TestfieldDesign
 
 _SPACING_PX = 0.8
 """Largest distance of nodes along outlines: images shift by less than 1e-4 px against those of many nodes."""
+_FAR = 1e5
+"""Distance of an object far away, mm."""
 _ROUNDS = 3
 _SETTLED_PX = 0.3
 """A change of the predicted positions below this does not change the formed images noticeably."""
@@ -144,7 +146,7 @@ def lens_camera(
     Raises
     ------
     UsageError
-        When there is no sensor and no pitch, or its size is another one.
+        When there is no sensor and no pitch, its size is another one, or no light passes the lens.
 
     Examples
     --------
@@ -177,7 +179,13 @@ def lens_camera(
         first = Paraxial(prescription)
         radius = abs(first.focal_length) / (2 * f_number) / abs(first.entrance_pupil[1])
         prescription = replace(prescription, stop_radius=radius)
-    return LensCamera(prescription if distance is None else focused(prescription, distance), plane)
+    camera = LensCamera(prescription if distance is None else focused(prescription, distance), plane)
+    far = np.array([0.0, 0.0, distance or _FAR])
+    if not np.isfinite(camera.corresponding(far[None])).all():
+        raise UsageError(
+            f"forms no image of a point on the axis: {camera.why_dark(far)}", where=prescription.name
+        )
+    return camera
 
 
 def targets_of(design: Design, pose: Pose, camera: RayMap) -> tuple[tuple[str, ...], list[PlaneTarget]]:
@@ -212,11 +220,12 @@ def targets_of(design: Design, pose: Pose, camera: RayMap) -> tuple[tuple[str, .
     matrix = pose.matrix
     centres = pose(np.concatenate([design.xy, np.zeros((len(design.ids), 1))], axis=1))
     axes = matrix[:, :2]
-    middle = centres[len(centres) // 2]
-    near = camera.corresponding(np.stack([middle, middle + axes[:, 0], middle + axes[:, 1]]))
-    scale = float(np.sqrt(abs(np.linalg.det(near[1:] - near[0]))))
-    if not (np.isfinite(scale) and scale > 0):
+    around = centres[:, None] + np.array([np.zeros(3), axes[:, 0], axes[:, 1]])
+    near = camera.corresponding(around.reshape(-1, 3)).reshape(-1, 3, 2)
+    near = near[np.isfinite(near).all(axis=(1, 2))]
+    if not len(near):
         raise UsageError("the design is not in the field of the lens", where=design.name)
+    scale = float(np.median(np.sqrt(np.abs(determinant(near[:, 1:] - near[:, :1])))))
     spacing = _SPACING_PX / scale
     if isinstance(design, TestfieldDesign):
         t = design.targets
@@ -288,10 +297,10 @@ def orient_by_rays(camera: RayMap, design: Design, points: ImagePoints) -> tuple
 
 def _approximate_slopes(camera: RayMap, xy: Array) -> Array:
     """X/Z and Y/Z (n, 2) of points of the image, by Newton's method for objects far away."""
-    far, h = 1e5, 1e-3
+    h = 1e-3
 
     def pixels(slopes: Array) -> Array:
-        return camera.corresponding(far * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1))
+        return camera.corresponding(_FAR * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1))
 
     def slope_at(slopes: Array) -> tuple[Array, Array]:
         here = pixels(slopes)
@@ -342,7 +351,7 @@ def measure_blurred_frame(
     """
     options = options or BlurredOptions(polarity=design.polarity)
     if pose is not None:
-        return _described(_measured(frame, design, camera, pose, options, np.nan))
+        return _some(_described(_measured(frame, design, camera, pose, options, np.nan)))
     first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
@@ -362,9 +371,22 @@ def measure_blurred_frame(
         if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
             break
         points, before = found.measured.points, found.measured.predicted
-    return _described(
-        replace(found, measured=replace(found.measured, notes=(*first.remarks, *found.measured.notes)))
+    return _some(
+        _described(
+            replace(found, measured=replace(found.measured, notes=(*first.remarks, *found.measured.notes)))
+        )
     )
+
+
+def _some(found: BlurredFrame) -> BlurredFrame | Failure:
+    """The frame, or the most frequent reason why nothing was measured in it."""
+    measured = found.measured
+    if measured.ok.any():
+        return found
+    reasons = [str(why) for why in measured.why]
+    most = max(set(reasons), key=reasons.count)
+    code = measured.codes[reasons.index(most)] or Code.DECLINED
+    return Failure(f"none of {len(measured.ids)} targets was measured; {reasons.count(most)}: {most}", code)
 
 
 def _described(found: BlurredFrame) -> BlurredFrame:

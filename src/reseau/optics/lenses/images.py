@@ -214,8 +214,7 @@ class LensCamera(_ByRays):
         """By wavelength: what aims rays, traces them, and traces them with apertures, where it has any."""
         return {}
 
-    def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
-        """Rays by ray tracing."""
+    def _at(self, wavelength_nm: float) -> tuple[Aiming, Tracer, Tracer | None]:
         if wavelength_nm not in self._ready:
             limited = any(surface.apertures for surface in self.lens.surfaces)
             self._ready[wavelength_nm] = (
@@ -223,7 +222,22 @@ class LensCamera(_ByRays):
                 Tracer(self.lens, wavelength_nm, apertures=False),
                 Tracer(self.lens, wavelength_nm) if limited else None,
             )
-        aiming, tracer, limits = self._ready[wavelength_nm]
+        return self._ready[wavelength_nm]
+
+    def why_dark(self, point: Array) -> str:
+        """Why no light of a point (3,) reaches the sensor, by its principal ray."""
+        aiming, tracer, limits = self._at(self.wavelength_nm)
+        local = point[None] @ self.rotation.T + self._centre
+        reason = aiming.why(local[0])
+        if reason is not None:
+            return reason
+        tracer = limits or tracer
+        lost = int(tracer.trace(aiming(local, np.zeros((1, 2))).rays).lost[0])
+        return f"its principal ray {tracer.reason(lost)}" if lost else "apertures stop it"
+
+    def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """Rays by ray tracing."""
+        aiming, tracer, limits = self._at(wavelength_nm)
         aimed = aiming(points @ self.rotation.T + self._centre, pupil)
         free, weight = tracer.trace(aimed.rays), aimed.solid_angle
         if limits is not None:
@@ -460,7 +474,8 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     emitted = np.abs(light.mean(axis=1) @ target.normal)
     coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, emitted, 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
-        raise UsageError("no light of the target reaches the sensor", do="is it in the field of the lens?")
+        why = camera.why_dark(target.centre) if isinstance(camera, LensCamera) else "it is not in the field"
+        raise UsageError(f"no light of the target reaches the sensor: {why}")
     # Elements without light remain, as points: images with other parameters have the same nodes.
     coefficients[share == 0] = 0.0
     coefficients[share == 0, 0] = point

@@ -228,6 +228,18 @@ class Aiming:
         rays = Rays(rays.xyz, np.where(ok[:, None], rays.directions, np.nan))
         return Aimed(rays, np.where(ok, angle, 0.0), ok)
 
+    def why(self, point: Array) -> str | None:
+        """Why there is no principal ray of a point (3,); None if there is one.
+
+        The ray towards the middle of the entrance pupil says what happens to such rays in front of the stop.
+        """
+        aimed = self(point[None], np.zeros((1, 2)))
+        if aimed.found[0]:
+            return None
+        towards = Rays(point[None], self._along(self._away(np.zeros((1, 2)), point[None])))
+        lost = int(self._to_stop.trace(towards).lost[0])
+        return f"its principal ray {self._to_stop.reason(lost)}" if lost else "no ray passes the stop"
+
     def _away(self, targets: Array, start: Array) -> Array:
         """Vectors (n, 3) from points (n, 3) to targets (n, 2) in the plane at which rays are aimed."""
         return np.asarray(self._plane + targets @ self.front.axes[:, :2].T - start)
