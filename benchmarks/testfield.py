@@ -56,7 +56,13 @@ FREED: dict[str, dict[str, Any]] = {
     "glare to saturation": {"stains": (Stain(150, 100, 25, 120.0, opaque=False),)},
 }
 """Benches by condition, and the curve that the file states."""
-ROUGH = {"motion to and fro, 4 px", "sharpened", "JPEG of quality 60", "glare to saturation"}
+ROUGH = {
+    "motion to and fro, 4 px",
+    "sharpened",
+    "curve, sharpened, JPEG 85",
+    "JPEG of quality 60",
+    "glare to saturation",
+}
 PAPER = {
     ("square", False): 0.040,
     ("triangle", False): 0.056,

@@ -41,6 +41,9 @@ _FEW, _AGAIN = 0.05, 4
 _BESIDE_PX = 0.025
 """Distance of targets from their predictions, exceeded by one coordinate in ten, for which another round is
 made: the light of lines and neighbours was formed in wrong places."""
+_SAME_LIGHT = 0.005
+"""Relative change of contrast and sharpness for which another round is made: where neighbours blend, the
+light of each depends on that of the others."""
 _RESHAPED_PX, _REACH, _REPEATED = 0.015, 0.6, 1.05
 """Displacement of an outline by the mapping through all targets from which a target is matched again; reach
 of targets relative to their size; multiple of the residuals that may remain then."""
@@ -335,6 +338,7 @@ class _Measurement:
             off = (found.xy - self.predicted[wanted])[good]
             settled = good.mean() > 1 - _FEW and np.quantile(np.abs(off), 0.9) < _BESIDE_PX
             settled &= common_part(self.at[wanted[good]], off) is None
+            settled &= self._alike(found, good, wanted)
             if settled or good.sum() < _MOST_FIRST:
                 break
             # With many targets known, the mapping and the light of neighbours are known better.
@@ -366,6 +370,15 @@ class _Measurement:
             "predicted": predicted,
             "deviation": spread(found.xy - predicted[wanted], good),
         } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+
+    def _alike(self, found: Matches, good: Mask, wanted: Rows) -> bool:
+        """Whether light and sharpness of the targets are those with which their neighbours were formed."""
+        scene = self.scene
+        large = good & scene.design.large[wanted]
+        amplitude = scene.light.at(found.xy[large])[1]
+        depth = found.contrast[large] * (found.level[large] if scene.design.polarity == "dark" else 1.0)
+        change = np.median(depth / amplitude) - 1, np.median(found.psf_px[large]) / scene.psf_px - 1
+        return not large.any() or bool(np.abs(change).max() < _SAME_LIGHT)
 
     def _reshaped(
         self, wanted: Rows, found: Matches, why: Array, predicted: Array
@@ -490,12 +503,15 @@ class _Measurement:
         """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
         mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
+        # In small blurred targets contrast, sharpness and size can hardly be told apart.
+        large = sure & scene.design.large[rows]
+        plain = large if large.sum() >= _LEAST_FIRST else sure
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)
-        light = Light.through(first.xy[sure], first.level[sure], amplitude[sure], scene.light.size)
-        psf_px = float(np.median(first.psf_px[sure]))
+        light = Light.through(first.xy[plain], first.level[plain], amplitude[plain], scene.light.size)
+        psf_px = float(np.median(first.psf_px[plain]))
         # The light of neighbours was not known well yet: the targets with small residuals give the noise.
         noise = float(np.quantile(first.noise[sure], 0.2))
-        self.growth = float(np.median(first.form[sure, 0]))
+        self.growth = float(np.median(first.form[plain, 0]))
         self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
