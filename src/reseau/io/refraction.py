@@ -50,14 +50,15 @@ class MediumEntry(Strict):
             When the medium or its index is not known.
         """
         where = f"medium {name}"
-        value = self.index
+        value, dispersion = self.index, None
         if self.medium is not None and self.wavelength_nm is not None:
+            dispersion = medium_of(self.medium, where)
             try:
-                value = medium_of(self.medium, where).index(self.wavelength_nm)
+                value = dispersion.index(self.wavelength_nm)
             except UsageError as error:
                 raise UsageError(error.what, where=where, do=error.do) from None
         assert value is not None
-        return RefractiveIndex(name, value, self.free, self.sigma)
+        return RefractiveIndex(name, value, self.free, self.sigma, dispersion)
 
 
 class WindowEntry(Strict):

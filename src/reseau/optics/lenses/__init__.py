@@ -29,6 +29,7 @@ from .paraxial import Paraxial
 from .prescription import Aperture, Layout, Prescription, Surface, in_order
 from .pupils import Aimed, Aiming, PupilElements, RayKind, aim, labels
 from .trace import SURFACE_PARAMETERS, RayDerivatives, Rays, Traced, Tracer
+from .windows import behind_windows
 
 __all__ = [
     "AIR",
@@ -62,6 +63,7 @@ __all__ = [
     "Tracer",
     "Water",
     "aim",
+    "behind_windows",
     "counted_image",
     "glass",
     "glass_names",

@@ -198,7 +198,8 @@ class LensCamera(_ByRays):
         return self.lens.wavelength_nm
 
     @cached_property
-    def _centre(self) -> Array:
+    def projection_centre(self) -> Array:
+        """Projection centre (3,) in the axes of the lens."""
         if self.centre is not None:
             return self.centre
         position = Paraxial(self.lens).entrance_pupil[0]
@@ -227,7 +228,7 @@ class LensCamera(_ByRays):
     def why_dark(self, point: Array) -> str:
         """Why no light of a point (3,) reaches the sensor, by its principal ray."""
         aiming, tracer, limits = self._at(self.wavelength_nm)
-        local = point[None] @ self.rotation.T + self._centre
+        local = point[None] @ self.rotation.T + self.projection_centre
         reason = aiming.why(local[0])
         if reason is not None:
             return reason
@@ -238,7 +239,7 @@ class LensCamera(_ByRays):
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays by ray tracing."""
         aiming, tracer, limits = self._at(wavelength_nm)
-        aimed = aiming(points @ self.rotation.T + self._centre, pupil)
+        aimed = aiming(points @ self.rotation.T + self.projection_centre, pupil)
         free, weight = tracer.trace(aimed.rays), aimed.solid_angle
         if limits is not None:
             weight = weight * limits.trace(aimed.rays).arrived
