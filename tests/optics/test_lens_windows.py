@@ -93,7 +93,9 @@ def test_the_projection_centre_stays_where_it_was() -> None:
 
 def test_water_of_known_dispersion_colours_the_rim() -> None:
     grey, _ = through("plane")
-    coloured = replace(grey, media=(*MEDIA[:2], replace(MEDIA[2], dispersion=Water())), windows=grey.windows)
+    coloured = replace(
+        grey, media=(*MEDIA[:2], replace(MEDIA[2], dispersion=Water().index)), windows=grey.windows
+    )
     one, other = (behind_windows(BARE, r, 0, np.eye(3), np.zeros(3)) for r in (grey, coloured))
     point = np.array([[300.0, 0.0, 1000.0]])
     np.testing.assert_allclose(other.corresponding(point), one.corresponding(point), rtol=0, atol=1e-9)

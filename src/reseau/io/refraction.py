@@ -52,9 +52,9 @@ class MediumEntry(Strict):
         where = f"medium {name}"
         value, dispersion = self.index, None
         if self.medium is not None and self.wavelength_nm is not None:
-            dispersion = medium_of(self.medium, where)
+            dispersion = medium_of(self.medium, where).index
             try:
-                value = dispersion.index(self.wavelength_nm)
+                value = dispersion(self.wavelength_nm)
             except UsageError as error:
                 raise UsageError(error.what, where=where, do=error.do) from None
         assert value is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,16 +21,13 @@ __all__ = ["behind_windows"]
 class _Adjusted:
     """The dispersion of a medium, with the index at one wavelength that an adjustment gave."""
 
-    medium: Medium
+    name: str
+    dispersion: Callable[[float], float]
     value: float
     wavelength_nm: float
 
-    @property
-    def name(self) -> str:
-        return self.medium.name
-
     def index(self, wavelength_nm: float) -> float:
-        return self.value + self.medium.index(wavelength_nm) - self.medium.index(self.wavelength_nm)
+        return self.value + self.dispersion(wavelength_nm) - self.dispersion(self.wavelength_nm)
 
 
 def behind_windows(
@@ -121,7 +119,7 @@ def behind_windows(
 def _medium(medium: RefractiveIndex, wavelength_nm: float) -> Medium:
     if medium.dispersion is None:
         return Constant(medium.value, medium.name)
-    return _Adjusted(medium.dispersion, medium.value, wavelength_nm)
+    return _Adjusted(medium.name, medium.dispersion, medium.value, wavelength_nm)
 
 
 def _axes(along: Array) -> Array:

@@ -16,11 +16,11 @@ outside the first. The radius of a sphere or cylinder is that of its inner surfa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,9 +28,6 @@ from numpy.typing import ArrayLike
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
-
-if TYPE_CHECKING:
-    from ..lenses.media import Medium
 
 __all__ = ["Refraction", "RefractionColumns", "RefractiveIndex", "Window", "window_parameters"]
 
@@ -78,8 +75,8 @@ class RefractiveIndex:
         Whether it is estimated.
     sigma : float, optional
         Standard deviation of a free index whose value is an observation.
-    dispersion : Medium, optional
-        Index as a function of the wavelength, for images formed by rays of several wavelengths.
+    dispersion : callable, optional
+        Index as a function of the wavelength (nm), for images formed by rays of several wavelengths.
 
     Examples
     --------
@@ -91,7 +88,7 @@ class RefractiveIndex:
     value: float
     free: bool = False
     sigma: float | None = None
-    dispersion: Medium | None = None
+    dispersion: Callable[[float], float] | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.value) and 0.5 < self.value < 10):
