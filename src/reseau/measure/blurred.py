@@ -349,7 +349,7 @@ class EstimatedOptics:
     names: tuple[str, ...]
     values: Array
     cov: Array
-    camera: RayMap
+    camera: RayMap = field(repr=False)
     used: int
 
     @property

@@ -371,10 +371,10 @@ def measure_blurred_frame(
         if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
             break
         points, before = found.measured.points, found.measured.predicted
+    # What is said of deviations concerns the targets measured as if they were sharp.
+    notes = [remark for remark in first.remarks if remark.code != Code.INCONSISTENT]
     return _some(
-        _described(
-            replace(found, measured=replace(found.measured, notes=(*first.remarks, *found.measured.notes)))
-        )
+        _described(replace(found, measured=replace(found.measured, notes=(*notes, *found.measured.notes))))
     )
 
 

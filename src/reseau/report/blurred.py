@@ -97,7 +97,7 @@ def _drawn(
         first.plot(*centroid, "x", color=ACCENT, markersize=7)
         first.set_aspect("equal", adjustable="datalim")
         first.invert_yaxis()
-        first.set_title("rays of the centre (px)")
+        first.set_title("rays of the centre (px), by wavelength")
         (columns, rows), (low, high) = pixels, (float(photograph.min()), float(photograph.max()))
         extent = (columns[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5, rows[0] - 0.5)
         residuals = photograph - formed
