@@ -172,6 +172,8 @@ def main() -> None:
                 outwards = (drawn.truth[k] - PRINCIPAL) / np.hypot(*(drawn.truth[k] - PRINCIPAL))
                 error, sigma = found.xy[k] - drawn.truth[k], np.sqrt(np.diagonal(found.cov[k]))
                 rows.setdefault((name, blur), []).append((error, sigma, float(error @ outwards)))
+            state = "none" if found is None else f"{found.found} measured, {len(found.notes)} notes"
+            print(f"world {seed}, {name}: {state}", flush=True)
         for k, at in enumerate(xy):
             error = at - drawn.truth[k]
             rows.setdefault(("gravity", blur), []).append((error, np.full(2, np.nan), 0.0))

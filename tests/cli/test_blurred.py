@@ -81,6 +81,12 @@ def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path:
     assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
 
 
+def principal_distance() -> float:
+    """Of the lens, mm."""
+    near = LensCamera(lens(), SENSOR.plane()).corresponding(np.array([[0.0, 0, 480.0], [1.0, 0, 480.0]]))
+    return float((near[1] - near[0])[0] * 480.0 * 0.013)
+
+
 def network(path: Path, x0: list[float]) -> Path:
     """A file with the orientation of the photograph, and with the points of the design."""
     plane = np.concatenate([DESIGN.xy, np.zeros((24, 1))], axis=1)
@@ -89,8 +95,8 @@ def network(path: Path, x0: list[float]) -> Path:
         "unit": "mm",
         "cameras": [
             {
-                "id": "c", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [0.01, 0.01], "model": "brown",
-                "side": "image", "parameters": {"c": 34.0}, "free": [],
+                "id": "c", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [0.013, 0.013], "model": "brown",
+                "side": "object", "parameters": {"c": principal_distance()}, "free": [],
             }
         ],
         "images": {"id": ["photo"], "camera": ["c"], "X0": [x0], "rotation": [POSE.rotation.tolist()]},
@@ -130,8 +136,8 @@ NAME = 'name = "singlet"'
         (STOP, f"{STOP}\ndecentre = [80.0, 0.0, 0.0]", 1.0, "no ray passes the stop"),
         ("wavelengths_nm = [486.1, 546.1, 632.8]", "wavelengths_nm = []", 1.0, "wavelengths_nm"),
         (NAME, f"{NAME}\nfocal_length = 50000.0", 1.0, "states a focal length of 50000 mm"),
-        (SECOND, SECOND, -1.0, "a point of the object lies behind surface 1"),
-        (SECOND, SECOND, 30.0, "the design is not in the field of the lens"),
+        (SECOND, SECOND, -1.0, "a point of the object lies behind the lens"),
+        (SECOND, SECOND, 30.0, "none of 24 targets was measured; 24: no light of the target reaches"),
     ],
     ids=["total reflection", "no ray", "no wavelength", "50 m", "behind the window", "out of the field"],
 )

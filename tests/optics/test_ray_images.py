@@ -12,11 +12,13 @@ from scipy.optimize import least_squares
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.measure.matching import GrownOutline, Window
+from reseau.optics import Brown, PixelGrid
 from reseau.optics.formation import Outline, PixelResponse, coverage, mark_outline
 from reseau.optics.lenses import (
     AIR,
     AberratedLens,
     Aperture,
+    CalibratedLens,
     LensCamera,
     Paraxial,
     PlaneTarget,
@@ -226,6 +228,23 @@ def test_a_lens_with_aberrations_follows_the_rays_of_its_design() -> None:
     found = least_squares(beside, np.zeros(4), x_scale=1e-3)
     assert np.abs(found.fun).max() < 0.05 * np.abs(spot(view)).max()
     assert np.abs(found.fun).max() < 0.2 * np.abs(beside(np.zeros(4))).max()
+
+
+def test_a_calibrated_lens_forms_the_image_of_the_lens_where_the_calibration_has_it() -> None:
+    view, elements = camera(0.05), PupilElements.gauss(4)
+    at = target(60.0, 40.0, 600.0, 20.0)
+    near = view.corresponding(np.array([[0.0, 0.0, 600.0], [1.0, 0.0, 600.0]]))
+    grid = PixelGrid(1600, 1200, (0.006, 0.006))
+    principal = float(near[1, 0] - near[0, 0]) * 600.0 * 0.006
+    # Displaced by 20 and 8 pixels, and with decentring distortion.
+    calibrated = Brown(side="object", grid=grid).with_values(
+        {"c": principal, "x0": 0.12, "y0": -0.048, "P1": 1e-4, "P2": -2e-4}
+    )
+    own, placed = (ray_image(each, at, elements) for each in (view, CalibratedLens(view, calibrated)))
+    assert np.hypot(*(placed.point - own.point)) > 15
+    assert np.abs(placed.point - calibrated(at.centre[None, :2] / at.centre[2])[0]).max() < 1e-9
+    assert abs(placed.blur - own.blur) < 1e-6
+    assert 1e-4 < np.abs(placed.centroid - own.centroid).max() < 0.05  # the distortion within the target
 
 
 def test_light_that_an_aperture_stops_is_missing_from_the_image() -> None:

@@ -26,6 +26,7 @@ from .measure import Overlay, Task
 if TYPE_CHECKING:
     from ..core.data import Frame
     from ..measure.blurred import BlurredResult
+    from ..optics.lenses import RayMap
 
 __all__ = ["blurred"]
 
@@ -96,7 +97,7 @@ def blurred(
     from ..io.reading import read_design
     from ..measure import ReseauOptions, measure_reseau
     from ..measure.blurred import BlurredOptions
-    from ..procedures.blurred import lens_camera, measure_blurred_frame, pose_in_network
+    from ..procedures.blurred import calibrated_by, lens_camera, measure_blurred_frame, pose_in_network
 
     kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
     task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
@@ -110,9 +111,12 @@ def blurred(
         search_px=search,
         fill=1.0 if optics.sensor is None else optics.sensor.fill,
     )
+    view: RayMap = camera
     pose, sharp = None, None
     if network is not None:  # it determines the orientation; names need no help
-        pose = pose_in_network(read_network(network), image.name, target)
+        block = read_network(network)
+        pose = pose_in_network(block, image.name, target)
+        view = calibrated_by(camera, block, image.name)
     elif isinstance(target, ReseauDesign):
         target = seen(target, mirrored)
         turned = ReseauOptions(**orientation(mirrored, max_rotation))
@@ -121,7 +125,7 @@ def blurred(
         target = target.from_behind()
 
     def measured(_: Frame) -> BlurredResult | Failure:
-        found = measure_blurred_frame(frame, target, camera, pose, options, sharp=sharp)
+        found = measure_blurred_frame(frame, target, view, pose, options, sharp=sharp)
         if isinstance(found, Failure):
             return found
         if figure is not None:
@@ -129,7 +133,7 @@ def blurred(
             from ..core.files import write_whole
             from ..report.blurred import blurred_figure
 
-            drawn = blurred_figure(frame, camera, found.targets, found.measured, fill=options.fill)
+            drawn = blurred_figure(frame, view, found.targets, found.measured, fill=options.fill)
             write_whole(figure, to_bytes(drawn, kind[1:], dpi=150))
         return found.measured
 

@@ -28,7 +28,7 @@ __all__ = ["GriddedOutline"]
 
 _PER_PX = 4
 """Cells of the grid along a pixel."""
-_WIDEST = 1500
+_WIDEST = 400
 """Largest extent of an image, pixels."""
 _REACH = 5.5
 """Gaussian widths beyond which a response counts as zero."""

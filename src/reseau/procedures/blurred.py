@@ -24,7 +24,15 @@ from ..io import ReseauDesign, TestfieldDesign
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..optics import Pose
 from ..optics.formation import mark_outline
-from ..optics.lenses import LensCamera, Paraxial, PlaneTarget, Prescription, RayMap, SensorPlane
+from ..optics.lenses import (
+    CalibratedLens,
+    LensCamera,
+    Paraxial,
+    PlaneTarget,
+    Prescription,
+    RayMap,
+    SensorPlane,
+)
 from ..optics.newton import determinant, newton
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
@@ -32,6 +40,7 @@ from .target_measurement import Measurer, measurer_of
 
 __all__ = [
     "BlurredFrame",
+    "calibrated_by",
     "focused",
     "lens_camera",
     "measure_blurred_frame",
@@ -441,12 +450,8 @@ def pose_in_network(network: Network, image: str, design: Design) -> Pose:
     ...
     reseau.core.errors.UsageError: nowhere.png: is not an image of the network
     """
-    names = [name for name in (image, Path(image).name, Path(image).stem) if name in network.images]
-    rows = [network.images.index(name) for name in names]
-    rows += [k for k, file in enumerate(network.files) if file and Path(file).name == Path(image).name]
-    if not rows:
-        raise UsageError("is not an image of the network", where=image)
-    rotation, x0 = network.rotation[rows[0]], network.x0[rows[0]]
+    row = _row_in(network, image)
+    rotation, x0 = network.rotation[row], network.x0[row]
     if not np.isfinite([*rotation, *x0]).all():
         raise UsageError(
             "has no orientation in the network", where=image, do="use the result of `reseau bundle`"
@@ -473,6 +478,49 @@ def pose_in_network(network: Network, image: str, design: Design) -> Pose:
         )
     matrix = rotation_matrix(rotation) @ turn
     return Pose(matrix_to_vector(matrix), turn.T @ (scale * x0 - shift))
+
+
+def calibrated_by(camera: RayMap, network: Network, image: str) -> RayMap:
+    """The lens with its images where the calibrated camera of an image of a network has them.
+
+    Cameras behind windows, or with several sets of additional parameters, have no such mapping: then the lens
+    is returned as it is.
+
+    Parameters
+    ----------
+    camera : RayMap
+    network : Network
+    image : str
+        Its name, or that of its file.
+
+    Raises
+    ------
+    UsageError
+        When the image is missing.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> from reseau.optics.lenses import ThinLens
+    >>> thin = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (500.0, 400.0)))
+    >>> network = example_network()
+    >>> type(calibrated_by(thin, network, network.images[0])).__name__
+    'CalibratedLens'
+    """
+    own = network.cameras[network.camera_of[_row_in(network, image)]]
+    if network.refraction is not None or not own.has_plane_mapping:
+        return camera
+    return CalibratedLens(camera, own.plane_mapping())
+
+
+def _row_in(network: Network, image: str) -> int:
+    """Row of an image of a network, by its name or that of its file."""
+    names = [name for name in (image, Path(image).name, Path(image).stem) if name in network.images]
+    rows = [network.images.index(name) for name in names]
+    rows += [k for k, file in enumerate(network.files) if file and Path(file).name == Path(image).name]
+    if not rows:
+        raise UsageError("is not an image of the network", where=image)
+    return rows[0]
 
 
 def _measured(

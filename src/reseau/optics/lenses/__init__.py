@@ -2,6 +2,7 @@
 
 from .images import (
     AberratedLens,
+    CalibratedLens,
     LensCamera,
     PlaneTarget,
     RayImage,
@@ -39,6 +40,7 @@ __all__ = [
     "Aiming",
     "Air",
     "Aperture",
+    "CalibratedLens",
     "Cauchy",
     "Constant",
     "Layout",

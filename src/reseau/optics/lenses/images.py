@@ -24,6 +24,7 @@ from ...core.data import Array
 from ...core.errors import UsageError
 from ..formation import Outline
 from ..gridded import GriddedOutline
+from ..mapping import PlaneMapping
 from .paraxial import Paraxial
 from .prescription import Prescription
 from .pupils import Aiming, PupilElements
@@ -31,6 +32,7 @@ from .trace import Tracer
 
 __all__ = [
     "AberratedLens",
+    "CalibratedLens",
     "LensCamera",
     "PlaneTarget",
     "RayImage",
@@ -369,6 +371,45 @@ class AberratedLens(ThinLens):
 
 
 @dataclass(frozen=True, eq=False)
+class CalibratedLens:
+    """A lens whose images lie where a calibrated camera has them.
+
+    A calibration knows principal distance, principal point and distortion, also one that is not symmetric,
+    better than the design of the lens (Meid 1992, section 3.1.3). Places of images, and with them their
+    distortion, are those of the calibration; the rays around each place are those of the lens.
+
+    Parameters
+    ----------
+    camera : RayMap
+    mapping : PlaneMapping
+        From directions X/Z, Y/Z to pixels.
+
+    Examples
+    --------
+    >>> from reseau.optics import Brown, PixelGrid
+    >>> from reseau.optics.lenses import SensorPlane
+    >>> thin = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (49.5, 49.5)))
+    >>> calibrated = Brown(side="object", grid=PixelGrid(100, 100, (0.01, 0.01))).with_values({"c": 52.5})
+    >>> CalibratedLens(thin, calibrated).corresponding(np.array([[1.0, 0.0, 1000.0]]))
+    array([[54.75, 49.5 ]])
+    """
+
+    camera: RayMap
+    mapping: PlaneMapping
+
+    def corresponding(self, points: Array) -> Array:
+        """See :class:`RayMap`."""
+        if (points[:, 2] <= 0).any():
+            raise UsageError("a point of the object lies behind the lens")
+        return np.asarray(self.mapping(points[:, :2] / points[:, 2:]))
+
+    def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
+        """See :class:`RayMap`."""
+        xy, light = self.camera.spots(points, elements)
+        return xy + (self.corresponding(points) - self.camera.corresponding(points))[:, None], light
+
+
+@dataclass(frozen=True, eq=False)
 class PlaneTarget:
     """A plane target in space.
 
@@ -475,7 +516,8 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     emitted = np.abs(light.mean(axis=1) @ target.normal)
     coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, emitted, 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
-        why = camera.why_dark(target.centre) if isinstance(camera, LensCamera) else "it is not in the field"
+        lens = camera.camera if isinstance(camera, CalibratedLens) else camera
+        why = lens.why_dark(target.centre) if isinstance(lens, LensCamera) else "it is not in the field"
         raise UsageError(f"no light of the target reaches the sensor: {why}")
     # Elements without light remain, as points: images with other parameters have the same nodes.
     coefficients[share == 0] = 0.0
