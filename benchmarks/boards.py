@@ -1,13 +1,14 @@
 """Testfield and sheet in pictures of another program: what is found, errors, sigmas and processor time.
 
 Run from the checkout: ``RESEAU_DATA=… python benchmarks/boards.py [--target tf|sheet] [--data FOLDER]
-[--condition C …] [--each] [--others] [--worlds N]``. The pictures of ``independent/boards`` share neither the
-camera nor the formation of pixels with the project. Poses are pooled; with ``--each`` every picture has its
-own row. ``--others`` also measures the pictures of all other targets with the design: they must be declined.
-``--worlds`` draws and measures N sets of views, near and wide, with ``benchmarks/worlds/boards.py``.
-``--calibrate`` draws 12 views of the testfield for each of ``--seeds`` 20, calibrates the camera as
-``reseau calibrate`` does with its defaults, and compares the errors of its parameters with their sigmas.
-``--keep FOLDER`` keeps the pictures of the calibrations for the next run.
+[--condition C …] [--each] [--others] [--squares] [--worlds N]``. The pictures of ``independent/boards``
+share neither the camera nor the formation of pixels with the project. Poses are pooled; with ``--each``
+every picture has its own row. ``--others`` also measures the pictures of all other targets with the design:
+they must be declined. ``--squares`` cuts single squares with their lines from the pictures of the testfield,
+and measures each. ``--worlds`` draws and measures N sets of views, near and wide, with
+``benchmarks/worlds/boards.py``. ``--calibrate`` draws 12 views of the testfield for each of ``--seeds`` 20,
+calibrates the camera as ``reseau calibrate`` does with its defaults, and compares the errors of its
+parameters with their sigmas. ``--keep FOLDER`` keeps the pictures of the calibrations for the next run.
 
 A target counts as inside where its whole image, and two pixels more, lies in the picture and nothing hides
 it. Wrong is a position in error by more than 0.15 px and 5 sigma.
@@ -44,6 +45,7 @@ DECLINED = {"defoc3", "mirror"}
 ROUGH = {"jpeg60", "sharpened", "motion3", "motion6", "specular"}
 MARGIN_PX, LEAST_FOUND, WRONG_PX, WRONG_SIGMA = 2.0, 0.95, 0.15, 5.0
 NORMALISED, NORMALISED_ROUGH = (0.85, 1.2), (0.7, 1.25)
+SQUARE_MARGIN_PX = 8
 LABELS = {"tn": "near", "td": "near, distorted"}
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -155,6 +157,40 @@ def table(folder: Path, target: str, design: Any, conditions: list[str], each: b
                 line(name, [found], label in ROUGH)
     for label, done in parts.items():
         good &= line(label, done, label in ROUGH)
+    return good
+
+
+def squares(folder: Path, design: Any, conditions: list[str]) -> bool:
+    """Measure every square that lies in a picture with its four lines, cut out with a margin."""
+    front, _ = measurers("tf", design)
+    good, of = True, np.array(design.targets.square)
+    print(f"{'one square with its lines':26} {'read':>10}")
+    for name, condition, truth in pictures(folder, "tf"):
+        if condition not in (conditions or ["clean"]):
+            continue
+        frame, xy = read_image(folder / name), np.array(truth["xy"])
+        to_image: Any = cv2.findHomography(design.xy, xy)[0]
+        parts, read, misnumbered = [], 0, 0
+        count = 0
+        for number in np.unique(of):
+            ends = design.centres[number - 1] + design.pitch / 2 * np.array(
+                [[-1, -1], [-1, 1], [1, 1], [1, -1]]
+            )
+            corners = cv2.perspectiveTransform(ends[None].astype(np.float64), to_image)[0]
+            low = np.floor(corners.min(axis=0)).astype(int) - SQUARE_MARGIN_PX
+            high = np.ceil(corners.max(axis=0)).astype(int) + SQUARE_MARGIN_PX + 1
+            if (low < 0).any() or (high > [frame.width, frame.height]).any():
+                continue
+            count += 1
+            part = replace(frame, pixels=frame.pixels[low[1] : high[1], low[0] : high[0]])
+            found = measured(part, front, xy - low, of == number)
+            if isinstance(found, str):
+                good &= not found.startswith("RAISED")
+                continue
+            read, misnumbered = read + 1, misnumbered + int((np.hypot(*found.error.T) > 2).sum())
+            parts.append(found)
+        print(f"{name:26} {read:3} of {count:3}, {misnumbered} misnumbered")
+        good &= line(name, parts, rough=False) and not misnumbered if parts else False
     return good
 
 
@@ -278,6 +314,7 @@ def main() -> int:
     parser.add_argument("--condition", nargs="+", default=[], help="only these conditions")
     parser.add_argument("--each", action="store_true", help="a row for every picture")
     parser.add_argument("--others", action="store_true", help="pictures of other targets, too")
+    parser.add_argument("--squares", action="store_true", help="only single squares of the testfield")
     parser.add_argument("--worlds", type=int, default=0, help="sets of own views, drawn at 2 s each")
     parser.add_argument("--calibrate", action="store_true", help="calibrate from own views, and nothing else")
     parser.add_argument("--seeds", type=int, default=20, help="number of calibrations")
@@ -293,6 +330,9 @@ def main() -> int:
     if options.calibrate:
         seeds = range(options.first, options.first + options.seeds)
         return 0 if calibrations(folder / DESIGNS["tf"], seeds, options.keep) else 1
+    if options.squares:
+        path = folder / DESIGNS["tf"]
+        return 0 if squares(folder, parse_design(path.read_text(), path), options.condition) else 1
     for target in DESIGNS if options.target is None else (options.target,):
         path = folder / DESIGNS[target]
         design = parse_design(path.read_text(), path)

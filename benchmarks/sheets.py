@@ -1,9 +1,11 @@
 """Photographs of sheets and testfields of independent formation: what is found, errors and sigmas.
 
 Run from the checkout: ``python benchmarks/sheets.py [--target sheet|field] [--count 3] [--condition C …]
-[--large]``; see :mod:`worlds.sheets` for the conditions. ``--large`` measures one photograph of 20 megapixels
-of a sheet, and prints processor time and memory. A target counts as inside if its image is more than 2 px
-from the border and nothing in front of the sheet comes nearer than 2 px (to disks: 12 px from the centre).
+[--large] [--sizes]``; see :mod:`worlds.sheets` for the conditions. ``--large`` measures one photograph of 20
+megapixels of a sheet, and prints processor time and memory. ``--sizes`` measures testfields of decreasing
+size in the picture, and reads their squares with the true lines given, as far as the pixels of targets
+allow. A target counts as inside if its image is more than 2 px from the border and nothing in front of the
+sheet comes nearer than 2 px (to disks: 12 px from the centre).
 """
 
 from __future__ import annotations
@@ -13,18 +15,23 @@ import json
 import resource
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from boards import reaches
 from worlds.boards import Field
-from worlds.sheets import CONDITIONS, View, coded, views
+from worlds.sheets import CONDITIONS, Printed, View, coded, pose, views
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.designs import coded_testfield
-from reseau.io import ReseauDesign, parse_design
+from reseau.io import ReseauDesign, TestfieldDesign, parse_design
 from reseau.measure import measure_reseau
+from reseau.measure.testfield.lattice_fit import LatticeFit, refit
+from reseau.measure.testfield.lattice_mapping import started
+from reseau.measure.testfield.recognition import read_clusters
+from reseau.optics.formation import PixelResponse
 from reseau.procedures.target_measurement import measurer_of
 
 _MARGIN_PX, _CLEAR_PX = 2.0, 12.0
@@ -48,6 +55,34 @@ def measured(view: View, target: str) -> tuple[np.ndarray, np.ndarray, int, int,
     root = np.linalg.cholesky(found.cov[found.ok])
     scaled = np.linalg.solve(root, error[..., None])[..., 0]
     return error, scaled, int((found.ok & inside).sum()), int(inside.sum()), seconds
+
+
+def sizes(field: Printed, count: int) -> None:
+    """Measure testfields of decreasing size, and read their squares where the lines are known."""
+    design = parse_design(json.dumps(field.design()), Path("field"))
+    assert isinstance(design, TestfieldDesign)
+    lines = round(np.sqrt(len(design.centres)))
+    at, numbers = design.xy / design.pitch + lines / 2, np.arange(lines + 1)
+    for nearer in (0.5, 0.45, 0.4, 0.36, 0.33, 0.3, 0.26, 0.22):
+        for seed in range(count):
+            view = View(field, *pose(seed, field, nearer=nearer), seed=10 * seed)
+            pixels, (wide, high) = view.picture(), np.ptp(view.truth, axis=0)
+            straight: Any = cv2.findHomography(at, view.truth)[0]
+            mapping = refit(started(straight, 3, pixels.shape), at, view.truth, 0.03)
+            fit = LatticeFit(mapping, numbers, numbers, 0.0, len(at))
+            read = read_clusters(pixels.astype(np.float32), fit, design, view.blur, PixelResponse())
+            legible = 0 if isinstance(read, Failure) else sum(map(bool, read.decoded))
+            found = measured(view, "field")
+            text = f"declined: {found.reason}" if isinstance(found, Failure) else ""
+            if not isinstance(found, Failure):
+                error, scaled, count_in, inside, _ = found
+                text = f"{count_in} of {inside} targets, rms {np.sqrt((error**2).mean()):.4f} px, "
+                text += f"error/sigma {np.sqrt((scaled**2).mean()):.2f}"
+            print(
+                f"{wide:.0f} x {high:.0f} px, {legible} of {lines**2} squares legible with known lines: "
+                f"{text}",
+                flush=True,
+            )
 
 
 def large() -> None:
@@ -94,9 +129,13 @@ def main() -> None:
     parser.add_argument("--target", choices=("sheet", "field"), default="sheet")
     parser.add_argument("--count", type=int, default=3)
     parser.add_argument("--condition", nargs="*", default=list(CONDITIONS))
+    parser.add_argument("--sizes", action="store_true", help="only testfields of decreasing size")
     parser.add_argument("--large", action="store_true", help="only time and memory for 20 megapixels")
     arguments = parser.parse_args()
     sheet = coded() if arguments.target == "sheet" else Field(json.loads(coded_testfield().to_json()))
+    if arguments.sizes:
+        sizes(Field(json.loads(coded_testfield().to_json())), arguments.count)
+        return
     if arguments.large:
         large()
         return
