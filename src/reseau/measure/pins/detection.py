@@ -23,11 +23,12 @@ from ...core.failure import Code
 from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
-from .arcs import ArcMatches, ends_of, reach_of
+from .arcs import ArcMatches
 from .echoes import Echoes, find_echoes, ground_of
 from .forms import match_arcs
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
 from .screenlight import blur_of_wires, falloff
+from .shapes import ends_of, reach_of
 
 if TYPE_CHECKING:
     from ...core.overlay import Layer

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
 from ..matching import MatchOptions
-from .arcs import BEAM, FURTHER, LINE, ArcMatches, Form, Windows, ends_of, lines_with
+from .arcs import ArcMatches, Windows
+from .details import details_of
 from .echoes import Echoes
+from .hidden_ends import integrate_over_hidden_ends
+from .shapes import BEAM, FURTHER, LINE, Form, ends_of, lines_with
 
 __all__ = ["match_arcs"]
 
@@ -39,6 +42,8 @@ _PLAUSIBLE = 3.0
 """Largest median deviation from a form, over its prior standard deviation."""
 _SHARED = 6
 """Minimum number of clear echoes that determine what all have in common; for their tilt, twice as many."""
+_QUADRATIC = 18
+"""Minimum number of clear echoes that show how the tilt depends on the squares of coordinates."""
 _LEAST_SCATTER = {"softness": 0.01, "tilt": 0.002, "fading": 0.01, "tapering": 0.01, "thickening": 0.01}
 """Smallest scatter between echoes that is assumed."""
 _BLUR_SHARE = 0.25
@@ -49,16 +54,6 @@ _ORDER = 0.7
 """Uncertainty of the order in which a line fades and its ends become soft: 0 or 1, and the fading itself."""
 _HALF_HIDDEN = 0.5
 """Hidden share of a flank from which the position of an arc depends on the other flank."""
-_END_HIDDEN = 0.15
-"""Hidden share of an end of a line from which its place is integrated over."""
-_BEYOND_PX, _PLACES = 24.0, 25
-"""Largest displacement of a hidden end, and number of its places; as many again among the likely ones."""
-_SCALES_PX = 0.1, 6.0
-"""Bounds of the displacement up to which the places are equidistant, not in a ratio."""
-_LINEAR = 0.15
-"""Standard deviation of an end over its softness up to which its likelihood is normal."""
-_UNLIKELY = 25.0
-"""Costs over the least of places that are left out."""
 
 
 def match_arcs(
@@ -107,7 +102,11 @@ def match_arcs(
         found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
     shift = _correct_for_details(work, found, form, blur)
     if "length" in form.sigma:
-        _integrate_over_hidden_ends(work, found, form, start)
+        ends = integrate_over_hidden_ends(work, found, form, start)
+        # What displaces a line along itself is known to first order only, where an end is hidden.
+        axes = np.stack([np.cos(found.arcs.tilt[ends]), np.sin(found.arcs.tilt[ends])], axis=1)
+        along = (shift[ends] * axes).sum(axis=1, keepdims=True) * axes
+        found.cov[ends] += along[:, :, None] * along[:, None, :]
     found.xy[:] -= shift
     if "fading" in form.sigma:
         # Whether a line fades before its ends become soft, or after, shifts its middle by g s²/a.
@@ -133,7 +132,7 @@ def _correct_for_details(
         return shift
     unknown = np.sqrt(_BLUR_SHARE) * np.minimum(arcs.across, ends_of(arcs)[1])
     widths = unknown if blur is None else np.full(len(arcs), blur[0])
-    less = work.details(rows, found, form, widths)
+    less = details_of(work, rows, found, form, widths)
     clear = found.t[rows] > _CLEAR
     information = float(less.information[clear].sum()) + 1 / _COURSE[1] ** 2
     course = (float(less.score[clear].sum()) + (_COURSE[0] - 1) / _COURSE[1] ** 2) / information
@@ -280,8 +279,13 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
         else:
             columns[name] = np.full(len(soft), mean[0])
     if len(rows) >= 2 * _SHARED:
-        # The arcs are parallel but for the distortion of display and camera.
-        place = np.column_stack([np.ones(len(arcs)), found.xy / 1000])
+        # The arcs are parallel but for the distortion of display and camera: shear turns them alike, the
+        # quadratic terms linearly with their place, and a radial distortion with the product of coordinates.
+        x, y = ((found.xy - found.xy[rows].mean(axis=0)) / 1000).T
+        terms = [np.ones_like(x), x, y, x * y]
+        if len(rows) >= _QUADRATIC:
+            terms += [x * x, y * y]
+        place = np.column_stack(terms)
         mean, scatter = _population(arcs.tilt[rows], found.sigma["tilt"][rows], place[rows])
         sigma["tilt"] = max(scatter, _LEAST_SCATTER["tilt"])
         usual = place @ mean
@@ -316,48 +320,5 @@ def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, floa
             break
         scatter = float(np.sqrt(grown))
     # The mean is uncertain, too.
-    return coefficients, float(np.sqrt(scatter**2 * (1 + 1 / len(values)) + 1 / (1 / sigma**2).sum()))
-
-
-def _integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, start: Arcs) -> None:
-    """Replace positions of lines of which one end is hidden by their mean over all places of that end.
-
-    The likelihood of the visible pixels as a function of the place e of the hidden end is far from normal.
-    For each e all other unknowns are adjusted anew; the middle has the mean m(e) and the covariance C(e)
-    then. With the weights w of the likelihoods, mean and covariance are Σwm and Σw(C + (m − Σwm)(m − Σwm)ᵀ).
-    """
-    hidden = work.hidden_ends(found) > _END_HIDDEN
-    soft = ends_of(found.arcs)[1]
-    for row in np.flatnonzero(found.converged & hidden.any(axis=1)).tolist():
-        tilt = found.arcs.tilt[row]
-        along = np.array([np.cos(tilt), np.sin(tilt)])
-        if hidden[row].all():
-            found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
-            continue
-        side = 1.0 if hidden[row, 1] else -1.0
-        end = 2 * float(np.sqrt(along @ found.cov[row] @ along))
-        if end < _LINEAR * soft[row]:
-            continue
-        scale = float(np.clip(end, *_SCALES_PX))
-        most = np.arcsinh(_BEYOND_PX / scale)
-        steps = scale * np.sinh(np.linspace(-most, most, _PLACES))
-        cost, _, _ = work.with_end_at(found, row, side, steps, form, start)
-        if not np.isfinite(cost).any():
-            found.converged[row] = False
-            continue
-        likely = np.flatnonzero(cost < cost.min() + _UNLIKELY)
-        first, last = steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)].tolist()
-        finer = np.linspace(first, last, _PLACES)
-        cost, middle, cov = work.with_end_at(found, row, side, finer, form, start)
-        seen = np.isfinite(cost)
-        if not seen.any():
-            found.converged[row] = False
-            continue
-        cost, middle, cov = cost[seen], middle[seen], cov[seen]
-        weight = np.exp(-0.5 * (cost - cost.min()))
-        weight /= weight.sum()
-        off = middle - weight @ middle
-        found.xy[row] = weight @ middle
-        found.cov[row] = np.einsum("n,nij->ij", weight, cov) + np.einsum("n,ni,nj->ij", weight, off, off)
-        if likely[0] == 0 or likely[-1] == len(steps) - 1:
-            found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
+    share = design.shape[1] / len(values)
+    return coefficients, float(np.sqrt(scatter**2 * (1 + share) + design.shape[1] / (1 / sigma**2).sum()))
