@@ -19,6 +19,7 @@ from . import (
     archive,
     bench,
     blurred,
+    blurred_network,
     bundle,
     bundle_compare,
     calibrate,
@@ -61,6 +62,7 @@ app.command()(refine.refine)
 app.command()(apply.apply)
 app.command()(export.export)
 app.command()(bundle.bundle)
+app.command("blurred")(blurred_network.blurred_network)
 app.command()(calibrate.calibrate)
 app.command()(bundle_compare.compare)
 

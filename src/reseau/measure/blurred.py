@@ -20,6 +20,7 @@ from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
+import scipy.spatial
 from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, Mask, Rows
@@ -59,6 +60,8 @@ _UNCHANGED = 1e-4
 _DAMPING, _STUCK = 1e-2, 1e6
 """First and largest damping of these corrections (Levenberg and Marquardt)."""
 _SEEN = 0.95
+_APART = 2.0
+"""Widths of the remaining blur by which images must be apart."""
 _BEGINNING = 0.75
 """Least correlation at whole pixels."""
 _ALIKE = 0.8
@@ -499,6 +502,7 @@ class _Run:
         rings, elements, images = self._images()
         self.elements, self.images = elements, images
         seen = np.array([k for k, image in enumerate(images) if image is not None], dtype=np.intp)
+        seen = self._apart(seen)
         start = np.full((len(self.ids), 2), np.nan)
         for k in seen:
             start[k] = self._found(int(k), cast(RayImage, images[k]))
@@ -575,6 +579,23 @@ class _Run:
             self.why[k] = Reason("outside the frame", Code.OUTSIDE)
             return None
         return image
+
+    def _apart(self, seen: Rows) -> Rows:
+        """Targets whose predicted images touch no other; the reason is noted for those that do."""
+        images = [cast(RayImage, self.images[k]) for k in seen]
+        if not images:
+            return seen
+        centre = np.array([image.point + image.centroid for image in images])
+        around = [image.outline.xy - image.centroid for image in images]
+        reach = np.array([np.hypot(*xy.T).max() for xy in around]) + _APART * self.options.psf_px
+        touching: dict[int, int] = {}
+        for a, b in scipy.spatial.cKDTree(centre).query_pairs(2 * float(reach.max())):
+            if np.hypot(*(centre[a] - centre[b])) < reach[a] + reach[b]:
+                touching.setdefault(a, b)
+                touching.setdefault(b, a)
+        for a, b in touching.items():
+            self.why[seen[a]] = Reason(f"its image touches that of {self.ids[seen[b]]}", Code.OVERLAPPING)
+        return seen[[a not in touching for a in range(len(seen))]]
 
     def _half(self, image: RayImage) -> int:
         """Half side of the window of a target."""

@@ -1,0 +1,178 @@
+"""`reseau blurred`: the blurred targets of a whole network, by rays through windows and lens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .common import SensorFile, corrected, progress, read_frame, required, say
+
+if TYPE_CHECKING:
+    from ..bundle import Network
+    from ..core.data import Frame
+    from ..io.network import Network1
+    from ..procedures.blurred_network import BlurredNetwork
+
+__all__ = ["blurred_network"]
+
+_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
+
+
+def blurred_network(
+    network: Annotated[
+        Path,
+        typer.Argument(help="reseau-network/1 with approximate image coordinates, windows and media."),
+    ],
+    images: Annotated[
+        Path,
+        typer.Option("--images", help="Folder with the photographs, named as the images of the network."),
+    ],
+    targets: Annotated[
+        Path,
+        typer.Option("--targets", "-t", help="Targets, reseau-targets/1: shape, size and direction."),
+    ],
+    lens: Annotated[
+        Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="Folder to write: every round, the final network, its result, a report."
+        ),
+    ],
+    focus: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="Distance from the front of the lens at which objects in air are sharp (mm). "
+            "Default: the image plane of the lens file.",
+        ),
+    ] = None,
+    pitch: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=1000, help="Pitch of the pixels (µm), if the lens file has no sensor."),
+    ] = None,
+    f_number: Annotated[
+        float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
+    ] = None,
+    psf: Annotated[
+        float,
+        typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
+    ] = 0.5,
+    search: Annotated[
+        float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
+    ] = 6.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 6,
+    sensor: SensorFile = None,
+) -> None:
+    """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
+    from ..bundle import ResultDocument
+    from ..core.errors import UsageError
+    from ..core.provenance import Provenance, sha256_of
+    from ..exchange import calibration_files, read_lens, read_network
+    from ..io import write_whole
+    from ..io.network import Network1
+    from ..io.targets import SpaceTargets
+    from ..measure.blurred import BlurredOptions
+    from ..procedures.blurred import lens_camera
+    from ..procedures.blurred_network import NetworkOptions, measure_blurred_network
+    from ..report.blurred_network import blurred_network_report
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError("exists already", where=out, do="give a new or an empty folder")
+    document, optics = Network1.read(network), read_lens(lens)
+    content = read_network(network)
+    space = SpaceTargets.read(targets)
+    frames: dict[str, Frame] = {}
+    for image, file in _photographs(images, content).items():
+        frames[image] = corrected(read_frame(file), sensor)
+    if not frames:
+        raise UsageError("has no photograph of an image of the network", where=images)
+    cameras = {
+        camera.id: lens_camera(
+            optics, (camera.width, camera.height), pitch_um=pitch, distance=focus, f_number=f_number
+        )
+        for camera in content.cameras
+    }
+    matching = BlurredOptions(
+        polarity=space.polarity,
+        psf_px=psf,
+        search_px=search,
+        fill=1.0 if optics.sensor is None else optics.sensor.fill,
+    )
+    with progress("measuring", 5) as step:
+        found = required(
+            measure_blurred_network(
+                content, frames, space, cameras, NetworkOptions(matching, rounds), watch=step
+            ),
+            network,
+        )
+    inputs = [network, *calibration_files(network), targets, lens]
+    provenance = Provenance(
+        {file.name: sha256_of(file) for file in inputs},
+        {"focus": focus, "pitch": pitch, "f-number": f_number, "psf": psf, "search": search},
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    for number, entry in enumerate(found.rounds):
+        ResultDocument.of(entry.result, provenance=provenance).write(out / f"round-{number}.json")
+    ResultDocument.of(found.result, provenance=provenance).write(out / "result.json")
+    _final(document, found).write(out / "network.json")
+    write_whole(out / "report.html", blurred_network_report(found, title=network.name, provenance=provenance))
+    _say(found, out)
+
+
+def _photographs(folder: Path, network: Network) -> dict[str, Path]:
+    """Files by image: that of the network, or one of the image's name."""
+    from ..core.errors import UsageError
+
+    if not folder.is_dir():
+        raise UsageError("is not a folder", where=folder)
+    files = {file.name: file for file in sorted(folder.iterdir()) if file.suffix.lower() in _SUFFIXES}
+    found: dict[str, Path] = {}
+    for image, name in zip(network.images, network.files, strict=True):
+        wanted = [Path(name).name] if name else []
+        wanted += [image, *(image + suffix for suffix in _SUFFIXES)]
+        file = next((files[name] for name in wanted if name in files), None)
+        if file is not None:
+            found[image] = file
+    return found
+
+
+def _final(document: Network1, found: BlurredNetwork) -> Network1:
+    """The document of the network with the final image coordinates."""
+    import numpy as np
+
+    from ..io.network import ObservationColumns
+
+    network = found.network
+    sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
+    rho = network.cov[:, 0, 1] / sigma.prod(axis=1)
+    columns = ObservationColumns(
+        image=tuple(network.images[i] for i in network.image_of),
+        point=tuple(network.points[j] for j in network.point_of),
+        x=tuple(network.xy[:, 0].tolist()),
+        y=tuple(network.xy[:, 1].tolist()),
+        sx=tuple(sigma[:, 0].tolist()),
+        sy=tuple(sigma[:, 1].tolist()),
+        rho=tuple(rho.tolist()),
+    )
+    return document.model_copy(update={"observations": columns})
+
+
+def _say(found: BlurredNetwork, out: Path) -> None:
+    for number, entry in enumerate(found.rounds):
+        what = "ordinary coordinates" if number == 0 else f"round {number}"
+        counts = (
+            ""
+            if number == 0
+            else f"; {int(entry.replaced.sum())} by rays (mean shift {entry.shift_px:.2g} px), "
+            f"{int(entry.kept.sum())} kept, {int(entry.declined.sum())} left out"
+        )
+        say(f"{what}: sigma0 {entry.result.sigma0:.4g}, residuals {entry.rms_px():.3g} px rms{counts}\n")
+    for remark in found.notes:
+        say(f"warning: {remark}\n")
+    for remark in found.result.warnings:
+        say(f"warning: {remark}\n")
+    say(f"{out}: result.json, network.json and report.html are those of round {found.chosen}\n")

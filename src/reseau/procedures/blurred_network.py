@@ -1,0 +1,370 @@
+"""Blurred targets of a whole network: Meid's procedure (1992, section 3, figure 3).
+
+Approximate image coordinates give the orientation by a multi-media bundle adjustment. From it follow the
+images of all targets by rays through windows and lens; matching them with the photographs gives better image
+coordinates, these a better orientation, and so on until sigma0 no longer falls. Where a target is sharp and
+its ordinary coordinates do not differ significantly, these are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..bundle import Network, Result, adjust_network
+from ..bundle import Options as BundleOptions
+from ..core.data import Array, Frame, Mask
+from ..core.display import Display
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure, Remark
+from ..io.targets import SpaceTargets
+from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from ..optics.lenses import LensCamera, PlaneTarget, behind_windows
+
+__all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
+
+_SPACING_PX = 0.6
+"""Largest distance of nodes along outlines."""
+_DIFFERS = 9.21
+"""Quantile 0.99 of χ² with two degrees of freedom: a larger difference of coordinates is significant."""
+_SHARP_PX = 1.0
+"""Blur (rms radius) up to which ordinary coordinates may be kept."""
+_FALLS = 0.99
+"""Another round must lower sigma0 to less than this part."""
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options of the procedure.
+
+    Parameters
+    ----------
+    matching : BlurredOptions
+        Measurement of the targets; its polarity is that of the targets.
+    rounds : int
+        Largest number of rounds.
+    keep_sharp : bool
+        Whether ordinary coordinates of sharp targets are kept where they do not differ significantly.
+    bundle : reseau.bundle.Options
+        Options of the adjustments.
+
+    Examples
+    --------
+    >>> NetworkOptions(rounds=3).keep_sharp
+    True
+    """
+
+    matching: BlurredOptions = field(default_factory=BlurredOptions)
+    rounds: int = 6
+    keep_sharp: bool = True
+    bundle: BundleOptions = field(default_factory=BundleOptions)
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise UsageError("must be at least 1", where="NetworkOptions.rounds")
+
+
+@dataclass(frozen=True, eq=False)
+class BlurredRound:
+    """One round: the adjustment, and what the measurement before it changed.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment; its network has the image coordinates of the round.
+    measured : mapping of str to BlurredResult
+        By image; empty in the first round, which has the ordinary coordinates.
+    replaced, kept, declined : ndarray of bool (n,)
+        Image points of the first network: measured by rays; with their ordinary coordinates; left out
+        because they are blurred and could not be measured.
+    shift_px : float
+        Mean distance of the replaced coordinates from the ordinary ones.
+
+    Examples
+    --------
+    See :class:`BlurredNetwork`.
+    """
+
+    result: Result
+    measured: Mapping[str, BlurredResult]
+    replaced: Mask
+    kept: Mask
+    declined: Mask
+    shift_px: float
+
+    def rms_px(self, rows: Mask | None = None) -> float:
+        """Root mean square of the residuals of image coordinates, px; of some rows of its network only."""
+        v = self.result.residuals
+        v = v if rows is None else v[rows]
+        return float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else float("nan")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BlurredNetwork(Display):
+    """A network whose blurred targets were measured by rays; truthy.
+
+    Parameters
+    ----------
+    rounds : tuple of BlurredRound
+        The adjustment of the ordinary coordinates, and every round after it.
+    chosen : int
+        The round with the smallest sigma0 of those that were measured by rays: the result.
+    notes : tuple of Remark
+        What a user should know.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> none = np.zeros(160, dtype=bool)
+    >>> first = BlurredRound(adjust_network(example_network()), {}, none, ~none, none, 0.0)
+    >>> BlurredNetwork((first,), 0)
+    <BlurredNetwork: 1 round, sigma0 1.005>
+    """
+
+    rounds: tuple[BlurredRound, ...]
+    chosen: int
+    notes: tuple[Remark, ...] = ()
+
+    @property
+    def result(self) -> Result:
+        """The final adjustment."""
+        return self.rounds[self.chosen].result
+
+    @property
+    def network(self) -> Network:
+        """The final network: an ordinary one."""
+        return self.result.network
+
+    def _facts(self) -> list[tuple[str, str]]:
+        count = len(self.rounds)
+        return [(f"{count} round{'s' * (count != 1)}", ""), ("sigma0", f"{self.result.sigma0:.4g}")]
+
+
+def measure_blurred_network(
+    network: Network,
+    frames: Mapping[str, Frame],
+    targets: SpaceTargets,
+    cameras: LensCamera | Mapping[str, LensCamera],
+    options: NetworkOptions | None = None,
+    *,
+    watch: Callable[[str], None] | None = None,
+) -> BlurredNetwork | Failure:
+    """Measure the blurred targets of a network, and adjust it.
+
+    Parameters
+    ----------
+    network : Network
+        With approximate image coordinates of the targets, measured in any way, and their covariances; its
+        refraction describes windows and media.
+    frames : mapping of str to Frame
+        Photographs by the names of the images; images without one keep their coordinates.
+    targets : SpaceTargets
+        Shape, size and direction of the targets, by the names of the points; points without one keep their
+        coordinates.
+    cameras : LensCamera, or mapping of str to LensCamera
+        Lens and sensor, of all cameras or by their names; in the medium next to the camera.
+    options : NetworkOptions, optional
+    watch : callable, optional
+        Called with a line about what is done.
+
+    Returns
+    -------
+    BlurredNetwork or Failure
+        A failure where the first network cannot be adjusted, or no target can be measured.
+
+    Raises
+    ------
+    UsageError
+        When the unit of the network is not that of a length, or a camera has no lens.
+
+    Notes
+    -----
+    Position, direction and windows of each round are those of its adjustment. The principal point of the
+    lens is put where the camera of the network images the direction of the view. A target that is blurred
+    and cannot be measured by rays is left out: its ordinary coordinates would be biased.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> from reseau.io.targets import TargetColumns
+    >>> from reseau.optics.lenses import AIR, Prescription, SensorPlane, glass, in_order
+    >>> lens = Prescription(in_order([(0.1, 1.0, glass("N-BK7")), (-0.1, 9.0, AIR)]), 0, 0.5)
+    >>> camera = LensCamera(lens, SensorPlane((0.01, 0.01), (319.5, 239.5)))
+    >>> one = TargetColumns(id=("none",), shape=("disk",), size=(0.1,), normal=((0.0, 0.0, 1.0),))
+    >>> targets = SpaceTargets(unit="m", polarity="dark", targets=one)
+    >>> print(measure_blurred_network(example_network(), {}, targets, camera))
+    no target of the network could be measured by rays
+    """
+    chosen, say = options or NetworkOptions(), watch or (lambda line: None)
+    first = adjust_network(network, chosen.bundle)
+    if isinstance(first, Failure):
+        return first
+    run = _Run(network, frames, targets, cameras, chosen)
+    none = np.zeros(len(network.xy), dtype=bool)
+    rounds = [BlurredRound(first, {}, none, ~none, none, 0.0)]
+    say(f"ordinary coordinates: sigma0 {first.sigma0:.4g}")
+    for number in range(1, chosen.rounds + 1):
+        found = run.round(rounds[-1].result)
+        if isinstance(found, Failure):
+            if number == 1:
+                return found
+            break
+        rounds.append(found)
+        say(
+            f"round {number}: {int(found.replaced.sum())} by rays, {int(found.kept.sum())} kept, "
+            f"{int(found.declined.sum())} left out; sigma0 {found.result.sigma0:.4g}"
+        )
+        if number > 1 and found.result.sigma0 >= _FALLS * rounds[-2].result.sigma0:
+            break
+    sigma0 = [entry.result.sigma0 for entry in rounds[1:]]
+    return BlurredNetwork(tuple(rounds), 1 + int(np.argmin(sigma0)), run.notes(rounds))
+
+
+class _Run:
+    """What stays the same in all rounds."""
+
+    def __init__(
+        self,
+        network: Network,
+        frames: Mapping[str, Frame],
+        targets: SpaceTargets,
+        cameras: LensCamera | Mapping[str, LensCamera],
+        options: NetworkOptions,
+    ) -> None:
+        unit = {"mm": 1.0, "m": 1000.0}.get(network.unit)
+        if unit is None:
+            raise UsageError(f"the network is in {network.unit!r}, lenses are in mm", do="use m or mm")
+        self.network, self.frames, self.targets, self.options = network, frames, targets, options
+        self.unit_mm = unit
+        self.row = {name: k for k, name in enumerate(targets.targets.id)}
+        self.cameras: dict[str, LensCamera] = {}
+        for camera in network.cameras:
+            lens = cameras if isinstance(cameras, LensCamera) else cameras.get(camera.id)
+            if lens is None:
+                raise UsageError("has no lens", where=f"camera {camera.id}")
+            self.cameras[camera.id] = lens
+        self.xyz = network.xyz.copy()
+        self.matching = replace(options.matching, polarity=targets.polarity)
+
+    def round(self, last: Result) -> BlurredRound | Failure:
+        """Measure all targets with the images that follow from an adjustment, and adjust again."""
+        network, n = self.network, len(self.network.xy)
+        xy, cov = network.xy.copy(), network.cov.copy()
+        replaced, declined = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        measured = {}
+        # Points that were left out stay where they were: their images may touch others.
+        usable = last.fit.usable.points[:, None]
+        self.xyz = np.where(usable, last.fit.values.xyz, self.xyz)
+        for i, image in enumerate(network.images):
+            if image not in self.frames or not last.fit.usable.images[i]:
+                continue
+            rows = [
+                k
+                for k in np.flatnonzero(network.image_of == i).tolist()
+                if network.points[network.point_of[k]] in self.row
+                and np.isfinite(self.xyz[network.point_of[k]]).all()
+            ]
+            if not rows:
+                continue
+            found = self._measured(last, i, rows)
+            measured[image] = found
+            for k, own in enumerate(rows):
+                if self._stays(found, k, own):
+                    continue
+                if found.ok[k]:
+                    xy[own], cov[own], replaced[own] = found.xy[k], found.cov[k], True
+                else:
+                    declined[own] = True
+        if not replaced.any():
+            return Failure("no target of the network could be measured by rays", Code.NOT_FOUND)
+        start = replace(network, xy=xy, cov=cov).select(~declined)
+        result = adjust_network(start, self.options.bundle)
+        if isinstance(result, Failure):
+            return result
+        shift = np.hypot(*(xy - network.xy)[replaced].T)
+        return BlurredRound(result, measured, replaced, ~replaced & ~declined, declined, float(shift.mean()))
+
+    def _measured(self, last: Result, i: int, rows: list[int]) -> BlurredResult:
+        network, values = self.network, last.fit.values
+        camera = self._camera(last, i)
+        rotation, x0 = values.rotation[i], values.x0[i]
+        names, planes = [], []
+        for own in rows:
+            j = network.point_of[own]
+            k = self.row[network.points[j]]
+            centre = self.unit_mm * (rotation @ (self.xyz[j] - x0))
+            axes = rotation @ self.targets.axes(k)
+            outline = self.targets.outline(k, self._spacing(camera, centre, axes) / self.targets.unit_mm)
+            scaled = replace(
+                outline,
+                xy=self.targets.unit_mm * outline.xy,
+                dxy=self.targets.unit_mm * outline.dxy,
+            )
+            names.append(network.points[j])
+            planes.append(PlaneTarget(centre, axes, scaled))
+        return measure_blurred(self.frames[network.images[i]], camera, names, planes, self.matching)
+
+    def _camera(self, last: Result, i: int) -> LensCamera:
+        """Lens and windows of an image, with its principal point where the adjustment has it."""
+        network, values = self.network, last.fit.values
+        c = int(network.camera_of[i])
+        entry = network.cameras[c]
+        mapping = entry.bare_mapping(values.cameras[c, : len(entry.names)])
+        lens = self.cameras[entry.id]
+        middle = mapping(np.zeros((1, 2)))[0]
+        sensor = replace(lens.sensor, principal_px=(float(middle[0]), float(middle[1])))
+        lens = replace(lens, sensor=sensor)
+        if network.refraction is None:
+            return lens
+        return behind_windows(
+            lens, network.refraction.with_values(values.refraction), int(network.refraction.path_of[i]),
+            values.rotation[i], values.x0[i], unit_mm=self.unit_mm,
+        )  # fmt: skip
+
+    def _spacing(self, camera: LensCamera, centre: Array, axes: Array) -> float:
+        """Distance of nodes, mm, that is some tenths of a pixel in the image."""
+        near = camera.corresponding(np.stack([centre, centre + axes[:, 0], centre + axes[:, 1]]))
+        scale = float(np.sqrt(abs(np.linalg.det(near[1:] - near[0]))))
+        # A target out of the field of the lens: it will not be measured.
+        return _SPACING_PX / scale if np.isfinite(scale) and scale > 0 else 1.0
+
+    def _stays(self, found: BlurredResult, k: int, own: int) -> bool:
+        """Whether a target keeps its ordinary coordinates."""
+        sharp = bool(found.blur_px[k] <= _SHARP_PX)
+        if not found.ok[k]:
+            return sharp
+        if not (sharp and self.options.keep_sharp):
+            return False
+        difference = found.xy[k] - self.network.xy[own]
+        both = found.cov[k] + self.network.cov[own]
+        return bool(difference @ np.linalg.solve(both, difference) <= _DIFFERS)
+
+    def notes(self, rounds: list[BlurredRound]) -> tuple[Remark, ...]:
+        """Return what a user should know."""
+        last, found = rounds[-1], list[Remark]()
+        missing = [name for name in self.network.images if name not in self.frames]
+        if missing:
+            found.append(
+                Remark(
+                    f"no photograph of {', '.join(missing)}: ordinary coordinates are kept",
+                    Code.PREREQUISITE_MISSING,
+                )
+            )
+        if last.declined.any():
+            rows = np.flatnonzero(last.declined)
+            network = self.network
+            names = [
+                f"{network.points[network.point_of[k]]} in {network.images[network.image_of[k]]}"
+                for k in rows[:8]
+            ]
+            more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+            found.append(
+                Remark(
+                    f"{len(rows)} blurred targets were not measured and are left out: "
+                    f"{', '.join(names)}{more}",
+                    Code.DECLINED,
+                )
+            )
+        return tuple(found)

@@ -1,0 +1,119 @@
+"""Meid's procedure over a network: blurred targets behind a port, measured by rays, better than before."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.core.errors import UsageError
+from reseau.core.failure import Failure
+from reseau.io.targets import SpaceTargets
+from reseau.procedures.blurred_network import (
+    BlurredNetwork,
+    NetworkOptions,
+    measure_blurred_network,
+)
+
+from . import underwater
+
+
+@cache
+def drawn() -> underwater.Project:
+    return underwater.project()
+
+
+@cache
+def measured() -> BlurredNetwork:
+    project = drawn()
+    found = measure_blurred_network(
+        project.network, project.frames, project.targets, underwater.CAMERA, NetworkOptions(rounds=2)
+    )
+    assert isinstance(found, BlurredNetwork)
+    return found
+
+
+def test_corresponding_rays_are_measured_where_centroids_are_biased() -> None:
+    project, found = drawn(), measured()
+    last = found.rounds[found.chosen]
+    off = (found.network.xy - project.true[~last.declined])[last.replaced[~last.declined]]
+    assert len(off) == 27
+    ordinary = project.network.xy - project.true
+    assert np.sqrt((ordinary**2).mean()) > 0.08
+    assert np.sqrt((off**2).mean()) < 0.02
+
+
+def test_residuals_and_errors_of_the_points_fall() -> None:
+    project, found = drawn(), measured()
+    before, after = (entry.result for entry in (found.rounds[0], found.rounds[found.chosen]))
+    assert found.rounds[found.chosen].rms_px() < 0.4 * found.rounds[0].rms_px()
+    errors = [np.sqrt(np.nanmean((r.points.xyz - project.xyz) ** 2)) for r in (before, after)]
+    assert errors[1] < 0.4 * errors[0]
+    assert found.chosen > 0
+
+
+def test_every_coordinate_is_accounted_for_in_every_round() -> None:
+    found = measured()
+    for entry in found.rounds:
+        counts = entry.replaced.astype(int) + entry.kept + entry.declined
+        assert (counts == 1).all()
+        assert len(entry.result.network.xy) == int((~entry.declined).sum())
+
+
+def test_images_without_a_photograph_keep_their_coordinates() -> None:
+    """Here only one photograph is given: the images without one keep theirs."""
+    project = drawn()
+    true = replace(project.network, xy=project.true)
+    found = measure_blurred_network(
+        true, {"i0": project.frames["i0"]}, project.targets, underwater.CAMERA, NetworkOptions(rounds=1)
+    )
+    assert isinstance(found, BlurredNetwork)
+    assert "no photograph of i1, i2" in found.notes[0].text
+    last = found.rounds[1]
+    off = (found.network.xy - project.true[~last.declined])[last.kept[~last.declined]]
+    assert len(off) > 15
+    assert np.abs(off).max() == 0.0
+
+
+def test_targets_whose_blurred_images_touch_are_left_out_and_named() -> None:
+    found = measured()
+    last = found.rounds[-1]
+    assert "2 blurred targets were not measured and are left out: t2 in i0, t5 in i0" in found.notes[0].text
+    assert last.measured["i0"].why[2] == "its image touches that of t5"
+
+
+def test_a_network_in_an_unknown_unit_and_a_camera_without_lens_are_refused() -> None:
+    project = drawn()
+    with pytest.raises(UsageError, match="mm"):
+        measure_blurred_network(replace(project.network, unit="inch"), {}, project.targets, underwater.CAMERA)
+    with pytest.raises(UsageError, match="has no lens"):
+        measure_blurred_network(project.network, {}, project.targets, {})
+
+
+def test_without_any_photograph_nothing_is_measured() -> None:
+    project = drawn()
+    found = measure_blurred_network(project.network, {}, project.targets, underwater.CAMERA)
+    assert isinstance(found, Failure)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"size": [0.0] * 12}, "size"),
+        ({"normal": [[0.0, 0.0, 0.0]] * 12}, "normal is zero"),
+        ({"id": ["t"] * 12}, "duplicate id"),
+        ({"shape": ["cone"] * 12}, "shape"),
+        ({"size": [1.0]}, "1 entries"),
+        ({"side": [[0.0, 0.0, 1.0]] * 12, "normal": [[0.0, 0.0, 1.0]] * 12}, "direction of its normal"),
+    ],
+)
+def test_what_are_no_targets_is_refused_in_one_line(change: dict[str, Any], words: str) -> None:
+    content = json.loads(drawn().targets.to_json())
+    content["targets"] |= change
+    with pytest.raises(Exception, match=words) as error:
+        SpaceTargets.parse(json.dumps(content), where="targets.json")
+    assert "\n" not in str(error.value)
