@@ -81,6 +81,19 @@ def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path:
     assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
 
 
+def test_a_focus_that_was_stated_wrong_is_estimated(files, tmp_path: Path, reseau: Run) -> None:
+    block = network(tmp_path / "network.json", POSE.x0.tolist())
+    status, out, err = reseau(
+        "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
+        "--network", block, "--focus", 460, "--focus-sigma", 0.5, "-o", tmp_path / "m.json",
+    )  # fmt: skip
+    assert status == 0, err
+    stated = focused(lens(), 460.0).surfaces[-1].vertex - lens().surfaces[-1].vertex
+    found = float(out.split("the focus was estimated: ")[1].split(" ±")[0])
+    assert abs(found + stated[2]) < 0.02
+    assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
+
+
 def principal_distance() -> float:
     """Of the lens, mm."""
     near = LensCamera(lens(), SENSOR.plane()).corresponding(np.array([[0.0, 0, 480.0], [1.0, 0, 480.0]]))

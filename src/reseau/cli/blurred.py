@@ -54,6 +54,15 @@ def blurred(
             "Default: the image plane of the lens file.",
         ),
     ] = None,
+    focus_sigma: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-4,
+            max=10,
+            help="Standard deviation of the place of the image plane (mm): it is then estimated from all "
+            "targets.",
+        ),
+    ] = None,
     pitch: Annotated[
         float | None,
         typer.Option(
@@ -125,7 +134,9 @@ def blurred(
         target = target.from_behind()
 
     def measured(_: Frame) -> BlurredResult | Failure:
-        found = measure_blurred_frame(frame, target, view, pose, options, sharp=sharp)
+        found = measure_blurred_frame(
+            frame, target, view, pose, options, sharp=sharp, focus_sigma_mm=focus_sigma
+        )
         if isinstance(found, Failure):
             return found
         if figure is not None:
@@ -133,7 +144,7 @@ def blurred(
             from ..core.files import write_whole
             from ..report.blurred import blurred_figure
 
-            drawn = blurred_figure(frame, view, found.targets, found.measured, fill=options.fill)
+            drawn = blurred_figure(frame, found.camera, found.targets, found.measured, fill=options.fill)
             write_whole(figure, to_bytes(drawn, kind[1:], dpi=150))
         return found.measured
 

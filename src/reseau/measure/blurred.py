@@ -53,7 +53,7 @@ _LEAST_SHIFT = 0.002
 """… or by less than this many pixels."""
 _STEP = 0.05
 """Step of a varied parameter for the motion of the nodes, in its standard deviations."""
-_ROUNDS = 40
+_ROUNDS = 20
 """Largest number of corrections of common parameters."""
 _UNCHANGED = 1e-4
 """Share of the sum of squares below which corrections end."""
@@ -402,7 +402,7 @@ def estimate_optics(
     array([0.1])
     """
     # The same rays and pixels throughout, so that sums of squares can be compared.
-    options, halves = replace(options, varied=None, rings=options.rings or _RINGS[1]), dict[int, int]()
+    options, halves = replace(options, varied=None, rings=options.rings or _RINGS[0]), dict[int, int]()
     prior, values = np.diag(1 / np.square(varied.sigma)), np.zeros(len(varied.names))
     equations = partial(_Common.of, frame, tuple(targets), varied, options, halves)
     at = equations(values)

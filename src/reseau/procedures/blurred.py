@@ -7,6 +7,7 @@ longer change.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..exchange import Lens
 from ..io import ReseauDesign, TestfieldDesign
-from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from ..measure.blurred import BlurredOptions, BlurredResult, Varied, estimate_optics, measure_blurred
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import (
@@ -46,6 +47,7 @@ __all__ = [
     "measure_blurred_frame",
     "orient_by_rays",
     "pose_in_network",
+    "refocused",
     "targets_of",
 ]
 
@@ -79,6 +81,8 @@ class BlurredFrame:
         The targets in camera axes.
     rms_px : float
         Root mean square of the residuals of the orientation; NaN where it was given.
+    camera : RayMap
+        The lens, with the focus that was estimated.
 
     Examples
     --------
@@ -93,6 +97,7 @@ class BlurredFrame:
     pose: Pose
     targets: tuple[PlaneTarget, ...]
     rms_px: float
+    camera: RayMap
 
 
 def focused(lens: Prescription, distance: float) -> Prescription:
@@ -326,6 +331,7 @@ def measure_blurred_frame(
     options: BlurredOptions | None = None,
     *,
     sharp: Measurer | None = None,
+    focus_sigma_mm: float | None = None,
 ) -> BlurredFrame | Failure:
     """Measure the blurred targets of a plane design in a frame.
 
@@ -344,10 +350,17 @@ def measure_blurred_frame(
     options : BlurredOptions, optional
     sharp : callable, optional
         Measures the targets as if they were sharp; by default as :func:`measurer_of` does.
+    focus_sigma_mm : float, optional
+        Standard deviation of the place of the image surface of a lens: it is estimated from all targets.
 
     Returns
     -------
     BlurredFrame or Failure
+
+    Raises
+    ------
+    UsageError
+        When a focus is to be estimated of a map of rays that is not a lens.
 
     Examples
     --------
@@ -360,16 +373,25 @@ def measure_blurred_frame(
     """
     options = options or BlurredOptions(polarity=design.polarity)
     if pose is not None:
-        return _some(_described(_measured(frame, design, camera, pose, options, np.nan)))
+        sharpened = _focused(frame, design, camera, pose, options, focus_sigma_mm)
+        if isinstance(sharpened, Failure):
+            return sharpened
+        found = _measured(frame, design, sharpened[0], pose, options, np.nan)
+        return _some(_described(_noted(found, _moved_by(*sharpened[1:]))))
     first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
-    points, before = first.points, np.full((len(design.ids), 2), np.inf)
+    points, before, moved = first.points, np.full((len(design.ids), 2), np.inf), 0.0
     for k in range(_ROUNDS):
         oriented = orient_by_rays(camera, design, points)
         if isinstance(oriented, Failure):
             return oriented
-        found = _measured(frame, design, camera, oriented[0], options, oriented[1])
+        sharpened = _focused(frame, design, camera, oriented[0], options, focus_sigma_mm)
+        if isinstance(sharpened, Failure):
+            return sharpened
+        view, by, sigma = sharpened
+        moved += by
+        found = _measured(frame, design, view, oriented[0], options, oriented[1])
         if found.measured.found < _FEWEST:
             return Failure(
                 f"{found.measured.found} of {len(design.ids)} targets are like their images by rays: "
@@ -379,12 +401,71 @@ def measure_blurred_frame(
         change = np.abs(found.measured.predicted - before)
         if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
             break
-        points, before = found.measured.points, found.measured.predicted
+        points, before, camera = found.measured.points, found.measured.predicted, view
     # What is said of deviations concerns the targets measured as if they were sharp.
     notes = [remark for remark in first.remarks if remark.code != Code.INCONSISTENT]
-    return _some(
-        _described(replace(found, measured=replace(found.measured, notes=(*notes, *found.measured.notes))))
-    )
+    return _some(_described(_noted(found, (*notes, *_moved_by(moved, sigma)))))
+
+
+def refocused(camera: RayMap, by_mm: float) -> RayMap:
+    """A lens with its image surface moved along the light.
+
+    Parameters
+    ----------
+    camera : RayMap
+        A lens, also with the places of a calibration.
+    by_mm : float
+
+    Raises
+    ------
+    UsageError
+        When it is not a lens.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
+    >>> moved = refocused(LensCamera(lens, SensorPlane((0.01, 0.01), (0.0, 0.0))), 0.5)
+    >>> float(moved.lens.surfaces[-1].vertex[2])
+    102.5
+    """
+    if isinstance(camera, CalibratedLens):
+        return replace(camera, camera=refocused(camera.camera, by_mm))
+    if not isinstance(camera, LensCamera):
+        raise UsageError("has no image surface to be moved", where=type(camera).__name__)
+    image = camera.lens.surfaces[-1]
+    return replace(camera, lens=camera.lens.moved((by_mm * image.axes[:, 2]).tolist()))
+
+
+def _focused(
+    frame: Frame,
+    design: Design,
+    camera: RayMap,
+    pose: Pose,
+    options: BlurredOptions,
+    sigma_mm: float | None,
+) -> tuple[RayMap, float, float] | Failure:
+    """The lens with the focus estimated from all targets, its displacement and sigma; or as it is."""
+    if sigma_mm is None:
+        return camera, 0.0, 0.0
+    focus = Varied(("focus_mm",), (sigma_mm,), lambda by: refocused(camera, float(by[0])))
+    found = estimate_optics(frame, targets_of(design, pose, camera)[1], focus, options)
+    if isinstance(found, Failure):
+        return found
+    return found.camera, float(found.values[0]), float(found.sigma[0])
+
+
+def _moved_by(by_mm: float, sigma_mm: float) -> tuple[Remark, ...]:
+    """A remark on the estimated focus, if it was."""
+    if sigma_mm == 0:
+        return ()
+    text = f"the focus was estimated: {by_mm:.4f} ± {sigma_mm:.4f} mm behind the stated image surface"
+    return (Remark(text, Code.BLURRED),)
+
+
+def _noted(found: BlurredFrame, remarks: Sequence[Remark]) -> BlurredFrame:
+    """The frame with remarks in front of its own."""
+    return replace(found, measured=replace(found.measured, notes=(*remarks, *found.measured.notes)))
 
 
 def _some(found: BlurredFrame) -> BlurredFrame | Failure:
@@ -528,4 +609,4 @@ def _measured(
 ) -> BlurredFrame:
     names, targets = targets_of(design, pose, camera)
     measured = measure_blurred(frame, camera, names, targets, options)
-    return BlurredFrame(measured, pose, tuple(targets), rms_px)
+    return BlurredFrame(measured, pose, tuple(targets), rms_px, camera)
