@@ -18,7 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-__all__ = ["WAVELENGTHS", "WEIGHTS", "Lens", "Target", "energy_diameter", "light", "noisy"]
+__all__ = [
+    "ROWS",
+    "SELLMEIER",
+    "WAVELENGTHS",
+    "WEIGHTS",
+    "Lens",
+    "Target",
+    "add_shares",
+    "energy_diameter",
+    "light",
+    "noisy",
+    "smoothed",
+    "spiral",
+]
 
 Array = NDArray[Any]
 
@@ -161,21 +174,22 @@ class Lens:
         stop, fitted to rays.
         """
         k = np.arange(400) + 0.5
-        wide = 1.08 * self.pupil_radius * np.sqrt(k / len(k))[:, None] * _spiral(k)
+        wide = 1.08 * self.pupil_radius * np.sqrt(k / len(k))[:, None] * spiral(k)
         start = point * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
         for _ in range(2):  # the second time about the principal ray
             through = np.concatenate([wide, np.full((len(wide), 1), self.pupil_z)], axis=1)
             rays = self._traced(np.tile(start, (len(k), 1)), through - start, wavelength_nm, "stop")
             at_stop = np.stack([rays.x, rays.y], axis=1) / self.stop_radius
             fit = np.linalg.lstsq(_terms(at_stop)[0], wide, rcond=None)[0]
-            wide = _terms(1.08 * np.sqrt(k / len(k))[:, None] * _spiral(k))[0] @ fit
+            wide = _terms(1.08 * np.sqrt(k / len(k))[:, None] * spiral(k))[0] @ fit
         k = np.arange(count) + 0.5
-        terms, by_x, by_y = _terms(np.sqrt(k / count)[:, None] * _spiral(k))
+        terms, by_x, by_y = _terms(np.sqrt(k / count)[:, None] * spiral(k))
         dx, dy = by_x @ fit, by_y @ fit
         return terms @ fit, np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
 
 
-def _spiral(k: Array) -> Array:
+def spiral(k: Array) -> Array:
+    """Unit vectors (n, 2) of Fibonacci's spiral: radii of the root of (k + ½) / n fill a disk evenly."""
     angle = k * np.pi * (3 - np.sqrt(5))
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -206,17 +220,50 @@ def energy_diameter(lens: Lens, point: Array, share: float = 0.8) -> float:
     return 2 * float(away[order][np.searchsorted(inside, share)])
 
 
+def add_shares(
+    image: Array, maps: Array, places: Array, low: Array, side: int, square: bool, half: float, weights: Array
+) -> None:
+    """Add, to every sample, the weights of the points of the pupil through which it sees the target.
+
+    Parameters
+    ----------
+    image : ndarray (r, c)
+        Samples, `side` per pixel.
+    maps : ndarray (p, 2, 6)
+        Polynomials of the second degree from places of the sensor to those of the target's plane.
+    places : ndarray (p, n, 2)
+        Places of the sensor between which the target lies.
+    low : ndarray (2,)
+        Upper left corner of the samples.
+    half : float
+        Radius, or half the side, of the target.
+    """
+    # A sequence that fills the square evenly: the average of places within samples is their centre.
+    jitter = (0.5 + np.arange(len(maps))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0
+    size = np.array(image.shape[::-1])
+    first = np.clip(np.floor((places.min(axis=1) - low) * side).astype(int) - 1, 0, size)
+    last = np.clip(np.ceil((places.max(axis=1) - low) * side).astype(int) + 1, 0, size)
+    _add(image, maps, first, last, low, 1 / side, square, half, weights, jitter)
+
+
 @numba.njit(cache=True)
 def _add(
-    image: Any, maps: Any, low: Any, step: float, square: bool, half: float, weights: Any, jitter: Any
+    image: Any,
+    maps: Any,
+    first: Any,
+    last: Any,
+    low: Any,
+    step: float,
+    square: bool,
+    half: float,
+    weights: Any,
+    jitter: Any,
 ) -> None:
-    """Add, to every sample, the weights of the points of the pupil through which it sees the target."""
-    rows, columns = image.shape
     for p in range(len(maps)):
         a, b = maps[p, 0], maps[p, 1]
-        for r in range(rows):
+        for r in range(first[p, 1], last[p, 1]):
             y = low[1] + (r + jitter[p, 1]) * step
-            for c in range(columns):
+            for c in range(first[p, 0], last[p, 0]):
                 x = low[0] + (c + jitter[p, 0]) * step
                 u = a[0] + a[1] * x + a[2] * y + a[3] * x * x + a[4] * x * y + a[5] * y * y
                 v = b[0] + b[1] * x + b[2] * y + b[3] * x * x + b[4] * x * y + b[5] * y * y
@@ -248,7 +295,7 @@ def light(
     grid = 0.75 * target.size * np.array([[u, v] for u in (-1, 0, 1) for v in (-1, 0, 1)])
     points = target.centre + grid @ target.axes.T
     normal = np.cross(*target.axes.T)
-    maps, weights = [], []
+    maps, weights, places = [], [], []
     for weight, wavelength in zip(WEIGHTS, WAVELENGTHS, strict=True):
         pupil, area = lens.pupil_points(target.centre, wavelength, count // len(WAVELENGTHS))
         # The stop is where the pupil ends; rays of other points of the target may miss its edge by a little.
@@ -258,6 +305,7 @@ def light(
         xy = xy.reshape(9, len(pupil), 2)
         # What each place of the sensor sees, relative to the middle of the window for the sake of the digits.
         x, y = xy[..., 0] - columns.mean(), xy[..., 1] - rows.mean()
+        places.append(np.stack([x.T, y.T], axis=-1))
         terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).transpose(1, 0, 2)
         turned = np.swapaxes(terms, 1, 2)
         found = np.linalg.solve(turned @ terms, turned @ np.broadcast_to(grid, (len(pupil), 9, 2)))
@@ -270,13 +318,16 @@ def light(
     margin = int(np.ceil(5 * sigma)) + 1
     samples = np.zeros(((len(rows) + 2 * margin) * side, (len(columns) + 2 * margin) * side))
     seen, share = np.concatenate(maps), np.concatenate(weights)
-    # A sequence that fills the square evenly: the average of places within samples is their centre.
-    jitter = (0.5 + np.arange(len(seen))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0
-    _add(samples, seen, low - margin, 1 / side, target.shape == "square", target.size / 2, share, jitter)
-    samples /= share.sum()
+    square = target.shape == "square"
+    add_shares(samples, seen, np.concatenate(places), low - margin, side, square, target.size / 2, share)
+    return smoothed(samples / share.sum(), side, sigma, margin)
+
+
+def smoothed(samples: Array, side: int, sigma: float, margin: int) -> Array:
+    """Pixels of samples, `side` per pixel, after a Gaussian of sigma pixels; without a margin of pixels."""
     samples = gaussian_filter(samples, sigma * side, truncate=5)
-    pixels = samples.reshape(len(rows) + 2 * margin, side, len(columns) + 2 * margin, side).mean(axis=(1, 3))
-    return pixels[margin:-margin, margin:-margin]
+    r, c = (n // side for n in samples.shape)
+    return np.asarray(samples.reshape(r, side, c, side).mean(axis=(1, 3))[margin:-margin, margin:-margin])
 
 
 def noisy(image: Array, contrast: float, decibels: float, rng: np.random.Generator) -> Array:
