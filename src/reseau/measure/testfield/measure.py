@@ -41,9 +41,9 @@ _FEW, _AGAIN = 0.05, 4
 _BESIDE_PX = 0.025
 """Distance of targets from their predictions, exceeded by one coordinate in ten, for which another round is
 made: the light of lines and neighbours was formed in wrong places."""
-_SAME_LIGHT = 0.005
-"""Relative change of contrast and sharpness for which another round is made: where neighbours blend, the
-light of each depends on that of the others."""
+_SAME_LIGHT, _SAME_PSF_PX = 0.005, 0.01
+"""Relative change of contrast, and change of sharpness in pixels, for which another round is made: where
+neighbours blend, the light of each depends on that of the others."""
 _RESHAPED_PX, _REACH, _REPEATED = 0.015, 0.6, 1.05
 """Displacement of an outline by the mapping through all targets from which a target is matched again; reach
 of targets relative to their size; multiple of the residuals that may remain then."""
@@ -377,8 +377,10 @@ class _Measurement:
         large = good & scene.design.large[wanted]
         amplitude = scene.light.at(found.xy[large])[1]
         depth = found.contrast[large] * (found.level[large] if scene.design.polarity == "dark" else 1.0)
-        change = np.median(depth / amplitude) - 1, np.median(found.psf_px[large]) / scene.psf_px - 1
-        return not large.any() or bool(np.abs(change).max() < _SAME_LIGHT)
+        if not large.any():
+            return True
+        wider = float(np.median(found.psf_px[large])) - scene.psf_px
+        return abs(float(np.median(depth / amplitude)) - 1) < _SAME_LIGHT and abs(wider) < _SAME_PSF_PX
 
     def _reshaped(
         self, wanted: Rows, found: Matches, why: Array, predicted: Array
