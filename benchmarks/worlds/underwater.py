@@ -404,7 +404,7 @@ def taken(
         weights.append(weight * np.abs(fit[:, 1, 0] * fit[:, 2, 1] - fit[:, 1, 1] * fit[:, 2, 0]))
         places.append(place)
     share, where = np.concatenate(weights), np.concatenate(places)
-    margin, side = int(np.ceil(5 * PSF)) + 1, 4
+    margin, side = int(np.ceil(5 * PSF)) + 1, 12 if sharp else 4
     low = np.floor(where.min(axis=(0, 1))) - margin
     size = (np.ceil(where.max(axis=(0, 1))) + margin - low).astype(int) + 1
     samples = np.zeros((size[1] * side, size[0] * side))
