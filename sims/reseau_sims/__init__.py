@@ -9,6 +9,7 @@ from .reflectors import Reflectors
 from .scanner import Scanner, Video
 from .screen import Screen
 from .testfield import FieldBench, FieldTruth, Stain, Station, paper_stations
+from .water import Water
 from .world import Truth, World
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "Station",
     "Truth",
     "Video",
+    "Water",
     "World",
     "film",
     "paper_stations",

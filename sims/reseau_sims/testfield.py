@@ -34,13 +34,18 @@ from reseau.optics.targets import target_outline
 
 from .photograph import Photograph
 from .streams import stream
+from .water import Water
 
 __all__ = ["FieldBench", "FieldTruth", "Stain", "Station", "paper_stations"]
 
 PITCH_MM, PIXELS, C_MM, DISTANCE_MM = 0.027, 240, 57.5, 5000.0
 """The paper's camera: table 1 and section 2.2."""
+WET_C_MM, WET_DISTANCE_MM = 8.0, 1000.0
+"""Camera under water: the board is as large in the frame as in air, and rays are refracted by up to 8°."""
 JITTER_PX = 0.0086
 """Row jitter by which the bound of x is 1.3 × that of y, over all targets recorded at right angles."""
+_OUTSIDE_PX = 60.0
+"""Distance from the frame beyond which no target is drawn."""
 _SPACING_PX = 0.7
 """Distance of nodes on an outline in widths of the point-spread function."""
 
@@ -182,6 +187,8 @@ class FieldBench:
         Tilt of the axis of the stage that lifts the board: x and y in the system of the board (rad).
     stage_sigma_mm : float
         Standard deviation of the true height of the stage about its reading.
+    water : Water, optional
+        Port of the camera and the water between it and the board; by default air.
 
     Examples
     --------
@@ -225,6 +232,12 @@ class FieldBench:
     waves_mm: float = 0.0
     stage_tilt: tuple[float, float] = (0.0, 0.0)
     stage_sigma_mm: float = 0.0
+    water: Water | None = None
+
+    def submerged(self, water: Water) -> FieldBench:
+        """The bench in a tank: a camera of 8 mm in a housing, 1 m in front of the testfield."""
+        camera = self.camera.with_values({"c": WET_C_MM})
+        return replace(self, water=water, camera=camera, distance_mm=WET_DISTANCE_MM)
 
     def distorted(self, edge_px: float) -> FieldBench:
         """The bench with a lens whose radial distortion displaces the middles of the edges by `edge_px`.
@@ -258,18 +271,32 @@ class FieldBench:
     def truth(self, station: Station) -> FieldTruth:
         """True positions of all targets in a recording, and the mapping that forms it."""
         pose, surface = self.pose(station), self.surface(station)
+        view = self._view(station)
+        xy = self.design.xy
+        return FieldTruth(self.design.ids, surface(xy)[0], view(xy)[0], pose, view)
+
+    def _view(
+        self, station: Station, colour_nm: float | None = None
+    ) -> Callable[[Array], tuple[Array, Array]]:
+        """The mapping that forms a recording, in light of one colour."""
+        pose, surface = self.pose(station), self.surface(station)
 
         def view(xy: Array) -> tuple[Array, Array]:
             points, slope = surface(xy)
-            seen = project(self.camera, pose, points)
-            image, jacobian = seen.xy.copy(), seen.d_point @ slope
+            if self.water is None:
+                seen = project(self.camera, pose, points)
+                image, jacobian = seen.xy.copy(), seen.d_point @ slope
+            else:
+                place = (points - pose.x0) @ pose.matrix.T
+                ray = self.water.directions(place, colour_nm)
+                image, by_ray, _ = self.camera.derivatives(ray.xy)
+                jacobian = by_ray @ ray.d_point @ pose.matrix @ slope
             if self.mirrored:
                 image[:, 0] = self.sensor.width - 1 - image[:, 0]
                 jacobian[:, 0] *= -1
             return image, jacobian
 
-        xy = self.design.xy
-        return FieldTruth(self.design.ids, surface(xy)[0], view(xy)[0], pose, view)
+        return view
 
     def inside(self, truth: FieldTruth, margin_px: float) -> Mask:
         """Targets (n,) whose centre is in the frame, at least `margin_px` from its edges."""
@@ -288,13 +315,16 @@ class FieldBench:
     def light(self, station: Station, row_shifts: Array | None = None) -> Array:
         """Light on each pixel, (height, width), in grey values and without noise."""
         shape = (self.sensor.height, self.sensor.width)
-        view = self.truth(station).view
+        colours = (None,) if self.water is None else self.water.colours
         share = np.zeros(shape)
-        for outline in self._outlines():
-            image = outline.mapped(view).oriented()
-            for place, weight in zip(*self.photograph.kernel(), strict=True):
-                moved = Outline(image.xy + place, image.dxy)
-                share += weight * draw(moved, shape, self.psf_px, self.response, row_shifts)
+        for colour in colours:
+            view = self._view(station, colour)
+            for outline in self._outlines(view):
+                image = outline.mapped(view).oriented()
+                for place, weight in zip(*self.photograph.kernel(), strict=True):
+                    moved = Outline(image.xy + place, image.dxy)
+                    drawn = draw(moved, shape, self.psf_px, self.response, row_shifts)
+                    share += weight / len(colours) * drawn
         if self.design.polarity == "bright":
             share = 1 - share
         even = illumination(
@@ -334,11 +364,14 @@ class FieldBench:
 
         return surface
 
-    def _outlines(self) -> list[Outline]:
-        """Outlines of targets and lines in the plane of the board, in batches of equal shape."""
+    def _outlines(self, view: Callable[[Array], tuple[Array, Array]]) -> list[Outline]:
+        """Outlines of seen targets and of lines in the plane of the board, in batches of equal shape."""
         spacing = _SPACING_PX * self.psf_px * self._mm_per_px()
         targets, xy = self.design.targets, self.design.xy
         there = np.array([name not in self.missing for name in targets.id])
+        if self.water is not None:  # rays through water take time: none to targets well outside of the frame
+            at, size = view(xy)[0], np.array([self.sensor.width, self.sensor.height])
+            there &= ((at > -_OUTSIDE_PX) & (at < size + _OUTSIDE_PX)).all(axis=1)
         kinds: dict[tuple[str, float, float], list[int]] = {}
         for k in np.flatnonzero(there):
             kinds.setdefault((targets.shape[k], targets.size[k], targets.angle[k]), []).append(int(k))
@@ -362,7 +395,8 @@ class FieldBench:
     def _mm_per_px(self) -> float:
         """Size of a pixel on a board perpendicular to the axis."""
         assert self.camera.grid is not None
-        return float(self.distance_mm / (self.camera.values[0] * self.camera.grid.pixels_per_mm[0]))
+        longer = 1.0 if self.water is None else self.water.index
+        return float(self.distance_mm / (longer * self.camera.values[0] * self.camera.grid.pixels_per_mm[0]))
 
     def _stained(self, light: Array, stain: Stain) -> Array:
         rows, columns = np.indices(light.shape)

@@ -16,6 +16,7 @@ from reseau.core.errors import BenchError, ConnectionLost, FormatError, InputErr
 from reseau.instruments import Oscilloscope, Turntable, UltrasonicScanner
 from reseau_sims import Reflectors
 from reseau_sims.serving import Fault, SimulatedBench
+from reseau_sims.serving.bench import serve
 
 HEAD = 'schema = "reseau-bench/1"\n'
 TABLE = '[instruments.table]\ndriver = "zaber"\naddress = "tcp://127.0.0.1:1"\n'
@@ -176,6 +177,30 @@ def test_sim_simulates_a_plane_testfield_on_request(monkeypatch: pytest.MonkeyPa
     for flat in ([], ["--flat"]):
         assert run(["bench", "sim", "--seconds", "0.01", *flat]) == 0
     assert [each.laboratory.field.bend_mm > 0 for each in made] == [True, False]
+
+
+def test_sim_puts_a_port_and_water_before_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[SimulatedBench] = []
+
+    def bench(seed: int, **options: Any) -> SimulatedBench:
+        made.append(serve(seed, **options))
+        return made[-1]
+
+    monkeypatch.setattr("reseau.capture.plugin", lambda group, name: bench)
+    water = ["--water", "--port-distance", "80", "--port-tilt", "2", "--temperature", "25"]
+    assert run(["bench", "sim", "--seconds", "0.01", *water]) == 0
+    assert run(["bench", "sim", "--seconds", "0.01"]) == 0
+    assert [each.laboratory.field.water is not None for each in made] == [True, False]
+    assert made[1].refraction == ""
+    text = HEAD + '[instruments.camera]\ndriver = "v4l2"\naddress = "a"\n' + made[0].refraction
+    entry = BenchFile.parse_toml(text, where="bench.toml").instruments["camera"].refraction
+    assert entry is not None
+    port = entry.windows[0].parameters
+    assert (port["distance"], port["thickness"]) == (80.0, 12.0)
+    assert port["tilt_X"] == pytest.approx(np.tan(np.deg2rad(2.0)), abs=1e-6)
+    with pytest.raises(FormatError, match="windows"):
+        BenchFile.parse_toml(text.replace('shape = "plane"', 'shape = "cone"'), where="bench.toml")
+    assert run(["bench", "sim", "--water", "--camera", "screen"]) == 2
 
 
 def test_list_shows_found_instruments_and_why_a_search_failed(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, Self, get_args
 
@@ -12,7 +14,9 @@ from numpy.typing import NDArray
 from reseau.core.errors import UsageError
 
 from ..laboratory import AXES, Laboratory
+from ..streams import stream
 from ..testfield import FieldBench
+from ..water import Water
 from ..world import World
 from .bk import BkScanner
 from .compactpulser import CompactPulser
@@ -104,6 +108,9 @@ class SimulatedBench:
         See :class:`~reseau_sims.laboratory.Laboratory`.
     flat : bool
         Whether the testfield is a plane in front of a lens with distortion.
+    water : Water, optional
+        Puts the testfield under water and the camera in a housing, with another lens and closer; the port as
+        designed. As made, it differs from this by tolerances that are drawn from the seed.
     in_process : bool
         Whether the camera is in this process even if Aravis is installed.
 
@@ -111,6 +118,8 @@ class SimulatedBench:
     ----------
     toml : str
         ``bench.toml`` for the instruments.
+    refraction : str
+        The part of a ``bench.toml`` about the port and the water before the camera; empty in air.
     laboratory : Laboratory
         Common simulated world.
     scripts : dict
@@ -121,7 +130,7 @@ class SimulatedBench:
     Raises
     ------
     UsageError
-        If the table, oscilloscope or scene does not exist.
+        If the table, oscilloscope or scene does not exist, or there is water before another scene.
 
     Examples
     --------
@@ -139,6 +148,7 @@ class SimulatedBench:
         camera: SceneName | None = None,
         repeatable: bool = False,
         flat: bool = False,
+        water: Water | None = None,
         in_process: bool = False,
     ) -> None:
         for what, known, asked in (
@@ -150,7 +160,15 @@ class SimulatedBench:
                 raise UsageError(
                     f"is not a simulated {what}", where=asked, do=f"choose from {', '.join(known)}"
                 )
-        field = FieldBench(seed=seed, bend_mm=0.0).distorted(_DISTORTION_PX) if flat else None
+        if water is not None and camera == "screen":
+            raise UsageError("there is water before the testfield only", where="water")
+        field = FieldBench(seed=seed)
+        self.refraction = ""
+        if water is not None:
+            field = field.submerged(water.made(stream(seed, "water")))
+            self.refraction = water.toml()
+        if flat:
+            field = replace(field, bend_mm=0.0).distorted(_DISTORTION_PX)
         self.laboratory = laboratory = Laboratory(World.standard(seed), field, repeatable=repeatable)
         self._pulser = CompactPulser()
         scope = Oscilloscope(family, lambda: laboratory.picture(*_SCREEN), self._channel)
@@ -193,7 +211,8 @@ class SimulatedBench:
             return ""
         served = GigeCamera(body, wait_s=_PATIENCE_S)
         stack.callback(served.close)
-        return _CAMERA.format(address=served.address, width=first.width, height=first.height)
+        entry = _CAMERA.format(address=served.address, width=first.width, height=first.height)
+        return entry + self.refraction
 
     def _table(self, kind: TableKind) -> Machine:
         """Create the controllers of the table, and connect them to the axes of the laboratory."""
@@ -244,14 +263,16 @@ def _axis_entry(kind: TableKind, name: str) -> str:
     return f"{name} = {{{where}, low = {_LOW}, high = {_HIGH[name]}{unit}}}\n"
 
 
-def serve(seed: int = 0, **options: Any) -> SimulatedBench:
+def serve(seed: int = 0, *, water: Mapping[str, Any] | None = None, **options: Any) -> SimulatedBench:
     """Create a simulated bench; entry point ``bench``.
 
     Parameters
     ----------
     seed : int
         Seed of the world.
+    water : mapping, optional
+        Arguments of :class:`~reseau_sims.water.Water`: testfield under water.
     **options
         Further arguments of :class:`SimulatedBench`.
     """
-    return SimulatedBench(seed, **options)
+    return SimulatedBench(seed, water=None if water is None else Water(**water), **options)

@@ -29,6 +29,7 @@ from pydantic import Field
 from ..core.errors import BenchError, FormatError, ReseauError, SettingError, UsageError
 from ..instruments import Identity, Instrument
 from ..io import Document, Strict, read_text
+from ..io.refraction import RefractionEntry
 from .lock import BenchLock
 
 __all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
@@ -117,6 +118,9 @@ class InstrumentEntry(Strict):
         Lowest and highest value of settings, narrower than those of the instrument.
     options : dict
         Arguments of the driver.
+    refraction : RefractionEntry, optional
+        For a camera: windows and media between it and its object, as in ``reseau-network/1``. All its images
+        are seen through all windows in their order.
 
     Examples
     --------
@@ -129,6 +133,7 @@ class InstrumentEntry(Strict):
     settings: dict[str, float | int | str] = Field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
+    refraction: RefractionEntry | None = None
 
 
 class BenchFile(Document):

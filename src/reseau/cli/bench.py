@@ -88,6 +88,21 @@ def sim(
         bool,
         typer.Option("--flat", help="Plane testfield. Default: bent by its mount, as in the paper."),
     ] = False,
+    water: Annotated[
+        bool, typer.Option("--water", help="Testfield under water, camera in a housing with a plane port.")
+    ] = False,
+    port_distance: Annotated[
+        float, typer.Option(min=1.0, max=200.0, help="Distance of the port from the camera (mm).")
+    ] = 60.0,
+    port_thickness: Annotated[
+        float, typer.Option(min=0.1, max=100.0, help="Thickness of the port (mm).")
+    ] = 12.0,
+    port_tilt: Annotated[
+        float, typer.Option(min=-15.0, max=15.0, help="Tilt of the port about the y-axis (degrees).")
+    ] = 0.0,
+    temperature: Annotated[
+        float, typer.Option(min=2.0, max=28.0, help="Temperature of the water (°C), and so its index.")
+    ] = 18.0,
     seconds: Annotated[float, typer.Option(min=0.0, help="Running time (s); 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print a bench.toml for them."""
@@ -100,6 +115,11 @@ def sim(
         writable(out)
     options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None}
     options |= {"repeatable": repeatable, "flat": flat}
+    if water:
+        options["water"] = {
+            "distance_mm": port_distance, "thickness_mm": port_thickness, "tilt_deg": (0.0, port_tilt),
+            "temperature_c": temperature,
+        }  # fmt: skip
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
         if camera and "[instruments.camera]" not in bench.toml:
             typer.echo("no camera: Aravis or PyGObject is not installed", err=True)

@@ -36,8 +36,10 @@ from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
+from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
+from ..optics.refraction import RefractedRays, Refraction
 from .target_measurement import Measurer, measured_in_order, measurer_of
 from .z_stage import Heights
 
@@ -57,6 +59,7 @@ __all__ = [
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
+_NARROW = 1e-3
 
 
 class PlaneDesign(Protocol):
@@ -152,6 +155,9 @@ class CalibrationOptions:
         Number of processes for the measurement.
     heights : Heights, optional
         Heights of the target on a z-stage.
+    refraction : RefractionEntry, optional
+        Windows and media between the camera, whose name is ``camera``, and the target. The calibration is
+        that of the camera in air.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -162,6 +168,7 @@ class CalibrationOptions:
     level: float | None = None
     workers: int = 1
     heights: Heights | None = None
+    refraction: RefractionEntry | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -317,8 +324,8 @@ def calibrate_camera(
     Raises
     ------
     UsageError
-        When two photographs have the same name or different sizes, the size is not known, or a point to leave
-        out was not measured.
+        When two photographs have the same name or different sizes, the size is not known, a point to leave
+        out was not measured, or windows and media contradict each other.
     """
     options = options or CalibrationOptions()
     measured, declined, size = _measured(frames, measure, size, options.workers)
@@ -332,8 +339,11 @@ def calibrate_camera(
         raise UsageError(
             "is not known without a photograph", where="size of the images", do="give width and height"
         )
-    camera = first_camera(measured, design, size, model or CameraOptions())
-    network = network_of(measured, design, camera)
+    refraction = None
+    if options.refraction is not None:
+        refraction = options.refraction.refraction(tuple(measured), ("camera",) * len(measured))
+    camera = first_camera(measured, design, size, model or CameraOptions(), _magnification(refraction))
+    network = replace(network_of(measured, design, camera), refraction=refraction)
     if options.heights is not None:
         network = options.heights.lifted(network)
     if options.control is not None:
@@ -459,10 +469,32 @@ def network_of(
     )
 
 
+def _magnification(refraction: Refraction | None) -> float:
+    """How much larger than in air the windows on the camera show distant things; 1.33 for a port in water."""
+    if refraction is None or not refraction.paths:
+        return 1.0
+    ports = tuple(k for k in refraction.paths[0] if refraction.windows[k].on == "camera")
+    if not ports:
+        return 1.0
+    only = replace(refraction, paths=(ports,), path_of=np.zeros(1, dtype=np.intp))
+    pose, every = (np.eye(3)[None], np.zeros((1, 3))), np.arange(2)
+    far = 1e4 * float(np.abs(only.values).max(initial=1.0))
+    points = far * np.array([[-_NARROW, -_NARROW, 1.0], [_NARROW, _NARROW, 1.0]])
+    rays = RefractedRays.of(only.columns(only.values), only.path_of, *pose, points, 0 * every, every)
+    return float((rays.uv[1] - rays.uv[0]).mean()) / (2 * _NARROW) if rays.reached.all() else 1.0
+
+
 def first_camera(
-    measured: Mapping[str, ImagePoints], design: PlaneDesign, size: tuple[int, int], model: CameraOptions
+    measured: Mapping[str, ImagePoints],
+    design: PlaneDesign,
+    size: tuple[int, int],
+    model: CameraOptions,
+    magnification: float = 1.0,
 ) -> Camera:
-    """Return a camera with approximate values, from the homographies of the images (Zhang 2000)."""
+    """Return a camera with approximate values, from the homographies of the images (Zhang 2000).
+
+    `magnification` is that of windows before the camera.
+    """
     known = dict(zip(design.ids, design.xy, strict=True))
     object_points, image_points = [], []
     for points in measured.values():
@@ -474,6 +506,7 @@ def first_camera(
     f = float(matrix[0, 0])
     if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
         f = 1.2 * max(size)
+    f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera("camera", *size, pitch, model.model, values, model.chosen, model.options)

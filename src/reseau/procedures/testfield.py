@@ -16,12 +16,14 @@ import numpy as np
 
 from ..archive import Verdict
 from ..bundle import Network, Result, adjust_network, calibration_of, camera_mapping
-from ..core.data import Frame, ImagePoints
+from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
-from ..optics import Pose, project
+from ..io.refraction import RefractionEntry
+from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
+from ..optics.refraction import RefractedRays
 from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
 from .target_measurement import Measurer
 from .turntable import HEIGHT, Mount
@@ -72,6 +74,8 @@ class TestfieldProcedure:
         Standard deviations of a height of the axis ``z`` (mm), of the two angles between this axis and the
         normal of the target (rad), and of the coordinates of the design (mm). With `sigmas`, consecutive
         frames that differ only in height have one orientation; without, each frame has its own.
+    refraction : RefractionEntry, optional
+        Windows and media before the camera; see :class:`~reseau.procedures.calibration.CalibrationOptions`.
 
     Examples
     --------
@@ -96,12 +100,13 @@ class TestfieldProcedure:
         inputs: Mapping[str, str] | None = None,
         least_points: int = 8,
         sigmas: tuple[float, float, float] | None = None,
+        refraction: RefractionEntry | None = None,
     ) -> None:
         self.design, self.model, self.name = design, model, name
         self._measure, self._options, self._least = measure, dict(options or {}), least_points
         self._measured: dict[str, ImagePoints] = {}
         self._places: dict[str, Mapping[str, float]] = {}
-        self._sigmas, self._pose = sigmas, dict[str, int]()
+        self._sigmas, self._pose, self._refraction = sigmas, dict[str, int](), refraction
         self._stands: tuple[int, dict[str, float] | None] = (-1, None)
         self._inputs = dict(inputs or {})
         self._size: tuple[int, int] | None = None
@@ -145,7 +150,7 @@ class TestfieldProcedure:
         count = len(self._measured)
         if self._current is None or self._current[0] != count:
             points = list(self._measured.items())
-            options = CalibrationOptions(heights=self._heights())
+            options = CalibrationOptions(heights=self._heights(), refraction=self._refraction)
             found = calibrate_camera(points, self.design, self._measure, self._size, self.model, options)
             self._current = (count, found)
         return self._current[1]
@@ -230,7 +235,15 @@ def _adjusted(result: Result) -> Network:
     """The network with its estimates as approximate values, for fast convergence."""
     network, values = result.network, result.fit.values
     camera = replace(network.cameras[0], values=values.cameras[0, : len(network.cameras[0].values)])
-    return replace(network, cameras=(camera,), x0=values.x0, rotation=result.rotation, xyz=values.xyz)
+    bent = network.refraction
+    return replace(
+        network,
+        cameras=(camera,),
+        x0=values.x0,
+        rotation=result.rotation,
+        xyz=values.xyz,
+        refraction=None if bent is None else bent.with_values(values.refraction),
+    )
 
 
 def _joined(
@@ -238,12 +251,12 @@ def _joined(
 ) -> Network | None:
     """The network with an image from another pose; None if the image shows fewer than four points."""
     camera, pose = network.cameras[0], _predicted(network, result, mount, place, heights)
-    seen = project(camera_mapping(result, 0).mapping, pose, network.xyz).xy
+    seen = camera_mapping(result, 0).mapping(_directions(network, pose))
     size = np.array([camera.width, camera.height]) - 1
     inside = np.flatnonzero(((seen >= _MARGIN_PX) & (seen <= size - _MARGIN_PX)).all(axis=1))
     if len(inside) < 4:
         return None
-    m = len(network.images)
+    m, bent = len(network.images), network.refraction
     cov = np.median(network.cov, axis=0)
     images = (*network.images, _PREDICTED)
     axis = np.array([0.0, 0.0, mount.lifts]) if network.stage is None else network.stage.axis
@@ -251,6 +264,7 @@ def _joined(
         network,
         images=images,
         stage=None if heights is None else heights.stage(images, axis),
+        refraction=None if bent is None else replace(bent, path_of=np.append(bent.path_of, bent.path_of[:1])),
         camera_of=np.append(network.camera_of, 0),
         x0=np.vstack([network.x0, pose.x0]),
         rotation=np.vstack([network.rotation, matrix_to_vector(pose.matrix)]),
@@ -261,6 +275,20 @@ def _joined(
         groups=(*network.groups, None),
         files=(*network.files, _PREDICTED),
     )
+
+
+def _directions(network: Network, pose: Pose) -> Array:
+    """Ideal directions (p, 2) of all points in another image with the windows of the first; NaN behind it."""
+    x = (network.xyz - pose.x0) @ pose.matrix.T
+    uv: Array = x[:, :2] / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
+    bent, every = network.refraction, np.arange(len(uv))
+    if bent is None or bent.path_of[0] < 0:
+        return uv
+    rays = RefractedRays.of(
+        bent.columns(bent.values), bent.path_of[:1], pose.matrix[None], pose.x0[None], network.xyz, 0 * every,
+        every,
+    )  # fmt: skip
+    return np.where(rays.reached[:, None], rays.uv, np.nan)
 
 
 def _predicted(network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None) -> Pose:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..archive import Session, Verdict
-from ..capture import Acquisition, Limits, Plan, Procedure, Step, plans, spread
+from ..capture import Acquisition, BenchFile, Limits, Plan, Procedure, Step, plans, spread
 from ..core.data import Frame
 from ..core.errors import FormatError, UsageError
 from ..io import ReseauDesign, parse_design
@@ -23,6 +23,7 @@ from .parameters import (
 )
 
 if TYPE_CHECKING:
+    from ..io.refraction import RefractionEntry
     from ..procedures.oscilloscope import OscilloscopeProcedure
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
@@ -219,8 +220,21 @@ def _testfield_procedure(session: Session, given: TestfieldParameters) -> Testfi
     measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
     return TestfieldProcedure(
         design, measure, given.camera_options(), name=session.name, options=options, inputs=_hashes(session),
-        sigmas=given.sigmas,
+        sigmas=given.sigmas, refraction=_refraction(session, given),
     )  # fmt: skip
+
+
+def _refraction(session: Session, given: SessionParameters) -> RefractionEntry | None:
+    """Windows and media before the camera, as the session's ``bench.toml`` describes them."""
+    if not session.bench:
+        return None
+    file = BenchFile.parse_toml(session.bench, where=f"bench of {session.name}")
+    found = {name: each.refraction for name, each in file.instruments.items() if each.refraction is not None}
+    if given.camera is not None:
+        return found.get(given.camera)
+    if len(found) > 1:
+        raise UsageError("have `refraction`", where=", ".join(found), do="name the camera of the session")
+    return next(iter(found.values()), None)
 
 
 def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
