@@ -76,7 +76,7 @@ class Water:
 
     >>> seen = Water().directions(np.array([[300.0, 0.0, 1000.0]]))
     >>> seen.xy.round(3), bool(seen.found.all())
-    (array([[0.391, 0.   ]]), True)
+    (array([[0.406, 0.   ]]), True)
     """
 
     distance_mm: float = 60.0

@@ -92,16 +92,18 @@ def sim(
         bool, typer.Option("--water", help="Testfield under water, camera in a housing with a plane port.")
     ] = False,
     port_distance: Annotated[
-        float, typer.Option(min=1.0, max=200.0, help="Distance of the port from the camera (mm).")
+        float,
+        typer.Option(min=1.0, max=200.0, help="With --water: distance of the port from the camera (mm)."),
     ] = 60.0,
     port_thickness: Annotated[
-        float, typer.Option(min=0.1, max=100.0, help="Thickness of the port (mm).")
+        float, typer.Option(min=0.1, max=100.0, help="With --water: thickness of the port (mm).")
     ] = 12.0,
     port_tilt: Annotated[
-        float, typer.Option(min=-15.0, max=15.0, help="Tilt of the port about the y-axis (degrees).")
+        float,
+        typer.Option(min=-15.0, max=15.0, help="With --water: tilt of the port about the y-axis (degrees)."),
     ] = 0.0,
     temperature: Annotated[
-        float, typer.Option(min=2.0, max=28.0, help="Temperature of the water (°C), and so its index.")
+        float, typer.Option(min=2.0, max=28.0, help="With --water: its temperature (°C), and so its index.")
     ] = 18.0,
     seconds: Annotated[float, typer.Option(min=0.0, help="Running time (s); 0: until interrupted.")] = 0.0,
 ) -> None:
