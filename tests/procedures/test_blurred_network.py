@@ -56,6 +56,20 @@ def test_residuals_and_errors_of_the_points_fall() -> None:
     assert found.chosen > 0
 
 
+@pytest.mark.parametrize("method", ["centroid", "edge"])
+def test_ordinary_coordinates_can_be_measured(method: Any) -> None:
+    project = drawn()
+    rough = replace(project.network, xy=np.round(project.true / 4) * 4)
+    options = NetworkOptions(rounds=1, initial=method)
+    found = measure_blurred_network(rough, project.frames, project.targets, underwater.CAMERA, options)
+    assert isinstance(found, BlurredNetwork)
+    rows = found.rounds[1].replaced
+    ordinary = found.rounds[0].result.network.xy[rows] - project.true[rows]
+    assert rows.sum() >= 25
+    # The image is where the light is; that is up to 0.6 px beside the corresponding ray.
+    assert np.abs(ordinary).max() < 1.0
+
+
 def test_every_coordinate_is_accounted_for_in_every_round() -> None:
     found = measured()
     for entry in found.rounds:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -65,6 +65,13 @@ def blurred_network(
         float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
     ] = 6.0,
     rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 6,
+    initial: Annotated[
+        str,
+        typer.Option(
+            help="Ordinary coordinates: given (those of the network), centroid, or edge (ellipses), measured "
+            "near the given ones."
+        ),
+    ] = "given",
     sensor: SensorFile = None,
 ) -> None:
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
@@ -80,6 +87,8 @@ def blurred_network(
     from ..procedures.blurred_network import NetworkOptions, measure_blurred_network
     from ..report.blurred_network import blurred_network_report
 
+    if initial not in ("given", "centroid", "edge"):
+        raise UsageError(f"is {initial!r}", where="--initial", do="use given, centroid or edge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("exists already", where=out, do="give a new or an empty folder")
     document, optics = Network1.read(network), read_lens(lens)
@@ -105,14 +114,26 @@ def blurred_network(
     with progress("measuring", 5) as step:
         found = required(
             measure_blurred_network(
-                content, frames, space, cameras, NetworkOptions(matching, rounds), watch=step
+                content,
+                frames,
+                space,
+                cameras,
+                NetworkOptions(matching, rounds, initial=cast(Any, initial)),
+                watch=step,
             ),
             network,
         )
     inputs = [network, *calibration_files(network), targets, lens]
     provenance = Provenance(
         {file.name: sha256_of(file) for file in inputs},
-        {"focus": focus, "pitch": pitch, "f-number": f_number, "psf": psf, "search": search},
+        {
+            "focus": focus,
+            "pitch": pitch,
+            "f-number": f_number,
+            "psf": psf,
+            "search": search,
+            "initial": initial,
+        },
     )
     out.mkdir(parents=True, exist_ok=True)
     for number, entry in enumerate(found.rounds):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -21,12 +22,15 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import LensCamera, PlaneTarget, behind_windows
 
 __all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
 
 _SPACING_PX = 0.6
 """Largest distance of nodes along outlines."""
+_NODES = 150
+"""Largest number of nodes along the size of a target."""
 _DIFFERS = 9.21
 """Quantile 0.99 of χ² with two degrees of freedom: a larger difference of coordinates is significant."""
 _SHARP_PX = 1.0
@@ -47,6 +51,9 @@ class NetworkOptions:
         Largest number of rounds.
     keep_sharp : bool
         Whether ordinary coordinates of sharp targets are kept where they do not differ significantly.
+    initial : {"given", "centroid", "edge"}
+        Ordinary coordinates: those of the network, or measured near these as centres of gravity or of
+        ellipses through the edges. A target that this does not find keeps the coordinates given.
     bundle : reseau.bundle.Options
         Options of the adjustments.
 
@@ -59,6 +66,7 @@ class NetworkOptions:
     matching: BlurredOptions = field(default_factory=BlurredOptions)
     rounds: int = 6
     keep_sharp: bool = True
+    initial: Literal["given", "centroid", "edge"] = "given"
     bundle: BundleOptions = field(default_factory=BundleOptions)
 
     def __post_init__(self) -> None:
@@ -198,6 +206,7 @@ def measure_blurred_network(
     no target of the network could be measured by rays
     """
     chosen, say = options or NetworkOptions(), watch or (lambda line: None)
+    network = _ordinary(network, frames, targets, chosen)
     first = adjust_network(network, chosen.bundle)
     if isinstance(first, Failure):
         return first
@@ -220,6 +229,27 @@ def measure_blurred_network(
             break
     sigma0 = [entry.result.sigma0 for entry in rounds[1:]]
     return BlurredNetwork(tuple(rounds), 1 + int(np.argmin(sigma0)), run.notes(rounds))
+
+
+def _ordinary(
+    network: Network, frames: Mapping[str, Frame], targets: SpaceTargets, options: NetworkOptions
+) -> Network:
+    """The network with ordinary coordinates, measured where that is asked for."""
+    if options.initial == "given":
+        return network
+    xy, named = network.xy.copy(), set(targets.targets.id)
+    for i, image in enumerate(network.images):
+        if image in frames:
+            rows = [
+                k
+                for k in np.flatnonzero(network.image_of == i).tolist()
+                if network.points[network.point_of[k]] in named
+            ]
+            found = ordinary_coordinates(
+                frames[image], xy[rows], polarity=targets.polarity, method=options.initial
+            )
+            xy[rows] = np.where(np.isfinite(found), found, xy[rows])
+    return replace(network, xy=xy)
 
 
 class _Run:
@@ -296,7 +326,12 @@ class _Run:
             k = self.row[network.points[j]]
             centre = self.unit_mm * (rotation @ (self.xyz[j] - x0))
             axes = rotation @ self.targets.axes(k)
-            outline = self.targets.outline(k, self._spacing(camera, centre, axes) / self.targets.unit_mm)
+            # A target that is predicted too near, by a bad orientation, has no more nodes than others.
+            spacing = max(
+                self._spacing(camera, centre, axes) / self.targets.unit_mm,
+                self.targets.targets.size[k] / _NODES,
+            )
+            outline = self.targets.outline(k, spacing)
             scaled = replace(
                 outline,
                 xy=self.targets.unit_mm * outline.xy,
