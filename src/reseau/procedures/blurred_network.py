@@ -3,7 +3,7 @@
 Approximate image coordinates give the orientation by a multi-media bundle adjustment. From it follow the
 images of all targets by rays through windows and lens; matching them with the photographs gives better image
 coordinates, these a better orientation, and so on until sigma0 no longer falls. Where a target is sharp and
-its ordinary coordinates do not differ significantly, these are kept.
+its ordinary coordinates are as certain and do not differ significantly, these are kept.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import LensCamera, PlaneTarget, behind_windows
+from ..optics.refraction import RefractedRays
 
 __all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
 
@@ -35,6 +36,8 @@ _DIFFERS = 9.21
 """Quantile 0.99 of χ² with two degrees of freedom: a larger difference of coordinates is significant."""
 _SHARP_PX = 1.0
 """Blur (rms radius) up to which ordinary coordinates may be kept."""
+_FAR_MM = 1e6
+"""Distance of a far point."""
 _FALLS = 0.99
 """Another round must lower sigma0 to less than this part."""
 
@@ -50,10 +53,15 @@ class NetworkOptions:
     rounds : int
         Largest number of rounds.
     keep_sharp : bool
-        Whether ordinary coordinates of sharp targets are kept where they do not differ significantly.
+        Whether ordinary coordinates of sharp targets are kept where they do not differ significantly, and
+        are not less certain than those by rays.
     initial : {"given", "centroid", "edge"}
         Ordinary coordinates: those of the network, or measured near these as centres of gravity or of
         ellipses through the edges. A target that this does not find keeps the coordinates given.
+    reduce : bool
+        Whether image coordinates are reduced to a fixed projection centre by the design of the lens: its
+        entrance pupil moves with the direction, which shifts the images of near points behind a window by
+        some hundredths of a pixel.
     bundle : reseau.bundle.Options
         Options of the adjustments.
 
@@ -67,6 +75,7 @@ class NetworkOptions:
     rounds: int = 6
     keep_sharp: bool = True
     initial: Literal["given", "centroid", "edge"] = "given"
+    reduce: bool = True
     bundle: BundleOptions = field(default_factory=BundleOptions)
 
     def __post_init__(self) -> None:
@@ -191,7 +200,8 @@ def measure_blurred_network(
     -----
     Position, direction and windows of each round are those of its adjustment. The principal point of the
     lens is put where the camera of the network images the direction of the view. A target that is blurred
-    and cannot be measured by rays is left out: its ordinary coordinates would be biased.
+    and cannot be measured by rays is left out: its ordinary coordinates would be biased. The coordinates of
+    the final network are reduced to its projection centre (see :class:`NetworkOptions`).
 
     Examples
     --------
@@ -307,18 +317,25 @@ class _Run:
                     xy[own], cov[own], replaced[own] = found.xy[k], found.cov[k], True
                 else:
                     declined[own] = True
-        if not replaced.any():
+        if not any(found.ok.any() for found in measured.values()):
             return Failure("no target of the network could be measured by rays", Code.NOT_FOUND)
+        shift = np.hypot(*(xy - network.xy)[replaced].T) if replaced.any() else np.zeros(1)
+        if self.options.reduce:
+            reduction = self._reduction(last)
+            # Without a ray through the lens the coordinates cannot be reduced.
+            declined |= ~np.isfinite(reduction).all(axis=1)
+            xy = xy - np.nan_to_num(reduction)
         start = replace(network, xy=xy, cov=cov).select(~declined)
         result = adjust_network(start, self.options.bundle)
         if isinstance(result, Failure):
             return result
-        shift = np.hypot(*(xy - network.xy)[replaced].T)
-        return BlurredRound(result, measured, replaced, ~replaced & ~declined, declined, float(shift.mean()))
+        return BlurredRound(
+            result, measured, replaced & ~declined, ~replaced & ~declined, declined, float(shift.mean())
+        )
 
     def _measured(self, last: Result, i: int, rows: list[int]) -> BlurredResult:
         network, values = self.network, last.fit.values
-        camera = self._camera(last, i)
+        _, camera = self._camera(last, i)
         rotation, x0 = values.rotation[i], values.x0[i]
         names, planes = [], []
         for own in rows:
@@ -341,8 +358,38 @@ class _Run:
             planes.append(PlaneTarget(centre, axes, scaled))
         return measure_blurred(self.frames[network.images[i]], camera, names, planes, self.matching)
 
-    def _camera(self, last: Result, i: int) -> LensCamera:
-        """Lens and windows of an image, with its principal point where the adjustment has it."""
+    def _reduction(self, last: Result) -> Array:
+        """What aberrations of the pupil shift corresponding rays by, beside a fixed projection centre (n, 2).
+
+        The principal ray of a near point does not pass the projection centre of the network, but it arrives
+        where that of a far point does, whose ray is nearly the same line. The difference of the image of the
+        point and that of a far point in the direction of the ray through the projection centre is taken from
+        the image coordinates; what is left depends on that direction only, as in the bundle.
+        """
+        network, values = self.network, last.fit.values
+        reduction = np.zeros((len(network.xy), 2))
+        known: Mask = np.asarray(np.isfinite(self.xyz).all(axis=1))
+        for i in np.flatnonzero(last.fit.usable.images).tolist():
+            rows = np.flatnonzero((network.image_of == i) & known[network.point_of])
+            if not len(rows):
+                continue
+            lens, wet = self._camera(last, i)
+            rotation, x0 = values.rotation[i], values.x0[i]
+            xyz = self.xyz[network.point_of[rows]]
+            x = (xyz - x0) @ rotation.T
+            uv, refraction = x[:, :2] / x[:, 2:], network.refraction
+            if refraction is not None and refraction.path_of[i] >= 0:
+                rays = RefractedRays.of(
+                    refraction.columns(values.refraction), refraction.path_of[[i]], rotation[None], x0[None],
+                    xyz, np.zeros(len(rows), np.intp), np.arange(len(rows)),
+                )  # fmt: skip
+                uv = rays.uv
+            far = _FAR_MM * np.column_stack([uv, np.ones(len(rows))])
+            reduction[rows] = wet.corresponding(self.unit_mm * x) - lens.corresponding(far)
+        return reduction
+
+    def _camera(self, last: Result, i: int) -> tuple[LensCamera, LensCamera]:
+        """Lens of an image, and the same behind its windows, with the principal point of the adjustment."""
         network, values = self.network, last.fit.values
         c = int(network.camera_of[i])
         entry = network.cameras[c]
@@ -352,8 +399,8 @@ class _Run:
         sensor = replace(lens.sensor, principal_px=(float(middle[0]), float(middle[1])))
         lens = replace(lens, sensor=sensor)
         if network.refraction is None:
-            return lens
-        return behind_windows(
+            return lens, lens
+        return lens, behind_windows(
             lens, network.refraction.with_values(values.refraction), int(network.refraction.path_of[i]),
             values.rotation[i], values.x0[i], unit_mm=self.unit_mm,
         )  # fmt: skip
@@ -370,7 +417,8 @@ class _Run:
         sharp = bool(found.blur_px[k] <= _SHARP_PX)
         if not found.ok[k]:
             return sharp
-        if not (sharp and self.options.keep_sharp):
+        surer = np.trace(self.network.cov[own]) <= np.trace(found.cov[k])
+        if not (sharp and surer and self.options.keep_sharp):
             return False
         difference = found.xy[k] - self.network.xy[own]
         both = found.cov[k] + self.network.cov[own]
