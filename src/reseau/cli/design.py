@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,6 +12,7 @@ from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..io import ReseauDesign, TestfieldDesign
+    from ..io.targets import SpaceTargets
 
 __all__ = ["app"]
 
@@ -170,8 +171,37 @@ def coded_field(
     _write(design, svg, pdf, out, f"{columns} × {rows} squares, pitch {pitch:g} mm")
 
 
+@app.command()
+def frame(
+    sides: Annotated[
+        tuple[float, float, float], typer.Option(help="Sides of the frame along X, Y and Z (mm).")
+    ] = (1200.0, 900.0, 400.0),
+    count: Annotated[int, typer.Option(help="Number of targets.")] = 28,
+    size: Annotated[float, typer.Option(help="Diameter of a disk or side of a square (mm).")] = 20.0,
+    shape: Annotated[Shape, typer.Option(help="disk or square.")] = Shape.DISK,
+    polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
+    name: Annotated[str, typer.Option(help="Name of the design.")] = "frame",
+    svg: Svg = None,
+    pdf: Pdf = None,
+    out: Design = None,
+) -> None:
+    """Design the targets of a space frame, to be cut out and fixed to it; for `reseau blurred`."""
+    from ..core.errors import UsageError
+    from ..designs import space_frame
+
+    if shape is not Shape.DISK and shape is not Shape.SQUARE:
+        raise UsageError(f"is {shape.value!r}", where="--shape", do="use disk or square")
+    kind: Literal["disk", "square"] = "disk" if shape is Shape.DISK else "square"
+    design = space_frame(sides, count, size, shape=kind, polarity=polarity.value, name=name)
+    _write(design, svg, pdf, out, f"{count} targets of {size:g} mm")
+
+
 def _write(
-    design: ReseauDesign | TestfieldDesign, svg: Path | None, pdf: Path | None, out: Path | None, what: str
+    design: ReseauDesign | TestfieldDesign | SpaceTargets,
+    svg: Path | None,
+    pdf: Path | None,
+    out: Path | None,
+    what: str,
 ) -> None:
     """Write the requested drawings and design, either all or none, and report their paths."""
     from ..io import write_whole

@@ -1,5 +1,6 @@
-"""Targets as designed: reseaus, an ultrasonic test object, the coded testfield and its code, and drawings."""
+"""Targets as designed: reseaus, an ultrasonic test object, coded testfields, space frames, and drawings."""
 
+from .frames import space_frame
 from .reseaus import coded_sheet, n_wire_phantom, regular_reseau, standard_reseau, test_object
 from .testfield import coded_testfield
 from .topology import HIDDEN, Decoded, TopologicalCode
@@ -12,6 +13,7 @@ __all__ = [
     "coded_testfield",
     "n_wire_phantom",
     "regular_reseau",
+    "space_frame",
     "standard_reseau",
     "test_object",
 ]

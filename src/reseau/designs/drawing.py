@@ -16,15 +16,20 @@ from ..core.errors import UsageError
 from ..core.figures import drawing as house_style
 from ..core.figures import to_bytes
 from ..io import ReseauDesign, TestfieldDesign
+from ..io.targets import SpaceTargets
 from ..optics.targets import target_corners
 
 __all__ = ["design_pdf", "design_svg"]
+
+Drawable = ReseauDesign | TestfieldDesign | SpaceTargets
 
 _MARGIN = 18.0
 """Margin around the target, mm, for crop marks, scale bar and title."""
 _BAR = 100.0
 _CROP = 5.0
 _GREY = "#555555"
+_GROUND, _LETTERS = 3.0, 6.0
+"""Ground of a single target in its sizes, and room for its name, mm."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class _Content:
     letters: dict[str, Array]
 
 
-def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
+def _sheet(design: Drawable) -> _Sheet:
     """Lay out the design on paper.
 
     Raises
@@ -88,7 +93,10 @@ def _sheet(design: ReseauDesign | TestfieldDesign) -> _Sheet:
     UsageError
         When coordinates are missing, the unit is not the millimetre, or wires are not parallel to the axes.
     """
-    content = _testfield(design) if isinstance(design, TestfieldDesign) else _reseau(design)
+    if isinstance(design, TestfieldDesign):
+        content = _testfield(design)
+    else:
+        content = _frame(design) if isinstance(design, SpaceTargets) else _reseau(design)
     size = content.high - content.low
     width, height = size + 2 * _MARGIN
     # A narrow target has a sheet that is wide enough for the bar.
@@ -187,6 +195,28 @@ def _testfield(design: TestfieldDesign) -> _Content:
     return _Content(low, high, polygons, circles, title, {})
 
 
+def _frame(design: SpaceTargets) -> _Content:
+    """Single targets in rows, each on a ground of three times its size, to be cut out."""
+    if design.unit != "mm":
+        raise UsageError("is not in millimetres", where=f"design {design.name}")
+    targets, count = design.targets, len(design.targets.id)
+    cell = _GROUND * max(targets.size) + _LETTERS
+    columns = int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    polygons, circles, letters = list[Array](), list[tuple[float, float, float]](), {}
+    for k, (name, shape, size) in enumerate(zip(targets.id, targets.shape, targets.size, strict=True)):
+        row, column = divmod(k, columns)
+        at = np.array([(column + 0.5) * cell, -(row + 0.5) * cell])
+        if shape == "disk":
+            circles.append((float(at[0]), float(at[1]), size / 2))
+        else:
+            polygons.append(at + _box(-size / 2, -size / 2, size / 2, size / 2))
+        letters[name] = at - 0.5 * cell + 1.5
+    low, high = np.array([0.0, -rows * cell]), np.array([columns * cell, 0.0])
+    title = f"{design.name}: {count} single targets, cells of {cell:g} mm"
+    return _Content(low, high, polygons, circles, title, letters)
+
+
 def _gap(xy: Array) -> float:
     distance = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
     np.fill_diagonal(distance, np.inf)
@@ -224,7 +254,7 @@ def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, flo
         yield left + 10 * k, y - tall, left + 10 * k, y + tall
 
 
-def _colours(design: ReseauDesign | TestfieldDesign) -> tuple[str, str]:
+def _colours(design: Drawable) -> tuple[str, str]:
     """Colours of background and marks."""
     return ("#ffffff", "#000000") if design.polarity == "dark" else ("#000000", "#ffffff")
 
@@ -233,12 +263,12 @@ def _number(value: float) -> str:
     return f"{value:.4f}".rstrip("0").rstrip(".")
 
 
-def design_svg(design: ReseauDesign | TestfieldDesign) -> str:
+def design_svg(design: Drawable) -> str:
     """Draw a target as SVG in true size.
 
     Parameters
     ----------
-    design : ReseauDesign or TestfieldDesign
+    design : ReseauDesign, TestfieldDesign or SpaceTargets
         The target.
 
     Returns
@@ -283,12 +313,12 @@ def design_svg(design: ReseauDesign | TestfieldDesign) -> str:
     return "\n".join(parts) + "</g></svg>\n"
 
 
-def design_pdf(design: ReseauDesign | TestfieldDesign) -> bytes:
+def design_pdf(design: Drawable) -> bytes:
     """Draw a target as a PDF of one page in true size; all elements are vectors.
 
     Parameters
     ----------
-    design : ReseauDesign or TestfieldDesign
+    design : ReseauDesign, TestfieldDesign or SpaceTargets
         The target.
 
     Returns
