@@ -296,3 +296,42 @@ def test_documents_of_measurements_are_accepted_as_images(
     first = reseau("calibrate", *files, *arguments)
     assert first[0] == 0
     assert reseau("calibrate", *files, *arguments) == first
+
+
+def port(folder: Path, water: float) -> Path:
+    content = {
+        "schema": "reseau-refraction/1",
+        "media": {"air": 1.0, "glass": 1.0, "water": water},
+        "windows": [{"id": "port", "shape": "plane", "on": "camera", "media": ["air", "glass", "water"],
+                     "parameters": {"distance": 30.0, "thickness": 10.0}}],
+    }  # fmt: skip
+    path = folder / f"port-{water:g}.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def checked(answer: tuple[int, str, str]) -> str:
+    status, out, err = answer
+    assert (status, err) == (0, "")
+    return out
+
+
+def test_windows_before_the_target_are_taken_from_a_file(
+    reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
+    """The recordings were made in air: media of the index 1 change nothing, through water c is less."""
+    command = (*common(measured), "--free", "c,x0,y0,K1", "--json")
+    plain, dry, wet = (
+        json.loads(checked(reseau(*command, *more)))
+        for more in ((), ("--refraction", port(tmp_path, 1.0)), ("--refraction", port(tmp_path, 1.333)))
+    )
+    assert dry["sigma0"] == pytest.approx(plain["sigma0"], abs=1e-3)
+    c = [each["parameters"]["c"]["value"] for each in (plain, dry, wet)]
+    assert c[1] == pytest.approx(c[0], abs=1e-3)
+    assert c[2] == pytest.approx(c[0] / 1.333, abs=0.05)
+    path = port(tmp_path, 1.333)
+    path.write_text(path.read_text().replace("glass", "mud", 1))
+    status, out, err = reseau(*command, "--refraction", path)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "glass" in err

@@ -22,6 +22,7 @@ from .bundle_options import (
     say_left_out,
     say_model,
     say_parameters,
+    say_refraction,
 )
 from .common import (
     AsJson,
@@ -53,6 +54,10 @@ Sigma = Annotated[
 Control = Annotated[
     Path | None,
     typer.Option(help="Control points of the target, CSV id,x,y,z[,sx,sy,sz]; by default a free network."),
+]
+Refraction = Annotated[
+    Path | None,
+    typer.Option(help="Windows and media before the target, reseau-refraction/1; lengths in mm."),
 ]
 LeaveOut = Annotated[
     list[str] | None, typer.Option(help="Image point to leave out, e.g. photo.jpg:A1; repeatable.")
@@ -95,6 +100,7 @@ def calibrate(
     sensor: SensorFile = None,
     sigma: Sigma = None,
     control: Control = None,
+    refraction: Refraction = None,
     leave_out: LeaveOut = None,
     reject: Reject = False,
     components: ComponentsOf = None,
@@ -123,7 +129,7 @@ def calibrate(
     target, kind = parse_design(read_text(design), design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
     level = level_of(eliminate, "--eliminate")
-    options = _options(sigma, control, leave_out or [], reject, kind, level, workers)
+    options = _options(sigma, control, refraction, leave_out or [], reject, kind, level, workers)
     camera = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(measure, {path.name: file for path, file in drawn.items()})
@@ -131,7 +137,7 @@ def calibrate(
         frames = _frames(images, channel, sensor, step)
         done = required(calibrate_camera(frames, target, measure, _size(size), camera, options), design)
     provenance = _provenance(
-        [design, *images, *(path for path in (control, sensor) if path)],
+        [design, *images, *(path for path in (control, refraction, sensor) if path)],
         model=camera.model, pitch=pitch, options=dict(camera.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
         leave_out=list(leave_out or []), components=kind,
@@ -157,6 +163,7 @@ def _provenance(inputs: list[Path], **settings: Any) -> Provenance:
 def _options(
     sigma: float | None,
     control: Path | None,
+    refraction: Path | None,
     leave_out: list[str],
     reject: bool,
     components: Kind | None,
@@ -167,6 +174,7 @@ def _options(
     from ..bundle import Options
     from ..core.errors import UsageError
     from ..exchange import read_control
+    from ..io.refraction import RefractionFile
     from ..procedures.calibration import CalibrationOptions
 
     pairs = []
@@ -178,6 +186,7 @@ def _options(
     return CalibrationOptions(
         Options(outliers="reject" if reject else "keep"), sigma,
         None if control is None else read_control(control), tuple(pairs), components, level, workers,
+        refraction=None if refraction is None else RefractionFile.read(refraction),
     )  # fmt: skip
 
 
@@ -277,6 +286,9 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     v = v[np.isfinite(v).all(axis=1)]
     say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
     say_parameters(result.camera(0), sigma_between_images(result, 0))
+    if result.refraction is not None:
+        say("windows and media\n")
+        say_refraction(result.refraction)
     sigma = projection_field(camera_mapping(result, 0)).sigma
     middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
     say(f"uncertainty of the projection: median {middle:.2g} px over the image, at most {worst:.2g} px\n")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..core.errors import UsageError
 from ..optics.refraction import Refraction, RefractiveIndex, Window
-from .document import Strict
+from .document import Document, Strict
 from .lens import GlassOrMedium, medium_of
 
-__all__ = ["MediumEntry", "RefractionEntry", "WindowEntry"]
+__all__ = ["MediumEntry", "RefractionEntry", "RefractionFile", "WindowEntry"]
 
 Triple = tuple[float, float, float]
 
@@ -181,3 +181,18 @@ class RefractionEntry(Strict):
                 }
             ),
         )  # fmt: skip
+
+
+class RefractionFile(Document, RefractionEntry):
+    """``reseau-refraction/1``: the same as a file of its own, for `reseau calibrate --refraction`.
+
+    Examples
+    --------
+    >>> text = '{"schema": "reseau-refraction/1", "media": {"air": 1.0, "water": 1.333}, "windows": [{"id": '
+    >>> text += '"surface", "shape": "plane", "on": "camera", "parameters": {"distance": 40.0}, '
+    >>> text += '"media": ["air", "water"]}]}'
+    >>> RefractionFile.parse(text, where="port.json").refraction(("i1",), ("cam",))
+    <Refraction: 2 media, 1 window, 0 free parameters>
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-refraction/1"

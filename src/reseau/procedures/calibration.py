@@ -59,6 +59,8 @@ __all__ = [
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
+# Relative standard deviation of a diagonal of the target.
+_PRINTED = 1e-4
 _NARROW = 1e-3
 
 
@@ -157,7 +159,8 @@ class CalibrationOptions:
         Heights of the target on a z-stage.
     refraction : RefractionEntry, optional
         Windows and media between the camera, whose name is ``camera``, and the target. The calibration is
-        that of the camera in air.
+        that of the camera in air. Without control points the diagonals of the target are distances of the
+        design, known to a ten-thousandth: windows have dimensions, and the scale is not free.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -348,6 +351,8 @@ def calibrate_camera(
         network = options.heights.lifted(network)
     if options.control is not None:
         network = _controlled(network, options.control)
+    elif refraction is not None:
+        network = _scaled(network)
     if options.sigma_px is not None:
         network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
     found = search_model(network, options.adjustment, options.components, options.level)
@@ -415,6 +420,16 @@ def _controlled(network: Network, control: ControlPoints) -> Network:
         xyz[at, known], sigma[at] = given[known], own
         role[at] = "control"
     return replace(network, xyz=xyz, sigma=sigma, role=tuple(role), datum="control")
+
+
+def _scaled(network: Network) -> Network:
+    """Return the network with its longest diagonals as distances."""
+    rows = np.flatnonzero(network.rays > 1)
+    x, y = network.xyz[rows, :2].T
+    ends = [(rows[np.argmin(along)], rows[np.argmax(along)]) for along in (x + y, x - y)]
+    pairs = np.array([pair for pair in ends if pair[0] != pair[1]], dtype=np.intp).reshape(-1, 2)
+    length = np.linalg.norm(network.xyz[pairs[:, 1]] - network.xyz[pairs[:, 0]], axis=1)
+    return replace(network, distance_of=pairs, distance=np.column_stack([length, _PRINTED * length]))
 
 
 def network_of(

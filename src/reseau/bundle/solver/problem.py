@@ -26,7 +26,14 @@ from .datum import Freedom, freedom_of, held_minimally, scaled_by_windows, simil
 from .iteration import Iterated, iterate
 from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
-from .rank import SCALE_OF_WINDOWS, poorly_determined_points, steady_points, undetermined, weak_points
+from .rank import (
+    SCALE_OF_WINDOWS,
+    poorly_determined_points,
+    steady_points,
+    undetermined,
+    weak_points,
+    without_effect,
+)
 from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .values import Values
@@ -39,6 +46,8 @@ _UNSUPPORTED, _DEFAULTS = ("method", "curvature", "rank_tolerance", "check_jacob
 _DAMPING = 1e-5
 # Maximum number of rounds in which points that diverge to infinity are left out.
 _ROUNDS = 12
+# Iterations, and relative offset, of the first adjustment with windows and media as given.
+_BEFORE_WINDOWS, _ROUGHLY = 30, 1e-2
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
 _SLOW = 50
 
@@ -341,6 +350,7 @@ class _Run:
                 f"{counts[0]} observations for {counts[1]} unknowns and {counts[2]} constraints",
                 Code.NO_REDUNDANCY,
             )
+        start = self._behind_given_windows(start, redundancy)
         found = iterate(
             self.system, start, redundancy=redundancy, max_iterations=self.options.max_iterations,
             tolerance=self.options.tolerance, damping=self.options.damping, watch=problem.watch,
@@ -369,6 +379,12 @@ class _Run:
                 chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)
         linear = self.system.linearise(values)
+        idle = without_effect(linear)
+        if idle:
+            return AdjustmentFailure(
+                f"rank defect {len(idle)}: no ray depends on {', '.join(idle)}", Code.RANK_DEFECT,
+                costs=tuple(found.costs),
+            )  # fmt: skip
         freedom = freedom_of(self.system, values, self.usable.points)
         try:
             cofactors = cofactors_of(linear, freedom, chosen if inner else None, self.usable.points)
@@ -378,6 +394,22 @@ class _Run:
                 return self._without(weak, values)._adjusted(self.options)
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def _behind_given_windows(self, start: Values, redundancy: int) -> Values:
+        """Approximate values adjusted with windows and media as given.
+
+        Rough approximate values could otherwise move a window to where no further step leads back.
+        """
+        if self.unknowns.refraction < 0:
+            return start
+        held = self.system.held.copy()
+        self.system.held[self.unknowns.refraction_columns] = True
+        found = iterate(
+            self.system, start, redundancy=redundancy, max_iterations=_BEFORE_WINDOWS,
+            tolerance=_ROUGHLY, damping=self.options.damping,
+        )  # fmt: skip
+        self.system.held = held
+        return start if isinstance(found, Failure) or len(found.away) else found.values
 
     def _slowly_converging(self, found: Iterated) -> Rows:
         """Poorly determined points that may prevent convergence; none after few iterations."""

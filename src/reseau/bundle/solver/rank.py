@@ -18,12 +18,15 @@ __all__ = [
     "steady_points",
     "undetermined",
     "weak_points",
+    "without_effect",
 ]
 
 # What is wrong where nothing else gives the scale of a network.
 SCALE_OF_WINDOWS = (
     "only the dimensions of the windows determine the scale, too weakly; give a distance or control points"
 )
+# Effect of a parameter on all image coordinates, in their standard deviations, that is rounding.
+_IDLE = 1e-5
 # Eigenvalues of the scaled normal equations below this count as zero.
 _ZERO = 1e-11
 # Smallest eigenvalue of the scaled normal equations of a point with parallel rays: they intersect at less
@@ -95,6 +98,27 @@ def weak_points(linear: Linear) -> Rows:
     scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
     least = np.linalg.eigvalsh(scaled[known])[:, 0]
     return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
+
+
+def without_effect(linear: Linear) -> list[str]:
+    """Return the parameters of windows and media on which, but for rounding, no ray depends.
+
+    An example is the distance of a plate in one medium. A scaled matrix would not show it.
+    """
+    system = linear.system
+    unknowns, bent = system.unknowns, system.unknowns.network.refraction
+    if bent is None or unknowns.refraction < 0:
+        return []
+    count = len(unknowns.refracting)
+    at = unknowns.width - 3 - unknowns.extra_width - count
+    effect = np.sqrt((linear.rows[:, :, at : at + count] ** 2).sum(axis=(0, 1)))
+    # A change by the size of the network, of a length; by one, of a tilt or an index.
+    size = float(np.abs(linear.values.xyz - linear.values.xyz.mean(axis=0)).max())
+    names = [bent.names[row] for row in unknowns.refracting]
+    change = np.array([size if bent.unit_of(name, "m") == "m" else 1.0 for name in names])
+    observed = np.isin(unknowns.refracting, system.others.refraction)
+    idle = ~observed & (effect * change < _IDLE)
+    return [name for name, none in zip(names, idle, strict=True) if none]
 
 
 def steady_points(linear: Linear, chosen: Mask) -> Mask:
