@@ -28,15 +28,42 @@ if TYPE_CHECKING:
     from ..measure.blurred import BlurredResult
     from ..optics.lenses import RayMap
 
-__all__ = ["blurred"]
+__all__ = ["FNumber", "Focus", "LensFile", "Pitch", "Psf", "Search", "blurred"]
+
+LensFile = Annotated[
+    Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
+]
+Focus = Annotated[
+    float | None,
+    typer.Option(
+        min=1e-3,
+        help="Distance from the front of the lens at which objects in air are sharp (mm). "
+        "Default: the image plane of the lens file.",
+    ),
+]
+Pitch = Annotated[
+    float | None,
+    typer.Option(
+        min=0.1,
+        max=1000,
+        help="Pitch of the pixels (µm), if the lens file has no sensor; the axis of the lens is "
+        "then at the centre of the image.",
+    ),
+]
+FNumber = Annotated[
+    float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
+]
+Psf = Annotated[
+    float,
+    typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
+]
+Search = Annotated[float, typer.Option(min=1, help="Largest distance from the predicted position (px).")]
 
 
 def blurred(
     image: Annotated[Path, typer.Argument(help="Image.")],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the targets, in mm.")],
-    lens: Annotated[
-        Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
-    ],
+    lens: LensFile,
     network: Annotated[
         Path | None,
         typer.Option(
@@ -46,14 +73,7 @@ def blurred(
             "image is oriented by its targets.",
         ),
     ] = None,
-    focus: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-3,
-            help="Distance from the front of the lens at which objects are sharp (mm). "
-            "Default: the image plane of the lens file.",
-        ),
-    ] = None,
+    focus: Focus = None,
     focus_sigma: Annotated[
         float | None,
         typer.Option(
@@ -63,25 +83,10 @@ def blurred(
             "targets.",
         ),
     ] = None,
-    pitch: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            max=1000,
-            help="Pitch of the pixels (µm), if the lens file has no sensor; the axis of the lens is "
-            "then at the centre of the image.",
-        ),
-    ] = None,
-    f_number: Annotated[
-        float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
-    ] = None,
-    psf: Annotated[
-        float,
-        typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
-    ] = 0.5,
-    search: Annotated[
-        float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
-    ] = 6.0,
+    pitch: Pitch = None,
+    f_number: FNumber = None,
+    psf: Psf = 0.5,
+    search: Search = 6.0,
     mirrored: Mirrored = None,
     max_rotation: MaxRotation = None,
     out: Out = None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from .blurred import FNumber, Focus, LensFile, Pitch, Psf, Search
 from .common import SensorFile, corrected, progress, read_frame, required, say
 
 if TYPE_CHECKING:
@@ -33,37 +34,18 @@ def blurred_network(
         Path,
         typer.Option("--targets", "-t", help="Targets, reseau-targets/1: shape, size and direction."),
     ],
-    lens: Annotated[
-        Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
-    ],
+    lens: LensFile,
     out: Annotated[
         Path,
         typer.Option(
             "--out", "-o", help="Folder to write: every round, the final network, its result, a report."
         ),
     ],
-    focus: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-3,
-            help="Distance from the front of the lens at which objects in air are sharp (mm). "
-            "Default: the image plane of the lens file.",
-        ),
-    ] = None,
-    pitch: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=1000, help="Pitch of the pixels (µm), if the lens file has no sensor."),
-    ] = None,
-    f_number: Annotated[
-        float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
-    ] = None,
-    psf: Annotated[
-        float,
-        typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
-    ] = 0.5,
-    search: Annotated[
-        float, typer.Option(min=1, help="Largest distance from the predicted position (px).")
-    ] = 6.0,
+    focus: Focus = None,
+    pitch: Pitch = None,
+    f_number: FNumber = None,
+    psf: Psf = 0.5,
+    search: Search = 6.0,
     rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 6,
     initial: Annotated[
         str,
