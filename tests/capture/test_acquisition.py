@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bluesky import RunEngine
 
 from reseau.archive import Archive, Session, Verdict
 from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
@@ -263,6 +264,19 @@ def test_closing_the_terminal_stops_the_session_and_the_instruments(
     assert rig.table.stops > 0
     assert len(session.frames()) < len(FEW)
     assert rig.events[-1] == ("end", {"status": "stopped", "why": ""})
+
+
+def test_a_signal_ends_the_session_although_the_engine_has_lost_the_request_to_pause(
+    rig: FieldRig, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine this has happened while the engine waited for the camera."""
+    monkeypatch.setattr(RunEngine, "request_pause", lambda engine, defer=False: None)
+    rig.camera.during = lambda count: os.kill(os.getpid(), signal.SIGTERM) if count == 1 else None
+    run = rig.acquisition(session)
+    carry_out(run, plans.poses(run, FEW))
+    assert session.status == "stopped"
+    assert rig.table.stops > 0
+    assert len(session.frames()) < len(FEW)
 
 
 def test_a_failing_instrument_ends_the_session_without_losses_and_stops_the_others(

@@ -86,13 +86,13 @@ def carry_out(
     ('nothing to do', 'done')
     """
     in_main = threading.current_thread() is threading.main_thread()
-    engine, ended = _engine(run, in_main), threading.Event()
+    engine, ended = _engine(run, in_main), _Ended()
     status = "failed"
     try:
         run.ready()
         with one_thread():  # the same sums for any number of processors
             with contextlib.redirect_stdout(sys.stderr), _ended_by_signals(engine, ended, in_main):
-                outcome = _engaged(engine, _whole(run, plan, park or {}), paused, ended)
+                outcome = _engaged(engine, _whole(run, ended.heeded(plan), park or {}), paused, ended)
             run.settle()
             status = "stopped" if outcome is None else "done"
             if outcome is not None:
@@ -211,7 +211,7 @@ def _engaged(
     engine: Any,
     plan: Plan,
     paused: Callable[[], Decision],
-    ended: threading.Event,
+    ended: _Ended,
 ) -> Any:
     """The return value of the engine; None if the plan was ended early."""
     todo: Callable[[], Any] = lambda: engine(plan)  # noqa: E731
@@ -221,7 +221,7 @@ def _engaged(
         except RunEngineInterrupted:
             decision: Decision = "stop"
             with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C at the question means stop
-                decision = "stop" if ended.is_set() else paused()
+                decision = "stop" if ended.noticed() else paused()
             if decision == "resume":
                 todo = engine.resume
                 continue
@@ -230,15 +230,53 @@ def _engaged(
             return None
 
 
+class _Ended:
+    """Whether a signal has asked for the end of the run, and whether it has interrupted the engine."""
+
+    def __init__(self) -> None:
+        self._asked, self._interrupted = threading.Event(), threading.Event()
+
+    def ask(self) -> None:
+        """Note the signal."""
+        self._asked.set()
+
+    def noticed(self) -> bool:
+        """Note that the engine was interrupted; return whether a signal has asked for the end."""
+        if self._asked.is_set():
+            self._interrupted.set()
+        return self._asked.is_set()
+
+    def heeded(self, plan: Plan) -> Plan:
+        """The plan, which pauses before its next message where the engine has lost the request to pause.
+
+        On a busy machine a pause that is requested while the engine waits for an instrument can be lost.
+        """
+        lost = False
+
+        def before(message: Any) -> Any:
+            nonlocal lost
+            if lost or not self._asked.is_set() or self._interrupted.is_set():
+                return None, None
+            lost = True
+
+            def first() -> Plan:
+                yield from bps.pause()
+                return (yield message)
+
+            return first(), None
+
+        return (yield from bpp.plan_mutator(plan, before))  # type: ignore[no-untyped-call]
+
+
 @contextlib.contextmanager
-def _ended_by_signals(engine: Any, ended: threading.Event, in_main: bool) -> Iterator[None]:
+def _ended_by_signals(engine: Any, ended: _Ended, in_main: bool) -> Iterator[None]:
     """Make SIGTERM and SIGHUP end the run, like Ctrl-C twice and `stop`."""
     if not in_main:
         yield
         return
 
     def end(*_: object) -> None:
-        ended.set()
+        ended.ask()
         with contextlib.suppress(Exception):  # the run may have ended already
             engine.request_pause(False)
 
