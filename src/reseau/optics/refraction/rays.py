@@ -1,8 +1,8 @@
 """Exact rays through refracting surfaces, by Newton's method on Fermat's principle, with all derivatives.
 
-The optical path L = Σ n_j |Q_{j+1} − Q_j| from the projection centre Q_0 = 0 through points Q_j on the
-surfaces φ_j(Q_j) = 0 to the object point is stationary. Newton's method solves for the points in the tangent
-planes of the surfaces; the matrix is block-tridiagonal with 2 × 2 blocks,
+The optical path ``L = Σ n_j |Q_{j+1} − Q_j|`` from the projection centre ``Q_0 = 0`` through points ``Q_j``
+on the surfaces ``φ_j(Q_j) = 0`` to the object point is stationary. Newton's method solves for the points in
+the tangent planes of the surfaces; the matrix is block-tridiagonal with 2 × 2 blocks::
 
     H_jj = T_jᵀ (∂²L/∂Q_j² + μ_j ∂²φ_j) T_j,   H_j,j+1 = T_jᵀ ∂²L/∂Q_j∂Q_{j+1} T_{j+1},
 

@@ -7,7 +7,7 @@ camera (a port: *bundle-invariant* in Kotowski 1988) or to the object (the wall 
 - plane: m·X = d, with the unit normal m ∝ w + a·s + b·t for the nominal normal w and two directions s, t
   perpendicular to it; with a curvature κ the surface is the sphere that touches this plane at d·m and has its
   centre at (d + 1/κ)·m;
-- sphere: |X − C| = r;
+- sphere: ``|X − C| = r``;
 - cylinder: distance r from the line through x·s + y·t with the direction u ∝ w + a·s + b·t.
 
 The second surface of a pane is farther from the camera by the thickness: at d + τ, or with the radius r + τ
