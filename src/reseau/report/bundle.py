@@ -193,8 +193,7 @@ def _fields(
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     fields = [("directions", projection_field(lens, _PLACES))]
-    bent = network.refraction
-    if bent is not None and (bent.path_of[network.camera_of == c] >= 0).any():
+    if network.behind_windows(c):
         distances, usual = [], 0.0
     fields += [
         (

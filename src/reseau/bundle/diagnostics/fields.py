@@ -112,8 +112,7 @@ def projection_field_at(
     """
     if not distance > 0:
         raise UsageError(f"{distance:g} is not positive", where="distance")
-    bent = result.network.refraction
-    if bent is not None and (bent.path_of[result.network.camera_of == c] >= 0).any():
+    if result.network.behind_windows(c):
         raise UsageError(
             "the projection of points through windows is not known at a distance",
             where=result.network.cameras[c].label,

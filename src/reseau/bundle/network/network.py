@@ -475,6 +475,11 @@ class Network(Display):
                 raise UsageError("is not a camera of the network", where=name)
         return replace(self, cameras=tuple(cameras.get(camera.id, camera) for camera in self.cameras))
 
+    def behind_windows(self, c: int) -> bool:
+        """Whether any image of the c-th camera looks through windows."""
+        refraction = self.refraction
+        return refraction is not None and bool((refraction.path_of[self.camera_of == c] >= 0).any())
+
     def select(self, observations: Mask) -> Self:
         """Return the network with a selection of the image observations (n,)."""
         return replace(

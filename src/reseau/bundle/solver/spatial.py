@@ -6,7 +6,6 @@ points are those of OpenCV, applied to directions corrected for distortion.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -92,12 +91,7 @@ def behind_ports(refraction: Refraction, uv: Array, image_of: Rows) -> Array:
     ndarray (n, 2)
         Directions of distant points that are seen in the directions `uv`.
     """
-    ports = [tuple(k for k in path if refraction.windows[k].on == "camera") for path in refraction.paths]
-    kept = [p for p, path in enumerate(ports) if path]
-    number = np.array([kept.index(p) if path else -1 for p, path in enumerate(ports)] + [-1], dtype=np.intp)
-    only = replace(
-        refraction, paths=tuple(ports[p] for p in kept), path_of=number[refraction.path_of]
-    )  # air is −1, the last
+    only = refraction.ports()
     rows = np.flatnonzero((only.path_of[image_of] >= 0) & np.isfinite(uv).all(axis=1))
     found = uv.copy()
     if not len(rows):

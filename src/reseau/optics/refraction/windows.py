@@ -529,6 +529,14 @@ class Refraction(Display):
         )
         return replace(self, windows=windows, media=media)
 
+    def ports(self) -> Self:
+        """Return the same with the windows on the camera only; images without any are in air."""
+        paths = [tuple(k for k in path if self.windows[k].on == "camera") for path in self.paths]
+        kept = [p for p, path in enumerate(paths) if path]
+        # Air is −1, the last.
+        number = np.array([kept.index(p) if p in kept else -1 for p in range(len(paths))] + [-1], np.intp)
+        return replace(self, paths=tuple(paths[p] for p in kept), path_of=number[self.path_of])
+
     def transformed(self, values: Array, scale: float, turn: Array, shift: Array) -> Array:
         """Return the parameters after the similarity X' = scale · turn · X + shift of object space."""
         moved = values.copy()
