@@ -181,9 +181,12 @@ def robust(
                 return found
             fit = found
             t = runs.standardised(fit)
+            # The residual of an observation whose unknowns are not determined says nothing about it.
+            known = np.isfinite(t)
             if scale == "mad":
-                unit = max(float(np.median(t[runs.eligible])) / runs.median, np.finfo(float).tiny)
-            fresh = function(t / unit)
+                middle = float(np.median(t[runs.eligible & known])) if (runs.eligible & known).any() else 0.0
+                unit = max(middle / runs.median, np.finfo(float).tiny)
+            fresh = np.where(known, function(np.where(known, t, 0.0) / unit), 1.0)
             change, factors = float(np.abs(fresh - factors)[runs.eligible].max()), fresh
             if change < tolerance:
                 break
@@ -363,6 +366,7 @@ def _restored(
     if not out.any():
         return None
     t = runs.standardised(fit) / (fit.sigma0 if level[0] == "tau" and fit.sigma0 > 0 else 1.0)
+    t = np.where(np.isfinite(t), t, np.inf)
     size = np.where(out, 1.0 / np.maximum(t, np.finfo(float).tiny), 0.0)
     several = label.any()
     best = _foremost(size, label)

@@ -20,6 +20,8 @@ __all__ = ["doubtful_control"]
 _TRIPLES, _SIGMAS, _LEAST = 500, 8.0, 4
 # Tolerated error of a control point, as a fraction of their extent.
 _LOOSE = 2e-3
+# Misfits after an exchange of two points that explains those before it, relative to these.
+_SMALLER = 0.2
 
 
 def doubtful_control(network: Network) -> str:
@@ -102,21 +104,29 @@ def _free(network: Network) -> BundleFit | None:
 
 def _exchanged(found: Array, given: Array, limit: Array) -> list[tuple[int, int]]:
     """Return pairs whose exchange makes all points agree; several pairs where the control is symmetric."""
-    pairs = []
+    pairs, every = [], np.ones(len(found), dtype=bool)
+    as_given = _misfits(found, given, every)
     for a, b in combinations(range(len(found)), 2):
         order = np.arange(len(found))
         order[[a, b]] = b, a
-        if _agreeing(found, given[order], limit, np.ones(len(found), dtype=bool)).all():
+        misfit = _misfits(found, given[order], every)
+        # In a symmetric figure an exchange can leave the shape as it is.
+        if (misfit < limit).all() and np.linalg.norm(misfit) < _SMALLER * np.linalg.norm(as_given):
             pairs.append((a, b))
     return pairs
 
 
 def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
     """Return which points agree with the similarity of the chosen ones."""
+    return np.asarray(_misfits(found, given, chosen) < limit)
+
+
+def _misfits(found: Array, given: Array, chosen: Mask) -> Array:
+    """Distances of all points after the similarity of the chosen ones."""
     nothing = np.zeros((1, 12))
     values = Values(np.zeros((0, 3, 3)), np.zeros((0, 3)), found, nothing, nothing)
     moved = similarity_onto(values.xyz[chosen], given[chosen], scaled=True)(values).xyz
-    return np.asarray(np.linalg.norm(moved - given, axis=1) < limit)
+    return np.asarray(np.linalg.norm(moved - given, axis=1))
 
 
 def _largest_agreement(found: Array, given: Array, limit: Array) -> Mask:

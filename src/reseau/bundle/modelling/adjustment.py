@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ...adjust import data_snooping, robust
-from ...adjust.outliers import SnoopingStep
+from ...adjust.outliers import Rejection, SnoopingStep
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ..diagnostics import Result, checks, doubtful_control
@@ -19,11 +19,16 @@ from ..network.network import finite
 from ..solver import BundleFit, BundleProblem, approximate
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
+from .startup import improved, lost_images, settled
 
 __all__ = ["Options", "adjust_network", "problem_of"]
 
 # Weight of a robust adjustment below which an observation is a gross error, and tolerance of its iteration.
 _GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
+# Part of the points of an image above which it is left out as a whole.
+_MOSTLY = 0.5
+# Failures after which cameras are freed in steps.
+_RETRIED = (Code.NOT_CONVERGED, Code.SINGULAR, Code.RANK_DEFECT, Code.NOT_FINITE, Code.NOT_IDENTIFIED)
 # Sigma0 above which control points and single observations are checked.
 _DOUBT = 3.0
 # Maximum number of observations for the search for gross errors, because of its computing time.
@@ -93,6 +98,8 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )
+    if len(lost_images(network, start.x0, start.xyz)):
+        problem = settled(problem)
     return problem, found.notes
 
 
@@ -132,9 +139,10 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found = _without_gross_errors(problem, options)
         if isinstance(found, Failure):
             return _explained(found, problem)
-        fit, steps = found
+        fit, steps, left = found
+        notes = (*notes, *left)
     else:
-        plain = problem.adjusted()
+        plain = _plain(problem)
         if isinstance(plain, Failure):
             return _explained(plain, problem)
         fit = plain
@@ -143,6 +151,19 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     bare = Result(network, fit, rejected, steps)
     doubts = _doubts(problem) if fit.sigma0 > _DOUBT else []
     return Result(network, fit, rejected, steps, (*notes, *doubts, *checks(bare)))
+
+
+def _plain(problem: BundleProblem) -> BundleFit | Failure:
+    """Adjust; where this fails, or images do not fit, with cameras that are freed in steps."""
+    fit = problem.adjusted()
+    if isinstance(fit, Failure):
+        if fit.code not in _RETRIED:
+            return fit
+        again = settled(problem).adjusted()
+        if isinstance(again, Failure):
+            return fit
+        fit = again
+    return improved(problem, fit)
 
 
 def _doubts(problem: BundleProblem) -> list[Remark]:
@@ -175,19 +196,64 @@ def _suspects(problem: BundleProblem) -> list[str]:
 
 def _without_gross_errors(
     problem: BundleProblem, options: Options
-) -> tuple[BundleFit, tuple[SnoopingStep, ...]] | Failure:
-    """Adjust robustly, then by data snooping, which may restore rejected observations."""
-    problem = _trimmed(problem)
-    first_fit = robust(problem, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
-    if not isinstance(first_fit, Failure):
-        start = problem.continued(first_fit.adjustment)
-        weights = np.where(first_fit.factors < _GROSS_ERROR, 0.0, 1.0)
-        first = start.with_weights(weights).adjusted()
-        problem = start if isinstance(first, Failure) else start.continued(first)
-    found = data_snooping(problem, options.alpha, "tau", options.max_fraction, groups=problem.groups)
+) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[Remark]] | Failure:
+    """Adjust robustly, then by data snooping, which may restore rejected observations.
+
+    Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
+    Where the approximate values do not suffice, the adjustment of all observations gives better ones.
+    """
+    found = _snooped(_trimmed(problem), options)
+    if isinstance(found, Failure):
+        plain = _plain(problem)
+        if isinstance(plain, Failure):
+            return found
+        problem = problem.continued(plain)
+        found = _snooped(problem, options)
     if isinstance(found, Failure):
         return found
-    return found.adjustment, found.steps
+    left: list[int] = []
+    while bad := _bad_images(problem, found):
+        left += bad
+        network = problem.network
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+        weights[: 2 * len(network.xy)][np.repeat(np.isin(network.image_of, bad), 2)] = 0.0
+        problem = problem.continued(found.adjustment).with_weights(weights)
+        again = _snooped(problem, options)
+        if isinstance(again, Failure):
+            return again
+        found = again
+    remarks = []
+    if left:
+        names = listed(problem.network.images[i] for i in left)
+        remarks = [
+            Remark(
+                f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a "
+                "whole",
+                Code.GROSS_ERRORS,
+            )
+        ]
+    return found.adjustment, found.steps, remarks
+
+
+def _snooped(problem: BundleProblem, options: Options) -> Rejection[BundleFit] | Failure:
+    """Adjust robustly, then by data snooping."""
+    first_fit = robust(problem, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
+    if not isinstance(first_fit, Failure):
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+        start = problem.continued(first_fit.adjustment)
+        first = start.with_weights(np.where(first_fit.factors < _GROSS_ERROR, 0.0, weights)).adjusted()
+        problem = start if isinstance(first, Failure) else start.continued(first)
+    return data_snooping(problem, options.alpha, "tau", options.max_fraction, groups=problem.groups)
+
+
+def _bad_images(problem: BundleProblem, found: Rejection[BundleFit]) -> list[int]:
+    """Images most of whose points are rejected, which are not left out yet."""
+    network, n = problem.network, len(problem.network.xy)
+    out = found.rejected[: 2 * n].reshape(n, 2).any(axis=1)
+    used = out | found.adjustment.usable.observations
+    count = np.bincount(network.image_of[used], minlength=len(network.images))
+    gone = np.bincount(network.image_of[out], minlength=len(network.images))
+    return [int(i) for i in np.flatnonzero((count > 0) & (gone > _MOSTLY * count))]
 
 
 def _trimmed(problem: BundleProblem) -> BundleProblem:

@@ -20,7 +20,7 @@ from .values import Values
 
 __all__ = ["Approximate", "approximate"]
 
-# Largest misfit of an ideal direction that is not a gross error while distortion and principal distance are
+# Largest misfit of a direction (rad) that is not a gross error while distortion and principal distance are
 # only roughly known.
 _LOOSE = 0.03
 # Minimum intersection angle (rad) of the rays of a point that is used to orient another image.
@@ -173,10 +173,12 @@ class _Block:
         self.angle = np.where(self.known, np.pi / 2, angle)
 
     def _misfit(self, image: Rows, point: Rows, uv: Array, xyz: Array) -> Array:
-        """Distances between computed and measured directions; infinite behind the camera."""
+        """Angles (sine) between computed and measured directions; infinite behind the camera."""
         x = np.einsum("nij,nj->ni", self.rotation[image], xyz[point] - self.x0[image])
+        ray = np.column_stack([uv, np.ones(len(uv))])
         with np.errstate(divide="ignore", invalid="ignore"):
-            off: Array = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
+            across = np.linalg.norm(np.cross(x, ray), axis=1)
+            off: Array = across / np.linalg.norm(x, axis=1) / np.linalg.norm(ray, axis=1)
         return np.where(x[:, 2] > 0, off, np.inf)
 
     def _resect_all(self) -> bool:

@@ -23,12 +23,14 @@ from .values import Correction, Values
 
 __all__ = ["Iterated", "iterate"]
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
+_LEAST_DAMPING, _MOST_DAMPING = 1e-16, 1e12
 # Ratio of actual to predicted decrease above which the damping is multiplied by the factor that follows.
 _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 # Damping at which a step is practically undamped; relative decrease that is rounding; relative offset
 # accepted in the last iteration.
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
+# Relative increase of the sum of squares that can be rounding.
+_ROUNDING = 1e-10
 # Points farther away than this many times the extent of the network are at infinity.
 _HORIZON, _NEARLY = 1e8, 0.99
 # A step rejected at a damping below this lies in a curved valley. The second difference of the misfits is
@@ -142,12 +144,16 @@ def iterate(
             trial = trial.confined(away, radius)
         out, others = system.misfits(trial)
         there = float((out**2).sum() + others @ others)
-        flat = step.predicted <= _FLAT * cost and there <= cost * (1.0 + 1e-10)
+        flat = step.predicted <= _FLAT * cost and there <= cost * (1.0 + _ROUNDING)
         gain = (cost - there) / step.predicted if np.isfinite(there) and step.predicted > 0 else -1.0
         if gain > 1e-4 or flat:
             linear, cost, growth = system.linearise(trial), there, 2.0
             costs.append(cost)
-            shrink = _SHRINK if flat or gain > _GOOD else _SLOWLY if gain > _FAIR else 1.0
+            shrink = _SHRINK if gain > _GOOD else _SLOWLY if gain > _FAIR else 1.0
+            if flat and gain < _FAIR:
+                # Rounding, or a step that is too long: with large residuals the sum of squares can be more
+                # curved across a narrow valley than its linear part.
+                shrink = _SHRINK if damping > _SMALL else 2.0
             damping = max(damping * shrink, _LEAST_DAMPING)
             if watch is not None:
                 watch(tried, cost)

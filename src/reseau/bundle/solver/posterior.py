@@ -217,7 +217,7 @@ def _marginal(
         if normal.least < PARALLEL:
             raise Singular
         z = arrow.inverse()
-        found = _with_inverse(linear, normal, z, held, taking_part)
+        found = _with_inverse(linear, normal, z, held, taking_part, turned=True)
         missing = abs(_total(found) - free)
         if arrow.weakest >= _RANK and missing < _EXACT:
             return found
@@ -270,18 +270,25 @@ def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
 
 
 def _with_inverse(
-    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask
+    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask, *, turned: bool = False
 ) -> tuple[Array, Array, Array, Array]:
-    """Cofactors from the inverse of the reduced normal equations."""
+    """Cofactors from the inverse of the reduced normal equations.
+
+    `turned` tells that these are for the combinations of camera parameters of :class:`Normal`.
+    """
     system = linear.system
     z[held] = 0.0
     z[:, held] = 0.0
     points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
 
+    rows = linear.turned_rows if turned and normal.bases else linear.rows
+
     def work(_: int, a: int, b: int) -> None:
-        posterior(a, b, linear.rows, system.pattern, normal.inverse, z, points, seen)
+        posterior(a, b, rows, system.pattern, normal.inverse, z, points, seen)
 
     in_parallel(work, system.chunks)
+    if turned:
+        z = normal.in_parameters(normal.in_parameters(z).T)
     points *= system.movable[:, :, None] * system.movable[:, None, :]
     points[~taking_part] = 0.0
     kept = np.flatnonzero(system.unknowns.kept >= 0)

@@ -31,6 +31,7 @@ from .rank import (
     poorly_determined_points,
     steady_points,
     undetermined,
+    weak_images,
     weak_points,
     without_effect,
 )
@@ -194,6 +195,11 @@ class BundleProblem(Display):
                     do="use its default",
                 )
         return self._adjusted(options)
+
+    def approached(self, max_iterations: int) -> Values | None:
+        """Return approximate values after some iterations, converged or not; None where they fail."""
+        with one_thread():
+            return _Run(self, AdjustOptions(max_iterations=max_iterations, damping=_DAMPING)).approach()
 
     def _adjusted(self, options: AdjustOptions) -> BundleFit | Failure:
         with one_thread():
@@ -392,8 +398,35 @@ class _Run:
             weak = weak_points(linear)
             if len(weak) and problem.rounds < _ROUNDS:
                 return self._without(weak, values)._adjusted(self.options)
+            images = weak_images(linear)
+            if 0 < len(images) < self.usable.images.sum() and problem.rounds < _ROUNDS:
+                left = self._without(weak, values)
+                left.start.x0[images] = np.nan
+                return left._adjusted(self.options)
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def approach(self) -> Values | None:
+        """Approximate values in the coordinate system of the network after some iterations."""
+        if not self.usable.images.any():
+            return None
+        start = self._start()
+        freedom = freedom_of(self.system, start, self.usable.points)
+        counts = self._counts(freedom)
+        if counts[0] - counts[1] + counts[2] < 0:
+            return None
+        if self.network.datum == "minimal":
+            self.system.held[held_minimally(freedom, self.unknowns, start)] = True
+        found = iterate(
+            self.system, start, redundancy=max(1, counts[0] - counts[1]), tolerance=_ROUGHLY,
+            max_iterations=self.options.max_iterations, damping=self.options.damping,
+        )  # fmt: skip
+        if isinstance(found, Failure) or not np.isfinite(found.linear.cost):
+            return None
+        values, chosen = found.values, self.network.datum_points & self.usable.points
+        if self.network.datum == "free" and freedom.defect and chosen.sum() >= 3:
+            values = self._aligned(values, freedom, chosen)
+        return self._without(found.away, values).start
 
     def _behind_given_windows(self, start: Values, redundancy: int) -> Values:
         """Approximate values adjusted with windows and media as given.

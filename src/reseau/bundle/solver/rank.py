@@ -17,6 +17,7 @@ __all__ = [
     "poorly_determined_points",
     "steady_points",
     "undetermined",
+    "weak_images",
     "weak_points",
     "without_effect",
 ]
@@ -100,6 +101,26 @@ def weak_points(linear: Linear) -> Rows:
     return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
 
 
+def weak_images(linear: Linear) -> Rows:
+    """Return the images with singular normal equations: their points do not determine the pose.
+
+    An example are three points on one line. All points and cameras are held.
+    """
+    system, unknowns = linear.system, linear.system.unknowns
+    if system.constraints is not None:
+        return np.zeros(0, dtype=np.intp)
+    j = linear.rows[:, :, :6]
+    normal = np.zeros((len(unknowns.pose), 6, 6))
+    np.add.at(normal, system.seen.image, np.swapaxes(j, 1, 2) @ j)
+    images = np.flatnonzero(unknowns.pose >= 0)
+    size = np.sqrt(np.diagonal(normal[images], axis1=1, axis2=2))
+    known = (size > 0).all(axis=1)
+    scaled = normal[images[known]] / (size[known][:, :, None] * size[known][:, None, :])
+    weak = np.ones(len(images), dtype=bool)
+    weak[known] = np.linalg.eigvalsh(scaled)[:, 0] < _ZERO
+    return np.asarray(images[weak], dtype=np.intp)
+
+
 def without_effect(linear: Linear) -> list[str]:
     """Return the parameters of windows and media on which, but for rounding, no ray depends.
 
@@ -174,7 +195,7 @@ def _own_normals(linear: Linear) -> Array:
 def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     """Basis of the null space of the reduced normal equations, with as many zeros as possible."""
     system = linear.system
-    normal = linear.normal(0.0)
+    normal = linear.normal(0.0, turned=False)
     held = system.held.copy()
     held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
     diagonal = normal.sums.diagonal

@@ -34,6 +34,8 @@ _DISTANT = 1e4
 _STEPS, _SHORT, _ROUGH = 20, 1e-9, 1e-3
 
 
+# Rays closer than this (sine) to the plane across the middle of all rays are not used in a resection.
+_GRAZING = 0.1
 # Steps of a resection through windows, and its cost of a point that has no ray.
 _POSE_STEPS, _MISSED = 60, 10.0
 
@@ -162,15 +164,20 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     uv : ndarray (k, 2)
         Ideal directions.
     tolerance : float
-        Largest misfit of the ideal direction of a consistent point.
+        Largest misfit of the direction of a consistent point (rad).
 
     Returns
     -------
     Resection or None
         None where fewer than four points are consistent.
     """
-    if len(xyz) < 4:
+    # In a plane across the middle of the rays misfits are angles, even in the corners of a wide lens.
+    turn = _towards(uv)
+    ray = np.column_stack([uv, np.ones(len(uv))]) @ turn.T
+    front = ray[:, 2] > _GRAZING * np.linalg.norm(ray, axis=1)
+    if front.sum() < 4:
         return None
+    uv, given, xyz = ray[front, :2] / ray[front, 2:], len(xyz), xyz[front]
     centre = xyz.mean(axis=0)
     size = float(np.abs(xyz - centre).max()) or 1.0
     local = np.ascontiguousarray((xyz - centre) / size)
@@ -181,8 +188,20 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
         return None
     if best is None:
         return None
-    rotation, shift, agree = best
-    return Resection(rotation, centre - size * rotation.T @ shift, agree)
+    rotation, shift, consistent = best
+    agree = np.zeros(given, dtype=bool)
+    agree[front] = consistent
+    return Resection(turn.T @ rotation, centre - size * rotation.T @ shift, agree)
+
+
+def _towards(uv: Array) -> Array:
+    """Rotation (3, 3) that turns the mean of the rays to the optical axis."""
+    ray = np.column_stack([uv, np.ones(len(uv))])
+    z = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).mean(axis=0)
+    z /= np.linalg.norm(z)
+    x = np.array([z[2], 0.0, -z[0]])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
 
 
 def resect_through(

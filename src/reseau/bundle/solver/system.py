@@ -11,6 +11,7 @@ from ...core.data import Array, Mask, Rows
 from ...optics import PlaneMapping
 from ..network import Network
 from .arrow import Arrow, full
+from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
 from .imaging import Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
@@ -185,16 +186,13 @@ class Linear:
         """Weights of observed coordinates of eliminated points, and weighted misfits (p, 3, 2)."""
         network, others = self.system.unknowns.network, self.system.others
         prior = np.zeros((len(network.points), 3, 2))
-        untouched = (network.rays == 0)[:, None] & ~network.observed
-        prior[..., 0] = np.where((self.system.movable == 0) | untouched, 1.0, 0.0)
+        prior[..., 0] = np.where(self.system.movable == 0, 1.0, 0.0)
         at = others.slices[1]
         j, axis = others.coordinate.T
         root = self.system.sigma_root[at]
         prior[j, axis, 0] += root**2
-        # A rejected coordinate observation of a point that no other observation determines.
-        prior[j, axis, 0] = np.where(
-            (prior[j, axis, 0] == 0) & (network.rays[j] == 0), 1.0, prior[j, axis, 0]
-        )
+        # Points without rays, and without an observed coordinate that is used, are not moved.
+        prior[..., 0] = np.where((prior[..., 0] == 0) & (network.rays == 0)[:, None], 1.0, prior[..., 0])
         prior[j, axis, 1] = root * self.other_misfits[at]
         return prior
 
@@ -241,8 +239,26 @@ class Linear:
             slopes.append((at, unknowns.camera[c] + np.arange(count), slope))
         return slopes
 
-    def normal(self, damping: float) -> Normal:
-        """Form the damped normal equations, reduced to the unknowns other than points."""
+    @cached_property
+    def bases(self) -> tuple[CameraBasis, ...]:
+        """Combinations of the parameters of cameras for which the normal equations are formed."""
+        return camera_bases(self)
+
+    @cached_property
+    def turned_rows(self) -> Array:
+        """Derivatives of the image coordinates (n, 2, w) by these combinations."""
+        return with_bases(self, self.bases)
+
+    def normal(self, damping: float, *, turned: bool = True) -> Normal:
+        """Form the damped normal equations, reduced to the unknowns other than points.
+
+        Parameters
+        ----------
+        damping : float
+            Relative to the diagonal.
+        turned : bool
+            Whether to form them for well-conditioned combinations of the parameters of cameras.
+        """
         system, unknowns = self.system, self.system.unknowns
         p, u, bands = len(self.prior), unknowns.size, unknowns.bands
         inverse, side, diagonal = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
@@ -255,10 +271,11 @@ class Linear:
             for _ in chunks
         ]  # fmt: skip
         least = np.ones(len(chunks))
+        bases, rows = (self.bases, self.turned_rows) if turned else ((), self.rows)
 
         def work(part: int, a: int, b: int) -> None:
             least[part] = assemble(
-                a, b, self.rows, self.misfits, system.pattern, self.prior, damping, parts[part], inverse,
+                a, b, rows, self.misfits, system.pattern, self.prior, damping, parts[part], inverse,
                 side, diagonal,
             )  # fmt: skip
 
@@ -273,10 +290,15 @@ class Linear:
             _hold(sums, int(column))
         if damping:
             extra = damping * np.where(sums.diagonal > 0, sums.diagonal, 1.0)
+            for basis in bases:
+                extra[basis.columns] = 0.0
+                basis.damp(sums, damping)
             sums.band[:, 0] += extra[:bands]
             corner = np.arange(u - bands)
             sums.border[corner, bands + corner] += extra[bands:]
-        return Normal(self, sums, inverse, side, diagonal, damping, float(least.min(initial=1.0)))
+        for basis in bases:
+            sums.diagonal[basis.columns] = basis.diagonal
+        return Normal(self, sums, inverse, side, diagonal, damping, float(least.min(initial=1.0)), bases)
 
 
 class Normal:
@@ -284,10 +306,10 @@ class Normal:
 
     def __init__(
         self, linear: Linear, sums: Sums, inverse: Array, side: Array, diagonal: Array, damping: float,
-        least: float,
+        least: float, bases: tuple[CameraBasis, ...] = (),
     ) -> None:  # fmt: skip
         self.linear, self.sums, self.inverse, self.side = linear, sums, inverse, side
-        self.diagonal, self.damping, self.least = diagonal, damping, least
+        self.diagonal, self.damping, self.least, self.bases = diagonal, damping, least, bases
 
     def hold(self, held: Mask) -> None:
         """Hold reduced unknowns (u,)."""
@@ -327,14 +349,24 @@ class Normal:
         constraints, q, by_stage = self.linear.system.constraints, None, 0.0
         if constraints is None:
             y = self.factorise().solve(-self.sums.reduced)
+            gradient = self.sums.gradient @ y
+            y = self.in_parameters(y)
         else:
             own = self.constrained(constraints)
             q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
             y, by_stage = own.back @ q, float(own.own @ q)
+            gradient = self.sums.gradient @ y
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
-        gradient = self.sums.gradient @ y + float((self.side * points).sum()) + by_stage
+        gradient += float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
         return Correction(y, points, float(-gradient + self.damping * bent), float(np.sqrt(bent)), q)
+
+    def in_parameters(self, z: Array) -> Array:
+        """Return reduced unknowns (u, …) for the parameters of cameras, from those for their combinations."""
+        y = z.copy()
+        for basis in self.bases:
+            y[basis.columns] = basis.turn @ z[basis.columns]
+        return y
 
     def points(self, side: Array, y: Array) -> Array:
         """Compute points (p, 3, s) from right-hand sides (p, 3, s) and reduced unknowns (u, s)."""

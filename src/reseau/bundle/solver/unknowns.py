@@ -196,7 +196,8 @@ class Unknowns:
         total = locals_of(self.first, start, width, place, table, number)
         at, size, offset = (np.ascontiguousarray(table[:total, i]) for i in range(3))
         local = np.concatenate([[0], np.cumsum(number)])
-        eliminated = (self.kept < 0).astype(np.intp)
+        # Points with held coordinates have no unknowns: to eliminate them would couple all their images.
+        eliminated = ((self.kept < 0) & ~self.network.held.all(axis=1)).astype(np.intp)
         return Pattern(self.first, start, width, column, place, local, at, size, offset, eliminated)
 
     @cached_property

@@ -1,0 +1,99 @@
+"""Well-conditioned combinations of the parameters of a camera, for the normal equations.
+
+The coefficients of a polynomial, and more so of a quotient of polynomials, act on an image almost alike: the
+normal equations have the square of the condition number of the derivatives, and lose the digits that tell
+the coefficients apart. With the QR factors J = Q R of the derivatives of the image coordinates by the
+parameters of one camera, the corrections z = R y have derivatives with orthonormal columns (Golub & Van Loan,
+*Matrix Computations*, ch. 5). The normal equations are formed for z; corrections and cofactors are returned
+for y. Damping remains that of the parameters themselves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from ...core.data import Array, Rows
+
+if TYPE_CHECKING:
+    from .normal import Sums
+    from .system import Linear
+
+__all__ = ["CameraBasis", "camera_bases", "with_bases"]
+
+# Least eigenvalue of the normal equations of a camera with unit diagonal for which its parameters are used as
+# they are, and least singular value of its derivatives that is not rounding.
+_GOOD, _RANK = 1e-6, 1e-12
+
+
+class CameraBasis(NamedTuple):
+    """Combinations of the parameters of one camera.
+
+    Parameters
+    ----------
+    columns : ndarray of int (k,)
+        Reduced unknowns of the parameters.
+    turn : ndarray (k, k)
+        y = turn · z.
+    diagonal : ndarray (k,)
+        Diagonal of the normal equations of y.
+    """
+
+    columns: Rows
+    turn: Array
+    diagonal: Array
+
+    def damp(self, sums: Sums, damping: float) -> None:
+        """Add the damping of the parameters to the normal equations of the combinations."""
+        block = damping * (self.turn.T * self.diagonal) @ self.turn
+        bands, first = len(sums.band), int(self.columns[0])
+        if first >= bands:
+            sums.border[np.ix_(self.columns - bands, self.columns)] += block
+            return
+        for i, c in enumerate(self.columns):
+            sums.band[c, self.columns[i:] - c] += block[i:, i]
+
+
+def camera_bases(linear: Linear) -> tuple[CameraBasis, ...]:
+    """Return the combinations for the cameras that need them.
+
+    Cameras whose parameters are observed as well are not among them, nor networks with a stage.
+    """
+    system, unknowns = linear.system, linear.system.unknowns
+    if system.constraints is not None:
+        return ()
+    observed = {*system.others.interior[:, 0].tolist(), *system.others.joint.tolist()}
+    found = []
+    for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1)).tolist():
+        if c in observed:
+            continue
+        own = system.seen.camera == c
+        rows = linear.rows if own.all() else linear.rows[own]
+        j = rows[:, :, 6 : 6 + int(unknowns.count[c])].reshape(-1, int(unknowns.count[c]))
+        diagonal = np.einsum("ni,ni->i", j, j)
+        if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
+            continue
+        length = np.sqrt(diagonal)
+        if np.linalg.eigvalsh(j.T @ j / np.outer(length, length))[0] > _GOOD:
+            continue
+        triangle = np.linalg.qr(j / length, mode="r")
+        if np.linalg.svd(triangle, compute_uv=False)[-1] < _RANK:
+            continue
+        turn = scipy.linalg.solve_triangular(triangle, np.eye(len(length))) / length[:, None]
+        columns = (unknowns.camera[c] + np.arange(len(length))).astype(np.intp)
+        found.append(CameraBasis(columns, turn, diagonal))
+    return tuple(found)
+
+
+def with_bases(linear: Linear, bases: tuple[CameraBasis, ...]) -> Array:
+    """Return the derivatives (n, 2, w) of the image coordinates by the combinations."""
+    if not bases:
+        return linear.rows
+    rows, unknowns = linear.rows.copy(), linear.system.unknowns
+    for basis in bases:
+        c = int(np.flatnonzero(unknowns.camera == basis.columns[0])[0])
+        own, part = linear.system.seen.camera == c, slice(6, 6 + len(basis.columns))
+        rows[own, :, part] = rows[own, :, part] @ basis.turn
+    return rows
