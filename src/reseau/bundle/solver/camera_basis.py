@@ -10,16 +10,15 @@ for y. Damping remains that of the parameters themselves.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Set
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from ...core.data import Array, Rows
-
-if TYPE_CHECKING:
-    from .normal import Sums
-    from .system import Linear
+from .normal import Sums
+from .unknowns import Unknowns
 
 __all__ = ["CameraBasis", "camera_bases", "with_bases"]
 
@@ -56,21 +55,28 @@ class CameraBasis(NamedTuple):
             sums.band[c, self.columns[i:] - c] += block[i:, i]
 
 
-def camera_bases(linear: Linear) -> tuple[CameraBasis, ...]:
+def camera_bases(
+    unknowns: Unknowns, camera_of: Rows, observed: Set[int], derivatives: Array
+) -> tuple[CameraBasis, ...]:
     """Return the combinations for the cameras that need them.
 
-    Cameras whose parameters are observed as well are not among them, nor networks with a stage.
+    Parameters
+    ----------
+    unknowns : Unknowns
+        Columns.
+    camera_of : ndarray of int (n,)
+        Camera of each image point.
+    observed : set of int
+        Cameras whose parameters are observed as well: these are left as they are.
+    derivatives : ndarray (n, 2, w)
+        Weighted derivatives of the image coordinates; those by the camera begin in the seventh column.
     """
-    system, unknowns = linear.system, linear.system.unknowns
-    if system.constraints is not None:
-        return ()
-    observed = {*system.others.interior[:, 0].tolist(), *system.others.joint.tolist()}
     found = []
     for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1)).tolist():
         if c in observed:
             continue
-        own = system.seen.camera == c
-        rows = linear.rows if own.all() else linear.rows[own]
+        own = camera_of == c
+        rows = derivatives if own.all() else derivatives[own]
         j = rows[:, :, 6 : 6 + int(unknowns.count[c])].reshape(-1, int(unknowns.count[c]))
         diagonal = np.einsum("ni,ni->i", j, j)
         if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
@@ -87,13 +93,15 @@ def camera_bases(linear: Linear) -> tuple[CameraBasis, ...]:
     return tuple(found)
 
 
-def with_bases(linear: Linear, bases: tuple[CameraBasis, ...]) -> Array:
+def with_bases(
+    derivatives: Array, unknowns: Unknowns, camera_of: Rows, bases: tuple[CameraBasis, ...]
+) -> Array:
     """Return the derivatives (n, 2, w) of the image coordinates by the combinations."""
     if not bases:
-        return linear.rows
-    rows, unknowns = linear.rows.copy(), linear.system.unknowns
+        return derivatives
+    rows = derivatives.copy()
     for basis in bases:
         c = int(np.flatnonzero(unknowns.camera == basis.columns[0])[0])
-        own, part = linear.system.seen.camera == c, slice(6, 6 + len(basis.columns))
+        own, part = camera_of == c, slice(6, 6 + len(basis.columns))
         rows[own, :, part] = rows[own, :, part] @ basis.turn
     return rows

@@ -242,12 +242,16 @@ class Linear:
     @cached_property
     def bases(self) -> tuple[CameraBasis, ...]:
         """Combinations of the parameters of cameras for which the normal equations are formed."""
-        return camera_bases(self)
+        system, others = self.system, self.system.others
+        if system.constraints is not None:
+            return ()
+        observed = {*others.interior[:, 0].tolist(), *others.joint.tolist()}
+        return camera_bases(system.unknowns, system.seen.camera, observed, self.rows)
 
     @cached_property
     def turned_rows(self) -> Array:
         """Derivatives of the image coordinates (n, 2, w) by these combinations."""
-        return with_bases(self, self.bases)
+        return with_bases(self.rows, self.system.unknowns, self.system.seen.camera, self.bases)
 
     def normal(self, damping: float, *, turned: bool = True) -> Normal:
         """Form the damped normal equations, reduced to the unknowns other than points.
