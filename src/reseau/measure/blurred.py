@@ -49,8 +49,10 @@ _RINGS = (4, 6, 8, 11)
 """Rings of elements of the stop: each step doubles the number of rays."""
 _SETTLED = 0.1
 """More rays no longer matter if they shift the match by less than this many of its standard deviations."""
-_LEAST_SHIFT = 0.002
+_LEAST_SHIFT = 0.0005
 """… or by less than this many pixels."""
+_CRITICAL = 4
+"""Number of targets with which this is tested."""
 _STEP = 0.05
 """Step of a varied parameter for the motion of the nodes, in its standard deviations."""
 _ROUNDS = 20
@@ -732,7 +734,8 @@ class _Run:
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
         """Rings of elements of the stop (0: of a surrogate), these elements, and images of all targets.
 
-        As many rings that more of them no longer change the most blurred image within the noise.
+        As many rings that more of them no longer change the images of the most critical targets within the
+        noise.
         """
 
         def images(elements: PupilElements) -> list[RayImage | None]:
@@ -746,15 +749,19 @@ class _Run:
         seen = [(k, image) for k, image in enumerate(found) if image is not None]
         if self.options.rings or not seen:
             return rings, elements, found
-        k, before = max(seen, key=lambda pair: pair[1].blur)
-        half, xy = self._half(before), np.rint(before.point)
-        formed = self._formed(before, half, xy)
+        # Small targets that are much blurred show the single elements first.
+        seen.sort(key=lambda pair: -pair[1].blur / self.targets[pair[0]].extent)
+        critical = [k for k, _ in seen[:_CRITICAL]]
+        windows = {k: (self._half(image), np.rint(image.point)) for k, image in seen[:_CRITICAL]}
+        formed = {k: self._formed(image, *windows[k]) for k, image in seen[:_CRITICAL]}
         for few, many in pairwise(_RINGS):
-            rings, finer = few, self._imaged(k, PupilElements.gauss(many))
-            if finer is None:
-                break
-            coarser, formed = formed, self._formed(finer, half, xy)
-            if self._alike(coarser, formed):
+            rings, settled = few, True
+            for k in critical:
+                finer = self._imaged(k, PupilElements.gauss(many))
+                if finer is not None:
+                    coarser, formed[k] = formed[k], self._formed(finer, *windows[k])
+                    settled &= self._alike(coarser, formed[k])
+            if settled:
                 break
             rings = many
         if rings == _RINGS[0]:

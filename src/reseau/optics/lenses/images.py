@@ -53,6 +53,15 @@ def _powers(uv: Array) -> Array:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
+def _slopes(uv: Array) -> tuple[Array, Array]:
+    """Derivatives (n, 6) of these terms by u and by v."""
+    (u, v), none, one = uv.T, np.zeros(len(uv)), np.ones(len(uv))
+    return (
+        np.stack([none, one, none, 2 * u, v, none], axis=1),
+        np.stack([none, none, one, none, u, 2 * v], axis=1),
+    )
+
+
 _GOLDEN = np.pi * (3 - np.sqrt(5.0))
 _FIT = np.linalg.pinv(_powers(_GRID))
 
@@ -513,8 +522,14 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     point = camera.corresponding(target.centre[None])[0]
     usable = np.asarray(np.isfinite(xy).all(axis=(1, 3)))
     maps = np.einsum("tg,wgex->wetx", _FIT, np.where(usable[:, None, :, None], xy, 0.0))
-    emitted = np.abs(light.mean(axis=1) @ target.normal)
-    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, emitted, 0.0).ravel()
+    emitted = np.moveaxis(np.abs(light @ target.normal), 1, 2)
+    # Light per area of the image: where an element images the target smaller, it is brighter. In a tilted
+    # target this cancels what Lambert's law changes over the stop, which alone would displace the image.
+    by_u, by_v = (np.einsum("gt,wetx->wegx", slopes, maps) for slopes in _slopes(_GRID))
+    area = np.abs(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
+    usable &= (area > 0).all(axis=2)
+    density = (emitted / np.where(usable[..., None], area, 1.0)).mean(axis=2)
+    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, density, 0.0).ravel()
     if not (share.sum() > 0 and np.isfinite(point).all()):
         lens = camera.camera if isinstance(camera, CalibratedLens) else camera
         why = lens.why_dark(target.centre) if isinstance(lens, LensCamera) else "it is not in the field"
@@ -529,9 +544,7 @@ def _assembled(coefficients: Array, share: Array, target: PlaneTarget, point: Ar
     """Outline of an image from the mappings (m, 6, 2) of the elements and their light (m,)."""
     uv = target.outline.xy / target.extent
     xy = _powers(uv) @ coefficients
-    (u, v), none, one = uv.T, np.zeros(len(uv)), np.ones(len(uv))
-    by_u = np.stack([none, one, none, 2 * u, v, none], axis=1) @ coefficients
-    by_v = np.stack([none, none, one, none, u, 2 * v], axis=1) @ coefficients
+    by_u, by_v = (slopes @ coefficients for slopes in _slopes(uv))
     du, dv = target.outline.dxy.T[:, None, :, None] / target.extent
     dxy = (by_u * du + by_v * dv) * share[:, None, None]
     outline = Outline((xy - point).reshape(-1, 2), dxy.reshape(-1, 2)).oriented()
