@@ -35,8 +35,8 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
     The likelihood of the visible pixels as a function of the place e of the hidden end is far from normal.
     For each e all other unknowns are adjusted anew; the middle has the mean m(e) and the covariance C(e)
     then. With the weights w of the likelihoods, mean and covariance are Σwm and Σw(C + (m − Σwm)(m − Σwm)ᵀ).
-    Where both ends are partly hidden, the position along the line counts as unknown unless the visible part of
-    the other end determines it well.
+    Where both ends are hidden in part, their visible parts determine them well, or the position along the
+    line counts as unknown.
 
     Parameters
     ----------
@@ -62,13 +62,15 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
         tilt = found.arcs.tilt[row]
         along = np.array([np.cos(tilt), np.sin(tilt)])
         middle = float(np.sqrt(along @ found.cov[row] @ along))
-        # Where one end is certain, the other is twice as uncertain as the middle.
-        both = hidden[row].all()
-        end = middle + half[row] * found.sigma["length"][row] if both else 2 * middle
+        if hidden[row].all():
+            # What shows both ends determines them well, or is mistaken for them: a fragment beside a wire.
+            if np.hypot(middle, half[row] * found.sigma["length"][row]) > _LINEAR * soft[row]:
+                found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
+            continue
+        side = 1.0 if hidden[row, 1] else -1.0
+        end = 2 * middle  # the other end is certain
         if end < _LINEAR * soft[row]:
             continue
-        # Of two hidden ends the other one is adjusted.
-        side = 1.0 if share[row, 1] > share[row, 0] else -1.0
         scale = float(np.clip(end, *_SCALES_PX))
         most = np.arcsinh(_BEYOND_PX / scale)
         steps = scale * np.sinh(np.linspace(-most, most, _PLACES))
@@ -90,9 +92,7 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
         off = middle - weight @ middle
         found.xy[row] = weight @ middle
         found.cov[row] = np.einsum("n,nij->ij", weight, cov) + np.einsum("n,ni,nj->ij", weight, off, off)
-        other = 2 * float(np.sqrt(along @ np.einsum("n,nij->ij", weight, cov) @ along))
-        unknown = both and other > _LINEAR * soft[row]
-        if unknown or likely[0] == 0 or likely[-1] == len(steps) - 1:
+        if likely[0] == 0 or likely[-1] == len(steps) - 1:
             found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
     return rows
 
