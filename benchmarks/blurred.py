@@ -111,7 +111,9 @@ def world(seed: int) -> World:
         point = lens.principal_ray(centre, WAVELENGTHS[1])
         half = int(0.75 * pixels + 1.2 * wanted) + 12
         columns, rows = (np.arange(-half, half + 1) + round(v) for v in point)
-        share = light(lens, target, columns.astype(float), rows.astype(float), PSF)
+        share = light(
+            lens, target, columns.astype(float), rows.astype(float), PSF, 3000 + round(800 * wanted)
+        )
         inside = (rows[:, None] >= 0) & (rows[:, None] < SIZE[1]) & (columns >= 0) & (columns < SIZE[0])
         y, x = np.broadcast_arrays(rows[:, None], columns[None])
         image[y[inside], x[inside]] -= (BRIGHT - DARK) * share[inside]

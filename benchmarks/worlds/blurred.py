@@ -264,7 +264,7 @@ def add_shares(
     _add(image, maps, first, last, low, 1 / side, square, half, weights, jitter)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def _add(
     image: Any,
     maps: Any,
@@ -277,20 +277,32 @@ def _add(
     weights: Any,
     jitter: Any,
 ) -> None:
+    h2 = half * half
     for p in range(len(maps)):
-        a, b, d, e = maps[p]
+        w, left = weights[p], low[0] + jitter[p, 0] * step
         for r in range(first[p, 1], last[p, 1]):
             y = low[1] + (r + jitter[p, 1]) * step
-            for c in range(first[p, 0], last[p, 0]):
-                x = low[0] + (c + jitter[p, 0]) * step
-                u = a[0] + a[1] * x + a[2] * y + a[3] * x * x + a[4] * x * y + a[5] * y * y
-                v = b[0] + b[1] * x + b[2] * y + b[3] * x * x + b[4] * x * y + b[5] * y * y
-                inside = max(abs(u), abs(v)) <= half if square else u * u + v * v <= half * half
-                if inside:
-                    s = d[0] + d[1] * x + d[2] * y + d[3] * x * x + d[4] * x * y + d[5] * y * y
-                    t = e[0] + e[1] * x + e[2] * y + e[3] * x * x + e[4] * x * y + e[5] * y * y
-                    if s * s + t * t <= 1:
-                        image[r, c] += weights[p]
+            m = maps[p]
+            a0, a1, a2 = m[0, 0] + y * (m[0, 2] + y * m[0, 5]), m[0, 1] + y * m[0, 4], m[0, 3]
+            b0, b1, b2 = m[1, 0] + y * (m[1, 2] + y * m[1, 5]), m[1, 1] + y * m[1, 4], m[1, 3]
+            d0, d1, d2 = m[2, 0] + y * (m[2, 2] + y * m[2, 5]), m[2, 1] + y * m[2, 4], m[2, 3]
+            e0, e1, e2 = m[3, 0] + y * (m[3, 2] + y * m[3, 5]), m[3, 1] + y * m[3, 4], m[3, 3]
+            row = image[r]
+            # Without branches, so that several samples are computed at once.
+            if square:
+                for c in range(first[p, 0], last[p, 0]):
+                    x = left + c * step
+                    u, v = a0 + x * (a1 + x * a2), b0 + x * (b1 + x * b2)
+                    s, t = d0 + x * (d1 + x * d2), e0 + x * (e1 + x * e2)
+                    seen = (u * u <= h2) & (v * v <= h2) & (s * s + t * t <= 1.0)
+                    row[c] += w if seen else 0.0
+            else:
+                for c in range(first[p, 0], last[p, 0]):
+                    x = left + c * step
+                    u, v = a0 + x * (a1 + x * a2), b0 + x * (b1 + x * b2)
+                    s, t = d0 + x * (d1 + x * d2), e0 + x * (e1 + x * e2)
+                    seen = (u * u + v * v <= h2) & (s * s + t * t <= 1.0)
+                    row[c] += w if seen else 0.0
 
 
 def light(
@@ -299,7 +311,7 @@ def light(
     columns: Array,
     rows: Array,
     sigma: float,
-    count: int = 16000,
+    count: int = 9000,
 ) -> Array:
     """Share (r, c) of the light of each pixel that the target takes.
 

@@ -76,6 +76,13 @@ class RayMap(Protocol):
     array([[999.5, 749.5]])
     """
 
+    @property
+    def unknown(self) -> float:
+        """Standard deviation of where corresponding rays lie in a blurred image, in parts of its blur.
+
+        Of the form of the image, which follows from a design; a stand-in knows it to a part only.
+        """
+
     def corresponding(self, points: Array) -> Array:
         """Pixels (n, 2) of the corresponding rays of points (n, 3): principal rays of one wavelength."""
 
@@ -90,6 +97,11 @@ class RayMap(Protocol):
 
 class _ByRays(ABC):
     """A map of single rays as a :class:`RayMap`."""
+
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`; of a design, nothing."""
+        return 0.0
 
     @property
     @abstractmethod
@@ -289,6 +301,11 @@ class ThinLens(_ByRays):
     colours: tuple[tuple[float, float], ...] = ((550.0, 1.0),)
 
     @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`; a value of experience, with a double Gauss in place of which it stood."""
+        return 0.1
+
+    @property
     def wavelength_nm(self) -> float:
         """The first one."""
         return self.colours[0][0]
@@ -361,6 +378,11 @@ class AberratedLens(ThinLens):
     narrowing: float = 0.0
     colour: float = 0.0
 
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`; a value of experience, with aberrations estimated from photographs."""
+        return 0.02
+
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays of a thin lens with aberrations."""
         field = points[:, :2] * [-self.image_distance, self.image_distance] / points[:, 2:] / self.field_mm
@@ -405,6 +427,11 @@ class CalibratedLens:
 
     camera: RayMap
     mapping: PlaneMapping
+
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`."""
+        return self.camera.unknown
 
     def corresponding(self, points: Array) -> Array:
         """See :class:`RayMap`."""
@@ -615,6 +642,8 @@ class RaySurrogate:
     corresponding_coefficients : ndarray (a, b, c, 2)
     error_px : float
         Largest difference from traced rays at points between those of the fit.
+    unknown : float
+        That of the map of rays; see :class:`RayMap`.
 
     Examples
     --------
@@ -627,6 +656,7 @@ class RaySurrogate:
     coefficients: Array
     corresponding_coefficients: Array
     error_px: float
+    unknown: float = 0.0
 
     @classmethod
     def of(
@@ -680,7 +710,7 @@ class RaySurrogate:
             for axis, fit in enumerate(fits):
                 table = np.moveaxis(np.tensordot(fit, table, (1, axis)), 0, axis)
             found.append(table.reshape(*shape, *column.shape[1:]))
-        fast = cls(elements, low, high, found[0], found[1], 0.0)
+        fast = cls(elements, low, high, found[0], found[1], 0.0, camera.unknown)
         between = np.random.default_rng(0).uniform(-1, 1, (60, 3))
         traced, point = cls._sampled(camera, elements, low, high, between)
         error = np.abs(fast._at(between, fast.coefficients) - traced)[..., :2].max()
