@@ -40,7 +40,12 @@ class EstimatedOptics:
 
     Examples
     --------
-    See :func:`estimate_optics`, which returns it.
+    :func:`estimate_optics` returns it.
+
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> lens = ThinLens(50.0, 12.5, 52.1, SensorPlane((0.01, 0.01), (40.0, 40.0)))
+    >>> EstimatedOptics(("focus_mm",), np.array([0.1]), np.array([[4e-4]]), lens, 24).sigma
+    array([0.02])
     """
 
     names: tuple[str, ...]
