@@ -143,6 +143,7 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
 
     Examples
     --------
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
     >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(4.0, 0.2))
     >>> image = ray_image(camera, disk, PupilElements.gauss(6))
@@ -207,6 +208,7 @@ def counted_image(
 
     Examples
     --------
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
     >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.2))
     >>> pixels = np.arange(-20.0, 21.0)

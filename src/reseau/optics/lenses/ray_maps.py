@@ -31,6 +31,7 @@ class RayMap(Protocol):
 
     Examples
     --------
+    >>> from reseau.optics.lenses import ThinLens
     >>> camera: RayMap = ThinLens(50.0, 25.0, 51.0, SensorPlane((0.005, 0.005), (999.5, 749.5)))
     >>> camera.corresponding(np.array([[0.0, 0.0, 2000.0]])).round(3)
     array([[999.5, 749.5]])

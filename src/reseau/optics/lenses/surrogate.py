@@ -76,6 +76,7 @@ class RaySurrogate:
 
         Examples
         --------
+        >>> from reseau.optics.lenses import SensorPlane, ThinLens
         >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
         >>> range_ = ((-0.3, 0.3), (-0.2, 0.2)), (900.0, 1100.0)
         >>> fast = RaySurrogate.of(camera, PupilElements.gauss(4), *range_)
