@@ -248,7 +248,7 @@ class CalibratedLens:
     Examples
     --------
     >>> from reseau.optics import Brown, PixelGrid
-    >>> from reseau.optics.lenses import SensorPlane
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
     >>> thin = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (49.5, 49.5)))
     >>> calibrated = Brown(side="object", grid=PixelGrid(100, 100, (0.01, 0.01))).with_values({"c": 52.5})
     >>> CalibratedLens(thin, calibrated).corresponding(np.array([[1.0, 0.0, 1000.0]]))
