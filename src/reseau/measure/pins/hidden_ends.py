@@ -61,14 +61,14 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
     for row in rows.tolist():
         tilt = found.arcs.tilt[row]
         along = np.array([np.cos(tilt), np.sin(tilt)])
-        middle = float(np.sqrt(along @ found.cov[row] @ along))
+        sigma = float(np.sqrt(along @ found.cov[row] @ along))
         if hidden[row].all():
             # What shows both ends determines them well, or is mistaken for them: a fragment beside a wire.
-            if np.hypot(middle, half[row] * found.sigma["length"][row]) > _LINEAR * soft[row]:
+            if np.hypot(sigma, half[row] * found.sigma["length"][row]) > _LINEAR * soft[row]:
                 found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
             continue
         side = 1.0 if hidden[row, 1] else -1.0
-        end = 2 * middle  # the other end is certain
+        end = 2 * sigma  # the other end is certain
         if end < _LINEAR * soft[row]:
             continue
         scale = float(np.clip(end, *_SCALES_PX))
