@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from .bundle_options import (
     Alpha,
     ComponentsOf,
+    DatumChoice,
     Distances,
     Eliminate,
     Reject,
@@ -25,9 +26,13 @@ from .bundle_options import (
 from .common import AsJson, Out, progress, required, say
 
 if TYPE_CHECKING:
-    from ..bundle import Result
+    from ..bundle import Network, Result
+    from ..bundle.network.network import Datum
 
 __all__ = ["bundle"]
+
+# Settings that the provenance always has.
+_ALWAYS = ("reject", "alpha", "components", "eliminate")
 
 
 def bundle(
@@ -52,21 +57,48 @@ def bundle(
             "as ID=calibration.json; repeatable."
         ),
     ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameters to estimate, e.g. K1,K2 or ID:K1 for one camera; all; repeatable."),
+    ] = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(help="Parameters to hold at their given values; as --free.")
+    ] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(help="Control points, id,x,y,z[,sx,sy,sz]; held without sigmas, otherwise observed."),
+    ] = None,
+    datum: Annotated[
+        DatumChoice | None, typer.Option(help="What defines position, orientation and scale.")
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option(help="Standard deviation of all image coordinates, pixels.")
+    ] = None,
+    convert: Annotated[
+        Path | None,
+        typer.Option(help="Write the network as reseau-network/1 with these settings; nothing is adjusted."),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust a network of images: orientation, calibration and object points, with their uncertainty."""
     from ..bundle import Options, ResultDocument, search_model
+    from ..bundle.network import network_document
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import read_network
     from ..io import write_whole
 
     level_of(alpha, "--alpha")
     outputs(out, report)
+    outputs(convert, None)
     distance = positive(distance)
     calibrations = _calibrations(camera or [])
-    content = read_network(network, calibrations)
+    chosen = None if datum is None else datum.value
+    content = _with_settings(read_network(network, calibrations), free, fix, control, chosen, sigma)
+    if convert is not None:
+        network_document(content).write(convert)
+        return
     with progress("adjusting", 30) as step:
         options = Options(
             outliers="reject" if reject else "keep", alpha=alpha, watch=lambda k, cost: step(f"iteration {k}")
@@ -74,8 +106,11 @@ def bundle(
         found = search_model(content, options, component_kind(components), level_of(eliminate, "--eliminate"))
         result = required(found, network)
     settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
-                "eliminate": eliminate}  # fmt: skip
-    hashes = {file.name: sha256_of(file) for file in calibrations.values()}
+                "eliminate": eliminate, "free": free, "fix": fix, "datum": chosen,
+                "sigma": sigma}  # fmt: skip
+    settings = {key: value for key, value in settings.items() if key in _ALWAYS or value is not None}
+    more = [*calibrations.values(), *([] if control is None else [control])]
+    hashes = {file.name: sha256_of(file) for file in more}
     provenance = Provenance(_hashes(network) | hashes, settings)
     document = ResultDocument.of(result, covariances=cov, provenance=provenance)
     if report is not None:
@@ -89,6 +124,33 @@ def bundle(
         say(document.to_json())
     else:
         _say(network, result)
+
+
+def _with_settings(
+    network: Network,
+    free: list[str] | None,
+    fix: list[str] | None,
+    control: Path | None,
+    datum: str | None,
+    sigma: float | None,
+) -> Network:
+    """Return the network with what the user sets."""
+    from ..bundle.network import with_control, with_datum, with_parameters, with_sigma
+    from ..core.errors import UsageError
+    from ..exchange import read_control
+
+    names = [
+        [name.strip() for text in given or [] for name in text.split(",") if name.strip()]
+        for given in (free, fix)
+    ]
+    network = with_parameters(network, *names)
+    if control is not None:
+        if datum not in (None, "control"):
+            raise UsageError("cannot be combined with --control", where=f"--datum {datum}")
+        network = with_control(network, read_control(control))
+    if datum is not None:
+        network = with_datum(network, cast("Datum", datum))
+    return network if sigma is None else with_sigma(network, sigma)
 
 
 def _hashes(path: Path) -> dict[str, str]:

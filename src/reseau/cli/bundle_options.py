@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Alpha",
     "ComponentsOf",
+    "DatumChoice",
     "Distances",
     "Eliminate",
     "Reject",
@@ -39,6 +40,14 @@ class Components(StrEnum):
     AXES = "axes"
     IMAGES = "images"
     CAMERAS = "cameras"
+
+
+class DatumChoice(StrEnum):
+    """Datum of a network."""
+
+    CONTROL = "control"
+    MINIMAL = "minimal"
+    FREE = "free"
 
 
 Reject = Annotated[bool, typer.Option("--reject", help="Reject gross errors by data snooping.")]

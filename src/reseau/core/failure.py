@@ -44,7 +44,9 @@ class Code(StrEnum):
     EDGE_MISSING = "edge-missing"  # one edge of a frame was not found; the format determines it
     FILTERED = "filtered"  # moved during the exposure, out of focus, or sharpened by a program
     GROSS_ERRORS = "gross-errors"  # single observations are probably wrong: check or leave them out
+    FRONTAL = "frontal"  # a plane is seen at right angles only: principal distance and distance are one
     HIDDEN = "hidden"  # covered, saturated or on lost pixels
+    IMPLAUSIBLE = "implausible"  # a value that no real camera has: check its unit
     INCONSISTENT = "inconsistent"  # the observations contradict the model or each other
     INSTRUMENT_CHANGED = "instrument-changed"  # the instrument has changed since its calibration
     LOW_CONTRAST = "low-contrast"  # nothing stands out from the noise
@@ -57,6 +59,7 @@ class Code(StrEnum):
     NO_COORDINATES = "no-coordinates"  # the design does not define the position
     NO_DATUM = "no-datum"  # nothing defines the coordinate system
     NO_REDUNDANCY = "no-redundancy"  # too few observations for the unknowns, or for a test
+    ONE_STATION = "one-station"  # the camera was only turned: points have no depth
     OTHER_DESIGN = "other-design"  # a target of another design is in the image
     OUTSIDE = "outside"  # beyond the edge of the frame
     OVERLAPPING = "overlapping"  # the image touches that of another mark

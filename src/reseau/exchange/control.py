@@ -17,10 +17,11 @@ _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
 
 def read_control(path: Path | str) -> ControlPoints:
-    r"""Read control points from a CSV file ``id,x,y,z[,sx,sy,sz]`` with a header.
+    r"""Read control points from a table ``id,x,y,z[,sx,sy,sz]``.
 
-    Without standard deviations, or where they are 0, coordinates are held. An empty field leaves its
-    coordinate free.
+    Fields are separated by commas, semicolons or blanks; a header may be left out; what follows ``#`` or
+    ``%`` is a comment. Without standard deviations, or where they are 0, coordinates are held. An empty
+    field leaves its coordinate free.
 
     Parameters
     ----------
@@ -46,14 +47,18 @@ def read_control(path: Path | str) -> ControlPoints:
            [0.1, 0.1, nan]]))
     """
     path = Path(path)
-    lines = [line for line in csv.reader(read_text(path).splitlines()) if any(word.strip() for word in line)]
-    header = [word.strip().lower() for word in lines[0]] if lines else []
-    if header not in (_COLUMNS[:4], _COLUMNS):
+    lines = _rows(read_text(path))
+    header = [word.lower() for word in lines[0][1]] if lines else []
+    if lines and header not in (_COLUMNS[:4], _COLUMNS) and len(header) in (4, 7) and _is_number(header[1]):
+        header = _COLUMNS[: len(header)]
+    elif header in (_COLUMNS[:4], _COLUMNS):
+        lines = lines[1:]
+    else:
         raise FormatError(
             "is not a table of control points", where=path, do="start with the header id,x,y,z[,sx,sy,sz]"
         )
     names, rows = list[str](), list[list[float]]()
-    for number, line in enumerate(lines[1:], start=2):
+    for number, line in lines:
         where = f"{path}, line {number}"
         if len(line) != len(header):
             raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
@@ -71,6 +76,27 @@ def read_control(path: Path | str) -> ControlPoints:
         name = names[int(np.flatnonzero((sigma < 0).any(axis=1))[0])]
         raise FormatError(f"the sigma of point {name} is negative", where=path)
     return ControlPoints(tuple(names), values[:, :3], sigma)
+
+
+def _rows(text: str) -> list[tuple[int, list[str]]]:
+    """Line numbers and fields; separated by commas, semicolons or blanks, without comments."""
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        line = line.split("#")[0].split("%")[0]
+        if not line.strip():
+            continue
+        mark = "," if "," in line else ";" if ";" in line else None
+        fields = next(csv.reader([line], delimiter=mark)) if mark else line.split()
+        if any(field.strip() for field in fields):
+            rows.append((number, [field.strip() for field in fields]))
+    return rows
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return bool(np.isfinite(float(word)))
+    except ValueError:
+        return False
 
 
 def _number(word: str, where: str) -> float:

@@ -6,6 +6,9 @@ lines (number and file; X, Y, Z, kappa, phi, omega in degrees; their sigmas) and
 (id, X, Y, Z, sigmas) and observations (image, id, x, y, sigmas) follow, separated by blank lines. Pixel
 coordinates have their origin at the corner of the top-left pixel, ours at its centre. Control points are in
 another file: the network is read as a free network.
+
+Marks without an object point are left out. A standard deviation of 0 means that none was set: the median of
+the others is used, or 1 px without any.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
+from ..core.data import Array
 from ..core.errors import FormatError
 from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
@@ -87,16 +91,20 @@ def read_photomodeler(path: Path | str) -> Network:
         if table and len(words) == 3:
             break  # tables of features follow, which are not needed
         lines.next()
-        if len(words) != 6 or words[0] not in images or words[1] not in rows:
+        if len(words) != 6 or words[0] not in images:
             raise FormatError(
-                f"line {lines.number}: `{' '.join(words)[:60]}` is not an observation of a known image "
-                "and point",
+                f"line {lines.number}: `{' '.join(words)[:60]}` is not an observation of a known image",
                 where=path,
             )
+        if words[1] not in rows:
+            # A mark without an object point, which the project does not use.
+            numbers(words[2:], 4, path, lines.number)
+            continue
         table.append([images[words[0]], rows[words[1]], *numbers(words[2:], 4, path, lines.number)])
     if not table:
         raise FormatError("contains no observations", where=path)
     values, table_of = np.array(poses), np.array(table)
+    sigma = _sigmas(table_of[:, 4:6], path)
     omega, phi, kappa = np.radians(values[:, [5, 4, 3]]).T
     # The file counts images from zero, the user interface of PhotoModeler from one.
     return network_of(
@@ -111,10 +119,19 @@ def read_photomodeler(path: Path | str) -> Network:
             table_of[:, 0].astype(np.intp),
             table_of[:, 1].astype(np.intp),
             table_of[:, 2:4] - 0.5,
-            table_of[:, 4:6],
+            sigma,
         ),
         files=tuple(files),
     )
+
+
+def _sigmas(sigma: Array, path: Path) -> Array:
+    """Standard deviations (n, 2), px: zero means that none was set, which is the median of the others."""
+    if (sigma < 0).any():
+        raise FormatError("contains a negative standard deviation of an image point", where=path)
+    given = sigma[sigma > 0]
+    usual = float(np.median(given)) if len(given) else 1.0
+    return np.where(sigma > 0, sigma, usual)
 
 
 class _Lines:

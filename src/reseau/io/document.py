@@ -52,11 +52,24 @@ def read_text(path: Path) -> str:
     try:
         if path.stat().st_size > 1_000_000_000:
             raise InputError("is larger than 1 GB", where=path)
-        return path.read_text("utf-8")
+        # Some editors write a byte-order mark.
+        return path.read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError("is not UTF-8 text", where=path, do="check the file name") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+class _Duplicate(Exception):
+    """A key that appears twice in an object."""
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise _Duplicate(next(name for name in names if names.count(name) > 1))
+    return found
 
 
 def _one_line(error: ValidationError) -> str:
@@ -108,7 +121,9 @@ class Document(Strict):
             When it is not JSON, or not this document.
         """
         try:
-            content = json.loads(text)
+            content = json.loads(text, object_pairs_hook=_without_duplicates)
+        except _Duplicate as error:
+            raise FormatError(f"the key `{error}` appears twice", where=where, do="keep one") from None
         except (json.JSONDecodeError, RecursionError) as error:
             raise FormatError(f"is not JSON ({error})", where=where) from None
         return cls.from_content(content, where=where)

@@ -299,7 +299,7 @@ def _weak(result: Result) -> list[Remark]:
 def _datum(result: Result) -> list[Remark]:
     """Weak points that inner constraints over all points leave out."""
     network, fit = result.network, result.fit
-    if fit.datum is None or not network.datum_points.all():
+    if fit.datum is None or network.datum_chosen or not network.datum_points.all():
         return []
     rows = np.flatnonzero(fit.usable.points & ~fit.datum)
     if not len(rows):

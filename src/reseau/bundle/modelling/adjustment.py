@@ -10,13 +10,17 @@ import numpy as np
 
 from ...adjust import data_snooping, robust
 from ...adjust.outliers import Rejection, SnoopingStep
+from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ..diagnostics import Result, checks, doubtful_control
+from ..diagnostics.causes import causes, given_poses_that_do_not_fit, seen_frontally
 from ..diagnostics.checks import listed
+from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
 from ..network import Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem, approximate
+from ..solver.problem import LAST_ROUND
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
 from .startup import improved, lost_images, settled
@@ -25,6 +29,10 @@ __all__ = ["Options", "adjust_network", "problem_of"]
 
 # Weight of a robust adjustment below which an observation is a gross error, and tolerance of its iteration.
 _GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
+# Relative sigma of a principal distance that is hardly determined.
+_WEAK = 3e-3
+# Iterations of an adjustment with values that are not plausible.
+_FEW = 30
 # Part of the points of an image above which it is left out as a whole.
 _MOSTLY = 0.5
 # Failures after which cameras are freed in steps.
@@ -88,7 +96,10 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     >>> problem, notes
     (<BundleProblem: 8 images, 20 points, 320 observations>, ())
     """
-    options = options or Options()
+    return _begun(network, options or Options(), settle=True)
+
+
+def _begun(network: Network, options: Options, *, settle: bool) -> tuple[BundleProblem, tuple[Remark, ...]]:
     found = approximate(network)
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
@@ -98,6 +109,8 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )
+    if not settle:
+        return replace(problem, rounds=LAST_ROUND), found.notes
     if len(lost_images(network, start.x0, start.xyz)):
         problem = settled(problem)
     return problem, found.notes
@@ -133,24 +146,77 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     'no-datum'
     """
     options = options or Options()
-    problem, notes = problem_of(network, options)
+    found = causes(network)
+    if found:
+        # Far from any solution many iterations lead nowhere.
+        options = replace(options, max_iterations=min(options.max_iterations, _FEW))
+    problem, notes = _begun(network, options, settle=not found)
+    problem, false_bars = without_false_bars(problem)
+    found += false_bars
+    found += given_poses_that_do_not_fit(network, _misfits_px(problem))
     steps: tuple[SnoopingStep, ...] = ()
     if options.outliers == "reject":
-        found = _without_gross_errors(problem, options)
-        if isinstance(found, Failure):
-            return _explained(found, problem)
-        fit, steps, left = found
+        careful = _without_gross_errors(problem, options)
+        if isinstance(careful, Failure):
+            return _explained(careful, problem, found)
+        fit, steps, left = careful
         notes = (*notes, *left)
     else:
-        plain = _plain(problem)
+        plain = _plain(problem) if not found or false_bars else problem.adjusted()
         if isinstance(plain, Failure):
-            return _explained(plain, problem)
+            return _explained(plain, problem, found)
         fit = plain
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
-    doubts = _doubts(problem) if fit.sigma0 > _DOUBT else []
-    return Result(network, fit, rejected, steps, (*notes, *doubts, *checks(bare)))
+    if len(found) == len(false_bars):
+        found += _doubts(problem, fit)
+        found += _rejected_control(network, rejected)
+        found += _frontal(network, bare)
+    return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+
+
+def _rejected_control(network: Network, rejected: Mask) -> list[Remark]:
+    """Control points most of whose rays are rejected: their coordinates are wrong, not the rays."""
+    gone = np.bincount(network.point_of[rejected], minlength=len(network.points))
+    bad = network.held.all(axis=1) & (gone > 1) & (gone > _MOSTLY * network.rays)
+    if not bad.any():
+        return []
+    names = listed(network.points[j] for j in np.flatnonzero(bad))
+    several = int(bad.sum()) > 1
+    return [
+        Remark(
+            f"the control point{'s' * several} {names} contradict{'s' * (not several)} the images: most rays "
+            "are rejected; are the coordinates right?",
+            Code.DOUBTFUL_CONTROL,
+        )
+    ]
+
+
+def _misfits_px(problem: BundleProblem) -> Array:
+    """Misfits (n,) of the image coordinates at the approximate values, in pixels."""
+    size = np.sqrt(np.trace(problem.network.cov, axis1=1, axis2=2) / 2)
+    weighted: Array = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1)) * size
+    return weighted
+
+
+def _frontal(network: Network, result: Result) -> list[Remark]:
+    """A principal distance that a plane seen frontally leaves uncertain."""
+    fit = result.fit
+    found = seen_frontally(network, fit.values.rotation, fit.values.xyz, fit.usable.images)
+    if not found:
+        return []
+    for c, camera in enumerate(network.cameras):
+        names, _, values = result.camera_columns(c)
+        model = camera.registered
+        sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+        scale = () if model is None else model.of_role("scale")
+        weak = [
+            name for name, v, s in zip(names, values, sigma, strict=True) if name in scale and s > _WEAK * v
+        ]
+        if weak:
+            return found
+    return []
 
 
 def _plain(problem: BundleProblem) -> BundleFit | Failure:
@@ -166,32 +232,59 @@ def _plain(problem: BundleProblem) -> BundleFit | Failure:
     return improved(problem, fit)
 
 
-def _doubts(problem: BundleProblem) -> list[Remark]:
-    """Return remarks on control points and gross errors of a network that fits badly."""
-    doubts = []
+def _doubts(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
+    """Return remarks on what contradicts the rest, in a network that fits badly."""
+    n, weights, every = len(problem.network.xy), fit.problem.weights, fit
+    if weights is not None and (weights[2 * n :] == 0).any():
+        # Elements are named one by one, also those of which data snooping left out coordinates.
+        given = np.ones(len(weights)) if problem.weights is None else problem.weights
+        weights = np.concatenate([weights[: 2 * n], given[2 * n :]])
+        again = problem.continued(fit).with_weights(weights).adjusted()
+        every = fit if isinstance(again, Failure) else again
+    current = problem.with_weights(weights)
+    doubts = contradicting(current, every)
+    if not fit.sigma0 > _DOUBT:
+        return doubts
     control = doubtful_control(problem.network) if problem.network.datum == "control" else ""
     if control:
         doubts.append(Remark(control, Code.DOUBTFUL_CONTROL))
     if len(problem.observations) <= _MANY:
-        names = _suspects(problem)
-        if names:
-            doubts.append(Remark(f"gross errors are likely in {listed(names)}", Code.GROSS_ERRORS))
+        held = doubtful_parameters(current, fit)
+        doubts += held
+        rows = _suspects(problem)
+        if len(rows) and not held:
+            doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
     return doubts
 
 
-def _suspects(problem: BundleProblem) -> list[str]:
-    """Image points with very small weights in a robust adjustment, the smallest first."""
-    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
-    if isinstance(off, Failure):
-        return []
-    network = problem.network
-    n = len(network.xy)
-    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
-    rows = np.argsort(weight, kind="stable")
-    rows = rows[weight[rows] < _GROSS_ERROR]
-    return [
+def _gross(network: Network, rows: Rows) -> Remark:
+    names = [
         f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
     ]
+    return Remark(f"gross errors are likely in {listed(names)}", Code.GROSS_ERRORS)
+
+
+def _worst_images(network: Network, size: Array) -> list[Remark]:
+    """Name the images with the largest misfits (px), where nothing else can be said."""
+    median = [
+        float(np.median(own)) if (own := size[(network.image_of == i) & np.isfinite(size)]).size else 0.0
+        for i in range(len(network.images))
+    ]
+    order = np.argsort(-np.array(median), kind="stable")[:3]
+    names = listed(f"{network.images[i]} ({median[i]:.3g} px)" for i in order if median[i] > 0)
+    return [Remark(f"the largest median misfits are in image {names}", Code.NOT_CONVERGED)] if names else []
+
+
+def _suspects(problem: BundleProblem) -> Rows:
+    """Image points with very small weights in a robust adjustment, the smallest first."""
+    nothing: Rows = np.zeros(0, dtype=np.intp)
+    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
+    if isinstance(off, Failure):
+        return nothing
+    n = len(problem.network.xy)
+    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
+    rows = np.argsort(weight, kind="stable")
+    return np.asarray(rows[weight[rows] < _GROSS_ERROR], dtype=np.intp)
 
 
 def _without_gross_errors(
@@ -283,13 +376,24 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
     return problem
 
 
-def _explained(failure: Failure, problem: BundleProblem) -> Failure:
-    """Add wrong control points or likely gross errors to the reason of a failure."""
-    if failure.code is Code.NO_DATUM:
+def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) -> Failure:
+    """Add the cause to the reason of a failure."""
+    network = problem.network
+    if failure.code is Code.NO_DATUM and not found:
         return failure
-    doubt = doubtful_control(problem.network) if problem.network.datum == "control" else ""
-    if doubt:
-        return replace(failure, reason=f"{failure.reason}; {doubt}", code=Code.DOUBTFUL_CONTROL)
-    names = _suspects(problem)
-    hint = f"; gross errors are likely in {listed(names)}" if names else ""
-    return replace(failure, reason=failure.reason + hint)
+    if not found:
+        start = problem.start
+        found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))
+    if not found and network.datum == "control" and (doubt := doubtful_control(network)):
+        found = [Remark(doubt, Code.DOUBTFUL_CONTROL)]
+    if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= _MANY:
+        rows = _suspects(problem)
+        if len(rows):
+            found = [*grouped(network, rows), _gross(network, rows)]
+        elif failure.code in (Code.NOT_CONVERGED, Code.NOT_FINITE):
+            found = _worst_images(network, _misfits_px(problem))
+    if not found:
+        return failure
+    reason = "; ".join([failure.reason, *(remark.text for remark in found)])
+    code = failure.code if found[0].code is Code.GROSS_ERRORS else found[0].code
+    return replace(failure, reason=reason, code=code)

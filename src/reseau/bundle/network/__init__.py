@@ -3,6 +3,7 @@
 from .calibrated import calibrated_camera, film_camera
 from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network
+from .settings import network_document, with_control, with_datum, with_parameters, with_sigma
 from .stage import Stage
 
 __all__ = [
@@ -14,4 +15,9 @@ __all__ = [
     "calibrated_camera",
     "example_network",
     "film_camera",
+    "network_document",
+    "with_control",
+    "with_datum",
+    "with_parameters",
+    "with_sigma",
 ]

@@ -295,6 +295,8 @@ class Network(Display):
         File of each image.
     unit : str
         Unit of object space; a label.
+    datum_chosen : bool
+        Whether the datum points were chosen; otherwise weak points are left out of the inner constraints.
     stage : Stage, optional
         Stage that moved the field between images with the same exterior orientation; requires the datum
         ``control``.
@@ -331,6 +333,7 @@ class Network(Display):
     groups: tuple[str | None, ...]
     files: tuple[str | None, ...]
     unit: str = "mm"
+    datum_chosen: bool = False
     stage: Stage | None = None
     refraction: Refraction | None = None
 
@@ -420,6 +423,7 @@ class Network(Display):
             groups=images.group or (None,) * len(images.id),
             files=images.file or (None,) * len(images.id),
             unit=document.unit,
+            datum_chosen=document.datum_points is not None,
             refraction=None if document.refraction is None
             else document.refraction.refraction(images.id, images.camera),
         )  # fmt: skip

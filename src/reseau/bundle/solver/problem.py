@@ -39,14 +39,14 @@ from .system import Linear, System, residuals
 from .unknowns import Unknowns
 from .values import Values
 
-__all__ = ["BundleFit", "BundleProblem"]
+__all__ = ["LAST_ROUND", "BundleFit", "BundleProblem"]
 
 # Options of the dense engine that this solver does not support, and their defaults.
 _UNSUPPORTED, _DEFAULTS = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()
 # Initial damping, relative to the diagonal of the normal equations.
 _DAMPING = 1e-5
 # Maximum number of rounds in which points that diverge to infinity are left out.
-_ROUNDS = 12
+LAST_ROUND = 12
 # Iterations, and relative offset, of the first adjustment with windows and media as given.
 _BEFORE_WINDOWS, _ROUGHLY = 30, 1e-2
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
@@ -365,7 +365,7 @@ class _Run:
             return found
         # Points with nearly parallel rays converge very slowly, and only follow the noise.
         away = found.away if found.converged else self._slowly_converging(found)
-        if len(away) and problem.rounds < _ROUNDS:
+        if len(away) and problem.rounds < LAST_ROUND:
             again = self._without(away, found.values)._adjusted(self.options)
             if found.converged or again:
                 return again
@@ -381,7 +381,7 @@ class _Run:
         if inner:
             if int(chosen.sum()) < 3:
                 return Failure("inner constraints require three determined datum points", Code.TOO_FEW_POINTS)
-            if network.datum_points.all():
+            if network.datum_points.all() and not network.datum_chosen:
                 chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)
         linear = self.system.linearise(values)
@@ -396,10 +396,10 @@ class _Run:
             cofactors = cofactors_of(linear, freedom, chosen if inner else None, self.usable.points)
         except Singular:
             weak = weak_points(linear)
-            if len(weak) and problem.rounds < _ROUNDS:
+            if len(weak) and problem.rounds < LAST_ROUND:
                 return self._without(weak, values)._adjusted(self.options)
             images = weak_images(linear)
-            if 0 < len(images) < self.usable.images.sum() and problem.rounds < _ROUNDS:
+            if 0 < len(images) < self.usable.images.sum() and problem.rounds < LAST_ROUND:
                 left = self._without(weak, values)
                 left.start.x0[images] = np.nan
                 return left._adjusted(self.options)

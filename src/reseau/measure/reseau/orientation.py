@@ -13,9 +13,7 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
 from ...optics.field import SmoothField, trend_degree
-from .assignment import Assignment, assign, spacing
-from .grid_search import GridOptions, climbed
-from .placement import Placement
+from .placement import Assignment, GridOptions, Placement, assign, climbed, spacing
 from .wires import grid_wires
 
 __all__ = ["misfit", "rival_orientations"]

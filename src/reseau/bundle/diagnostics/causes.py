@@ -1,0 +1,351 @@
+"""Causes of a failed or doubtful adjustment that a network shows before it is adjusted.
+
+Values in another unit are recognised by what cameras can be: the angle of view, the size of the sensor, the
+place of the principal point. Geometry that cannot determine the unknowns is recognised by the directions of
+the rays alone, without an adjustment that would not converge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Remark
+from ..network import Camera, Network
+from ..network.network import finite
+from ..solver.spatial import directions
+from .checks import listed
+
+__all__ = ["causes", "given_poses_that_do_not_fit", "seen_frontally"]
+
+# Half the diagonal of the image in the principal distance: tangents of half angles of view of real cameras.
+_NARROWEST, _WIDEST = 6e-4, 12.0
+# Diagonals of sensors and scanned films (mm).
+_SENSORS = (0.5, 600.0)
+# Distance of the principal point from the middle, in half the diagonal; displacement in a corner by the given
+# distortion, in the radius.
+_OFF_CENTRE, _DISTORTED = 0.75, 0.8
+# Coordinates this far outside, in the size of the image, are outside.
+_OUTSIDE = 0.01
+# Extent of all coordinates, in the size of the image, below which they have another unit.
+_TINY = 0.02
+# Misfit of rays after the best rotation, in their spread, that is no parallax; pairs of images tested, points
+# of a pair, and smallest rotation that counts as another view (rad).
+_PARALLAX, _PAIRS, _COMMON = 0.03, 40, 6
+# Points are on a line, or in a plane, to this part of their extent.
+_FLAT = 1e-3
+# Angle (rad) between the optical axes and the normal of a plane that is seen frontally.
+_FRONTAL = 0.03
+
+
+def causes(network: Network) -> list[Remark]:
+    """Return what is implausible in a network, or cannot determine the unknowns.
+
+    Parameters
+    ----------
+    network : Network
+        The network, before its adjustment.
+
+    Returns
+    -------
+    list of Remark
+        Empty where nothing was found.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from reseau.bundle import example_network
+    >>> network = example_network()
+    >>> causes(network)
+    []
+    >>> camera = replace(network.cameras[0], values=network.cameras[0].values * [1e-3] + [0.0])
+    >>> str(causes(replace(network, cameras=(camera,)))[0])[:52]
+    'camera: the principal distance of 0.008 mm is too sh'
+    """
+    found = [remark for camera in network.cameras for remark in _camera(camera)]
+    found += _outside(network)
+    found += _rotations(network)
+    if found:
+        # Directions follow from these values.
+        return found
+    uv = directions(network)
+    return [*_one_station(network, uv), *_lines(network, uv)]
+
+
+def _camera(camera: Camera) -> list[Remark]:
+    """Implausible values of a camera."""
+    model = camera.registered
+    if model is None:
+        return []
+    values = camera.parameters
+    half = np.hypot(camera.width, camera.height) / 2
+    scale = [name for name in model.of_role("scale") if values[name] > 0]
+    found: list[str] = []
+    if model.needs_pitch:
+        pitch = float(np.mean(camera.pitch_mm))
+        diagonal = 2 * half * pitch
+        views = {name: half * pitch / values[name] for name in scale}
+        if not _SENSORS[0] <= diagonal <= _SENSORS[1]:
+            unit = "micrometres" if diagonal > _SENSORS[1] else "metres"
+            factor = 1e-3 if unit == "micrometres" else 1e3
+            guess = f"; is it given in {unit}?" if _within(diagonal * factor, _SENSORS) else ""
+            found.append(
+                f"a pixel size of {pitch:g} mm makes a sensor of {diagonal:.4g} mm across, which is not "
+                f"plausible{guess}"
+            )
+            views = {}
+    else:
+        pitch, views = 0.0, {name: half / values[name] for name in scale}
+    told = set[float]()
+    for name, view in views.items():
+        if _within(view, (_NARROWEST, _WIDEST)) or values[name] in told:
+            continue
+        told.add(values[name])
+        unit = model.units[name]
+        size = f"{values[name]:g} {unit}"
+        across = f"{2 * half * pitch:.3g} mm" if model.needs_pitch else f"{2 * half:.0f} px"
+        side = "too short" if view > _WIDEST else "too long"
+        tries = {"metres": 1e3, "micrometres": 1e-3, "pixels": pitch} if model.needs_pitch else {}
+        fits = [other for other, f in tries.items() if f and _within(view / f, (_NARROWEST, _WIDEST))]
+        # Of several units the one that gives the most usual angle of view.
+        fits.sort(key=lambda other: abs(np.log(view / tries[other] / 0.5)))
+        guess = f"; is it given in {fits[0]}?" if fits else "" if model.needs_pitch else "; give it in pixels"
+        what = "focal length" if unit == "px" else "principal distance"
+        found.append(f"the {what} of {size} is {side} for an image of {across}{guess}")
+    named = {name: name for name in model.of_role("centre")}
+    if len(named) == 2 and not found:
+        here = camera.bare_mapping(distorted=False)(np.zeros((1, 2)))[0]
+        off = float(np.hypot(*(here - camera.grid.centre))) / half
+        if off > _OFF_CENTRE:
+            at = ", ".join(f"{name} {values[name]:g} {model.units[name]}" for name in named)
+            guess = "; is it given in pixels?" if model.needs_pitch else ""
+            found.append(
+                f"the principal point ({at}) is {off * half:.0f} px from the middle of the image{guess}"
+            )
+    if not found and any(values[name] for name in model.of_role("distortion")):
+        found += _distortion(camera, half)
+    return [Remark(f"{camera.label}: {text}", Code.IMPLAUSIBLE) for text in found]
+
+
+def _distortion(camera: Camera, half: float) -> list[str]:
+    """Given distortion that folds the image, or displaces its middle part by much of the radius."""
+    plain, bent = camera.bare_mapping(distorted=False), camera.bare_mapping()
+    centre = plain(np.zeros((1, 2)))[0]
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    # Half of the image: towards the corners strong distortion is usual in wide lenses.
+    at = centre + 0.5 * half * np.column_stack([np.cos(angle), np.sin(angle)])
+    with np.errstate(all="ignore"):
+        move = np.linalg.norm(bent(plain.inverse(at)) - at, axis=1) / (0.5 * half)
+    if np.isfinite(move).all() and move.max() < _DISTORTED:
+        return []
+    names = [name for name in camera.distortions if camera.parameters.get(name)]
+    return [f"the given distortion ({', '.join(names)}) displaces points halfway to the corners by more than "
+            f"{100 * _DISTORTED:.0f} % of their radius"]  # fmt: skip
+
+
+def _within(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] <= value <= limits[1]
+
+
+def _outside(network: Network) -> list[Remark]:
+    """Image coordinates outside the image, or in another unit."""
+    found = []
+    for c, camera in enumerate(network.cameras):
+        rows = np.flatnonzero(network.camera_of[network.image_of] == c)
+        if not len(rows):
+            continue
+        size = np.array([camera.width, camera.height], dtype=np.float64)
+        xy = network.xy[rows]
+        extent = np.ptp(xy, axis=0)
+        if len(rows) >= 4 and (extent < _TINY * size).all() and (np.abs(xy) < 0.1 * size).all():
+            unit = "in millimetres" if (xy < 0).any() else "normalised"
+            found.append(
+                Remark(
+                    f"{camera.label}: all image coordinates are within {extent[0]:.3g} × {extent[1]:.3g} px "
+                    f"of an image of {camera.width}×{camera.height}; are they {unit}?",
+                    Code.IMPLAUSIBLE,
+                )
+            )
+            continue
+        out = rows[((xy < -0.5 - _OUTSIDE * size) | (xy > size * (1 + _OUTSIDE) - 0.5)).any(axis=1)]
+        if not len(out):
+            continue
+        swapped = ((xy > -0.5 - _OUTSIDE * size) & (xy < size[::-1] * (1 + _OUTSIDE) - 0.5)).all()
+        if swapped and len(out) > 2:
+            found.append(
+                Remark(
+                    f"{camera.label}: {len(out)} image points are outside the {camera.width}×{camera.height} "
+                    "pixels; are width and height, or x and y, exchanged?",
+                    Code.OUTSIDE,
+                )
+            )
+            continue
+        names = [
+            f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]} "
+            f"({network.xy[k, 0]:.1f}, {network.xy[k, 1]:.1f})"
+            for k in out
+        ]
+        found.append(
+            Remark(
+                f"outside the image of {camera.width}×{camera.height} px: point"
+                f"{'s' * (len(out) > 1)} {listed(names)}",
+                Code.OUTSIDE,
+            )
+        )
+    return found
+
+
+def _rotations(network: Network) -> list[Remark]:
+    """Rotation vectors longer than a full turn: they are in degrees."""
+    size = np.linalg.norm(network.rotation, axis=1)
+    rows = np.flatnonzero(np.nan_to_num(size) > 2 * np.pi + 1e-6)
+    if not len(rows):
+        return []
+    names = listed(f"{network.images[i]} ({size[i]:.4g})" for i in rows)
+    return [
+        Remark(
+            f"rotation vectors longer than a full turn of 2π rad, in image{'s' * (len(rows) > 1)} {names}; "
+            "are they in degrees?",
+            Code.IMPLAUSIBLE,
+        )
+    ]
+
+
+def _one_station(network: Network, uv: Array) -> list[Remark]:
+    """All images from one station: the rays of each pair agree after a rotation; there is no depth."""
+    m = len(network.images)
+    if m < 2 or finite(network.xyz).sum() >= 4 or network.refraction is not None:
+        return []
+    seen = [np.flatnonzero((network.image_of == i) & finite(uv)) for i in range(m)]
+    tested = 0
+    for a, b in _spread_pairs(m):
+        _, left, right = np.intersect1d(
+            network.point_of[seen[a]], network.point_of[seen[b]], assume_unique=True, return_indices=True
+        )
+        if len(left) < _COMMON:
+            continue
+        one, other = (_unit(uv[rows]) for rows in (seen[a][left], seen[b][right]))
+        u, _, vt = np.linalg.svd(other.T @ one)
+        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        misfit = float(np.sqrt(np.median(((other - one @ turn.T) ** 2).sum(axis=1))))
+        spread = float(np.sqrt(((one - one.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        if not misfit < _PARALLAX * spread:
+            return []
+        tested += 1
+    if tested < min(2, m - 1):
+        return []
+    return [
+        Remark(
+            "all images are from one station: the rays agree after rotations of the camera alone, so that "
+            "points have no depth; take images from different places",
+            Code.ONE_STATION,
+        )
+    ]
+
+
+def _spread_pairs(m: int) -> list[tuple[int, int]]:
+    """Pairs of images, at most `_PAIRS`, spread over all."""
+    pairs = [(i, j) for step in (1, m // 2, 2, m // 3) if step for i in range(m) for j in [(i + step) % m]]
+    pairs = [pair for pair in dict.fromkeys((min(p), max(p)) for p in pairs) if pair[0] != pair[1]]
+    at = np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(int))
+    return [pairs[int(k)] for k in at] if pairs else []
+
+
+def _unit(uv: Array) -> Array:
+    ray = np.column_stack([uv, np.ones(len(uv))])
+    unit: Array = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    return unit
+
+
+def _lines(network: Network, uv: Array) -> list[Remark]:
+    """Images whose points lie on one line: they do not determine the pose."""
+    bad = []
+    for i in range(len(network.images)):
+        own = uv[(network.image_of == i) & finite(uv)]
+        if len(own) < 3:
+            continue
+        size = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)
+        if size[1] < _FLAT * size[0]:
+            bad.append(network.images[i])
+    if not bad:
+        return []
+    plural = "s" * (len(bad) > 1)
+    return [Remark(f"all points of image{plural} {listed(bad)} lie on one line: they do not determine its "
+                   "position", Code.COLLINEAR)]  # fmt: skip
+
+
+def seen_frontally(network: Network, rotation: Array, xyz: Array, used: Mask) -> list[Remark]:
+    """Return a remark where all images look at a plane at right angles, and a principal distance is free.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+    rotation : ndarray (m, 3, 3)
+        Rotations, approximate or adjusted.
+    xyz : ndarray (p, 3)
+        Points, NaN where unknown.
+    used : ndarray of bool (m,)
+        Images with a known rotation.
+    """
+    points = xyz[finite(xyz)]
+    if len(points) < 4 or not used.any():
+        return []
+    _, size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if not size[2] < 0.05 * size[1]:
+        return []
+    found = []
+    for c, camera in enumerate(network.cameras):
+        own = used & (network.camera_of == c)
+        model = camera.registered
+        if model is None or not own.any():
+            continue
+        scale = [name for name in model.of_role("scale") if name in camera.free and name not in camera.sigma]
+        tilt = np.arccos(np.clip(np.abs(rotation[own, 2] @ axes[2]), 0.0, 1.0))
+        # Poses of a plane seen frontally are uncertain themselves by some degrees.
+        if scale and camera.covariance is None and float(np.median(tilt)) < _FRONTAL:
+            found.append(
+                Remark(
+                    f"{camera.label}: all points lie in a plane that the images see frontally: {scale[0]} "
+                    "cannot be separated from the distance; tilt the camera by 20 to 40 degrees, or hold "
+                    f"{', '.join(scale)}",
+                    Code.FRONTAL,
+                )
+            )
+    return found
+
+
+def given_poses_that_do_not_fit(network: Network, misfit: Array) -> list[Remark]:
+    """Return a remark on images whose given poses contradict their image points.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+    misfit : ndarray (n,)
+        Distances (px) of image points from their places with the given poses; NaN where unknown.
+    """
+    wrong: Rows = np.array(
+        [
+            i
+            for i in np.flatnonzero(network.posed)
+            if (own := misfit[(network.image_of == i) & np.isfinite(misfit)]).size >= 4
+            and np.median(own) > 0.25 * max(_size(network, int(i)))
+        ],
+        dtype=np.intp,
+    )
+    if not len(wrong):
+        return []
+    names = listed(network.images[i] for i in wrong)
+    return [
+        Remark(
+            f"the given orientation{'s' * (len(wrong) > 1)} of image{'s' * (len(wrong) > 1)} {names} do not "
+            "fit the points; leave them out, or check the order and the sense of the rotations",
+            Code.INCONSISTENT,
+        )
+    ]
+
+
+def _size(network: Network, image: int) -> tuple[int, int]:
+    camera = network.cameras[network.camera_of[image]]
+    return camera.width, camera.height

@@ -1,0 +1,274 @@
+"""Elements that contradict the others: scale bars and control points with sigmas, held parameters.
+
+Each is the largest of its kind in test value while those found before are left out, as in data snooping:
+errors of one element appear in the residuals of its neighbours as well.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...adjust import critical_w
+from ...core.data import Array, Rows
+from ...core.failure import Code, Failure, Remark
+from ..network import Camera, Network
+from ..network.network import finite
+from ..solver import BundleFit, BundleProblem
+from .checks import listed
+
+__all__ = ["contradicting", "doubtful_parameters", "grouped", "without_false_bars"]
+
+_ALPHA, _MOST = 1e-4, 12
+# Times by which a false distance is too long or too short at the approximate values.
+_FALSE = 1.5
+# Redundancy number below which an error of an observation can hardly be found.
+_UNCHECKED = 0.05
+# Times by which sigma0 falls when held parameters are estimated, where their values are wrong.
+_FALLS, _SIGMAS = 2.0, 5.0
+# Part of the rays of a point, or of the points of an image, that must be suspected for a common cause.
+_SHARE = 0.4
+
+
+def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
+    """Find distances and observed control points that contradict the other observations.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The problem, with weights.
+    fit : BundleFit
+        Its adjustment.
+
+    Returns
+    -------
+    list of Remark
+        The elements, the foremost first, and control points that cannot be checked; empty where all agree.
+    """
+    network, others, n = problem.network, problem.others, 2 * len(problem.network.xy)
+    bars, coordinates, _ = others.slices
+    element = np.concatenate([np.arange(bars.stop), bars.stop + others.coordinate[:, 0]]).astype(np.intp)
+    if not len(element):
+        return []
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    critical = critical_w(_ALPHA / len(element))
+    found: list[tuple[int, float, float]] = []
+    current = fit
+    for _ in range(_MOST):
+        own = slice(n, n + coordinates.stop)
+        seen = np.abs(current.w[:n])
+        seen = seen[np.isfinite(seen) & (seen > 0)]
+        # Gross errors of image points must not hide those of other observations.
+        unit = max(1.0, float(np.median(seen)) / 0.6745) if len(seen) else 1.0
+        w = np.where(weights[own] > 0, np.nan_to_num(np.abs(current.w[own])), 0.0) / unit
+        worst = int(np.argmax(w))
+        if not w[worst] > critical:
+            break
+        trial = weights.copy()
+        trial[own][element == element[worst]] = 0.0
+        again = problem.continued(current).with_weights(trial).adjusted()
+        if isinstance(again, Failure):
+            # The datum depends on it, so that it cannot be said which is wrong.
+            found.append((int(element[worst]), float(w[worst]), np.nan))
+            break
+        off = float(np.abs(again.residuals[n + worst]))
+        found.append((int(element[worst]), float(w[worst]), off))
+        weights, current = trial, again
+    if not found:
+        return []
+    unchecked = _unchecked(problem, current, weights)
+    return [*_bars(network, found, bars.stop), *_control(network, found, bars.stop, unchecked)]
+
+
+def without_false_bars(problem: BundleProblem) -> tuple[BundleProblem, list[Remark]]:
+    """Leave out distances that are far from the others, or from the control points, at the start.
+
+    With a wrong unit or a lost decimal point the adjustment would not converge.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        Problem with approximate values.
+
+    Returns
+    -------
+    BundleProblem, list of Remark
+        The problem with zero weights for these distances, and what was left out.
+    """
+    network, n = problem.network, 2 * len(problem.network.xy)
+    if not len(network.distance) or network.refraction is not None:
+        return problem, []
+    a, b = network.distance_of.T
+    length = np.linalg.norm(problem.start.xyz[b] - problem.start.xyz[a], axis=1)
+    known = np.isfinite(length) & (length > 0)
+    ratio = np.where(known, network.distance[:, 0] / np.where(known, length, 1.0), np.nan)
+    fixed = finite(network.xyz).sum() >= 3 or network.posed.sum() >= 2
+    if not fixed and known.sum() < 3:
+        return problem, []
+    scale = 1.0 if fixed else float(np.nanmedian(ratio))
+    with np.errstate(invalid="ignore"):
+        false = np.flatnonzero(known & (np.abs(np.log(ratio / scale)) > np.log(_FALSE)))
+    if not len(false) or (not fixed and len(false) > 0.5 * known.sum()):
+        return problem, []
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    weights[n + false] = 0.0
+    names = [
+        f"{network.points[a[k]]} to {network.points[b[k]]} ({network.distance[k, 0]:g} {network.unit}, "
+        f"{ratio[k] / scale:.3g} times as long)"
+        for k in false
+    ]
+    several = len(false) > 1
+    return problem.with_weights(weights), [
+        Remark(
+            f"the distance{'s' * several} {listed(names)} contradict{'s' * (not several)} the other "
+            "observations: left out",
+            Code.DOUBTFUL_CONTROL,
+        )
+    ]
+
+
+def _bars(network: Network, found: list[tuple[int, float, float]], bars: int) -> list[Remark]:
+    names = []
+    for k, w, off in found:
+        if k >= bars:
+            continue
+        a, b = (network.points[j] for j in network.distance_of[k])
+        by = "" if np.isnan(off) else f", by {off:.3g} {network.unit} from the others"
+        names.append(f"{a} to {b} ({network.distance[k, 0]:g} {network.unit}{by}, w {w:.1f})")
+    if not names:
+        return []
+    verb = "contradicts" if len(names) == 1 else "contradict"
+    return [
+        Remark(
+            f"the distance{'s' * (len(names) > 1)} {listed(names)} {verb} the other observations",
+            Code.DOUBTFUL_CONTROL,
+        )
+    ]
+
+
+def _control(
+    network: Network, found: list[tuple[int, float, float]], bars: int, unchecked: list[str]
+) -> list[Remark]:
+    names = [f"{network.points[k - bars]} (w {w:.1f})" for k, w, _ in found if k >= bars]
+    if not names:
+        return []
+    verb = "contradicts" if len(names) == 1 else "contradict"
+    rest = (
+        f"; errors of the control point{'s' * (len(unchecked) > 1)} {listed(unchecked)} cannot be found: too "
+        "few rays, or rays along the error"
+        if unchecked
+        else ""
+    )
+    text = f"the control point{'s' * (len(names) > 1)} {listed(names)} {verb} the other observations{rest}"
+    return [Remark(text, Code.DOUBTFUL_CONTROL)]
+
+
+def _unchecked(problem: BundleProblem, fit: BundleFit, weights: Array) -> list[str]:
+    """Control points with an observed coordinate of which an error can hardly be found."""
+    network, n = problem.network, 2 * len(problem.network.xy)
+    _, coordinates, _ = problem.others.slices
+    own = slice(n + coordinates.start, n + coordinates.stop)
+    r = np.nan_to_num(fit.redundancy_numbers[own])
+    point = problem.others.coordinate[:, 0]
+    bad = (weights[own] > 0) & fit.usable.points[point] & (r < _UNCHECKED)
+    return [network.points[j] for j in np.unique(point[bad])]
+
+
+def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
+    """Find held parameters of cameras whose values do not fit: sigma0 falls when they are estimated.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The adjusted problem.
+    fit : BundleFit
+        Its adjustment.
+    """
+    network = problem.network
+    cameras = tuple(_freed(camera) for camera in network.cameras)
+    if all(new is old for new, old in zip(cameras, network.cameras, strict=True)):
+        return []
+    freed = replace(network, cameras=cameras)
+    again = replace(problem.continued(fit), network=freed, rounds=0).adjusted()
+    if isinstance(again, Failure) or not again.sigma0 * _FALLS < fit.sigma0:
+        return []
+    found = []
+    for c, (new, old) in enumerate(zip(cameras, network.cameras, strict=True)):
+        at, count = int(again.unknowns.camera[c]), len(new.free)
+        if at < 0:
+            continue
+        columns = np.arange(at, at + count)
+        sigma = np.sqrt(np.diag(again.cofactors.reduced)[columns] * again.variance)
+        rows = again.unknowns.free[c, :count]
+        change = np.abs(again.values.cameras[c, rows] - old.values[rows])
+        named = [
+            f"{name} {old.values[k]:g} → {again.values.cameras[c, k]:.6g}"
+            for name, k, s, d in zip(new.free, rows, sigma, change, strict=True)
+            if name not in old.free and d > _SIGMAS * s
+        ]
+        if named:
+            found.append(f"{old.label}: {', '.join(named)}")
+    if not found:
+        return []
+    return [
+        Remark(
+            f"held parameters do not fit: sigma0 falls from {fit.sigma0:.3g} to {again.sigma0:.3g} "
+            f"when they are estimated ({'; '.join(found)})",
+            Code.UNMODELLED,
+        )
+    ]
+
+
+def _freed(camera: Camera) -> Camera:
+    """The camera with its usual parameters estimated; as it is, where they are already."""
+    model = camera.registered
+    if model is None or camera.covariance is not None:
+        return camera
+    free = tuple(name for name in model.names if name in {*camera.free, *model.usual})
+    return camera if set(free) == set(camera.free) else replace(camera, free=free)
+
+
+def grouped(network: Network, rows: Rows | Sequence[int]) -> list[Remark]:
+    """Name points and images to which many of the suspected image points belong.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+    rows : sequence of int
+        Suspected image points.
+
+    Returns
+    -------
+    list of Remark
+        A point most of whose rays disagree may have two identities; an image, that of another scene.
+    """
+    rows = np.asarray(rows, dtype=np.intp)
+    found = []
+    images = Counter(network.image_of[rows].tolist())
+    whole = [i for i, count in images.items() if count > 3 and count >= _SHARE * network.seen[i]]
+    rest = rows[~np.isin(network.image_of[rows], whole)]
+    points = Counter(network.point_of[rest].tolist())
+    twice = [j for j, count in points.items() if count > 1 and count >= _SHARE * network.rays[j]]
+    if whole and len(whole) <= 0.5 * len(network.images):
+        names = listed(network.images[i] for i in sorted(whole))
+        found.append(
+            Remark(
+                f"many points of image{'s' * (len(whole) > 1)} {names} contradict the others: names of "
+                "another image, another camera, or a mirrored image?",
+                Code.GROSS_ERRORS,
+            )
+        )
+    if twice:
+        names = listed(network.points[j] for j in sorted(twice))
+        found.append(
+            Remark(
+                f"the rays of point{'s' * (len(twice) > 1)} {names} contradict each other: one name for two "
+                "points?",
+                Code.GROSS_ERRORS,
+            )
+        )
+    return found

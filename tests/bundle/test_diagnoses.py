@@ -1,0 +1,534 @@
+"""Broken networks: each is told with its cause and the offending element, with and without rejection.
+
+A network that is fine is not accused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.bundle import Camera, Network, Options, Result, adjust_network
+from reseau.core.data import Array
+from reseau.core.failure import Code
+from reseau.optics.poses import matrix_to_vector
+
+from . import networks
+
+Change = Callable[[Network, np.random.Generator], Network]
+
+
+def block(**more: Any) -> Network:
+    """Eight images of forty points, six of them control; noise of the given sigma."""
+    return networks.world(**({"images": 8, "points": 40, "control": 6} | more)).noisy(1)
+
+
+def free_block() -> Network:
+    """The same without control, with four scale bars of 1 mm."""
+    world = networks.world(images=8, points=40, control=0, datum="free")
+    pairs = np.array([[0, 1], [2, 3], [4, 5], [6, 7]])
+    length = np.linalg.norm(world.xyz[pairs[:, 1]] - world.xyz[pairs[:, 0]], axis=1)
+    bars = np.column_stack([length, np.full(4, 1e-3)])
+    return replace(world.noisy(1), distance_of=pairs, distance=bars)
+
+
+def opencv() -> Network:
+    return block(cameras=(networks.camera("opencv"),))
+
+
+def observed() -> Network:
+    """Control points with sigmas of 1 mm."""
+    world = networks.world(images=8, points=40, control=10)
+    sigma = np.where(world.network.sigma == 0, 1e-3, np.nan)
+    return replace(world.noisy(1), sigma=sigma)
+
+
+def seen_from(
+    centres: Array, targets: Array, xyz: Array, control: int, camera: Camera | None = None
+) -> Network:
+    """Images from given places towards given targets."""
+    camera = camera or networks.camera()
+    base = networks.world(images=len(centres), points=len(xyz), control=control).network
+    turn = [networks.looking_at(x0, t, 0.0) for x0, t in zip(centres, targets, strict=True)]
+    xy = np.stack([networks.image_points(camera, r, x0, xyz) for r, x0 in zip(turn, centres, strict=True)])
+    with np.errstate(invalid="ignore"):
+        inside = (xy > 0).all(axis=2) & (xy < [639, 479]).all(axis=2)
+    image, point = np.nonzero(inside)
+    noise = np.random.default_rng(4).normal(0, 0.05, (len(image), 2))
+    known = np.arange(len(xyz))[:, None] < control
+    return replace(
+        base, cameras=(camera,), image_of=image, point_of=point, xy=xy[inside] + noise,
+        cov=np.tile(0.0025 * np.eye(2), (len(image), 1, 1)), xyz=np.where(known, xyz, np.nan),
+        datum="control" if control else "free",
+    )  # fmt: skip
+
+
+def one_station() -> Network:
+    rng = np.random.default_rng(5)
+    xyz = rng.uniform(-3, 3, (80, 3)) + np.array([0, 0, 9.0])
+    targets = np.array([[x, y, 9.0] for x in (-1.5, 0, 1.5) for y in (-1.0, 1.0)])
+    return seen_from(np.zeros((6, 3)), targets, xyz, 0)
+
+
+def plane(tilt: float, seed: int = 6) -> Network:
+    """A plane of 36 known points seen by six images at a given tilt."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-0.8, 0.8, 6)))
+    xyz = np.column_stack([x, y, 0 * x])
+    angle = np.linspace(0, 2 * np.pi, 6, endpoint=False) + seed
+    height = np.array([3.0, 3.3, 3.6, 3.1, 3.5, 3.8])
+    centres = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), height], axis=1)
+    aim = centres * [1, 1, 0]
+    centres = centres + np.tan(tilt) * height[:, None] * np.stack(
+        [np.cos(angle), np.sin(angle), 0 * angle], axis=1
+    )
+    return seen_from(centres, aim, xyz, 36, networks.camera(free=("c", "x0", "y0", "K1")))
+
+
+def camera_of(network: Network, **values: float) -> Network:
+    camera = network.cameras[0]
+    at = {camera.names.index(name): value for name, value in values.items()}
+    new = np.array([at.get(k, value) for k, value in enumerate(camera.values)])
+    return replace(network, cameras=(replace(camera, values=new),))
+
+
+def with_camera(network: Network, **more: Any) -> Network:
+    return replace(network, cameras=(replace(network.cameras[0], **more),))
+
+
+def moved(network: Network, row: int, by: tuple[float, float]) -> Network:
+    xy = network.xy.copy()
+    xy[row] += by
+    return replace(network, xy=xy)
+
+
+def mapped(network: Network, function: Callable[[Array], Array], image: int | None = None) -> Network:
+    own = np.ones(len(network.xy), dtype=bool) if image is None else network.image_of == image
+    return replace(network, xy=np.where(own[:, None], function(network.xy), network.xy))
+
+
+def point_moved(network: Network, j: int, by: tuple[float, float, float]) -> Network:
+    xyz = network.xyz.copy()
+    xyz[j] += by
+    return replace(network, xyz=xyz)
+
+
+def renamed(network: Network, rows: Array, point: int) -> Network:
+    """Rays given the name of another point; those of this point in the same images are removed."""
+    images = set(network.image_of[rows].tolist())
+    twice = (network.point_of == point) & np.isin(network.image_of, list(images))
+    point_of = network.point_of.copy()
+    point_of[rows] = point
+    return replace(network, point_of=point_of).select(~twice)
+
+
+def posed(network: Network) -> Network:
+    """The network with the poses of its adjustment given."""
+    fit = adjust_network(network).required().fit
+    return replace(network, x0=fit.values.x0.copy(), rotation=matrix_to_vector(fit.values.rotation))
+
+
+def bar(network: Network, k: int, factor: float) -> Network:
+    distance = network.distance.copy()
+    distance[k, 0] *= factor
+    return replace(network, distance=distance)
+
+
+def control_on_a_line(network: Network) -> Network:
+    xyz = network.xyz.copy()
+    fit = adjust_network(network).required().fit
+    order = np.argsort(fit.values.xyz[:, 0])
+    xyz[:] = np.nan
+    keep = order[[0, 20]]
+    xyz[keep] = fit.values.xyz[keep]
+    sigma = np.where(np.isnan(xyz), np.nan, 0.0)
+    return replace(network, xyz=xyz, sigma=sigma)
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A broken network, the code and words of its diagnosis."""
+
+    name: str
+    network: Callable[[], Network]
+    code: Code
+    words: tuple[str, ...]
+    rejecting: bool = True
+
+
+def row_of(network: Network, image: int, k: int = 3) -> int:
+    return int(np.flatnonzero(network.image_of == image)[k])
+
+
+BROKEN = [
+    # Units and values that no camera has.
+    Broken(
+        "pitch in micrometres",
+        lambda: with_camera(block(), pitch_mm=(10.0, 10.0)),
+        Code.IMPLAUSIBLE,
+        ("pixel size of 10 mm", "micrometres"),
+    ),
+    Broken(
+        "pitch of 3.45 micrometres",
+        lambda: with_camera(block(), pitch_mm=(3.45, 3.45)),
+        Code.IMPLAUSIBLE,
+        ("pixel size of 3.45 mm", "micrometres"),
+    ),
+    Broken(
+        "pitch in metres",
+        lambda: with_camera(block(), pitch_mm=(1e-5, 1e-5)),
+        Code.IMPLAUSIBLE,
+        ("pixel size of 1e-05 mm", "metres"),
+    ),
+    Broken(
+        "principal distance in metres",
+        lambda: camera_of(block(), c=0.008),
+        Code.IMPLAUSIBLE,
+        ("principal distance of 0.008 mm", "metres"),
+    ),
+    Broken(
+        "principal distance in micrometres",
+        lambda: camera_of(block(), c=8000.0),
+        Code.IMPLAUSIBLE,
+        ("principal distance of 8000 mm",),
+    ),
+    Broken(
+        "focal length in millimetres",
+        lambda: camera_of(opencv(), fx=8.0, fy=8.0),
+        Code.IMPLAUSIBLE,
+        ("focal length of 8 px",),
+    ),
+    Broken(
+        "one focal length in millimetres",
+        lambda: camera_of(opencv(), fy=8.0),
+        Code.IMPLAUSIBLE,
+        ("focal length of 8 px",),
+    ),
+    Broken(
+        "principal point in pixels",
+        lambda: camera_of(block(), x0=319.5, y0=239.5),
+        Code.IMPLAUSIBLE,
+        ("principal point", "x0 319.5 mm", "pixels"),
+    ),
+    Broken(
+        "principal point left at zero",
+        lambda: camera_of(opencv(), cx=0.0, cy=0.0),
+        Code.IMPLAUSIBLE,
+        ("principal point", "cx 0 px"),
+    ),
+    Broken(
+        "distortion in another unit",
+        lambda: camera_of(block(), K1=2.0),
+        Code.IMPLAUSIBLE,
+        ("distortion", "K1"),
+    ),
+    Broken(
+        "image coordinates in millimetres",
+        lambda: mapped(block(), lambda xy: (xy - [319.5, 239.5]) * [0.01, -0.01]),
+        Code.IMPLAUSIBLE,
+        ("all image coordinates are within", "millimetres"),
+    ),
+    Broken(
+        "normalised image coordinates",
+        lambda: mapped(block(), lambda xy: xy / [640, 480]),
+        Code.IMPLAUSIBLE,
+        ("all image coordinates are within", "normalised"),
+    ),
+    Broken(
+        "rotations in degrees",
+        lambda: (lambda n: replace(n, rotation=np.degrees(n.rotation)))(posed(block())),
+        Code.IMPLAUSIBLE,
+        ("rotation vectors", "degrees"),
+    ),
+    # Coordinates outside the image.
+    Broken(
+        "a decimal point lost",
+        lambda: mapped_row(block(), 2, 10.0),
+        Code.OUTSIDE,
+        ("in image i2", "outside the image"),
+    ),
+    Broken(
+        "a negative coordinate",
+        lambda: (lambda n: moved(n, row_of(n, 3), (-900.0, 0.0)))(block()),
+        Code.OUTSIDE,
+        ("in image i3", "outside the image"),
+    ),
+    Broken(
+        "width and height exchanged",
+        lambda: with_camera(block(), width=480, height=640),
+        Code.OUTSIDE,
+        ("exchanged",),
+    ),
+    Broken(
+        "x and y exchanged", lambda: mapped(block(), lambda xy: xy[:, ::-1]), Code.OUTSIDE, ("exchanged",)
+    ),
+    # Geometry that determines nothing.
+    Broken("one station", one_station, Code.ONE_STATION, ("from one station",)),
+    Broken(
+        "a plane seen frontally", lambda: plane(0.0), Code.FRONTAL, ("frontally", "c cannot be separated")
+    ),
+    Broken(
+        "a plane seen frontally, one image",
+        lambda: (lambda n: n.select(n.image_of == 0))(plane(0.0)),
+        Code.FRONTAL,
+        ("frontally",),
+    ),
+    Broken(
+        "points of an image on a line",
+        lambda: on_a_line(block(), 4),
+        Code.COLLINEAR,
+        ("image i4", "one line"),
+    ),
+    Broken(
+        "no datum",
+        lambda: replace(block(control=0), datum="control"),
+        Code.NO_DATUM,
+        ("scale", "not determined"),
+    ),
+    Broken(
+        "two control points",
+        lambda: control_on_a_line(block()),
+        Code.NO_DATUM,
+        ("rotation", "not determined"),
+    ),
+    Broken(
+        "an image with two points",
+        lambda: (lambda n: n.select((n.image_of != 6) | (np.cumsum(n.image_of == 6) < 3)))(block()),
+        Code.TOO_FEW_POINTS,
+        ("image i6 has 2 points",),
+    ),
+    Broken(
+        "a point in one image",
+        lambda: (lambda n: n.select((n.point_of != 20) | (n.image_of == n.image_of[n.point_of == 20][0])))(
+            block()
+        ),
+        Code.RANK_DEFECT,
+        ("single ray", "p20"),
+    ),
+    Broken(
+        "two blocks without a common point",
+        lambda: two_blocks(free_block()),
+        Code.TOO_FEW_POINTS,
+        ("left out",),
+    ),
+    # Scale bars and control.
+    *[
+        Broken(
+            f"scale bar {k} times {f}",
+            lambda k=k, f=f: bar(free_block(), k, f),
+            Code.DOUBTFUL_CONTROL,
+            ("distance", f"p{2 * k} to p{2 * k + 1}"),
+        )
+        for k, f in ((0, 1.02), (2, 1.1), (3, 1000.0))
+    ],
+    Broken(
+        "control point with a typing error",
+        lambda: point_moved(block(), 2, (1.0, 0, 0)),
+        Code.DOUBTFUL_CONTROL,
+        ("p2",),
+    ),
+    Broken(
+        "height of a control point wrong",
+        lambda: point_moved(block(), 4, (0, 0, -0.3)),
+        Code.DOUBTFUL_CONTROL,
+        ("p4",),
+    ),
+    Broken(
+        "control points exchanged",
+        lambda: exchanged(block(), 1, 3),
+        Code.DOUBTFUL_CONTROL,
+        ("p1 and p3 look exchanged",),
+    ),
+    Broken(
+        "mirrored control",
+        lambda: (lambda n: replace(n, xyz=n.xyz * [1, -1, 1]))(block()),
+        Code.DOUBTFUL_CONTROL,
+        ("mirrored",),
+    ),
+    Broken(
+        "y upwards",
+        lambda: mapped(block(), lambda xy: [0, 479] + xy * [1, -1]),
+        Code.DOUBTFUL_CONTROL,
+        ("mirrored",),
+    ),
+    *[
+        Broken(
+            f"observed control point p{j} off by {d}",
+            lambda j=j, d=d: point_moved(observed(), j, d),
+            Code.DOUBTFUL_CONTROL,
+            (f"p{j} ", "contradict"),
+        )
+        for j, d in ((3, (0.02, 0.0, 0.0)), (7, (0.0, 0.05, 0.05)))
+    ],
+    Broken(
+        "two observed control points wrong",
+        lambda: point_moved(point_moved(observed(), 2, (0.05, 0, 0)), 8, (0, 0, 0.04)),
+        Code.DOUBTFUL_CONTROL,
+        ("p2 ", "p8 ", "contradict"),
+    ),
+    # Observations and names.
+    Broken(
+        "a gross error",
+        lambda: (lambda n: moved(n, row_of(n, 5, 8), (25.0, 0.0)))(block()),
+        Code.GROSS_ERRORS,
+        ("in image i5",),
+        False,
+    ),
+    Broken(
+        "an image of another scene", lambda: mapped(block(), scrambled, 5), Code.TOO_FEW_POINTS, ("image i5",)
+    ),
+    Broken(
+        "an image mirrored",
+        lambda: mapped(block(), lambda xy: [639, 0] + xy * [-1, 1], 2),
+        Code.GROSS_ERRORS,
+        ("image i2",),
+    ),
+    Broken(
+        "one name for two points",
+        lambda: (lambda n: renamed(n, np.flatnonzero((n.point_of == 30) & (n.image_of % 2 == 0)), 31))(
+            block()
+        ),
+        Code.GROSS_ERRORS,
+        ("p31",),
+        False,
+    ),
+    # Held values and sigmas.
+    Broken(
+        "principal distance held at a wrong value",
+        lambda: camera_of(with_camera(block(), free=()), c=8.6),
+        Code.UNMODELLED,
+        ("held parameters", "c 8.6"),
+    ),
+    Broken(
+        "distortion held at zero",
+        lambda: camera_of(with_camera(block(), free=("c",)), K1=0.0, K2=0.0),
+        Code.UNMODELLED,
+        ("held parameters", "K1 0"),
+    ),
+    Broken(
+        "principal point held at a wrong place",
+        lambda: camera_of(with_camera(block(), free=("c",)), x0=0.5),
+        Code.UNMODELLED,
+        ("held parameters", "x0 0.5"),
+    ),
+    Broken(
+        "sigmas a thousand times too small",
+        lambda: (lambda n: replace(n, cov=n.cov * 1e-6))(block()),
+        Code.SIGMAS_DOUBTFUL,
+        ("larger than one",),
+    ),
+    Broken(
+        "sigmas a hundred times too large",
+        lambda: (lambda n: replace(n, cov=n.cov * 1e4))(block()),
+        Code.SIGMAS_DOUBTFUL,
+        ("smaller than one",),
+    ),
+    Broken(
+        "given rotations in the other sense",
+        lambda: (lambda n: replace(n, rotation=-n.rotation))(posed(block())),
+        Code.INCONSISTENT,
+        ("given orientation",),
+    ),
+]
+
+
+def mapped_row(network: Network, image: int, factor: float) -> Network:
+    xy = network.xy.copy()
+    xy[row_of(network, image), 0] *= factor
+    return replace(network, xy=xy)
+
+
+def scrambled(xy: Array) -> Array:
+    return np.random.default_rng(9).uniform([0, 0], [639, 479], xy.shape)
+
+
+def on_a_line(network: Network, image: int) -> Network:
+    own = network.image_of == image
+    xy = network.xy.copy()
+    xy[own] = [50, 60] + np.linspace(0, 1, int(own.sum()))[:, None] * [500, 300]
+    return replace(network, xy=xy)
+
+
+def two_blocks(network: Network) -> Network:
+    """Images 0 to 3 see the first half of the points, the others the rest."""
+    return network.select((network.image_of < 5) == (network.point_of < 25))
+
+
+def exchanged(network: Network, a: int, b: int) -> Network:
+    xyz = network.xyz.copy()
+    xyz[[a, b]] = xyz[[b, a]]
+    return replace(network, xyz=xyz)
+
+
+def exchanged_poses(network: Network, a: int, b: int) -> Network:
+    x0, rotation = network.x0.copy(), network.rotation.copy()
+    x0[[a, b]], rotation[[a, b]] = x0[[b, a]], rotation[[b, a]]
+    return replace(network, x0=x0, rotation=rotation)
+
+
+def said(network: Network, outliers: Any) -> tuple[str, set[Code]]:
+    found = adjust_network(network, Options(outliers=outliers))
+    if isinstance(found, Result):
+        return " | ".join(map(str, found.warnings)), {remark.code for remark in found.warnings}
+    return found.reason, {found.code}
+
+
+# Cases of more than a second; all of them, with and without rejection, are run by `make slow`.
+SLOW = {
+    "pitch in micrometres", "pitch of 3.45 micrometres", "principal distance in metres",
+    "focal length in millimetres", "one focal length in millimetres", "principal point in pixels",
+    "control points exchanged", "mirrored control", "y upwards", "control point with a typing error",
+    "height of a control point wrong", "an image mirrored", "one name for two points",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("outliers", ["keep", pytest.param("reject", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.slow if c.name in SLOW else (), id=c.name) for c in BROKEN],
+)
+def test_a_broken_network_is_told_with_its_cause(case: Broken, outliers: str) -> None:
+    if outliers == "reject" and not case.rejecting:
+        pytest.skip("what is rejected is listed with the result")
+    text, codes = said(case.network(), outliers)
+    for word in case.words:
+        assert word in text
+    assert case.code in codes
+
+
+ACCUSING = {
+    Code.IMPLAUSIBLE,
+    Code.OUTSIDE,
+    Code.ONE_STATION,
+    Code.FRONTAL,
+    Code.COLLINEAR,
+    Code.DOUBTFUL_CONTROL,
+    Code.INCONSISTENT,
+    Code.GROSS_ERRORS,
+}
+
+
+@pytest.mark.parametrize(
+    "sound",
+    [
+        block,
+        free_block,
+        opencv,
+        observed,
+        lambda: plane(0.5),
+        lambda: plane(0.15),
+        lambda: posed(block()),
+        lambda: exchanged_poses(posed(block()), 1, 5),
+        lambda: camera_of(block(), c=7.0),
+        lambda: with_camera(plane(0.0), free=()),
+        lambda: block(cameras=(networks.camera("brown-image"),)),
+        lambda: block(images=20, points=60),
+    ],
+)
+@pytest.mark.parametrize("outliers", ["keep", pytest.param("reject", marks=pytest.mark.slow)])
+def test_a_sound_network_is_not_accused(sound: Callable[[], Network], outliers: str) -> None:
+    text, codes = said(sound(), outliers)
+    assert not codes & ACCUSING, text
