@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from cruz import cruz_corners
 from real_frames import print_real
 
 from reseau.core.data import Array
+from reseau.core.tone import ToneCurve
 from reseau.io.images import open_scan
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
@@ -56,6 +58,8 @@ CASES = {
     "sharp, clean": FilmFrame(blur_px=0.3, noise=0.5, grain=0.0),
     "sharp, 9°, bowed": FilmFrame(blur_px=0.4, noise=0.8, grain=0.5, tilt_deg=9.0, bow_mm=0.05),
     "out of focus": FilmFrame(blur_px=0.4, defocus_px=3.0),
+    "spread by carriage": FilmFrame(blur_px=0.5, carriage_px=0.45),
+    "sRGB, stated": FilmFrame(srgb=True, blur_px=1.0),
     "trees": FilmFrame(scene="trees"),
     "trees, faded edges": FilmFrame(scene="trees", fade=0.75),
     "trees, faint": FilmFrame(scene="trees", fade=0.8, contrast=0.25, noise=2.0, grain=1.0),
@@ -93,7 +97,9 @@ def one(frame: FilmFrame, known: bool = True) -> Row:
     pixels = frame.scan()
     grey = pixels if pixels.ndim == 2 else pixels[:, :, 0]
     options = FrameOptions(formats=(frame.format[:2],)) if known else FrameOptions()
-    result = orient_frames(scan_of(pixels, dpi=frame.dpi if known else None), options)[0]
+    scan = scan_of(pixels, dpi=frame.dpi if known else None)
+    scan = replace(scan, curve=ToneCurve(None) if frame.srgb else None)
+    result = orient_frames(scan, options)[0]
     truth, none = frame.truth.corners, np.full((4, 2), np.nan)
     theirs = cruz_corners(grey, _areas(truth), frame.negative)
     return result, *_errors(result, frame), none if theirs is None else theirs - truth

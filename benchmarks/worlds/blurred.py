@@ -154,6 +154,13 @@ class Lens:
         xy = np.stack([-rays.x, rays.y], axis=1) / self.pitch + self.principal
         return np.where(good[:, None], xy, np.nan)
 
+    def at_stop(self, points: Array, pupil: Array, wavelength_nm: float) -> Array:
+        """Where rays from points (n, 3) through the pupil (n, 2) pass the stop (n, 2), in its radii."""
+        start = points * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
+        through = np.concatenate([pupil, np.full((len(pupil), 1), self.pupil_z)], axis=1)
+        rays = self._traced(start, through - start, wavelength_nm, "stop")
+        return np.stack([rays.x, rays.y], axis=1) / self.stop_radius
+
     def principal_ray(self, point: Array, wavelength_nm: float) -> Array:
         """Pixel of the ray from a point (3,) through the centre of the stop."""
         start = point * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
@@ -167,23 +174,22 @@ class Lens:
             at = at - np.linalg.solve(((hit[1:] - hit[0]) / h).T, hit[0])
         return self.arrive(point[None], at[None], wavelength_nm)[0]
 
-    def pupil_points(self, point: Array, wavelength_nm: float, count: int) -> tuple[Array, Array]:
+    def pupil_points(
+        self, point: Array, wavelength_nm: float, count: int, beyond: float = 1.0
+    ) -> tuple[Array, Array]:
         """Points (n, 2) of the entrance pupil whose rays from a point (3,) fill the stop, and areas (n,).
 
-        At the stop they lie on Fibonacci's spiral. The points of the pupil are a polynomial of those at the
-        stop, fitted to rays.
+        They fill the stop to `beyond` of its radius. At the stop they lie on Fibonacci's spiral. The points
+        of the pupil are a polynomial of those at the stop, fitted to rays.
         """
         k = np.arange(400) + 0.5
         wide = 1.08 * self.pupil_radius * np.sqrt(k / len(k))[:, None] * spiral(k)
-        start = point * [1.0, -1.0, -1.0] + [0.0, 0.0, self.pupil_z]
         for _ in range(2):  # the second time about the principal ray
-            through = np.concatenate([wide, np.full((len(wide), 1), self.pupil_z)], axis=1)
-            rays = self._traced(np.tile(start, (len(k), 1)), through - start, wavelength_nm, "stop")
-            at_stop = np.stack([rays.x, rays.y], axis=1) / self.stop_radius
+            at_stop = self.at_stop(np.tile(point, (len(k), 1)), wide, wavelength_nm)
             fit = np.linalg.lstsq(_terms(at_stop)[0], wide, rcond=None)[0]
             wide = _terms(1.08 * np.sqrt(k / len(k))[:, None] * spiral(k))[0] @ fit
         k = np.arange(count) + 0.5
-        terms, by_x, by_y = _terms(np.sqrt(k / count)[:, None] * spiral(k))
+        terms, by_x, by_y = _terms(beyond * np.sqrt(k / count)[:, None] * spiral(k))
         dx, dy = by_x @ fit, by_y @ fit
         return terms @ fit, np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
 
@@ -197,11 +203,20 @@ def spiral(k: Array) -> Array:
 def _terms(xy: Array, degree: int = 7) -> tuple[Array, Array, Array]:
     """Terms (n, t) of a polynomial, and their derivatives by x and y."""
     x, y = xy.T
-    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    powers = _powers(degree)
     terms = np.stack([x**i * y**j for i, j in powers], axis=1)
     by_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=1)
     by_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=1)
     return terms, by_x, by_y
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Powers of x and y in the terms of a polynomial."""
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
+_SECOND = [_powers(2).index(power) for power in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
+"""Terms of the second degree in the order of the maps: 1, x, y, x², xy, y²."""
 
 
 def energy_diameter(lens: Lens, point: Array, share: float = 0.8) -> float:
@@ -229,8 +244,9 @@ def add_shares(
     ----------
     image : ndarray (r, c)
         Samples, `side` per pixel.
-    maps : ndarray (p, 2, 6)
-        Polynomials of the second degree from places of the sensor to those of the target's plane.
+    maps : ndarray (p, 2 or 4, 6)
+        Polynomials of the second degree from places of the sensor to those of the target's plane, and to
+        those of the stop, in its radii; without the latter, no ray is stopped.
     places : ndarray (p, n, 2)
         Places of the sensor between which the target lies.
     low : ndarray (2,)
@@ -238,6 +254,8 @@ def add_shares(
     half : float
         Radius, or half the side, of the target.
     """
+    if maps.shape[1] == 2:
+        maps = np.concatenate([maps, np.zeros_like(maps)], axis=1)
     # A sequence that fills the square evenly: the average of places within samples is their centre.
     jitter = (0.5 + np.arange(len(maps))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0
     size = np.array(image.shape[::-1])
@@ -246,7 +264,7 @@ def add_shares(
     _add(image, maps, first, last, low, 1 / side, square, half, weights, jitter)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def _add(
     image: Any,
     maps: Any,
@@ -259,17 +277,32 @@ def _add(
     weights: Any,
     jitter: Any,
 ) -> None:
+    h2 = half * half
     for p in range(len(maps)):
-        a, b = maps[p, 0], maps[p, 1]
+        w, left = weights[p], low[0] + jitter[p, 0] * step
         for r in range(first[p, 1], last[p, 1]):
             y = low[1] + (r + jitter[p, 1]) * step
-            for c in range(first[p, 0], last[p, 0]):
-                x = low[0] + (c + jitter[p, 0]) * step
-                u = a[0] + a[1] * x + a[2] * y + a[3] * x * x + a[4] * x * y + a[5] * y * y
-                v = b[0] + b[1] * x + b[2] * y + b[3] * x * x + b[4] * x * y + b[5] * y * y
-                inside = max(abs(u), abs(v)) <= half if square else u * u + v * v <= half * half
-                if inside:
-                    image[r, c] += weights[p]
+            m = maps[p]
+            a0, a1, a2 = m[0, 0] + y * (m[0, 2] + y * m[0, 5]), m[0, 1] + y * m[0, 4], m[0, 3]
+            b0, b1, b2 = m[1, 0] + y * (m[1, 2] + y * m[1, 5]), m[1, 1] + y * m[1, 4], m[1, 3]
+            d0, d1, d2 = m[2, 0] + y * (m[2, 2] + y * m[2, 5]), m[2, 1] + y * m[2, 4], m[2, 3]
+            e0, e1, e2 = m[3, 0] + y * (m[3, 2] + y * m[3, 5]), m[3, 1] + y * m[3, 4], m[3, 3]
+            row = image[r]
+            # Without branches, so that several samples are computed at once.
+            if square:
+                for c in range(first[p, 0], last[p, 0]):
+                    x = left + c * step
+                    u, v = a0 + x * (a1 + x * a2), b0 + x * (b1 + x * b2)
+                    s, t = d0 + x * (d1 + x * d2), e0 + x * (e1 + x * e2)
+                    seen = (u * u <= h2) & (v * v <= h2) & (s * s + t * t <= 1.0)
+                    row[c] += w if seen else 0.0
+            else:
+                for c in range(first[p, 0], last[p, 0]):
+                    x = left + c * step
+                    u, v = a0 + x * (a1 + x * a2), b0 + x * (b1 + x * b2)
+                    s, t = d0 + x * (d1 + x * d2), e0 + x * (e1 + x * e2)
+                    seen = (u * u + v * v <= h2) & (s * s + t * t <= 1.0)
+                    row[c] += w if seen else 0.0
 
 
 def light(
@@ -297,30 +330,38 @@ def light(
     normal = np.cross(*target.axes.T)
     maps, weights, places = [], [], []
     for weight, wavelength in zip(WEIGHTS, WAVELENGTHS, strict=True):
-        pupil, area = lens.pupil_points(target.centre, wavelength, count // len(WAVELENGTHS))
-        # The stop is where the pupil ends; rays of other points of the target may miss its edge by a little.
-        xy = lens.arrive(
-            np.repeat(points, len(pupil), axis=0), np.tile(pupil, (9, 1)), wavelength, stopped=False
-        )
-        xy = xy.reshape(9, len(pupil), 2)
+        # Beyond the edge of the stop: rays of other points of the target pass it elsewhere.
+        pupil, area = lens.pupil_points(target.centre, wavelength, count // len(WAVELENGTHS), 1.03)
+        rays = np.repeat(points, len(pupil), axis=0), np.tile(pupil, (9, 1)), wavelength
+        xy = lens.arrive(*rays, stopped=False).reshape(9, len(pupil), 2)
+        hit = lens.at_stop(*rays).reshape(9, len(pupil), 2)
         # What each place of the sensor sees, relative to the middle of the window for the sake of the digits.
-        x, y = xy[..., 0] - columns.mean(), xy[..., 1] - rows.mean()
-        places.append(np.stack([x.T, y.T], axis=-1))
-        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).transpose(1, 0, 2)
+        x, y = xy[..., 0].T - columns.mean(), xy[..., 1].T - rows.mean()
+        places.append(np.stack([x, y], axis=-1))
+        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
         turned = np.swapaxes(terms, 1, 2)
-        found = np.linalg.solve(turned @ terms, turned @ np.broadcast_to(grid, (len(pupil), 9, 2)))
-        maps.append(found.transpose(0, 2, 1))
+        seen = np.concatenate([np.broadcast_to(grid, (len(pupil), 9, 2)), np.swapaxes(hit, 0, 1)], axis=2)
+        maps.append(np.swapaxes(np.linalg.solve(turned @ terms, turned @ seen), 1, 2))
         through = np.concatenate([pupil, np.zeros((len(pupil), 1))], axis=1) * [1.0, -1.0, 1.0]
         away = through - target.centre
-        distance = np.linalg.norm(away, axis=1)
-        weights.append(weight * area * np.abs(away[:, 2] * (away @ normal)) / distance**4)
+        emitted = area * np.abs(away[:, 2] * (away @ normal)) / np.linalg.norm(away, axis=1) ** 4
+        # What a place of the sensor receives of it: by the area of the target that it sees, at its centre.
+        (u, v), one, none = (x[:, 4], y[:, 4]), np.ones(len(x)), np.zeros(len(x))
+        slopes = np.stack([[none, one, none, 2 * u, v, none], [none, none, one, none, u, 2 * v]])
+        by_x, by_y = np.einsum("dtp,pct->dpc", slopes, maps[-1][:, :2])
+        weights.append(weight * emitted * np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]))
     low = np.array([columns[0] - columns.mean() - 0.5, rows[0] - rows.mean() - 0.5])
     margin = int(np.ceil(5 * sigma)) + 1
     samples = np.zeros(((len(rows) + 2 * margin) * side, (len(columns) + 2 * margin) * side))
-    seen, share = np.concatenate(maps), np.concatenate(weights)
-    square = target.shape == "square"
-    add_shares(samples, seen, np.concatenate(places), low - margin, side, square, target.size / 2, share)
-    return smoothed(samples / share.sum(), side, sigma, margin)
+    seen, share, where = np.concatenate(maps), np.concatenate(weights), np.concatenate(places)
+    add_shares(samples, seen, where, low - margin, side, target.shape == "square", target.size / 2, share)
+    # What a ground that fills the field would send: the light falls off towards the edge of the field.
+    y, x = (low[k] - margin + (np.arange(samples.shape[1 - k]) + 0.5) / side for k in (1, 0))
+    at = np.stack(np.meshgrid(*(np.linspace(v.min(), v.max(), 9) for v in (x, y))), axis=-1).reshape(-1, 2)
+    stop = np.einsum("pct,nt->cpn", seen[:, 2:], _terms(at, 2)[0][:, _SECOND])
+    fit = np.linalg.lstsq(_terms(at, 2)[0], share @ (np.hypot(*stop) <= 1), rcond=None)[0]
+    ground = sum(c * x**i * y[:, None] ** j for c, (i, j) in zip(fit, _powers(2), strict=True))
+    return smoothed(samples / ground, side, sigma, margin)
 
 
 def smoothed(samples: Array, side: int, sigma: float, margin: int) -> Array:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from worlds.pixels import Array, Scene, edge, form_at
+from worlds.pixels import Array, Scene, edge, form_at, interpolated
 
 __all__ = ["A_NAMES", "B_NAMES", "Difficulty", "Echoes", "Photo", "World", "write"]
 
@@ -42,6 +42,8 @@ _SCREEN = (51.0, 41.0)
 """Half the width and the height of the screen, mm."""
 _SOFT = 0.6
 """Standard deviation over which edges are softened before the rest of the blur is applied, pixels."""
+_ENDS = 8.5
+"""Standard deviations beyond which a softened edge is 0 or 1 in double precision."""
 _PER_PIXEL = 2
 """Samples per pixel and axis: with edges softened by 0.6 px, 8e-4 of their contrast is aliased at most."""
 
@@ -288,7 +290,11 @@ class World:
         )
         return _inverse(lambda p: np.stack(self.to_screen(photo, *p.T), axis=-1), xy, start)
 
-    def clear(self, x: Array, y: Array, soft: Soft) -> tuple[Array, Array]:
+    def on_screen(self, photo: Photo, x: Array, y: Array) -> Array:
+        """The screen (2, h, w) seen by the grid of columns x (w,) and rows y (h,) of a photograph."""
+        return interpolated(lambda u, v: np.stack(self.to_screen(photo, u, v)), x, y)
+
+    def clear(self, x: Array, y: Array, soft: Soft, reach: float) -> tuple[Array, Array]:
         """Share of the light of points of the screen that passes the wires, and share on the screen.
 
         Parameters
@@ -297,7 +303,15 @@ class World:
             The points.
         soft : callable
             From the signed distance to an edge, mm, to the share inside.
+        reach : float
+            Distance from an edge, mm, up to which that share is neither 0 nor 1.
         """
+
+        def share(inside: Array) -> Array:
+            found, near = (inside > 0).astype(np.float64), np.abs(inside) <= reach
+            found[near] = soft(inside[near])
+            return found
+
         half, c = self.wire / 2, self.difficulty.columns
         clear = np.ones_like(x)
         for own, across, along, some in ((0, x, y, slice(None, c)), (1, y, x, slice(c, None))):
@@ -308,8 +322,8 @@ class World:
             n, o, at = n[order], o[order], at[order]
             nearest = np.searchsorted((at[1:] + at[:-1]) / 2, across)
             away = np.abs(n[nearest, own] * across + n[nearest, 1 - own] * along - o[nearest])
-            clear *= 1.0 - soft(half - away)
-        return clear, soft(_SCREEN[0] - np.abs(x)) * soft(_SCREEN[1] - np.abs(y))
+            clear *= 1.0 - share(half - away)
+        return clear, share(_SCREEN[0] - np.abs(x)) * share(_SCREEN[1] - np.abs(y))
 
     def image(self, which: int) -> Array:
         """A photograph (height, width) without noise; 0, 1, 2 for PHOTO I, II, III.
@@ -323,7 +337,7 @@ class World:
         px, py = (np.arange((size + 2 * margin) * n) / n - margin for size in (width, height))
         unit = d.scale / _SOFT
         clear, inside = self.clear(
-            *self.to_screen(photo, *np.meshgrid(px, py)), lambda away: np.asarray(ndtr(away * unit))
+            *self.on_screen(photo, px, py), lambda away: np.asarray(ndtr(away * unit)), _ENDS / unit
         )
         clear *= photo.screen - photo.wire
         clear += photo.wire - photo.dark
@@ -358,8 +372,9 @@ class World:
         """The light of an echo that passes the wires."""
 
         def scene(px: Array, py: Array, spacing: float) -> Array:
-            x, y = self.to_screen(photo, px, py)
-            clear, inside = self.clear(x, y, lambda away: edge(away * self.difficulty.scale, spacing))
+            x, y = self.on_screen(photo, px[0], py[:, 0])
+            scale = self.difficulty.scale
+            clear, inside = self.clear(x, y, lambda away: edge(away * scale, spacing), spacing / scale)
             return echoes.light(which, x, y) * clear * inside
 
         return scene
@@ -535,7 +550,7 @@ def _hidden(world: World, echoes: Echoes) -> list[float]:
             *(np.linspace(c - r, c + r, n) for c, r, n in zip(at, reach, (300, 200), strict=True))
         )
         light = echoes.light(k, x, y)
-        clear, inside = world.clear(x, y, lambda away: (away > 0).astype(np.float64))
+        clear, inside = world.clear(x, y, lambda away: (away > 0).astype(np.float64), 0.0)
         found.append(round(float(1 - (light * clear * inside).sum() / light.sum()), 4))
     return found
 
@@ -679,7 +694,8 @@ def check() -> None:
 
         def whole(px: Array, py: Array, spacing: float, photo: Photo = photo, echoes: Any = echoes) -> Array:
             x, y = world.to_screen(photo, px, py)
-            clear, inside = world.clear(x, y, lambda away: edge(away * world.difficulty.scale, spacing))
+            scale = world.difficulty.scale
+            clear, inside = world.clear(x, y, lambda away: edge(away * scale, spacing), spacing / scale)
             light = photo.dark + (photo.wire + (photo.screen - photo.wire) * clear - photo.dark) * inside
             for k in range(0 if echoes is None else len(echoes.at)):
                 if np.abs(echoes.at[k] - [x.mean(), y.mean()]).max() < 9:

@@ -117,6 +117,10 @@ class FilmFrame:
         Width of the scanner's and the film's spread, one sigma.
     defocus_px : float
         Radius of the disk of a scanner out of focus.
+    carriage_px : float
+        Width of a further spread along the columns, by the carriage of the scanner.
+    srgb : bool
+        Whether grey values are coded as sRGB instead of proportional to the light.
     scene : {"forms", "trees"}
         Forms in any direction, or upright trunks before leaves: lines parallel to the edges.
     fade : float
@@ -152,6 +156,8 @@ class FilmFrame:
     grain: float = 3.0
     blur_px: float = 0.7
     defocus_px: float = 0.0
+    carriage_px: float = 0.0
+    srgb: bool = False
     scene: Literal["forms", "trees"] = "forms"
     fade: float = 0.0
     gate_sigma_mm: float = 0.03
@@ -275,7 +281,14 @@ def _light(frame: FilmFrame) -> Array:
         exposure = _blown(frame, exposure, x, y, corners, rng)
     grey = base + sign * 255.0 * frame.contrast * exposure
     grey = _film(frame, view, grey, rng)
-    return np.clip(grey, 0.0, 255.0).astype(np.float64)
+    if frame.carriage_px > 0:
+        column = cv2.getGaussianKernel(2 * int(np.ceil(4 * frame.carriage_px)) + 1, frame.carriage_px)
+        spread: Any = cv2.sepFilter2D(grey, -1, np.ones(1), column, borderType=cv2.BORDER_REPLICATE)
+        grey = spread
+    part = np.clip(grey, 0.0, 255.0).astype(np.float64) / 255.0
+    if not frame.srgb:
+        return np.asarray(255.0 * part)
+    return 255.0 * np.where(part > 0.0031308, 1.055 * part ** (1 / 2.4) - 0.055, 12.92 * part)
 
 
 def _grain(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Plane:

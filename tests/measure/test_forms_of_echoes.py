@@ -45,6 +45,12 @@ def test_lines_cut_by_turned_wires_are_measured_as_well_as_whole_ones():
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.06
 
 
+def test_lines_along_a_wire_that_hides_parts_of_both_ends_are_measured():
+    error, sigma, wanted = errors(draw("even", seed=3))
+    assert len(error) >= 0.9 * wanted
+    assert np.abs(error / sigma).max() < 4
+
+
 def test_lines_without_a_reseau_are_measured_within_their_sigmas():
     drawn = draw("even", seed=2, wires=False)
     points = find_pins(drawn.frame).points

@@ -10,8 +10,10 @@ import pytest
 
 from reseau.core.data import Array
 from reseau.core.failure import Code
+from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
+from reseau.measure.film.lines import robust_line, waviness
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -337,3 +339,42 @@ def test_a_picture_that_fades_on_one_side_is_no_frame_of_three_edges() -> None:
     fading = np.clip(np.linspace(2.5, -0.8, frame.shape[1]), 0, 1)
     scan = np.rint(14 + (frame.scan() - 14.0) * fading).clip(0, 255).astype(np.uint8)
     assert not orient_frames(scan_of(scan), FrameOptions(((36.0, 24.0),)))[0]
+
+
+def test_a_scan_that_is_sharper_in_one_direction_has_no_lines_beside_its_edges() -> None:
+    frame = FilmFrame(31, blur_px=0.5, carriage_px=0.45)
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert result.lines is not None
+    assert np.sqrt(np.diag(result.lines.covariance)).max() < 0.1
+    assert np.abs(errors(result, frame)).max() < 0.1
+
+
+@pytest.mark.parametrize("negative", [False, True])
+def test_grey_values_are_measured_with_the_curve_that_the_file_states(negative: bool) -> None:
+    frame = FilmFrame(32, srgb=True, blur_px=1.2, negative=negative)
+    coded = scan_of(frame.scan(), dpi=frame.dpi)
+    options = FrameOptions(formats=(frame.format[:2],))
+    outwards = []
+    for curve in (ToneCurve(None), None):
+        (result,) = orient_frames(replace(coded, curve=curve), options)
+        outwards.append(np.mean(errors(result, frame) * [[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+    assert abs(outwards[0]) < 0.05
+    assert abs(outwards[1]) > 0.15
+
+
+def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> None:
+    place, sigma = np.linspace(-1, 1, 300), np.full(300, 0.05)
+    noise = np.random.default_rng(0).normal(0, 0.05, 300)
+    assert waviness(place, noise, sigma) == 0.0
+    # A line through one wave of 0.5 px misses its ends by 0.48 px.
+    assert 0.4 < waviness(place, noise + 0.5 * np.sin(np.pi * place), sigma) < 0.8
+
+
+def test_a_line_is_found_through_profiles_of_which_half_may_be_displaced() -> None:
+    place = np.linspace(-1, 1, 200)
+    offset = 1 - 0.5 * place + np.random.default_rng(0).normal(0, 0.03, 200)
+    found = robust_line(place, offset, np.where(place < 0, 2.0, 0.03), 0.05)
+    assert found is not None
+    assert found[1].all()
+    np.testing.assert_allclose(found[0][:2], [1.5, 0.5], rtol=0, atol=0.1)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from reseau.measure.reseau.assignment import assign
 from reseau.measure.reseau.candidates import Candidates
-from reseau.measure.reseau.placement import GridOptions, assign, place_grid
+from reseau.measure.reseau.grid_search import GridOptions, place_grid
 
 WIDTH, HEIGHT = 900, 700
 VALID = np.ones((HEIGHT, WIDTH), dtype=bool)

@@ -5,8 +5,10 @@ from .compare import FieldDifference, calibration_difference
 from .document import Calibration, Covariance, Quantity
 from .fiducials import FiducialMapping, calibration_of_fiducials, film_axes, scan_coordinates, scan_pixels
 from .film import FilmFrameMapping, calibration_of_frame
+from .group_a import CameraCorrection, Datum
+from .group_b import InstrumentCorrection, ObjectPlane
+from .local_model import LocalModel
 from .mapping import CalibratedMapping
-from .oscilloscope import CameraCorrection, Datum, InstrumentCorrection, LocalModel, ObjectPlane
 from .raster import CorrectedImage, undistorted_camera, write_corrected
 from .reader import parse_calibration, read_calibration
 from .sensor import Fields, SensorCorrection

@@ -21,8 +21,8 @@ from .camera import CameraMapping
 from .document import Calibration, CameraModel, Covariance, Quantity
 from .fiducials import FiducialMapping
 from .film import FilmFrameMapping
+from .group_a import CameraCorrection
 from .mapping import BEYOND, CalibratedMapping
-from .oscilloscope import CameraCorrection
 
 __all__ = ["CorrectedImage", "planes_of", "undistorted_camera", "write_corrected"]
 

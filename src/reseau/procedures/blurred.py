@@ -33,13 +33,15 @@ from ..optics.lenses import (
     Prescription,
     RayMap,
     SensorPlane,
+    image_scale,
 )
-from ..optics.newton import determinant, newton
+from ..optics.newton import newton
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
 from .target_measurement import Measurer, measurer_of
 
 __all__ = [
+    "SPACING_PX",
     "BlurredFrame",
     "calibrated_by",
     "focused",
@@ -53,7 +55,7 @@ __all__ = [
 
 Design = ReseauDesign | TestfieldDesign
 
-_SPACING_PX = 0.8
+SPACING_PX = 0.8
 """Largest distance of nodes along outlines: images shift by less than 1e-4 px against those of many nodes."""
 _FAR = 1e5
 """Distance of an object far away, mm."""
@@ -234,13 +236,10 @@ def targets_of(design: Design, pose: Pose, camera: RayMap) -> tuple[tuple[str, .
     matrix = pose.matrix
     centres = pose(np.concatenate([design.xy, np.zeros((len(design.ids), 1))], axis=1))
     axes = matrix[:, :2]
-    around = centres[:, None] + np.array([np.zeros(3), axes[:, 0], axes[:, 1]])
-    near = camera.corresponding(around.reshape(-1, 3)).reshape(-1, 3, 2)
-    near = near[np.isfinite(near).all(axis=(1, 2))]
-    if not len(near):
+    scales = image_scale(camera, centres, np.broadcast_to(axes, (len(centres), 3, 2)))
+    if not np.isfinite(scales).any():
         raise UsageError("the design is not in the field of the lens", where=design.name)
-    scale = float(np.median(np.sqrt(np.abs(determinant(near[:, 1:] - near[:, :1])))))
-    spacing = _SPACING_PX / scale
+    spacing = SPACING_PX / float(np.nanmedian(scales))
     if isinstance(design, TestfieldDesign):
         t = design.targets
         outlines = [

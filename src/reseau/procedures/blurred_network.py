@@ -8,7 +8,7 @@ its ordinary coordinates are as certain and do not differ significantly, these a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -23,13 +23,12 @@ from ..core.failure import Code, Failure, Remark
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..measure.ordinary import ordinary_coordinates
-from ..optics.lenses import LensCamera, PlaneTarget, behind_windows
+from ..optics.lenses import LensCamera, PlaneTarget, behind_windows, image_scale
 from ..optics.refraction import RefractedRays
+from .blurred import SPACING_PX
 
 __all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
 
-_SPACING_PX = 0.6
-"""Largest distance of nodes along outlines."""
 _NODES = 150
 """Largest number of nodes along the size of a target."""
 _DIFFERS = 9.21
@@ -247,19 +246,21 @@ def _ordinary(
     """The network with ordinary coordinates, measured where that is asked for."""
     if options.initial == "given":
         return network
-    xy, named = network.xy.copy(), set(targets.targets.id)
+    xy = network.xy.copy()
     for i, image in enumerate(network.images):
         if image in frames:
-            rows = [
-                k
-                for k in np.flatnonzero(network.image_of == i).tolist()
-                if network.points[network.point_of[k]] in named
-            ]
+            rows = _rows_of(network, i, set(targets.targets.id))
             found = ordinary_coordinates(
                 frames[image], xy[rows], polarity=targets.polarity, method=options.initial
             )
             xy[rows] = np.where(np.isfinite(found), found, xy[rows])
     return replace(network, xy=xy)
+
+
+def _rows_of(network: Network, image: int, named: Collection[str]) -> list[int]:
+    """Rows of the coordinates of an image whose points are among those named."""
+    rows = np.flatnonzero(network.image_of == image).tolist()
+    return [k for k in rows if network.points[network.point_of[k]] in named]
 
 
 class _Run:
@@ -300,12 +301,8 @@ class _Run:
         for i, image in enumerate(network.images):
             if image not in self.frames or not last.fit.usable.images[i]:
                 continue
-            rows = [
-                k
-                for k in np.flatnonzero(network.image_of == i).tolist()
-                if network.points[network.point_of[k]] in self.row
-                and np.isfinite(self.xyz[network.point_of[k]]).all()
-            ]
+            rows = _rows_of(network, i, self.row)
+            rows = [k for k in rows if np.isfinite(self.xyz[network.point_of[k]]).all()]
             if not rows:
                 continue
             found = self._measured(last, i, rows)
@@ -343,11 +340,11 @@ class _Run:
             k = self.row[network.points[j]]
             centre = self.unit_mm * (rotation @ (self.xyz[j] - x0))
             axes = rotation @ self.targets.axes(k)
-            # A target that is predicted too near, by a bad orientation, has no more nodes than others.
-            spacing = max(
-                self._spacing(camera, centre, axes) / self.targets.unit_mm,
-                self.targets.targets.size[k] / _NODES,
-            )
+            scale = float(image_scale(camera, centre[None], axes[None])[0]) * self.targets.unit_mm
+            # A target that is predicted too near, by a bad orientation, has no more nodes than others; one
+            # out of the field of the lens will not be measured.
+            least = self.targets.targets.size[k] / _NODES
+            spacing = max(SPACING_PX / scale, least) if scale > 0 else self.targets.targets.size[k]
             outline = self.targets.outline(k, spacing)
             scaled = replace(
                 outline,
@@ -404,13 +401,6 @@ class _Run:
             lens, network.refraction.with_values(values.refraction), int(network.refraction.path_of[i]),
             values.rotation[i], values.x0[i], unit_mm=self.unit_mm,
         )  # fmt: skip
-
-    def _spacing(self, camera: LensCamera, centre: Array, axes: Array) -> float:
-        """Distance of nodes, mm, that is some tenths of a pixel in the image."""
-        near = camera.corresponding(np.stack([centre, centre + axes[:, 0], centre + axes[:, 1]]))
-        scale = float(np.sqrt(abs(np.linalg.det(near[1:] - near[0]))))
-        # A target out of the field of the lens: it will not be measured.
-        return _SPACING_PX / scale if np.isfinite(scale) and scale > 0 else 1.0
 
     def _stays(self, found: BlurredResult, k: int, own: int) -> bool:
         """Whether a target keeps its ordinary coordinates."""

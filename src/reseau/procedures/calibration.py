@@ -488,10 +488,10 @@ def _magnification(refraction: Refraction | None) -> float:
     """How much larger than in air the windows on the camera show distant things; 1.33 for a port in water."""
     if refraction is None or not refraction.paths:
         return 1.0
-    ports = tuple(k for k in refraction.paths[0] if refraction.windows[k].on == "camera")
-    if not ports:
+    ports = refraction.ports()
+    if not ports.paths:
         return 1.0
-    only = replace(refraction, paths=(ports,), path_of=np.zeros(1, dtype=np.intp))
+    only = replace(ports, paths=ports.paths[:1], path_of=np.zeros(1, dtype=np.intp))
     pose, every = (np.eye(3)[None], np.zeros((1, 3))), np.arange(2)
     far = 1e4 * float(np.abs(only.values).max(initial=1.0))
     points = far * np.array([[-_NARROW, -_NARROW, 1.0], [_NARROW, _NARROW, 1.0]])

@@ -8,18 +8,13 @@ without control points gets true coordinates. The steps have the numbers and sym
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, Self, TypeVar
+from typing import Literal, Self
 
-import numpy as np
-
-from ..archive import Verdict
 from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import Frame, ImagePoints
-from ..core.errors import EstimationError
 from ..core.failure import Code, Failure, Remark
-from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from ..measure import (
     PinDetections,
@@ -28,7 +23,6 @@ from ..measure import (
     ReseauOptions,
     ReseauResult,
     find_pins,
-    measure_pins,
     measure_reseau,
 )
 from ..optics import RationalPolynomial
@@ -44,11 +38,10 @@ from ..refine import (
     register,
     still_standard,
 )
-from ..refine.echoes import middles_on_screen
-from ..refine.remarks import ANOTHER_SHAPE_PX, of_the_camera, of_the_change, of_the_object
+from ..refine.remarks import of_the_camera, of_the_change, of_the_object
+from .oscilloscope_frames import declined_rods, middles_of_echoes, notes_of, pins_in, reseau_in
 
 __all__ = [
-    "OscilloscopeProcedure",
     "PhotoI",
     "PhotoII",
     "PhotoIII",
@@ -58,20 +51,6 @@ __all__ = [
     "photo_iii",
     "still_standard_in",
 ]
-
-_STATIONARY_PX = 6.0
-"""Search distance of the reseau from its position in PHOTO I; beyond it, the whole image is searched."""
-
-
-class _Named(Protocol):
-    """A step; see :class:`reseau.capture.Step`."""
-
-    @property
-    def name(self) -> str:
-        """PHOTO I, PHOTO II or PHOTO III."""
-
-
-P = TypeVar("P", bound=_Named)
 
 
 class _Corrected:
@@ -276,7 +255,7 @@ def photo_ii(
     [1.0, 1.0]
     """
     # (iv) photo-coordinates of the test object, (v) in the common system by PHOTO I
-    seen = _pins_in(photo, reseau, test_object, camera, marks, options, pins)
+    seen = pins_in(photo, reseau, test_object, camera, marks, options, pins)
     if isinstance(seen, Failure):
         return seen
     images, registration, measured, shown = seen
@@ -294,9 +273,9 @@ def photo_ii(
     if isinstance(instrument, Failure):
         return instrument if measured is None else replace(instrument, places=measured.points.xy)
     notes = of_the_camera(camera, registration) + of_the_object(
-        instrument, images, test_object, {} if measured is None else _declined(measured)
+        instrument, images, test_object, {} if measured is None else declined_rods(measured)
     )
-    notes += _of_the_measurements(shown, measured)
+    notes += notes_of(shown, measured)
     causes = None if instrument.fit is None else causes_of(instrument.fit.adjustment)
     return PhotoII(images, instrument, registration, causes, notes, measured, shown)
 
@@ -338,6 +317,7 @@ def photo_iii(
     --------
     Two points of a body, which are two of the rods here:
 
+    >>> import numpy as np
     >>> from reseau.designs import regular_reseau
     >>> from reseau.io import Mark
     >>> reseau = regular_reseau(5, 4, 20.0, Mark(shape="disk", size=4.0))
@@ -352,7 +332,7 @@ def photo_iii(
     """
     measured, shown = None, None
     if isinstance(photo, Frame):
-        seen = _reseau_in(photo, reseau, instrument.camera, options)
+        seen = reseau_in(photo, reseau, instrument.camera, options)
         if isinstance(seen, Failure):
             return seen
         marks, shown = seen.points, seen
@@ -371,10 +351,10 @@ def photo_iii(
         if isinstance(registered, Failure):
             return registered
         if measured is not None:
-            body = _middles(measured, instrument.camera, registered)
+            body = middles_of_echoes(measured, instrument.camera, registered)
         registration, body = registered, registered.apply(body)
         moves = registration.moves(body.xy)
-    notes = of_the_camera(instrument.camera, registration) + _of_the_measurements(shown)
+    notes = of_the_camera(instrument.camera, registration) + notes_of(shown)
     return PhotoIII(body, instrument.apply(body, moves), registration, notes, measured, shown)
 
 
@@ -454,7 +434,7 @@ def still_standard_in(
     >>> still_standard_in(imaged(rods), instrument, reseau, rods).test.holds
     True
     """
-    seen = _pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
+    seen = pins_in(photo, reseau, test_object, instrument.camera, marks, options, pins)
     if isinstance(seen, Failure):
         return seen
     images, registration, measured, shown = seen
@@ -463,195 +443,5 @@ def still_standard_in(
         return test if measured is None else replace(test, places=measured.points.xy)
     notes = of_the_camera(instrument.camera, registration)
     notes += of_the_change(test, registration, instrument.unit)
-    notes += _of_the_measurements(shown, measured)
+    notes += notes_of(shown, measured)
     return StillStandard(test, registration, notes, measured, shown)
-
-
-def _pins_in(
-    photo: Frame | ImagePoints,
-    reseau: ReseauDesign,
-    test_object: ReseauDesign,
-    camera: CameraCorrection,
-    marks: ImagePoints | None,
-    options: ReseauOptions | None,
-    pins: PinOptions | None,
-) -> tuple[ImagePoints, Registration | None, PinResult | None, ReseauResult | None] | Failure:
-    """Images of the rods (px of PHOTO I), their registration, and the measurements of rods and reseau."""
-    measured, shown = None, None
-    if isinstance(photo, Frame):
-        seen = _reseau_in(photo, reseau, camera, options)
-        if isinstance(seen, Failure):
-            return seen
-        hidden = seen.shadow(reseau, photo.pixels.shape)
-        found = measure_pins(photo, test_object, pins, hidden=hidden)
-        if isinstance(found, Failure):
-            return found
-        marks, shown, measured, images = seen.points, seen, found, found.points
-    else:
-        images = photo
-    if marks is None:
-        return images, None, measured, shown
-    registration = register(marks, reseau, camera)
-    if isinstance(registration, Failure):
-        return registration
-    if measured is not None:
-        images = _middles(measured, camera, registration)
-    return registration.carry(images), registration, measured, shown
-
-
-def _middles(
-    measured: PinResult | PinDetections, camera: CameraCorrection, registration: Registration
-) -> ImagePoints:
-    """The middles of echoes on the screen, in pixels of their photograph."""
-    points, ok = measured.points, measured.ok
-    if measured.reach is None:
-        return points
-    reach, curvature, tilt = (values[ok] for values in (measured.reach, measured.curvature, measured.tilt))
-    return middles_on_screen(points, reach, curvature, tilt, camera, registration)
-
-
-def _declined(measured: PinResult) -> dict[str, str]:
-    """Reasons of the rods that were seen, and not measured, by name."""
-    unseen = (None, Code.NOT_FOUND, Code.OUTSIDE, Code.NO_COORDINATES)
-    return {
-        name: str(why)
-        for name, why, code in zip(measured.ids, measured.why, measured.codes, strict=True)
-        if code not in unseen
-    }
-
-
-def _of_the_measurements(*results: ReseauResult | PinResult | None) -> tuple[Remark, ...]:
-    """Notes on the measurements of a photograph, each once."""
-    notes = [note for result in results if result is not None for note in result.notes]
-    return tuple(dict.fromkeys(notes))
-
-
-def _reseau_in(
-    photo: Frame, reseau: ReseauDesign, camera: CameraCorrection, options: ReseauOptions | None
-) -> ReseauResult | Failure:
-    """Measure the reseau at its position in PHOTO I; search it if that may have missed a row.
-
-    If the camera was moved by the pitch of the reseau, marks appear at the positions of others; if by half of
-    it, a single wire passes there. Neither has the shape that PHOTO I predicts.
-    """
-    o = options or ReseauOptions()
-    expected = camera.to_pixels(camera.object_system(reseau.xy))
-    near = replace(o, nominal=True, nominal_within_px=_STATIONARY_PX)
-    known = measure_reseau(photo, reseau.expected_at(expected), near)
-    found, left = 0, np.inf
-    if isinstance(known, ReseauResult):
-        found, left = known.found, _left_px(known, reseau, camera)
-    if len(reseau.ids) - found <= 0.5 * np.sqrt(len(reseau.ids)) and left <= ANOTHER_SHAPE_PX:
-        return known
-    anew = measure_reseau(photo, reseau, o)
-    if not isinstance(anew, ReseauResult):
-        return known
-    if left > ANOTHER_SHAPE_PX:
-        return anew if _left_px(anew, reseau, camera) < left else known
-    return anew if anew.found > found else known
-
-
-def _left_px(seen: ReseauResult, reseau: ReseauDesign, camera: CameraCorrection) -> float:
-    """Residuals of the marks of a photograph against PHOTO I, pixels rms; see `Registration`."""
-    registered = register(seen.points, reseau, camera)
-    return registered.left_px if isinstance(registered, Registration) else np.inf
-
-
-class OscilloscopeProcedure:
-    """The procedure in an acquisition: corrects PHOTO I, II and III as they are taken.
-
-    The same frames give the same results to the byte, live and from the archive.
-
-    Parameters
-    ----------
-    reseau, test_object : ReseauDesign
-        The reseau and the rods.
-    name : str
-        Name of the calibration.
-    options, inputs : mapping
-        Provenance: parameters, and SHA-256 of the input files by name.
-    check : iterable of str
-        Marks of PHOTO I used as check points only.
-
-    Examples
-    --------
-    >>> from reseau.designs import standard_reseau, test_object
-    >>> procedure = OscilloscopeProcedure(standard_reseau(), test_object(), name="monday")
-    >>> procedure.finish()
-    Traceback (most recent call last):
-        ...
-    reseau.core.errors.EstimationError: PHOTO I: could not be corrected; see the verdicts on its frames
-    """
-
-    def __init__(
-        self,
-        reseau: ReseauDesign,
-        test_object: ReseauDesign,
-        *,
-        name: str,
-        options: Mapping[str, Any] | None = None,
-        inputs: Mapping[str, str] | None = None,
-        check: Iterable[str] = (),
-    ) -> None:
-        self.reseau, self.test_object, self.name = reseau, test_object, name
-        self._check = tuple(check)
-        self._options, self._inputs = dict(options or {}), dict(inputs or {})
-        self.first: PhotoI | None = None
-        self.second: PhotoII | None = None
-        self.third: PhotoIII | None = None
-
-    def on_frame(self, frame: Frame, step: _Named) -> Verdict:
-        """Correct a photograph; the name of its step says which one it is."""
-        found = self._corrected(frame, step.name)
-        if isinstance(found, Failure):
-            return Verdict(False, found.reason)
-        self._inputs[step.name] = frame.sha256
-        points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
-        return Verdict(True, facts={"points": len(getattr(found, points))})
-
-    def _corrected(self, frame: Frame, photo: str) -> PhotoI | PhotoII | PhotoIII | Failure:
-        if photo == "PHOTO I":
-            one = photo_i(frame, self.reseau, check=self._check)
-            self.first = None if isinstance(one, Failure) else one
-            return one
-        if photo == "PHOTO II":
-            if self.first is None:
-                return Failure("PHOTO I is not corrected", Code.PREREQUISITE_MISSING)
-            two = photo_ii(frame, self.reseau, self.test_object, self.first.camera)
-            self.second = None if isinstance(two, Failure) else two
-            return two
-        if photo == "PHOTO III":
-            if self.second is None:
-                return Failure("PHOTO II is not corrected", Code.PREREQUISITE_MISSING)
-            three = photo_iii(frame, self.second.instrument, self.reseau)
-            self.third = None if isinstance(three, Failure) else three
-            return three
-        return Failure(f"{photo} is not a photograph of this procedure", Code.UNKNOWN_STEP)
-
-    def progress(self) -> dict[str, float]:
-        """Return nothing: no standard deviations are known before the end."""
-        return {}
-
-    def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
-        """Return None: the photographs are taken from one position."""
-        return None
-
-    def finish(self) -> dict[str, str]:
-        """Return the calibration of camera and instrument, and the true coordinates of the body if present.
-
-        Raises
-        ------
-        EstimationError
-            If PHOTO I or II could not be corrected.
-        """
-        if self.second is None:
-            what = "PHOTO I" if self.first is None else "PHOTO II"
-            raise EstimationError("could not be corrected", where=what, do="see the verdicts on its frames")
-        provenance = Provenance(self._inputs, self._options)
-        calibration = self.second.instrument.calibration(
-            self.reseau, self.test_object, name=self.name, provenance=provenance.to_dict(), times={}
-        )
-        made = {"calibration.json": calibration.to_json()}
-        if self.third is not None:
-            made["true.csv"] = self.third.true.to_csv()
-        return made

@@ -13,8 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ..adjust import Adjustment, Elimination, Options
+from ..calibration import CameraCorrection, Datum
+from ..calibration.entries import tests_of
 from ..calibration.mapping import carried
-from ..calibration.oscilloscope import CameraCorrection, Datum, tests_of
 from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign

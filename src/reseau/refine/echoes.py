@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..calibration.oscilloscope import CameraCorrection
+from ..calibration import CameraCorrection
 from ..core.data import Array, ImagePoints
 from .registration import Registration
 

@@ -14,14 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ..adjust import Adjustment, Elimination, Options
+from ..calibration import CameraCorrection, InstrumentCorrection, LocalModel, ObjectPlane
+from ..calibration.entries import tests_of
 from ..calibration.mapping import carried
-from ..calibration.oscilloscope import (
-    CameraCorrection,
-    InstrumentCorrection,
-    LocalModel,
-    ObjectPlane,
-    tests_of,
-)
 from ..core.data import Array, ImagePoints
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign

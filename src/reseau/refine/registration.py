@@ -15,8 +15,8 @@ import numpy as np
 import scipy.stats
 
 from ..adjust import Adjustment
+from ..calibration import CameraCorrection
 from ..calibration.mapping import carried
-from ..calibration.oscilloscope import CameraCorrection
 from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign

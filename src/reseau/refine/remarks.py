@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.oscilloscope import CameraCorrection, InstrumentCorrection
+from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import ImagePoints
 from ..core.failure import Code, Remark
 from ..io import ReseauDesign

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from ..calibration.oscilloscope import InstrumentCorrection
+from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure

@@ -9,7 +9,7 @@ import scipy.special
 from markupsafe import Markup
 
 from ..calibration import InstrumentCorrection
-from ..calibration.oscilloscope import unit_of
+from ..calibration.entries import unit_of
 from ..core.data import Array, Frame
 from ..core.figures import Panel
 from ..core.numbers import aligned, power

@@ -24,7 +24,7 @@ from .parameters import (
 
 if TYPE_CHECKING:
     from ..io.refraction import RefractionEntry
-    from ..procedures.oscilloscope import OscilloscopeProcedure
+    from ..procedures.oscilloscope_acquisition import OscilloscopeProcedure
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
 
@@ -188,7 +188,7 @@ def _oscilloscope(run: Acquisition, given: OscilloscopeParameters) -> Plan:
 
 
 def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> OscilloscopeProcedure:
-    from ..procedures.oscilloscope import OscilloscopeProcedure
+    from ..procedures.oscilloscope_acquisition import OscilloscopeProcedure
 
     reseau, rods = (
         ReseauDesign.parse(session.input(name), where=name) for name in ("reseau.json", "object.json")

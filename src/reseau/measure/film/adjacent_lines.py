@@ -55,6 +55,9 @@ _PIXEL = float(np.sqrt(1 / 12))
 _SMOOTH, _ANISOTROPIC, _END = 0.24, 0.5, 0.5
 """Largest rms deviation of logarithmic widths at the ends of edges from sharpness that changes smoothly over
 the scan, largest such difference of the two directions, and share of half an edge that makes an end."""
+_ALIKE, _OTHERWISE, _STEADY = 0.4, 0.25, 0.08
+"""A scan is sharper in one direction where opposite edges are alike: largest difference of these as a share
+of that of the directions, and of the directions (logarithms of widths), and largest scatter of an edge."""
 _TOO_SHARP = 0.3
 """Difference of logarithmic width from which steps are too sharp for an edge."""
 _LARGEST_DISPLACEMENT = 1.5
@@ -93,6 +96,15 @@ class SharpSteps(NamedTuple):
 
 def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
     """Form of the blurred step for each edge: common to all, unless their sharpness differs."""
+    if _anisotropic(profiles):
+        across, down = (
+            _common_forms([p if k % 2 == d else None for k, p in enumerate(profiles)]) for d in (0, 1)
+        )
+        return [(across, down)[k % 2][k] for k in range(len(profiles))]
+    return _common_forms(profiles)
+
+
+def _common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
     measured = sorted(
         (p.form for p in profiles if p is not None and p.good.sum() > 20), key=lambda f: f.width
     )
@@ -103,12 +115,12 @@ def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | Non
     width = measured[(len(measured) - 1) // 2].width
     weight = sum(form.weight for form in measured)
     lobes = sum(form.weight * form.lobes for form in measured) / max(weight, 1e-12)
-    return [None if p is None else StepForm(width, lobes, p.form.half, weight) for p in profiles]
+    return [None if p is None else StepForm(width, lobes, p.form.half, weight, p.form.tone) for p in profiles]
 
 
 def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:
     """Widths of sharp steps for each edge: common to all, unless their sharpness differs."""
-    own = [p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles]
+    own = _of_edges([p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles])
     sharp = [_sharp_steps(widths) for widths in own]
     seen = [each for each, widths in zip(sharp, own, strict=True) if len(widths)]
     if not seen:
@@ -116,10 +128,27 @@ def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:
     # A line beside one of the edges scatters the widths of that edge only.
     second = min(1, len(seen) - 1)
     texture = sorted(each.texture for each in seen)[second]
+    if _anisotropic(profiles):
+        scatter = sorted(each.scatter for each in seen)[second]
+        log = [_sharp_steps(np.concatenate(own[k::2])).log_width for k in (0, 1)]
+        return [SharpSteps(log[k % 2], scatter, texture) for k in range(len(profiles))]
     if _uneven(sorted(each.width for each in seen), profiles):
         return [each._replace(texture=texture) for each in sharp]
     scatter = sorted(each.scatter for each in seen)[second]
     return [SharpSteps(_sharp_steps(np.concatenate(own)).log_width, scatter, texture)] * len(profiles)
+
+
+def _of_edges(widths: list[Array]) -> list[Array]:
+    """Logarithmic widths without those of steps that are far sharper than the other edges.
+
+    Along a part of an edge these are lines of the picture, which would make the edge itself appear sharp.
+    """
+    sharp = [_sharp_steps(each).log_width if len(each) else np.inf for each in widths]
+    kept = []
+    for k, each in enumerate(widths):
+        slower = each > min((s for j, s in enumerate(sharp) if j != k), default=-np.inf) - _TOO_SHARP
+        kept.append(each[slower] if np.isfinite(sharp[k]) and slower.mean() > 0.5 else each)
+    return kept
 
 
 def displaced_by_lines(found: EdgeProfiles, sharp: SharpSteps) -> tuple[Array, float]:
@@ -166,6 +195,20 @@ def _uneven(widths: Sequence[float], profiles: Sequence[EdgeProfiles | None]) ->
     return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN) and _smooth(profiles)
 
 
+def _anisotropic(profiles: Sequence[EdgeProfiles | None]) -> bool:
+    """Whether the scan is sharper in one direction: opposite edges are alike, and unlike the others.
+
+    Lens and carriage spread a step differently. A line beside an edge widens this one only, and unevenly.
+    """
+    if any(p is None or p.good.sum() <= 20 for p in profiles):
+        return False
+    sharp = [_sharp_steps(p.blur[0][p.good]) for p in profiles if p is not None]
+    log = np.array([each.log_width for each in sharp])
+    apart = abs(log[0] + log[2] - log[1] - log[3]) / 2
+    alike = max(abs(log[0] - log[2]), abs(log[1] - log[3])) < _ALIKE * apart
+    return bool(alike and apart < _OTHERWISE and max(each.scatter for each in sharp) < _STEADY)
+
+
 def _smooth(profiles: Sequence[EdgeProfiles | None]) -> bool:
     """Whether widths at the ends of edges are those of a scan whose sharpness changes smoothly.
 
@@ -203,6 +246,8 @@ _CROSSED, _FEW_CROSSED = 9.0, 0.15
 """Misfit of a section, relative to the others, that another structure crosses; and largest share of such."""
 _TOGETHER = 1.7
 """Factor on the standard deviation of the edge, because errors of bins are correlated by grain."""
+_LINED = 0.25
+"""Least share of the sections that show the line."""
 _BOW = 0.3
 """Standard deviation of the bow of the edge, in widths."""
 _FARTHEST, _WELL = (2.0, 3.2), 0.6
@@ -250,7 +295,9 @@ def edge_beside_line(
     x, place = two.x, two.place
     first, second = x[_SHARED + 1 :: 4] / two.top, x[_SHARED + 2 :: 4] / two.top
     behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
-    there = (first > 0.02).mean() > 0.7 and (second > 0.1).mean() > 0.5
+    # Where there is no second step and most of the contrast is in the first, the edge is seen by itself.
+    lined, alone = second > 0.1, (second <= 0.1) & (first > 0.5)
+    there = (first > 0.02).mean() > 0.7 and lined.mean() > _LINED and (lined | alone).mean() > 0.5
     there &= (behind > -0.3 * width).mean() > 0.9
     farthest = _FARTHEST[int(two.chi < _WELL)] * width
     there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest

@@ -22,8 +22,8 @@ from .adjacent_lines import (
 )
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import EdgeData, robust_line, shared_error
-from .steps import StepForm
+from .lines import EdgeData, robust_line, shared_error, waviness
+from .steps import STRAIGHT, StepForm, Tone
 
 __all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
 
@@ -138,6 +138,7 @@ def measure_channel(
     polarity: int,
     reach: float,
     gap: float,
+    tone: Tone = STRAIGHT,
 ) -> Channel:
     """Profiles of the four edges in one channel that agree with a line through each edge."""
 
@@ -148,7 +149,7 @@ def measure_channel(
         pixels, reached = band(k, wide, far[k]), WIDER_SEARCH * reach if far[k] else reach
         if pixels is None:
             return None
-        return measure_profiles(pixels, channel, polarity, reached, gap, form, films[k])
+        return measure_profiles(pixels, channel, polarity, reached, gap, form, films[k], tone)
 
     profiles = [measured(k, False) for k in range(4)]
     for k, found in enumerate(profiles):
@@ -244,11 +245,12 @@ def _edge(
     residuals = _inward(line[0], place, offset)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
+    wave = waviness(place[agree], residuals[agree], total[agree])
     scale = shared_error(place[agree], residuals[agree], total[agree])
     # Steps that are too sharp belong to a scratch and are equally uninformative.
     hidden |= sharp.beyond(found)
-    ends = max(doubt, _ENDS * sharp.width * part if hidden else 0.0)
-    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends)
+    ends = float(np.hypot(max(doubt, _ENDS * sharp.width * part if hidden else 0.0), wave))
+    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends, wave)
     return data, rejected + int((~agree).sum()), ""
 
 

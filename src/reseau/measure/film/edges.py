@@ -16,11 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.special import ndtr
 
 from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
 from .border import Band, Border, Film, binned, border_of, row_median
-from .steps import SHIFTS, StepForm, profile_function
+from .steps import SHIFTS, STRAIGHT, StepForm, Tone, profile_function
 
 __all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged"]
 
@@ -90,6 +91,7 @@ def measure_profiles(
     gap: float,
     known: StepForm | None = None,
     film: Film | None = None,
+    tone: Tone = STRAIGHT,
 ) -> EdgeProfiles | None:
     """Locate the step from film to picture in every profile of one channel.
 
@@ -109,6 +111,8 @@ def measure_profiles(
         Form of the blurred step, if known from other edges.
     film : Film, optional
         Film as shown by other edges, if little film lies beyond this one.
+    tone : Tone
+        Curve between light and grey values, unless `known` has it.
 
     Returns
     -------
@@ -119,7 +123,7 @@ def measure_profiles(
     border = border_of(grey, band, reach, gap, film)
     if border is None:
         return None
-    found = _fitted(grey, band, border, known)
+    found = _fitted(grey, band, border, known, tone)
     if found is None:
         return None
     steps, form = found
@@ -162,10 +166,10 @@ class _Steps(NamedTuple):
 
 
 def _fitted(
-    grey: Array, band: Band, border: Border, known: StepForm | None
+    grey: Array, band: Band, border: Border, known: StepForm | None, tone: Tone
 ) -> tuple[_Steps, StepForm] | None:
     """Step of every profile, and their common form."""
-    form = StepForm(_width(grey, band, border), 0.0, band.half) if known is None else known
+    form = known or StepForm(_width(grey, band, border), 0.0, band.half, tone=tone)
     # The border is accurate to one or two pixels, not enough for a narrow window.
     first = _one_by_one(grey, band, border, border.start, form, _FREE)
     if first is None:
@@ -262,8 +266,9 @@ def _common_form(
     if window is None:
         return form
     value, distance, weight = window
-    part = np.where(lit, contrast, border.contrast)[:, None] / border.contrast
-    value, distance = (value - border.level[:, None]) / part, distance - start[:, None]
+    distance = distance - start[:, None]
+    value, part = _of_contrast(value, distance, border, np.where(lit, contrast, border.contrast), form)
+    form, tone = form._replace(tone=STRAIGHT), form.tone
     each = min(NEIGHBOURS, len(value))
     sections = len(value) // each
     value, distance, weight = (
@@ -272,19 +277,34 @@ def _common_form(
     )
     measured = (weight > 0).sum(axis=1) > _LEAST_PIXELS
     if not measured.any():
-        return form
+        return form._replace(tone=tone)
     value, distance, weight = value[measured], distance[measured], weight[measured]
     none = np.zeros(len(value))
     fit = _fit(value, distance, weight, border, none, none, form, _FREE, _SECTIONS)
     found = fit.estimates[fit.converged, 2]
     # If another structure runs along the edge, few sections converge.
     if len(found) <= 0.5 * len(value):
-        return form
+        return form._replace(tone=tone)
     form = form._replace(width=float(np.clip(np.exp(np.median(found)), *_WIDTHS)))
     for _ in range(0 if form.gaussian else _FORMING):
         fit = _fit(value, distance, weight, border, none, none, form, _HELD, _SECTIONS)
         form = _formed(form, fit, value, distance, weight, border)
-    return form
+    return form._replace(tone=tone)
+
+
+def _of_contrast(
+    value: Array, distance: Array, border: Border, contrast: Array, form: StepForm
+) -> tuple[Array, Array]:
+    """Light of profiles (n, s) as if all had the contrast of the edge, and how much noise it has less."""
+    level, top = border.level[:, None], contrast[:, None]
+    if form.tone.linear:
+        return (value - level) * border.contrast / top, np.broadcast_to(top / border.contrast, value.shape)
+    tone = form.tone
+    low = tone.light(level)
+    rise = (tone.light(level + top) - low) / border.contrast
+    # The noise of light depends on the expected grey value.
+    expected = tone.grey(low + rise * border.contrast * ndtr(distance / form.width))
+    return (tone.light(value) - low) / rise, rise / tone.slope(expected)
 
 
 def _formed(

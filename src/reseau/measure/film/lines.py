@@ -27,6 +27,7 @@ __all__ = [
     "robust_line",
     "shape_of",
     "shared_error",
+    "waviness",
 ]
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
@@ -34,6 +35,11 @@ _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 _SECTIONS = 24, 12
 """Numbers of sections of an edge whose means show the errors common to neighbouring profiles: structures of
 the picture and phases of the pixels are longer than some of them."""
+_LEAST_SCALE = 0.3
+"""Scatter of residuals over sigmas below which sigmas as given decide which profiles agree."""
+_WAVES, _LEAST_WAVED, _SIGNIFICANT, _LEAST_WAVE_PX = 5, 40, 5.0, 0.05
+"""Degree of the polynomials that show that an edge is no bowed line, minimum number of profiles, and least
+significance and size of their coefficients."""
 _MODEL_PX = 0.012
 """Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 
@@ -52,12 +58,15 @@ class EdgeData:
         Standard deviation of an error common to all profiles, pixels.
     ends : float
         Standard deviation of an independent error of either end of the edge, pixels.
+    wave : float
+        The part of it by which the edge is neither straight nor evenly bowed.
     """
 
     xy: Array
     sigma: Array
     common: float = 0.0
     ends: float = 0.0
+    wave: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +160,9 @@ def robust_line(
         jacobian=lambda x: design,
     )
     fit = robust(problem, "tukey", tolerance=1e-3)
+    if isinstance(fit, Failure) or fit.scale < _LEAST_SCALE:
+        # The sigmas of many profiles are far too large: those they could be displaced by are not there.
+        fit = robust(problem, "tukey", scale="a-priori", tolerance=1e-3)
     if isinstance(fit, Failure):
         return None
     values = fit.adjustment.values
@@ -363,6 +375,32 @@ def shared_error(place: Array, residuals: Array, sigma: Array) -> float:
         seen = weight > 0
         together.append(float((mean[seen] ** 2 / weight[seen]).sum()) / max(int(seen.sum()) - 3, 1))
     return float(np.sqrt(max(single, *together, 1.0)))
+
+
+def waviness(place: Array, residuals: Array, sigma: Array) -> float:
+    """Standard deviation of the ends of an edge that is neither straight nor evenly bowed, pixels.
+
+    A line and a bow through a wave, or through an edge that is bent at one place, miss its ends by about as
+    much as polynomials of higher degree depart there. Zero if they are not significant.
+
+    Parameters
+    ----------
+    place : ndarray (n,)
+        Positions of the profiles, −1 to 1.
+    residuals, sigma : ndarray (n,)
+        Residuals from the edge's own line, and their expected standard deviations.
+    """
+    if len(place) < _LEAST_WAVED:
+        return 0.0
+    design = np.polynomial.legendre.legvander(place, _WAVES) / sigma[:, None]
+    observed = residuals / sigma
+    cofactor = np.linalg.pinv(design.T @ design)
+    found = cofactor @ design.T @ observed
+    scale = shared_error(place, residuals - (design @ found) * sigma, sigma)
+    higher = found[3:]
+    own = scale * np.sqrt(np.diag(cofactor)[3:])
+    seen = np.abs(higher) > np.maximum(_SIGNIFICANT * own, _LEAST_WAVE_PX)
+    return float(np.sqrt((higher[seen] ** 2).sum()))
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:

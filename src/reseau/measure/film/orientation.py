@@ -20,6 +20,7 @@ from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
 from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
 from .search import FrameGuess, search_frames
+from .steps import Tone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,6 +58,8 @@ _REACHED, _SEEN, _SAMPLES = 0.12, 0.4, 20
 that must be seen; and the number of these parts."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Rank of each status."""
+_REMEDY = "scan it with more contrast"
+"""What helps if edges are uncertain."""
 _SLANT = float(np.deg2rad(0.7))
 """Standard deviation of the rotation angle of a tilted copying camera, radians."""
 _MOST_W = 4.0
@@ -417,11 +420,12 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
     shape = options.shape
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
+    tone = Tone.of_file(scan.curve, scan.full_scale, guess.polarity)
     best: FrameResult | None = None
     earlier: list[Channel] = []
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
         name = scan.channels[c]
-        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale)
+        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, tone)
         for other in earlier:
             measured = measured.doubted(other, corners)
         earlier.append(measured)
@@ -572,7 +576,9 @@ def _judged(
     if (most := float(sigma.max())) > max(
         _MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width
     ):
-        why = f"a corner would have a standard deviation of {most:.2f} px; scan it with more contrast"
+        wavy = [EDGES[k] for k, data in enumerate(measured.data) if data is not None and data.wave > most / 2]
+        remedy = f"the {wavy[0]} edge is no straight or evenly bowed line" if wavy else _REMEDY
+        why = f"a corner would have a standard deviation of {most:.2f} px; {remedy}"
         return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
     known = _resolution(scan, options, guess.format_mm)
     own = float(np.mean(base.px_per_mm or (1.0, 1.0)))

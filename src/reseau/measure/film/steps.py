@@ -16,14 +16,16 @@ the grid to the next, by up to 0.1 px, and neighbouring profiles alike.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 from ...core.data import Array, Rows
+from ...core.tone import ToneCurve
 
-__all__ = ["SHIFTS", "StepForm", "profile_function"]
+__all__ = ["SHIFTS", "STRAIGHT", "StepForm", "Tone", "profile_function"]
 
 SHIFTS = (3.0,)
 """Distances behind the edge, in widths of the step, at which the tone of the picture may change."""
@@ -32,6 +34,75 @@ _FORMED = 1.3
 _LEAST_VARIANCE = 0.01
 """Softening of the limit of σ² at zero, square pixels."""
 _ROOT = float(np.sqrt(2 * np.pi))
+
+
+_LEAST_LIGHT = 1e-4
+"""Least light, as a share of full scale, so that noise about zero has a grey value."""
+_SRGB = 2.4, 0.055
+"""Exponent of the curve of sRGB above its linear part, and the grey value that is added before."""
+_POWER = 0.01
+"""The same for powers."""
+
+
+@dataclass(frozen=True)
+class Tone:
+    """Curve between light, which a scanner spreads, and grey values times the polarity.
+
+    Parameters
+    ----------
+    gamma : float
+        Light is the grey value to the power of this; 1: proportional.
+    added : float
+        Grey value, as a share of full scale, that is added before.
+    scale : float
+        Grey value of full scale.
+    polarity : int
+        1 if film is darker than the picture, −1 if brighter.
+    """
+
+    gamma: float = 1.0
+    added: float = _POWER
+    scale: float = 1.0
+    polarity: int = 1
+
+    @classmethod
+    def of_file(cls, curve: ToneCurve | None, full_scale: float, polarity: int) -> Tone:
+        """The curve that a file states; a table is replaced by the power that agrees at its middle."""
+        if curve is None or curve.linear:
+            return STRAIGHT
+        if curve.exponent is None and not curve.table:
+            return cls(*_SRGB, full_scale, polarity)
+        middle = float(curve.light(np.array([0.5]), 1.0)[0])
+        exponent = curve.exponent or float(np.log(max(middle, 1e-3)) / np.log(0.5))
+        return cls(exponent, _POWER, full_scale, polarity)
+
+    @property
+    def linear(self) -> bool:
+        """Whether grey values are proportional to the light."""
+        return self.gamma == 1.0
+
+    def _part(self, grey: Array) -> Array:
+        least = _LEAST_LIGHT ** (1 / self.gamma)
+        return np.asarray(
+            np.maximum((self.polarity * grey / self.scale + self.added) / (1 + self.added), least)
+        )
+
+    def light(self, grey: Array) -> Array:
+        """Light in the scale of grey values."""
+        return np.asarray(self.polarity * self.scale * self._part(grey) ** self.gamma)
+
+    def slope(self, grey: Array) -> Array:
+        """Derivative of the light by the grey value."""
+        return np.asarray(self.gamma / (1 + self.added) * self._part(grey) ** (self.gamma - 1))
+
+    def grey(self, light: Array) -> Array:
+        """Grey values of light."""
+        part = np.maximum(self.polarity * light / self.scale, _LEAST_LIGHT) ** (1 / self.gamma)
+        return np.asarray(self.polarity * self.scale * ((1 + self.added) * part - self.added))
+
+
+STRAIGHT = Tone()
+"""Grey values that are proportional to the light."""
 
 
 class StepForm(NamedTuple):
@@ -47,12 +118,15 @@ class StepForm(NamedTuple):
         Half the side of a pixel across the edge, h.
     weight : float
         Inverse variance of the lobes; zero if they were not estimated.
+    tone : Tone
+        Curve between light, which is spread, and grey values.
     """
 
     width: float
     lobes: float = 0.0
     half: float = 0.5
     weight: float = 0.0
+    tone: Tone = STRAIGHT
 
     @property
     def gaussian(self) -> bool:
@@ -75,6 +149,31 @@ def profile_function(distance: Array, form: StepForm | None = None) -> Any:
     callable
         Function of the parameters p, b, log w, A and the c, and of a if there is one column more.
     """
+    linear = _linear(distance, form)
+    if form is None or form.tone.linear:
+        return linear
+    tone = form.tone
+
+    def function(x: Array, rows: Rows) -> tuple[Array, Array]:
+        grey = np.cumsum(x[:, [1, 3, 4]], axis=1)
+        light, slope = tone.light(grey), tone.slope(grey)
+        inner = x.copy()
+        inner[:, 1], inner[:, 3:5] = light[:, 0], np.diff(light, axis=1)
+        value, jacobian = linear(inner, rows)
+        first, second = jacobian[..., 3].copy(), jacobian[..., 4].copy()
+        # Each grey level is that of film and the steps up to it.
+        s0, s1, s2 = (slope[:, k, None] for k in range(3))
+        jacobian[..., 4] = s2 * second
+        jacobian[..., 3] = s1 * (first - second) + jacobian[..., 4]
+        jacobian[..., 1] = s0 * (1 - first) + jacobian[..., 3]
+        grey_of = tone.grey(value)
+        return grey_of, jacobian / tone.slope(grey_of)[..., None]
+
+    return function
+
+
+def _linear(distance: Array, form: StepForm | None) -> Any:
+    """The model in light."""
     shifts = np.array([0.0, *SHIFTS])
     plain = form is None or form.gaussian
 

@@ -35,6 +35,8 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
     The likelihood of the visible pixels as a function of the place e of the hidden end is far from normal.
     For each e all other unknowns are adjusted anew; the middle has the mean m(e) and the covariance C(e)
     then. With the weights w of the likelihoods, mean and covariance are Σwm and Σw(C + (m − Σwm)(m − Σwm)ᵀ).
+    Where both ends are hidden in part, their visible parts determine them well, or the position along the
+    line counts as unknown.
 
     Parameters
     ----------
@@ -52,17 +54,21 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
     ndarray of int
         Rows of the lines with a hidden end.
     """
-    hidden = _hidden_shares(work, found) > _END_HIDDEN
+    share = _hidden_shares(work, found)
+    hidden = share > _END_HIDDEN
     rows = np.flatnonzero(found.converged & hidden.any(axis=1))
-    soft = ends_of(found.arcs)[1]
+    half, soft = ends_of(found.arcs)
     for row in rows.tolist():
         tilt = found.arcs.tilt[row]
         along = np.array([np.cos(tilt), np.sin(tilt)])
+        sigma = float(np.sqrt(along @ found.cov[row] @ along))
         if hidden[row].all():
-            found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
+            # What shows both ends determines them well, or is mistaken for them: a fragment beside a wire.
+            if np.hypot(sigma, half[row] * found.sigma["length"][row]) > _LINEAR * soft[row]:
+                found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
             continue
         side = 1.0 if hidden[row, 1] else -1.0
-        end = 2 * float(np.sqrt(along @ found.cov[row] @ along))
+        end = 2 * sigma  # the other end is certain
         if end < _LINEAR * soft[row]:
             continue
         scale = float(np.clip(end, *_SCALES_PX))

@@ -17,7 +17,8 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
-from .placement import Placement, spacing
+from .assignment import spacing
+from .placement import Placement
 from .wires import grid_wires
 
 __all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]

@@ -27,9 +27,11 @@ from ...optics.field import SmoothField
 from ..fitting import on_one_line
 from ..matching import Matches
 from ..points import Measured, Reason, deviating
+from .assignment import in_sight, spacing
+from .grid_search import GridOptions, grid_steps
 from .marks import MarkMeasurement, ReseauOptions, Verdict
 from .orientation import misfit, rival_orientations
-from .placement import GridOptions, Placement, PlacingOptions, grid_steps, in_sight, place, spacing
+from .placement import Placement, PlacingOptions, place
 from .sheet import measure_sheet
 from .wires import cover, grid_wires
 

@@ -13,7 +13,9 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
 from ...optics.field import SmoothField, trend_degree
-from .placement import Assignment, GridOptions, Placement, assign, climbed, spacing
+from .assignment import Assignment, assign, spacing
+from .grid_search import GridOptions, climbed
+from .placement import Placement
 from .wires import grid_wires
 
 __all__ = ["misfit", "rival_orientations"]

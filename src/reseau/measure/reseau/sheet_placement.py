@@ -25,8 +25,8 @@ from ...io import ReseauDesign
 from ...optics import Chain, RationalPolynomial
 from ..testfield.lattice_fit import refit
 from ..testfield.lattice_mapping import second_order
+from .assignment import spacing
 from .disks import Disks
-from .placement import spacing
 
 __all__ = ["MOST_DISKS", "SheetPlacement", "lay_sheet", "through"]
 

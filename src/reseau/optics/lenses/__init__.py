@@ -1,18 +1,6 @@
 """Lenses: prescriptions, media, rays through them, and the images that rays form."""
 
-from .images import (
-    AberratedLens,
-    CalibratedLens,
-    LensCamera,
-    PlaneTarget,
-    RayImage,
-    RayMap,
-    RaySurrogate,
-    SensorPlane,
-    ThinLens,
-    counted_image,
-    ray_image,
-)
+from .images import PlaneTarget, RayImage, counted_image, image_scale, ray_image
 from .media import (
     AIR,
     Air,
@@ -29,6 +17,9 @@ from .media import (
 from .paraxial import Paraxial
 from .prescription import Aperture, Layout, Prescription, Surface, in_order
 from .pupils import Aimed, Aiming, PupilElements, RayKind, aim, labels
+from .ray_maps import CalibratedLens, LensCamera, RayMap, SensorPlane
+from .stand_ins import AberratedLens, ThinLens
+from .surrogate import RaySurrogate
 from .trace import SURFACE_PARAMETERS, RayDerivatives, Rays, Traced, Tracer
 from .windows import behind_windows
 
@@ -69,6 +60,7 @@ __all__ = [
     "counted_image",
     "glass",
     "glass_names",
+    "image_scale",
     "in_order",
     "labels",
     "model_glass",

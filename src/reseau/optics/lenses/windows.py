@@ -10,9 +10,9 @@ import numpy as np
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..refraction import Refraction, RefractiveIndex
-from .images import LensCamera
 from .media import Constant, Medium
 from .prescription import Surface
+from .ray_maps import LensCamera
 
 __all__ = ["behind_windows"]
 

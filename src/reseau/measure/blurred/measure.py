@@ -1,20 +1,9 @@
-"""Blurred targets: image coordinates of the corresponding rays, by matching with images formed by rays.
-
-In a blurred image the centre of density is not the image of the target's point: coma, colour and vignetting
-shift it, and it may be the image of another point at each place of the field. The image of the target is
-formed by rays (:mod:`reseau.optics.lenses.images`) and matched with the frame; the result is the place of the
-corresponding ray, the principal ray of one wavelength (Meid 1992, sections 2.2 and 3.2). The matcher is that
-of all other marks: two shifts, contrast and background, the width of the remaining blur, and, if wanted,
-parameters of the optics such as focus and media.
-
-Motion during the exposure is another physical cause: :class:`Moving` smears the images of any lens.
-"""
+"""Measurement of the blurred targets of one frame: formed, found, matched and judged."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any, Literal, cast
 
@@ -23,42 +12,38 @@ import numpy as np
 import scipy.spatial
 from numpy.typing import NDArray
 
-from ..core.data import Array, Frame, Mask, Rows
-from ..core.errors import UsageError
-from ..core.failure import Code, Failure, Remark
-from ..optics.formation import Outline, PixelResponse
-from ..optics.gridded import GriddedOutline
-from ..optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image
-from .matching import Matches, MatchOptions, Window, grey_variance, match, with_alike_errors
-from .points import Measured, Reason
-from .screening import screen
+from ...core.data import Array, Frame, Mask, Rows
+from ...core.errors import UsageError
+from ...core.failure import Code, Remark
+from ...optics.formation import Outline, PixelResponse
+from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image
+from ..matching import Matches, MatchOptions, grey_variance, match, with_alike_errors
+from ..points import Measured, Reason
+from ..screening import screen
+from .shapes import RayShapes
 
 __all__ = [
+    "RINGS",
     "BlurredOptions",
     "BlurredResult",
-    "EstimatedOptics",
     "Moving",
+    "Run",
     "Varied",
-    "estimate_optics",
     "measure_blurred",
 ]
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
 """Half sides of windows: targets of similar size are matched together."""
-_RINGS = (4, 6, 8, 11)
+RINGS = (4, 6, 8, 11)
 """Rings of elements of the stop: each step doubles the number of rays."""
 _SETTLED = 0.1
 """More rays no longer matter if they shift the match by less than this many of its standard deviations."""
-_LEAST_SHIFT = 0.002
+_LEAST_SHIFT = 0.0005
 """… or by less than this many pixels."""
+_CRITICAL = 4
+"""Number of targets with which this is tested."""
 _STEP = 0.05
 """Step of a varied parameter for the motion of the nodes, in its standard deviations."""
-_ROUNDS = 20
-"""Largest number of corrections of common parameters."""
-_UNCHANGED = 1e-4
-"""Share of the sum of squares below which corrections end."""
-_DAMPING, _STUCK = 1e-2, 1e6
-"""First and largest damping of these corrections (Levenberg and Marquardt)."""
 _SEEN = 0.95
 _APART = 2.0
 """Widths of the remaining blur by which images must be apart."""
@@ -167,6 +152,10 @@ class BlurredResult(Measured):
         Estimates of varied parameters of the optics, and their standard deviations.
     rings : int
         Rings of elements of the stop that were used; 0 for those of a surrogate.
+
+    Examples
+    --------
+    See :func:`measure_blurred`, which returns it.
     """
 
     psf_px: Array = field(default_factory=lambda: np.zeros(0))
@@ -200,6 +189,11 @@ class Moving:
     camera: RayMap
     path_px: Array
 
+    @property
+    def unknown(self) -> float:
+        """See :class:`reseau.optics.lenses.RayMap`."""
+        return self.camera.unknown
+
     def corresponding(self, points: Array) -> Array:
         """See :class:`reseau.optics.lenses.RayMap`."""
         return self.camera.corresponding(points)
@@ -210,73 +204,6 @@ class Moving:
         return np.concatenate([xy + step for step in self.path_px]), np.concatenate(
             [light] * len(self.path_px)
         )
-
-
-class _RayShapes:
-    """Images by rays as a shape of the matcher; its parameters of form are those of the optics.
-
-    Parameters
-    ----------
-    images : tuple of RayImage
-    motions : tuple of Outline (p, j)
-        Changes of the nodes and tangents of each image with each varied parameter; or none.
-    """
-
-    def __init__(self, images: tuple[RayImage, ...], motions: tuple[Outline, ...] = ()) -> None:
-        self.images, self.motions = images, motions
-        self._last: dict[int, tuple[Array, GriddedOutline]] = {}
-
-    @property
-    def parameters(self) -> int:
-        """See :class:`reseau.measure.matching.Shape`."""
-        return len(self.motions[0].xy) if self.motions else 0
-
-    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
-        """See :class:`reseau.measure.matching.Shape`."""
-        found = np.full((len(at), window.rows.shape[1], window.columns.shape[1]), np.nan)
-        for k, gridded, *place in self._each(xy, width, form, at, window):
-            found[k] = gridded.image(*place)
-        return found
-
-    def derivatives(
-        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
-    ) -> tuple[Array, Array]:
-        """See :class:`reseau.measure.matching.Shape`."""
-        size = window.rows.shape[1], window.columns.shape[1]
-        found = np.full((len(at), 4 + self.parameters, *size), np.nan)
-        for k, gridded, *place in self._each(xy, width, form, at, window):
-            found[k] = gridded.derivatives(*place)
-        return found[:, 0], found[:, 1:]
-
-    def _each(
-        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
-    ) -> Iterator[tuple[Any, ...]]:
-        """Number, outline, place, width, columns, rows, response of each image.
-
-        A step of an adjustment may lead to values without an image: these are left out.
-        """
-        for k, row in enumerate(at):
-            if not (np.isfinite(xy[k]).all() and np.isfinite(width[k]) and np.isfinite(form[k]).all()):
-                continue
-            try:
-                gridded = self.at(int(row), form[k])
-            except UsageError:
-                continue
-            yield k, gridded, xy[k], float(width[k]), window.columns[k], window.rows[k], window.response
-
-    def at(self, k: int, form: Array) -> GriddedOutline:
-        """The image `k` with changed parameters of the optics."""
-        image = self.images[k]
-        if not self.motions:
-            return image.gridded
-        if k in self._last and np.array_equal(self._last[k][0], form):
-            return self._last[k][1]
-        nodes, motion = image.outline, self.motions[k]
-        moved = Outline(
-            nodes.xy + np.tensordot(form, motion.xy, 1), nodes.dxy + np.tensordot(form, motion.dxy, 1)
-        )
-        self._last[k] = form.copy(), GriddedOutline.of(moved, motion.xy)
-        return self._last[k][1]
 
 
 def measure_blurred(
@@ -327,153 +254,10 @@ def measure_blurred(
     """
     if len(ids) != len(targets):
         raise UsageError(f"{len(ids)} names were given for {len(targets)} targets")
-    return _Run(frame, camera, tuple(ids), tuple(targets), options).result()
+    return Run(frame, camera, tuple(ids), tuple(targets), options).result()
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatedOptics:
-    """Parameters of the optics, estimated from all targets of a frame.
-
-    Parameters
-    ----------
-    names : tuple of str (p,)
-    values : ndarray (p,)
-    cov : ndarray (p, p)
-    camera : RayMap
-        With these values.
-    used : int
-        Number of targets.
-
-    Examples
-    --------
-    See :func:`estimate_optics`, which returns it.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    cov: Array
-    camera: RayMap = field(repr=False)
-    used: int
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (p,)."""
-        sigma: Array = np.sqrt(np.diagonal(self.cov))
-        return sigma
-
-
-def estimate_optics(
-    frame: Frame, targets: Sequence[PlaneTarget], varied: Varied, options: BlurredOptions = BlurredOptions()
-) -> EstimatedOptics | Failure:
-    """Estimate parameters of the optics that all targets of a frame have in common.
-
-    The targets are measured with the present values; the forms of their images, without what position, light
-    and width of the remaining blur of each explain, give corrections of the values, until these no longer
-    change. So focus, an index, or the aberrations of a stand-in (:class:`AberratedLens`) become known.
-
-    Parameters
-    ----------
-    frame : Frame
-    targets : sequence of PlaneTarget (n,)
-        In camera axes. Where the stand-in has another scale or distortion than the lens, they must be
-        predicted within the range of search all the same.
-    varied : Varied
-        The parameters with their prior standard deviations.
-    options : BlurredOptions
-
-    Returns
-    -------
-    EstimatedOptics or Failure
-
-    Examples
-    --------
-    The distance of the sensor, from one disk:
-
-    >>> from reseau.optics.formation import coverage
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
-    >>> sensor = SensorPlane((0.01, 0.01), (40.0, 40.0))
-    >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
-    >>> image = ray_image(ThinLens(50.0, 12.5, 52.9, sensor), disk, PupilElements.gauss(12))
-    >>> placed, pixels = Outline(image.outline.xy + 40.2, image.outline.dxy), np.arange(81.0)
-    >>> noise = np.random.default_rng(0).normal(0.0, 1.0, (81, 81))
-    >>> frame = Frame(200 - 150 * coverage(placed, pixels, pixels, 0.5) + noise, 255.0)
-    >>> focus = Varied(("focus_mm",), (0.2,), lambda by: ThinLens(50.0, 12.5, 52.8 + by[0], sensor))
-    >>> estimate_optics(frame, [disk], focus).values.round(2)
-    array([0.1])
-    """
-    # The same rays and pixels throughout, so that sums of squares can be compared.
-    options, halves = replace(options, varied=None, rings=options.rings or _RINGS[0]), dict[int, int]()
-    prior, values = np.diag(1 / np.square(varied.sigma)), np.zeros(len(varied.names))
-    equations = partial(_Common.of, frame, tuple(targets), varied, options, halves)
-    at = equations(values)
-    damping = _DAMPING
-    for _ in range(_ROUNDS):
-        if not at.costs:
-            return Failure("no target is like its image: check lens, focus and aperture", Code.NOT_FOUND)
-        normal, right = at.normal + prior, at.right - prior @ values
-        cost = sum(at.costs.values())
-        newton = np.linalg.solve(normal, right)
-        if newton @ right < _UNCHANGED * cost:
-            cov: Array = np.asarray(np.linalg.inv(normal) * max(cost / at.freedom, 1.0), dtype=np.float64)
-            return EstimatedOptics(varied.names, values, cov, varied.camera(values), len(at.costs))
-        step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), right)
-        try:
-            trial = equations(values + step)
-        except UsageError:  # such a lens forms no image
-            damping *= 10
-            continue
-        if trial.better(at, prior, values, values + step):
-            at, values, damping = trial, values + step, damping / 5
-        elif damping > _STUCK:
-            break
-        else:
-            damping *= 10
-    return Failure("the parameters of the optics do not converge", Code.NOT_CONVERGED)
-
-
-@dataclass(frozen=True, eq=False)
-class _Common:
-    """Normal equations of all targets for common parameters, and the sum of squares of each target."""
-
-    normal: Array
-    right: Array
-    costs: dict[int, float]
-    freedom: int
-
-    @classmethod
-    def of(
-        cls,
-        frame: Frame,
-        targets: tuple[PlaneTarget, ...],
-        varied: Varied,
-        options: BlurredOptions,
-        halves: dict[int, int],
-        values: Array,
-    ) -> _Common:
-        around = replace(varied, camera=partial(_moved, varied.camera, values))
-        names = tuple(str(k) for k in range(len(targets)))
-        run = _Run(frame, varied.camera(values), names, targets, options)
-        normal, right, costs, freedom = np.zeros((len(values),) * 2), np.zeros(len(values)), {}, 0
-        for row, part, to_the_right, cost, count in run.equations(run.result(), around, halves):
-            normal, right, freedom = normal + part, right + to_the_right, freedom + count
-            costs[row] = cost
-        return cls(normal, right, costs, freedom)
-
-    def better(self, before: _Common, prior: Array, old: Array, new: Array) -> bool:
-        """Whether more targets are like their images, or the same ones more alike."""
-        if not set(before.costs) <= set(self.costs):
-            return False
-        gain = sum(cost - self.costs[row] for row, cost in before.costs.items())
-        gain += float(old @ prior @ old - new @ prior @ new)
-        return len(self.costs) > len(before.costs) or gain > 0
-
-
-def _moved(camera: Callable[[Array], RayMap], values: Array, by: Array) -> RayMap:
-    """The map of rays with parameters that differ from their present values."""
-    return camera(values + by)
-
-
-class _Run:
+class Run:
     """The measurement of one frame."""
 
     def __init__(
@@ -499,6 +283,7 @@ class _Run:
         self.ok = np.zeros(n, dtype=np.bool_)
 
     def result(self) -> BlurredResult:
+        """Form, find, match and judge all targets."""
         rings, elements, images = self._images()
         self.elements, self.images = elements, images
         seen = np.array([k for k, image in enumerate(images) if image is not None], dtype=np.intp)
@@ -519,6 +304,9 @@ class _Run:
         for k in seen:
             image = cast(RayImage, images[k])
             self.columns["blur_px"][k], self.columns["offset"][k] = image.blur, image.centroid
+            # What a stand-in does not know; the noise knows nothing of it, the remaining blur a part.
+            blur2 = image.blur**2 + 2 * self.columns["psf_px"][k] ** 2
+            self.columns["cov"][k] += self.camera.unknown**2 * blur2 * np.eye(2)
         return BlurredResult(
             image=self.frame.name,
             sha256=self.frame.sha256,
@@ -635,9 +423,9 @@ class _Run:
 
     def _shape(
         self, rows: Rows, images: list[RayImage], elements: PupilElements, varied: Varied | None
-    ) -> _RayShapes:
+    ) -> RayShapes:
         if varied is None:
-            return _RayShapes(tuple(images))
+            return RayShapes(tuple(images))
         steps = _STEP * np.diag(varied.sigma)
         beside = [(varied.camera(step), varied.camera(-step), 2 * float(step.sum())) for step in steps]
         motions = []
@@ -650,9 +438,9 @@ class _Run:
                 lit = np.asarray(a.dxy.any(axis=1) & b.dxy.any(axis=1))[:, None] / by
                 changes.append((lit * (a.xy - b.xy), lit * (a.dxy - b.dxy)))
             motions.append(Outline(*(np.stack(part) for part in zip(*changes, strict=True))))
-        return _RayShapes(tuple(images), tuple(motions))
+        return RayShapes(tuple(images), tuple(motions))
 
-    def _matched(self, shape: _RayShapes, start: Array, half: int) -> Matches:
+    def _matched(self, shape: RayShapes, start: Array, half: int) -> Matches:
         o = self.options
         options = MatchOptions(
             half_px=half,
@@ -732,7 +520,8 @@ class _Run:
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
         """Rings of elements of the stop (0: of a surrogate), these elements, and images of all targets.
 
-        As many rings that more of them no longer change the most blurred image within the noise.
+        As many rings that more of them no longer change the images of the most critical targets within the
+        noise.
         """
 
         def images(elements: PupilElements) -> list[RayImage | None]:
@@ -740,24 +529,28 @@ class _Run:
 
         if isinstance(self.camera, RaySurrogate):
             return 0, self.camera.elements, images(self.camera.elements)
-        rings = self.options.rings or _RINGS[0]
+        rings = self.options.rings or RINGS[0]
         elements = PupilElements.gauss(rings)
         found = images(elements)
         seen = [(k, image) for k, image in enumerate(found) if image is not None]
         if self.options.rings or not seen:
             return rings, elements, found
-        k, before = max(seen, key=lambda pair: pair[1].blur)
-        half, xy = self._half(before), np.rint(before.point)
-        formed = self._formed(before, half, xy)
-        for few, many in pairwise(_RINGS):
-            rings, finer = few, self._imaged(k, PupilElements.gauss(many))
-            if finer is None:
-                break
-            coarser, formed = formed, self._formed(finer, half, xy)
-            if self._alike(coarser, formed):
+        # Small targets that are much blurred show the single elements first.
+        seen.sort(key=lambda pair: -pair[1].blur / self.targets[pair[0]].extent)
+        critical = [k for k, _ in seen[:_CRITICAL]]
+        windows = {k: (self._half(image), np.rint(image.point)) for k, image in seen[:_CRITICAL]}
+        formed = {k: self._formed(image, *windows[k]) for k, image in seen[:_CRITICAL]}
+        for few, many in pairwise(RINGS):
+            rings, settled = few, True
+            for k in critical:
+                finer = self._imaged(k, PupilElements.gauss(many))
+                if finer is not None:
+                    coarser, formed[k] = formed[k], self._formed(finer, *windows[k])
+                    settled &= self._alike(coarser, formed[k])
+            if settled:
                 break
             rings = many
-        if rings == _RINGS[0]:
+        if rings == RINGS[0]:
             return rings, elements, found
         elements = PupilElements.gauss(rings)
         return rings, elements, images(elements)

@@ -1,0 +1,123 @@
+"""Corners of film frames in scans drawn by the way of the light, compared with their truth.
+
+Run from the checkout: ``python benchmarks/film_world.py [--frames 4] [--jobs 2] [--only KIND …] [--each]``.
+The scans are those of ``benchmarks/worlds/film.py``, which shares nothing with the project; their resolution
+and format are given, and the curve of their grey values as a file states it, except for those of `UNSTATED`.
+For each kind: frames drawn, oriented, answered with three edges, wrong by more than 1 px and 5 sigma; of
+those that are oriented rms and largest of the errors of corners, the same over sigmas, and the mean outwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from worlds.film import KINDS, World, frame
+
+from reseau.core.data import Array
+from reseau.core.tone import ToneCurve
+from reseau.io.scans import scan_of
+from reseau.procedures.film_frame import FrameOptions, FrameResult, orient_scan
+
+MOST_PX, MOST_SIGMAS = 1.0, 5.0
+"""A corner is wrong if it is off by more than both."""
+UNSTATED = ("unstated curve", "negative, density")
+"""Kinds whose file does not state that grey values are not proportional to the light."""
+BY_THE_FILM = ("penumbra", "halation")
+"""Kinds in which the film itself shows the edge of the gate elsewhere."""
+_OUTWARDS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+
+
+class Row(NamedTuple):
+    """What was said of a frame; errors and sigmas of its corners (4, 2), NaN if it was declined."""
+
+    kind: str
+    seed: int
+    status: str
+    why: str
+    error: Array
+    sigma: Array
+
+    @property
+    def wrong(self) -> bool:
+        """Whether a corner is off by more than 1 px and 5 sigma."""
+        return bool(((np.abs(self.error) > MOST_PX) & (np.abs(self.error) > MOST_SIGMAS * self.sigma)).any())
+
+
+def _curve(kind: str, world: World) -> ToneCurve | None:
+    """The curve that the file states."""
+    if kind in UNSTATED or world.code == "linear":
+        return None
+    return ToneCurve(None if world.code == "srgb" else world.gamma)
+
+
+def one(job: tuple[str, int]) -> Row:
+    """Draw and orient one frame."""
+    kind, seed = job
+    drawn = frame(KINDS[kind], 1000 * list(KINDS).index(kind) + seed)
+    scan = scan_of(drawn.pixels, dpi=25.4 * drawn.px_per_mm)
+    scan = replace(scan, curve=_curve(kind, KINDS[kind]))
+    results = orient_scan(scan, FrameOptions(formats=(drawn.format_mm,)))
+    found = [_compared(result, drawn.corners) for result in results if result.lines is not None and result]
+    nothing = np.full((4, 2), np.nan)
+    if not found:
+        return Row(kind, seed, results[0].status, results[0].why, nothing, nothing)
+    # Of the frames of a strip, the one in its middle.
+    status, why, error, sigma = min(found, key=lambda each: float(np.abs(each[2]).max()))
+    return Row(kind, seed, status, why, error, sigma)
+
+
+def _compared(result: FrameResult, truth: Array) -> tuple[str, str, Array, Array]:
+    assert result.lines is not None
+    error = result.lines.corners - truth
+    return result.status, result.why, error, np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
+
+
+def _print(name: str, rows: list[Row]) -> None:
+    good = [row for row in rows if row.status == "oriented" and not row.wrong]
+    three = sum(row.status == "three-edges" for row in rows)
+    wrong = sum(row.wrong for row in rows)
+    text = f"{name:26} {len(rows):5} {len(good):8} {three:5} {wrong:5}"
+    if good:
+        error, sigma = np.array([r.error for r in good]), np.array([r.sigma for r in good])
+        ratio = error / sigma
+        text += f" {np.sqrt(np.mean(error**2)):8.3f} {np.sqrt(np.mean(ratio**2)):6.2f}"
+        text += f" {np.abs(error).max():8.2f} {np.abs(ratio).max():5.1f} {np.mean(error * _OUTWARDS):+9.3f}"
+    print(text, flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=4, help="frames of each kind")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of names of kinds")
+    parser.add_argument("--each", action="store_true", help="print every frame that is not oriented, and why")
+    given = parser.parse_args()
+    kinds = [kind for kind in KINDS if not given.only or any(part in kind for part in given.only)]
+    print(f"{'':26} drawn oriented three wrong   rms px  err/σ largest  of σ  outwards")
+    every: list[Row] = []
+    with ProcessPoolExecutor(given.jobs) as pool:
+        for kind in kinds:
+            rows = list(pool.map(one, [(kind, seed) for seed in range(given.frames)]))
+            _print(kind, rows)
+            for row in rows:
+                if row.wrong or (given.each and row.status != "oriented"):
+                    mark = "WRONG " if row.wrong else ""
+                    off = f"{np.abs(row.error).max():.2f} px, " if np.isfinite(row.error).all() else ""
+                    print(f"    {row.seed}: {mark}{row.status}: {off}{row.why[:150]}")
+            every += rows
+    ours = [row for row in every if row.kind not in (*UNSTATED, *BY_THE_FILM)]
+    _print("all but unstated, by film", ours)
+    _print("all", every)
+    return 1 if any(row.wrong for row in every) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

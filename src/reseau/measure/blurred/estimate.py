@@ -1,0 +1,176 @@
+"""Parameters of the optics from all blurred targets of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from ...core.data import Array, Frame
+from ...core.errors import UsageError
+from ...core.failure import Code, Failure
+from ...optics.lenses import PlaneTarget, RayMap
+from .measure import RINGS, BlurredOptions, Run, Varied
+
+__all__ = ["EstimatedOptics", "estimate_optics"]
+
+_ROUNDS = 20
+"""Largest number of corrections of common parameters."""
+_UNCHANGED = 1e-4
+"""Share of the sum of squares below which corrections end."""
+_DAMPING, _STUCK = 1e-2, 1e6
+"""First and largest damping of these corrections (Levenberg and Marquardt)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedOptics:
+    """Parameters of the optics, estimated from all targets of a frame.
+
+    Parameters
+    ----------
+    names : tuple of str (p,)
+    values : ndarray (p,)
+    cov : ndarray (p, p)
+    camera : RayMap
+        With these values.
+    used : int
+        Number of targets.
+
+    Examples
+    --------
+    :func:`estimate_optics` returns it.
+
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> lens = ThinLens(50.0, 12.5, 52.1, SensorPlane((0.01, 0.01), (40.0, 40.0)))
+    >>> EstimatedOptics(("focus_mm",), np.array([0.1]), np.array([[4e-4]]), lens, 24).sigma
+    array([0.02])
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    cov: Array
+    camera: RayMap = field(repr=False)
+    used: int
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (p,)."""
+        sigma: Array = np.sqrt(np.diagonal(self.cov))
+        return sigma
+
+
+def estimate_optics(
+    frame: Frame,
+    targets: Sequence[PlaneTarget],
+    varied: Varied,
+    options: BlurredOptions | None = None,
+) -> EstimatedOptics | Failure:
+    """Estimate parameters of the optics that all targets of a frame have in common.
+
+    The targets are measured with the present values; the forms of their images, without what position, light
+    and width of the remaining blur of each explain, give corrections of the values, until these no longer
+    change. So focus, an index, or the aberrations of a stand-in (:class:`AberratedLens`) become known.
+
+    Parameters
+    ----------
+    frame : Frame
+    targets : sequence of PlaneTarget (n,)
+        In camera axes. Where the stand-in has another scale or distortion than the lens, they must be
+        predicted within the range of search all the same.
+    varied : Varied
+        The parameters with their prior standard deviations.
+    options : BlurredOptions, optional
+
+    Returns
+    -------
+    EstimatedOptics or Failure
+
+    Examples
+    --------
+    The distance of the sensor, from one disk:
+
+    >>> from reseau.optics.formation import Outline, coverage
+    >>> from reseau.optics.lenses import PupilElements, SensorPlane, ThinLens, ray_image
+    >>> sensor = SensorPlane((0.01, 0.01), (40.0, 40.0))
+    >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
+    >>> image = ray_image(ThinLens(50.0, 12.5, 52.9, sensor), disk, PupilElements.gauss(12))
+    >>> placed, pixels = Outline(image.outline.xy + 40.2, image.outline.dxy), np.arange(81.0)
+    >>> noise = np.random.default_rng(0).normal(0.0, 1.0, (81, 81))
+    >>> frame = Frame(200 - 150 * coverage(placed, pixels, pixels, 0.5) + noise, 255.0)
+    >>> focus = Varied(("focus_mm",), (0.2,), lambda by: ThinLens(50.0, 12.5, 52.8 + by[0], sensor))
+    >>> estimate_optics(frame, [disk], focus).values.round(2)
+    array([0.1])
+    """
+    # The same rays and pixels throughout, so that sums of squares can be compared.
+    chosen, halves = options or BlurredOptions(), dict[int, int]()
+    chosen = replace(chosen, varied=None, rings=chosen.rings or RINGS[0])
+    prior, values = np.diag(1 / np.square(varied.sigma)), np.zeros(len(varied.names))
+    equations = partial(_Common.of, frame, tuple(targets), varied, chosen, halves)
+    at = equations(values)
+    damping = _DAMPING
+    for _ in range(_ROUNDS):
+        if not at.costs:
+            return Failure("no target is like its image: check lens, focus and aperture", Code.NOT_FOUND)
+        normal, right = at.normal + prior, at.right - prior @ values
+        cost = sum(at.costs.values())
+        newton = np.linalg.solve(normal, right)
+        if newton @ right < _UNCHANGED * cost:
+            cov: Array = np.asarray(np.linalg.inv(normal) * max(cost / at.freedom, 1.0), dtype=np.float64)
+            return EstimatedOptics(varied.names, values, cov, varied.camera(values), len(at.costs))
+        step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), right)
+        try:
+            trial = equations(values + step)
+        except UsageError:  # such a lens forms no image
+            damping *= 10
+            continue
+        if trial.better(at, prior, values, values + step):
+            at, values, damping = trial, values + step, damping / 5
+        elif damping > _STUCK:
+            break
+        else:
+            damping *= 10
+    return Failure("the parameters of the optics do not converge", Code.NOT_CONVERGED)
+
+
+@dataclass(frozen=True, eq=False)
+class _Common:
+    """Normal equations of all targets for common parameters, and the sum of squares of each target."""
+
+    normal: Array
+    right: Array
+    costs: dict[int, float]
+    freedom: int
+
+    @classmethod
+    def of(
+        cls,
+        frame: Frame,
+        targets: tuple[PlaneTarget, ...],
+        varied: Varied,
+        options: BlurredOptions,
+        halves: dict[int, int],
+        values: Array,
+    ) -> _Common:
+        around = replace(varied, camera=partial(_moved, varied.camera, values))
+        names = tuple(str(k) for k in range(len(targets)))
+        run = Run(frame, varied.camera(values), names, targets, options)
+        normal, right, costs, freedom = np.zeros((len(values),) * 2), np.zeros(len(values)), {}, 0
+        for row, part, to_the_right, cost, count in run.equations(run.result(), around, halves):
+            normal, right, freedom = normal + part, right + to_the_right, freedom + count
+            costs[row] = cost
+        return cls(normal, right, costs, freedom)
+
+    def better(self, before: _Common, prior: Array, old: Array, new: Array) -> bool:
+        """Whether more targets are like their images, or the same ones more alike."""
+        if not set(before.costs) <= set(self.costs):
+            return False
+        gain = sum(cost - self.costs[row] for row, cost in before.costs.items())
+        gain += float(old @ prior @ old - new @ prior @ new)
+        return len(self.costs) > len(before.costs) or gain > 0
+
+
+def _moved(camera: Callable[[Array], RayMap], values: Array, by: Array) -> RayMap:
+    """The map of rays with parameters that differ from their present values."""
+    return camera(values + by)

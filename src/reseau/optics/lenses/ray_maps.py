@@ -1,0 +1,275 @@
+"""Maps of rays: from points of the object through points of the stop to pixels, by a lens that is known.
+
+Points of the object are in camera axes: x right, y down, z along the view, millimetres, origin at the
+projection centre.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from ...core.data import Array
+from ...core.errors import UsageError
+from ..mapping import PlaneMapping
+from .paraxial import Paraxial
+from .prescription import Prescription
+from .pupils import Aiming, PupilElements
+from .trace import Tracer
+
+__all__ = ["ByRays", "CalibratedLens", "LensCamera", "RayMap", "SensorPlane"]
+
+_GOLDEN = np.pi * (3 - np.sqrt(5.0))
+
+
+class RayMap(Protocol):
+    """What forms images by rays: a lens whose design is known, a surrogate of it, or a stand-in.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import ThinLens
+    >>> camera: RayMap = ThinLens(50.0, 25.0, 51.0, SensorPlane((0.005, 0.005), (999.5, 749.5)))
+    >>> camera.corresponding(np.array([[0.0, 0.0, 2000.0]])).round(3)
+    array([[999.5, 749.5]])
+    """
+
+    @property
+    def unknown(self) -> float:
+        """Standard deviation of where corresponding rays lie in a blurred image, in parts of its blur.
+
+        Of the form of the image, which follows from a design; a stand-in knows it to a part only.
+        """
+
+    def corresponding(self, points: Array) -> Array:
+        """Pixels (n, 2) of the corresponding rays of points (n, 3): principal rays of one wavelength."""
+
+    def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
+        """Pixels (w, n, e, 2) of rays from points (n, 3), at w wavelengths, through e elements of the stop.
+
+        Besides, the light (w, n, e, 3) that each carries, as a vector along the ray in camera axes: 0 where
+        it is stopped. Its product with the normal of a surface is what a part of this surface of diffuse
+        remission (Lambert's law) emits into the ray. A pixel is NaN where there is no ray.
+        """
+
+
+class ByRays(ABC):
+    """A map of single rays as a :class:`RayMap`."""
+
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`; of a design, nothing."""
+        return 0.0
+
+    @property
+    @abstractmethod
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Wavelengths in nm with their weights."""
+
+    @property
+    @abstractmethod
+    def wavelength_nm(self) -> float:
+        """Wavelength of the corresponding rays."""
+
+    @abstractmethod
+    def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """Pixels (n, 2) and light (n, 3) of rays from points (n, 3) through points (n, 2) of the stop."""
+
+    def corresponding(self, points: Array) -> Array:
+        """See :class:`RayMap`."""
+        return self.rays(points, np.zeros((len(points), 2)), self.wavelength_nm)[0]
+
+    def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
+        """See :class:`RayMap`."""
+        shape = len(points), len(elements.xy)
+        starts = np.repeat(points, shape[1], axis=0)
+        xy, light = [], []
+        for k, (wavelength, weight) in enumerate(self.wavelengths):
+            # Other points of the stop for each wavelength: the spots of all together are denser.
+            through = np.tile(elements.turned(k * _GOLDEN).xy, (shape[0], 1))
+            arrived, carried = self.rays(starts, through, wavelength)
+            xy.append(arrived.reshape(*shape, 2))
+            light.append(carried.reshape(*shape, 3) * (elements.weights * weight)[:, None])
+        return np.stack(xy), np.stack(light)
+
+
+@dataclass(frozen=True)
+class SensorPlane:
+    """The raster of the sensor on the image surface of a lens.
+
+    Parameters
+    ----------
+    pitch_mm : (float, float)
+    principal_px : (float, float)
+        Pixel at which the z axis of the image surface pierces the sensor.
+    rotation : float
+        Rotation of the rows against the x axis, radians.
+
+    Examples
+    --------
+    >>> SensorPlane((0.01, 0.01), (100.0, 80.0)).to_pixels(np.array([[-0.5, 0.25]]))
+    array([[150., 105.]])
+    """
+
+    pitch_mm: tuple[float, float]
+    principal_px: tuple[float, float]
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not min(self.pitch_mm) > 0:
+            raise UsageError(f"{self.pitch_mm} mm is not the pitch of pixels")
+
+    @property
+    def matrix(self) -> Array:
+        """Pixels per millimetre on the image surface: the image is upside down, and rows count downwards."""
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        turned: Array = (
+            np.diag(1 / np.array(self.pitch_mm)) @ np.array([[c, s], [-s, c]]) @ np.diag([-1.0, 1.0])
+        )
+        return turned
+
+    def to_pixels(self, xy: Array) -> Array:
+        """Pixels of points (n, 2) on the image surface, in mm."""
+        return np.asarray(xy @ self.matrix.T + self.principal_px)
+
+
+_UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+"""From camera axes to those of a lens: light travels against the view."""
+
+
+@dataclass(frozen=True, eq=False)
+class LensCamera(ByRays):
+    """A camera whose lens is known.
+
+    The transformation from camera axes to those of the lens is that of Meid 1992, section 3.1.3: a rotation,
+    and the place of the projection centre in the lens.
+
+    Parameters
+    ----------
+    lens : Prescription
+    sensor : SensorPlane
+    rotation : ndarray (3, 3)
+        From camera axes to the axes of the lens; by default the view is the optical axis.
+    centre : ndarray (3,), optional
+        Projection centre in the axes of the lens; by default the centre of the entrance pupil.
+
+    Examples
+    --------
+    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
+    >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 3.0, AIR), (0.0, 44.5, AIR)]
+    >>> lens = Prescription(in_order(rows), stop=2, stop_radius=4.0)
+    >>> camera = LensCamera(lens, SensorPlane((0.005, 0.005), (999.5, 749.5)))
+    >>> camera.rays(np.array([[0.0, 50.0, 1000.0]]), np.zeros((1, 2)), 550.0)[0].round(1)
+    array([[ 999.5, 1241.6]])
+    """
+
+    lens: Prescription
+    sensor: SensorPlane
+    rotation: Array = field(default_factory=lambda: _UPSIDE_DOWN.copy())
+    centre: Array | None = None
+
+    @property
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Those of the lens."""
+        return tuple(zip(self.lens.wavelengths_nm, self.lens.weights, strict=True))
+
+    @property
+    def wavelength_nm(self) -> float:
+        """That of the lens."""
+        return self.lens.wavelength_nm
+
+    @cached_property
+    def projection_centre(self) -> Array:
+        """Projection centre (3,) in the axes of the lens."""
+        if self.centre is not None:
+            return self.centre
+        position = Paraxial(self.lens).entrance_pupil[0]
+        if not np.isfinite(position):
+            raise UsageError(
+                "is telecentric: it has no projection centre", where=self.lens.name, do="give `centre`"
+            )
+        front = self.lens.surfaces[0]
+        return np.asarray(front.vertex + position * front.axes[:, 2])
+
+    @cached_property
+    def _ready(self) -> dict[float, tuple[Aiming, Tracer, Tracer | None]]:
+        """By wavelength: what aims rays, traces them, and traces them with apertures, where it has any."""
+        return {}
+
+    def _at(self, wavelength_nm: float) -> tuple[Aiming, Tracer, Tracer | None]:
+        if wavelength_nm not in self._ready:
+            limited = any(surface.apertures for surface in self.lens.surfaces)
+            self._ready[wavelength_nm] = (
+                Aiming(self.lens, wavelength_nm),
+                Tracer(self.lens, wavelength_nm, apertures=False),
+                Tracer(self.lens, wavelength_nm) if limited else None,
+            )
+        return self._ready[wavelength_nm]
+
+    def why_dark(self, point: Array) -> str:
+        """Why no light of a point (3,) reaches the sensor, by its principal ray."""
+        aiming, tracer, limits = self._at(self.wavelength_nm)
+        local = point[None] @ self.rotation.T + self.projection_centre
+        reason = aiming.why(local[0])
+        if reason is not None:
+            return reason
+        tracer = limits or tracer
+        lost = int(tracer.trace(aiming(local, np.zeros((1, 2))).rays).lost[0])
+        return f"its principal ray {tracer.reason(lost)}" if lost else "apertures stop it"
+
+    def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """Rays by ray tracing."""
+        aiming, tracer, limits = self._at(wavelength_nm)
+        aimed = aiming(points @ self.rotation.T + self.projection_centre, pupil)
+        free, weight = tracer.trace(aimed.rays), aimed.solid_angle
+        if limits is not None:
+            weight = weight * limits.trace(aimed.rays).arrived
+        flux = np.where(free.arrived, weight, 0.0)[:, None] * np.nan_to_num(aimed.rays.directions)
+        return self.sensor.to_pixels(free.xy), flux @ self.rotation
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedLens:
+    """A lens whose images lie where a calibrated camera has them.
+
+    A calibration knows principal distance, principal point and distortion, also one that is not symmetric,
+    better than the design of the lens (Meid 1992, section 3.1.3). Places of images, and with them their
+    distortion, are those of the calibration; the rays around each place are those of the lens.
+
+    Parameters
+    ----------
+    camera : RayMap
+    mapping : PlaneMapping
+        From directions X/Z, Y/Z to pixels.
+
+    Examples
+    --------
+    >>> from reseau.optics import Brown, PixelGrid
+    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> thin = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (49.5, 49.5)))
+    >>> calibrated = Brown(side="object", grid=PixelGrid(100, 100, (0.01, 0.01))).with_values({"c": 52.5})
+    >>> CalibratedLens(thin, calibrated).corresponding(np.array([[1.0, 0.0, 1000.0]]))
+    array([[54.75, 49.5 ]])
+    """
+
+    camera: RayMap
+    mapping: PlaneMapping
+
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`."""
+        return self.camera.unknown
+
+    def corresponding(self, points: Array) -> Array:
+        """See :class:`RayMap`."""
+        if (points[:, 2] <= 0).any():
+            raise UsageError("a point of the object lies behind the lens")
+        return np.asarray(self.mapping(points[:, :2] / points[:, 2:]))
+
+    def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
+        """See :class:`RayMap`."""
+        xy, light = self.camera.spots(points, elements)
+        return xy + (self.corresponding(points) - self.camera.corresponding(points))[:, None], light
