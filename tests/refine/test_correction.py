@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from reseau.adjust import adjust
-from reseau.calibration import Calibration, CameraCorrection
+from reseau.calibration import Calibration, CameraCorrection, CorrectedImage
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError
 from reseau.core.failure import Failure
@@ -443,3 +443,24 @@ def test_the_system_agrees_with_a_manual_computation():
     by_hand = Similarity.common_system(o, s, mirrored=True)
     scale = 50.0 / np.hypot(*(s - o))
     np.testing.assert_allclose(camera.photo_system(points.xy), scale * by_hand(points.xy), atol=1e-10)
+
+
+def test_two_halves_of_a_film_are_resampled_to_parts_of_one_raster() -> None:
+    film = regular_reseau(9, 17, 10.0, Mark(shape="cross", size=2.0, line_width=0.1))
+    named = {tuple(xy.tolist()): name for name, xy in zip(film.ids, film.xy, strict=True)}
+    # Both halves show O and S.
+    film = film.model_copy(update={"origin": named[0.0, 0.0], "axis": named[10.0, 0.0]})
+    halves = []
+    for side, angle in ((-1, 0.004), (1, -0.006)):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        scan = (film.xy * [1.0002, 1.0]) @ (50 * turn @ np.diag([1.0, -1.0])).T + [2500 - side * 900, 2200]
+        shown = side * film.xy[:, 0] > -11
+        marks = ImagePoints.with_sigma(
+            [n for n, s in zip(film.ids, shown, strict=True) if s], scan[shown], 0.05
+        )
+        camera = correct_camera(marks, film, trials=0).required()
+        halves.append(CorrectedImage.plan(camera, (5000, 4400), 40.0))
+        # Millimetres of the design, in either half.
+        assert np.abs(camera.to_pixels(film.xy[shown]) - scan[shown]).max() < 0.02
+    first = [np.array(half.origin) * 40 for half in halves]
+    np.testing.assert_allclose(first, np.rint(first), rtol=0, atol=1e-6)

@@ -27,6 +27,8 @@ from .mapping import BEYOND, CalibratedMapping
 __all__ = ["CorrectedImage", "planes_of", "undistorted_camera", "write_corrected"]
 
 _BAND = 256
+_ROUNDING = 1e-6
+"""Share of a pixel by which an extent may be smaller than a whole number of pixels through rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +82,15 @@ class CorrectedImage:
         size : (int, int)
             Width and height of the photograph.
         scale : float, optional
-            Pixels per unit; by default that of the photograph.
+            Pixels per unit; by default that of the photograph. If it is given, centres of pixels are at
+            multiples of the unit over the scale: the rasters of two scans of one film are parts of one.
 
         Raises
         ------
         UsageError
             When the raster would be larger than images may be, or shows nothing of the photograph.
         """
+        step = None if scale is None or not scale > 0 else 1 / scale
         scale = 1 / correction.photo_system.scale if scale is None else scale
         photo = correction.photo_system(_border(size))
         corrected = correction.model(photo)
@@ -98,6 +102,8 @@ class CorrectedImage:
             marks = np.array(correction.extent, dtype=np.float64).reshape(2, 2)
             reach = BEYOND * (marks[1] - marks[0])
             low, high = np.maximum(low, marks[0] - reach), np.minimum(high, marks[1] + reach)
+        if step is not None:
+            low, high = np.ceil(low / step) * step, np.floor(high / step) * step
         up = correction.photo_system.mirrored
         return cls._over(correction, low, high, (scale, scale), up)
 
@@ -178,7 +184,7 @@ class CorrectedImage:
         counts = (high - low) * scale
         if not (np.isfinite(counts).all() and (counts >= 1).all()):
             raise UsageError("shows nothing of the region the calibration holds for", where="frame")
-        width, height = (int(n) + 1 for n in counts)
+        width, height = (int(n + _ROUNDING) + 1 for n in counts)
         _affordable(width, height)
         origin = (float(low[0]), float(high[1] if up else low[1]))
         return cls(mapping, origin, (float(scale[0]), float(scale[1])), width, height, up)

@@ -52,6 +52,8 @@ _LEAST_AGREE = 0.45
 _BOWED, _OUTWARDS = 0.6, 0.1
 """Bow in pixels that picture content may cause; then the largest share of rejected profiles that lie
 outwards of an edge without it."""
+_BENT = 0.9
+"""Share of profiles that agree with a line below which the others may be parts of the edge, which is bent."""
 _WITHOUT_END, _BETTER, _AGREES, _CONTINUED = 0.3, 0.6, 5.0, 0.3
 """End of the part of an edge without the other end, which a dark structure may hide; misfit of this part
 relative to that of the whole from which there is such a structure; standard deviations, times the misfit,
@@ -234,18 +236,21 @@ def _edge(
         # A line displaces an edge by at most its width; a larger bow is real.
         own = bow if abs(bow) > 2 * found.width else 0.0
         fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
-        shown = grey, band, fitted, border.level, border.noise, sharp.width
+        sections = grey, band, fitted, border.level, border.noise, sharp.width
         if spans:
             # Of a line that nothing separates from the edge, noise lets few steps show the width.
-            doubt = max(doubt, _HIDDEN * sharp.width * is_one_step(*shown))
+            doubt = max(doubt, _HIDDEN * sharp.width * is_one_step(*sections))
         else:
-            two, hidden = edge_beside_line(*shown)
+            two, hidden = edge_beside_line(*sections)
             if two is not None:
                 return _along_chord(band, two, own + two.bow, common), rejected, ""
     residuals = _inward(line[0], place, offset)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
-    wave = waviness(place[agree], residuals[agree], total[agree])
+    # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
+    bent = agree.mean() < _BENT and not _only_inwards(residuals, line[1])
+    shown = np.ones(len(place), dtype=bool) if bent else agree
+    wave = waviness(place[shown], residuals[shown], total[shown])
     scale = shared_error(place[agree], residuals[agree], total[agree])
     # Steps that are too sharp belong to a scratch and are equally uninformative.
     hidden |= sharp.beyond(found)

@@ -35,11 +35,13 @@ _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 _SECTIONS = 24, 12
 """Numbers of sections of an edge whose means show the errors common to neighbouring profiles: structures of
 the picture and phases of the pixels are longer than some of them."""
+_REWEIGHTED = 8
+"""Number of adjustments of these polynomials with weights that decrease with the residuals."""
 _LEAST_SCALE = 0.3
 """Scatter of residuals over sigmas below which sigmas as given decide which profiles agree."""
-_WAVES, _LEAST_WAVED, _SIGNIFICANT, _LEAST_WAVE_PX = 5, 40, 5.0, 0.05
+_WAVES, _LEAST_WAVED, _SIGNIFICANT, _LEAST_WAVE_PX = 5, 40, 25.0, 0.05
 """Degree of the polynomials that show that an edge is no bowed line, minimum number of profiles, and least
-significance and size of their coefficients."""
+significance (χ² of three coefficients) and size."""
 _MODEL_PX = 0.012
 """Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 
@@ -393,14 +395,19 @@ def waviness(place: Array, residuals: Array, sigma: Array) -> float:
     if len(place) < _LEAST_WAVED:
         return 0.0
     design = np.polynomial.legendre.legvander(place, _WAVES) / sigma[:, None]
-    observed = residuals / sigma
-    cofactor = np.linalg.pinv(design.T @ design)
-    found = cofactor @ design.T @ observed
-    scale = shared_error(place, residuals - (design @ found) * sigma, sigma)
+    observed, factor = residuals / sigma, np.ones(len(place))
+    for _ in range(_REWEIGHTED):  # Cauchy's weights
+        cofactor = np.linalg.pinv(design.T @ (factor[:, None] * design))
+        found = cofactor @ design.T @ (factor * observed)
+        rest = observed - design @ found
+        unit = 2.5 * max(1.4826 * float(np.median(np.abs(rest))), 1e-3)
+        factor = 1 / (1 + (rest / unit) ** 2)
+    near = np.abs(rest) < 1.4 * unit
+    scale = shared_error(place[near], (rest * sigma)[near], sigma[near])
     higher = found[3:]
-    own = scale * np.sqrt(np.diag(cofactor)[3:])
-    seen = np.abs(higher) > np.maximum(_SIGNIFICANT * own, _LEAST_WAVE_PX)
-    return float(np.sqrt((higher[seen] ** 2).sum()))
+    together = float(higher @ np.linalg.solve(cofactor[3:, 3:], higher)) / scale**2
+    size = float(np.sqrt((higher**2).sum()))
+    return size if together > _SIGNIFICANT and size > _LEAST_WAVE_PX else 0.0
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:
