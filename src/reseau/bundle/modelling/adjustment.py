@@ -147,10 +147,12 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     """
     options = options or Options()
     found = causes(network)
-    if found:
+    # Single coordinates outside the image do not change what is to be done.
+    grave = [remark for remark in found if remark.code is not Code.OUTSIDE]
+    if grave:
         # Far from any solution many iterations lead nowhere.
         options = replace(options, max_iterations=min(options.max_iterations, _FEW))
-    problem, notes = _begun(network, options, settle=not found)
+    problem, notes = _begun(network, options, settle=not grave)
     problem, false_bars = without_false_bars(problem)
     found += false_bars
     found += given_poses_that_do_not_fit(network, _misfits_px(problem))
@@ -162,14 +164,14 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         fit, steps, left = careful
         notes = (*notes, *left)
     else:
-        plain = _plain(problem) if not found or false_bars else problem.adjusted()
+        plain = problem.adjusted() if grave else _plain(problem)
         if isinstance(plain, Failure):
             return _explained(plain, problem, found)
         fit = plain
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
-    if len(found) == len(false_bars):
+    if not grave:
         found += _doubts(problem, fit)
         found += _rejected_control(network, rejected)
         found += _frontal(network, bare)
