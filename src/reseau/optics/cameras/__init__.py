@@ -12,6 +12,7 @@ registry.
 # The order of the imports is the order of the registry.
 from .brown import Brown, BrownDistortion, BrownWithAdditional  # isort: skip
 from .opencv import OpenCV  # isort: skip
+from .fisheye import Fisheye  # isort: skip
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -39,6 +40,7 @@ __all__ = [
     "CameraModel",
     "Converted",
     "EbnerCorrection",
+    "Fisheye",
     "OpenCV",
     "Option",
     "Parameter",
