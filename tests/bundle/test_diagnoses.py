@@ -74,6 +74,17 @@ def one_station() -> Network:
     return seen_from(np.zeros((6, 3)), targets, xyz, 0)
 
 
+def long_lens() -> Network:
+    """A nearly flat relief seen at right angles from stations along a line, by a lens of ten degrees."""
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform(-1, 1, (60, 3)) * [3.0, 1.5, 0.3]
+    centres = np.array([[x, 0.2 * (-1) ** k, 24.0] for k, x in enumerate((-2.0, -1.0, 0.0, 1.0, 2.0))])
+    camera = networks.camera(free=())
+    values = camera.values.copy()
+    values[0], values[1:] = 40.0, 0.0
+    return seen_from(centres, centres * [1, 1, 0], xyz, 0, replace(camera, values=values))
+
+
 def plane(tilt: float, seed: int = 6) -> Network:
     """A plane of 36 known points seen by six images at a given tilt."""
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-0.8, 0.8, 6)))
@@ -519,6 +530,7 @@ ACCUSING = {
         opencv,
         observed,
         lambda: plane(0.5),
+        long_lens,
         lambda: plane(0.15),
         lambda: posed(block()),
         lambda: exchanged_poses(posed(block()), 1, 5),

@@ -31,6 +31,8 @@ __all__ = ["Options", "adjust_network", "problem_of"]
 _GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
 # Relative sigma of a principal distance that is hardly determined.
 _WEAK = 3e-3
+# Relative sigma of points with depth.
+_DEEP = 0.02
 # Iterations of an adjustment with values that are not plausible.
 _FEW = 30
 # Part of the points of an image above which it is left out as a whole.
@@ -147,8 +149,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     """
     options = options or Options()
     found = causes(network)
-    # Single coordinates outside the image do not change what is to be done.
-    grave = [remark for remark in found if remark.code is not Code.OUTSIDE]
+    grave = [remark for remark in found if remark.code is Code.IMPLAUSIBLE]
     if grave:
         # Far from any solution many iterations lead nowhere.
         options = replace(options, max_iterations=min(options.max_iterations, _FEW))
@@ -171,11 +172,22 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
+    if _has_depth(bare):
+        found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     if not grave:
         found += _doubts(problem, fit)
         found += _rejected_control(network, rejected)
         found += _frontal(network, bare)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+
+
+def _has_depth(result: Result) -> bool:
+    """Whether points are determined to a small part of their distance, in spite of narrow rays."""
+    points, images = result.fit.usable.points, result.fit.usable.images
+    middle = result.fit.values.x0[images].mean(axis=0)
+    sigma = np.sqrt((result.point_sigma[points] ** 2).sum(axis=1))
+    away = np.linalg.norm(result.fit.values.xyz[points] - middle, axis=1)
+    return bool(np.median(sigma / away) < _DEEP)
 
 
 def _rejected_control(network: Network, rejected: Mask) -> list[Remark]:
