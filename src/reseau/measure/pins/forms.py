@@ -44,6 +44,11 @@ _SHARED = 6
 """Minimum number of clear echoes that determine what all have in common; for their tilt, twice as many."""
 _QUADRATIC = 18
 """Minimum number of clear echoes that show how the tilt depends on the squares of coordinates."""
+_BENDING = 0.03, 0.03, 0.06
+"""Usual change of the tilt of lines in a photograph, rad: over 1000 px in x, in y, and over the squares of
+these. A lens that distorts by 1 % at 600 px turns lines by 0.06 times the product of both."""
+_MOSTLY = 0.9
+"""Share of the echoes for which the common tilt is at least as certain as its standard deviation says."""
 _LEAST_SCATTER = {"softness": 0.01, "tilt": 0.002, "fading": 0.01, "tapering": 0.01, "thickening": 0.01}
 """Smallest scatter between echoes that is assumed."""
 _BLUR_SHARE = 0.25
@@ -272,8 +277,8 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
     sigma = {}
     for name in names:
         values = np.log(soft) if name == "softness" else columns[name]
-        mean, scatter = _population(values[rows], found.sigma[name][rows], np.ones((len(rows), 1)))
-        sigma[name] = max(scatter, _LEAST_SCATTER.get(name, 0.01))
+        mean, cov, scatter = _population(values[rows], found.sigma[name][rows], np.ones((len(rows), 1)))
+        sigma[name] = max(float(np.sqrt(scatter**2 + cov[0, 0])), _LEAST_SCATTER.get(name, 0.01))
         if name == "softness":
             soft = np.full(len(soft), np.exp(mean[0]))
         else:
@@ -282,13 +287,18 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
         # The arcs are parallel but for the distortion of display and camera: shear turns them alike, the
         # quadratic terms linearly with their place, and a radial distortion with the product of coordinates.
         x, y = ((found.xy - found.xy[rows].mean(axis=0)) / 1000).T
-        terms = [np.ones_like(x), x, y, x * y]
+        terms, spread = [np.ones_like(x), x, y, x * y], [np.inf, *_BENDING]
         if len(rows) >= _QUADRATIC:
-            terms += [x * x, y * y]
+            terms, spread = [*terms, x * x, y * y], [*spread, _BENDING[-1], _BENDING[-1]]
         place = np.column_stack(terms)
-        mean, scatter = _population(arcs.tilt[rows], found.sigma["tilt"][rows], place[rows])
-        sigma["tilt"] = max(scatter, _LEAST_SCATTER["tilt"])
+        mean, cov, scatter = _population(
+            arcs.tilt[rows], found.sigma["tilt"][rows], place[rows], np.array(spread)
+        )
         usual = place @ mean
+        # Beyond the clear echoes, in the corners, the mean is less certain than among them.
+        unsure = np.einsum("ni,ij,nj->n", place[found.converged], cov, place[found.converged])
+        common = np.sqrt(scatter**2 + np.quantile(unsure, _MOSTLY))
+        sigma["tilt"] = max(float(common), _LEAST_SCATTER["tilt"])
         if sigma["tilt"] < form.sigma["tilt"]:
             columns["tilt"] = np.where(np.isfinite(usual), usual, start.tilt)
         else:
@@ -299,16 +309,37 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
     return form.with_(**sigma), lines_with(half, soft, common) if "softness" in sigma else common
 
 
-def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, float]:
-    """Coefficients of a linear model, and the scatter of a population around it (DerSimonian and Laird)."""
+def _population(
+    values: Array, sigma: Array, design: Array, spread: Array | None = None
+) -> tuple[Array, Array, float]:
+    """A linear model of a population, and the scatter around it (DerSimonian and Laird).
+
+    Parameters
+    ----------
+    values, sigma : ndarray (n,)
+        Values and their standard deviations.
+    design : ndarray (n, u)
+        Of the model.
+    spread : ndarray (u,), optional
+        Standard deviations of the coefficients about zero, known beforehand; by default infinite.
+
+    Returns
+    -------
+    coefficients : ndarray (u,)
+    covariance : ndarray (u, u)
+        Of the coefficients.
+    scatter : float
+        Of the population.
+    """
     scatter = 0.0
     coefficients: Array = np.zeros(design.shape[1])
+    known = np.zeros(design.shape[1]) if spread is None else 1 / spread**2
     for _ in range(20):
         weight = 1 / (sigma**2 + scatter**2)
         # Some echoes may be others: Huber's weights.
         off = np.abs(values - design @ coefficients) * np.sqrt(weight) if _ else np.zeros(len(values))
         weight = weight * np.minimum(1, 3 / np.maximum(off, 1e-12))
-        normal = (design * weight[:, None]).T @ design
+        normal = (design * weight[:, None]).T @ design + np.diag(known)
         coefficients = np.asarray(
             np.linalg.solve(normal, (design * weight[:, None]).T @ values), dtype=np.float64
         )
@@ -319,6 +350,4 @@ def _population(values: Array, sigma: Array, design: Array) -> tuple[Array, floa
         if abs(grown - scatter**2) < 1e-3 * (scatter**2 + np.median(sigma) ** 2):
             break
         scatter = float(np.sqrt(grown))
-    # The mean is uncertain, too.
-    share = design.shape[1] / len(values)
-    return coefficients, float(np.sqrt(scatter**2 * (1 + share) + design.shape[1] / (1 / sigma**2).sum()))
+    return coefficients, np.asarray(np.linalg.inv(normal), dtype=np.float64), scatter
