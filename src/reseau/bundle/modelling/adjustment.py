@@ -309,13 +309,35 @@ def _without_gross_errors(
     Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
     Where the approximate values do not suffice, the adjustment of all observations gives better ones.
     """
-    found = _snooped(_trimmed(problem), options)
-    if isinstance(found, Failure):
+    first = _careful(_trimmed(problem), options)
+    if isinstance(first, Failure) or first[2]:
         plain = _plain(problem)
-        if isinstance(plain, Failure):
-            return found
-        problem = problem.continued(plain)
-        found = _snooped(problem, options)
+        if not isinstance(plain, Failure):
+            second = _careful(_trimmed(problem.continued(plain)), options)
+            if not isinstance(second, Failure) and (
+                isinstance(first, Failure) or _used(second[0]) > _used(first[0])
+            ):
+                first = second
+    if isinstance(first, Failure):
+        return first
+    fit, steps, left = first
+    if not left:
+        return fit, steps, []
+    names = listed(problem.network.images[i] for i in left)
+    text = f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a whole"
+    return fit, steps, [Remark(text, Code.GROSS_ERRORS)]
+
+
+def _used(fit: BundleFit) -> int:
+    """Number of image points in an adjustment."""
+    return int(fit.usable.observations.sum())
+
+
+def _careful(
+    problem: BundleProblem, options: Options
+) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[int]] | Failure:
+    """Adjust with data snooping, and again without the images most of whose points are rejected."""
+    found = _snooped(problem, options)
     if isinstance(found, Failure):
         return found
     left: list[int] = []
@@ -329,17 +351,7 @@ def _without_gross_errors(
         if isinstance(again, Failure):
             return again
         found = again
-    remarks = []
-    if left:
-        names = listed(problem.network.images[i] for i in left)
-        remarks = [
-            Remark(
-                f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a "
-                "whole",
-                Code.GROSS_ERRORS,
-            )
-        ]
-    return found.adjustment, found.steps, remarks
+    return found.adjustment, found.steps, left
 
 
 def _snooped(problem: BundleProblem, options: Options) -> Rejection[BundleFit] | Failure:
