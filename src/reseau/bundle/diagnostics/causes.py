@@ -216,7 +216,7 @@ def _one_station(network: Network, uv: Array) -> list[Remark]:
     m = len(network.images)
     if m < 2 or finite(network.xyz).sum() >= 4 or network.refraction is not None:
         return []
-    seen = [np.flatnonzero((network.image_of == i) & finite(uv)) for i in range(m)]
+    seen = _by_image(network, finite(uv))
     tested = 0
     for a, b in _spread_pairs(m):
         _, left, right = np.intersect1d(
@@ -243,6 +243,14 @@ def _one_station(network: Network, uv: Array) -> list[Remark]:
     ]
 
 
+def _by_image(network: Network, chosen: Mask) -> list[Rows]:
+    """Rows of the chosen image points of each image."""
+    rows = np.flatnonzero(chosen)
+    rows = rows[np.argsort(network.image_of[rows], kind="stable")]
+    count = np.bincount(network.image_of[rows], minlength=len(network.images))
+    return [part.astype(np.intp) for part in np.split(rows, np.cumsum(count)[:-1])]
+
+
 def _spread_pairs(m: int) -> list[tuple[int, int]]:
     """Pairs of images, at most `_PAIRS`, spread over all."""
     pairs = [(i, j) for step in (1, m // 2, 2, m // 3) if step for i in range(m) for j in [(i + step) % m]]
@@ -260,8 +268,8 @@ def _unit(uv: Array) -> Array:
 def _lines(network: Network, uv: Array) -> list[Remark]:
     """Images whose points lie on one line: they do not determine the pose."""
     bad = []
-    for i in range(len(network.images)):
-        own = uv[(network.image_of == i) & finite(uv)]
+    for i, rows in enumerate(_by_image(network, finite(uv))):
+        own = uv[rows]
         if len(own) < 3:
             continue
         size = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)
@@ -325,15 +333,12 @@ def given_poses_that_do_not_fit(network: Network, misfit: Array) -> list[Remark]
     misfit : ndarray (n,)
         Distances (px) of image points from their places with the given poses; NaN where unknown.
     """
-    wrong: Rows = np.array(
-        [
-            i
-            for i in np.flatnonzero(network.posed)
-            if (own := misfit[(network.image_of == i) & np.isfinite(misfit)]).size >= 4
-            and np.median(own) > 0.25 * max(_size(network, int(i)))
-        ],
-        dtype=np.intp,
-    )
+    rows = _by_image(network, np.isfinite(misfit))
+    wrong = [
+        i
+        for i in np.flatnonzero(network.posed).tolist()
+        if len(rows[i]) >= 4 and np.median(misfit[rows[i]]) > 0.25 * max(_size(network, i))
+    ]
     if not len(wrong):
         return []
     names = listed(network.images[i] for i in wrong)
