@@ -13,8 +13,9 @@ from ..adjust.significance import CoefficientTest
 from ..core.data import Array
 from ..core.provenance import Provenance
 from ..io import Document, Strict
+from ..optics.poses import matrix_to_vector
 from ..optics.refraction import Refraction
-from .diagnostics import Result, sigma_between_images
+from .diagnostics import Result, RigEstimate, sigma_between_images
 from .network.network import finite
 
 __all__ = ["ResultDocument", "model_search_entries"]
@@ -69,6 +70,24 @@ class RefractionResult(Strict):
     correlation: Correlation
     tests: dict[str, Significance]
     partners: dict[str, tuple[str, float]]
+
+
+class RigResult(Strict):
+    """Relative orientations of the cameras of a rig, in columns.
+
+    `rotation` (vector, from the axes of the `reference` camera to those of the camera) and `base` (projection
+    centre in the axes of the reference) have the standard deviations `sigma`: rad about the axes of the
+    camera, then the base; `covariance` is the whole (6, 6).
+    """
+
+    camera: tuple[str, ...]
+    reference: tuple[str, ...]
+    rotation: Matrix
+    base: Matrix
+    sigma: Matrix
+    length: tuple[float, ...]
+    length_sigma: tuple[float, ...]
+    covariance: tuple[Matrix, ...]
 
 
 class ImagesResult(Strict):
@@ -211,6 +230,7 @@ class ResultDocument(Document):
     left_out: LeftOut | None = None
     distances: DistancesResult | None = None
     refraction: RefractionResult | None = None
+    rig: RigResult | None = None
     variance_components: ComponentsResult | None = None
     eliminated: tuple[EliminatedParameter, ...] | None = None
     cross_validation: CrossValidation | None = None
@@ -238,6 +258,8 @@ class ResultDocument(Document):
             more["distances"] = _distances(result)
         if result.network.refraction is not None:
             more["refraction"] = _refraction(result, result.network.refraction)
+        if result.rig is not None:
+            more["rig"] = _rig(result.rig)
         if provenance is not None:
             more["provenance"] = provenance.to_dict()
         return cls(
@@ -342,6 +364,19 @@ def _refraction(result: Result, bent: Refraction) -> RefractionResult:
         correlation=Correlation(names=names, matrix=() if found is None else _matrix(found.correlation)),
         tests={} if found is None else {test.name: _significance(test) for test in found.tests},
         partners={} if found is None else dict(zip(names, found.partners, strict=True)),
+    )
+
+
+def _rig(found: RigEstimate) -> RigResult:
+    return RigResult(
+        camera=found.cameras,
+        reference=found.references,
+        rotation=_matrix(matrix_to_vector(found.rotation)),
+        base=_matrix(found.base),
+        sigma=_matrix(found.sigma),
+        length=tuple(found.length.tolist()),
+        length_sigma=tuple(found.length_sigma.tolist()),
+        covariance=tuple(_matrix(cov) for cov in found.cov),
     )
 
 

@@ -22,6 +22,7 @@ from .bundle_options import (
     say_model,
     say_parameters,
     say_refraction,
+    say_rig,
 )
 from .common import AsJson, Out, progress, required, say
 
@@ -192,6 +193,8 @@ def _say(path: Path, result: Result) -> None:
     if result.refraction is not None:
         say("windows and media\n")
         say_refraction(result.refraction)
+    if result.rig is not None:
+        say_rig(result.rig)
     say_model(result)
     say_left_out(result)
     for warning in result.warnings:

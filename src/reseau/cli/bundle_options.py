@@ -11,7 +11,7 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import CameraEstimate, Kind, RefractionEstimate, Result
+    from ..bundle import CameraEstimate, Kind, RefractionEstimate, Result, RigEstimate
     from ..calibration import FieldDifference
     from ..core.data import Array
 
@@ -31,6 +31,7 @@ __all__ = [
     "say_model",
     "say_parameters",
     "say_refraction",
+    "say_rig",
 ]
 
 
@@ -149,6 +150,24 @@ def say_refraction(found: RefractionEstimate) -> None:
         say(
             f"  {name:<{width}}  {value}: {differs} from {found.given[k]:g} (p = {test.p:.2g}); "
             f"correlation {r:+.2f} with {partner}\n"
+        )
+
+
+def say_rig(found: RigEstimate) -> None:
+    """Print the relative orientations of the cameras of a rig."""
+    import numpy as np
+
+    from ..core.numbers import measured
+
+    for k, (camera, reference) in enumerate(zip(found.cameras, found.references, strict=True)):
+        base = ", ".join(
+            measured(float(v), float(s)) for v, s in zip(found.base[k], found.sigma[k, 3:], strict=True)
+        )
+        turn = float(np.rad2deg(found.sigma[k, :3].max()))
+        say(
+            f"camera {camera} from {reference}: base {base} {found.unit}, length "
+            f"{measured(float(found.length[k]), float(found.length_sigma[k]), found.unit)}; turned by "
+            f"{measured(float(found.angles[k]), turn, 'deg')}\n"
         )
 
 

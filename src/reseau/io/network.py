@@ -205,7 +205,10 @@ class _Columns(Strict):
 
 
 class ImageColumns(_Columns):
-    """Images: the camera of each, and its pose where it is known."""
+    """Images: the camera of each, and its pose where it is known.
+
+    Images with the same `exposure` were taken at once, by cameras that are fixed to each other (a rig).
+    """
 
     id: tuple[str, ...]
     camera: tuple[str, ...]
@@ -213,6 +216,7 @@ class ImageColumns(_Columns):
     rotation: tuple[Triple | None, ...]
     file: tuple[str | None, ...] | None = None
     group: tuple[str | None, ...] | None = None
+    exposure: tuple[str | None, ...] | None = None
 
 
 class PointColumns(_Columns):

@@ -66,6 +66,7 @@ def bundle_report(
         dropped=dropped_table(result),
         cameras=cameras,
         refraction=_refraction(result),
+        rig=_rig(result),
         more_cameras=max(0, len(_shown(result)) - _CAMERAS),
         images=images_table(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
@@ -178,6 +179,31 @@ def _refraction(result: Result) -> list[dict[str, Any]]:
             found.partners, strict=True,
         )
     ]  # fmt: skip
+
+
+def _rig(result: Result) -> list[dict[str, Any]]:
+    """Rows of the table of the cameras of a rig."""
+    found = result.rig
+    if found is None:
+        return []
+    rows = []
+    for k, (camera, reference) in enumerate(zip(found.cameras, found.references, strict=True)):
+        base = zip("XYZ", found.base[k], found.sigma[k, 3:], strict=True)
+        values = [(f"{axis} of its centre", value, sigma, found.unit) for axis, value, sigma in base]
+        values.append(("distance", found.length[k], found.length_sigma[k], found.unit))
+        turn = np.rad2deg(found.sigma[k, :3].max())
+        values.append(("rotation", found.angles[k], turn, "deg"))
+        rows += [
+            {
+                "camera": camera,
+                "reference": reference,
+                "name": name,
+                "estimate": power(float(value), float(sigma)),
+                "unit": unit_text(unit),
+            }
+            for name, value, sigma, unit in values
+        ]
+    return rows
 
 
 def _lens(result: Result, c: int) -> CameraMapping | None:

@@ -2,7 +2,7 @@
 
 from .checks import checks
 from .control_check import doubtful_control
-from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate
+from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate, RigEstimate
 from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
@@ -16,6 +16,7 @@ __all__ = [
     "PointEstimates",
     "RefractionEstimate",
     "Result",
+    "RigEstimate",
     "by_place",
     "by_point",
     "camera_mapping",

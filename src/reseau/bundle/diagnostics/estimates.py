@@ -11,7 +11,7 @@ from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.numbers import measured
 
-__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates", "RefractionEstimate"]
+__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates", "RefractionEstimate", "RigEstimate"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -101,6 +101,71 @@ class RefractionEstimate(CameraEstimate):
     given: Array
     tests: tuple[CoefficientTest, ...]
     partners: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RigEstimate(Display):
+    """Relative orientations of the cameras of a rig.
+
+    Parameters
+    ----------
+    cameras, references : tuple of str (k,)
+        Cameras, and for each the camera whose axes are those of the rig.
+    rotation : ndarray (k, 3, 3)
+        From the axes of the rig to those of the camera.
+    base : ndarray (k, 3)
+        Projection centres in the axes of the rig, in the unit of object space.
+    cov : ndarray (k, 6, 6)
+        Covariances of a small rotation about the axes of the camera (rad) and of the base.
+    unit : str
+        Unit of object space.
+
+    Examples
+    --------
+    >>> base, cov = np.array([[120.0, 0.0, 5.0]]), 1e-4 * np.eye(6)[None]
+    >>> rig = RigEstimate(("right",), ("left",), np.eye(3)[None], base, cov, "mm")
+    >>> rig
+    <RigEstimate: right from left: base 120.104 ± 0.010 mm>
+    >>> rig.length.round(3), rig.length_sigma
+    (array([120.104]), array([0.01]))
+    """
+
+    cameras: tuple[str, ...]
+    references: tuple[str, ...]
+    rotation: Array
+    base: Array
+    cov: Array
+    unit: str
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (k, 6) of rotation (rad) and base."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2)))
+
+    @property
+    def length(self) -> Array:
+        """Lengths (k,) of the bases."""
+        return np.asarray(np.linalg.norm(self.base, axis=1))
+
+    @property
+    def length_sigma(self) -> Array:
+        """Standard deviations (k,) of the lengths."""
+        along = self.base / self.length[:, None]
+        return np.asarray(np.sqrt(np.einsum("ki,kij,kj->k", along, self.cov[:, 3:, 3:], along)))
+
+    @property
+    def angles(self) -> Array:
+        """Angles (k,) of the rotations, degrees."""
+        cosine = (np.trace(self.rotation, axis1=1, axis2=2) - 1) / 2
+        return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{camera} from {reference}", f"base {measured(float(length), float(sigma), self.unit)}")
+            for camera, reference, length, sigma in zip(
+                self.cameras, self.references, self.length, self.length_sigma, strict=True
+            )
+        ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -21,7 +21,8 @@ from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ...optics.refraction import RefractedRays
 from ..network import Network
 from ..solver import BundleFit
-from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate
+from ..solver.rig_constraints import RigConstraints
+from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate, RigEstimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -250,6 +251,21 @@ class Result(Display):
             tuple(bent.unit_of(name, self.network.unit) for name in names), given, tests,
             self._partners(np.arange(at.start, at.stop)),
         )  # fmt: skip
+
+    @cached_property
+    def rig(self) -> RigEstimate | None:
+        """Relative orientations of the cameras of a rig; None without one."""
+        linear, rig, places = self.fit.linear, self.network.rig, self.fit.values.rig
+        constraints = linear.system.constraints
+        if rig is None or places is None or not isinstance(constraints, RigConstraints):
+            return None
+        at, names = constraints.cameras, [camera.id for camera in self.network.cameras]
+        t = constraints.matrix(places, linear.values.rotation, linear.values.x0)
+        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced) * self.fit.variance
+        each = np.arange(len(at))
+        cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
+        cov = cofactors[each, :, each]
+        return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
 
     def _partners(self, columns: Rows) -> tuple[tuple[str, float], ...]:
         """Most correlated other reduced unknown of each of these columns, and the correlation."""

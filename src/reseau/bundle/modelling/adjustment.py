@@ -108,6 +108,9 @@ def _begun(network: Network, options: Options, *, settle: bool) -> tuple[BundleP
     if network.stage is not None:
         moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
+    if network.rig is not None:
+        places, rotation, x0 = network.rig.approximate(start.rotation, start.x0)
+        start = replace(start, rotation=rotation, x0=x0, rig=places)
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )

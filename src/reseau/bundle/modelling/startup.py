@@ -111,7 +111,7 @@ def retried(problem: BundleProblem) -> BundleProblem | None:
     """
     network, start = problem.network, problem.start
     posed = finite(start.x0)
-    if network.stage is not None or not posed.any():
+    if network.stage is not None or network.rig is not None or not posed.any():
         return None
     size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
     median = _medians(network, size)

@@ -3,6 +3,7 @@
 from .calibrated import calibrated_camera, film_camera
 from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network
+from .rig import Rig
 from .settings import network_document, with_control, with_datum, with_parameters, with_sigma
 from .stage import Stage
 
@@ -11,6 +12,7 @@ __all__ = [
     "Camera",
     "ControlPoints",
     "Network",
+    "Rig",
     "Stage",
     "calibrated_camera",
     "example_network",

@@ -17,6 +17,7 @@ from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, N
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
 from ...optics.cameras import distortion_names
 from ...optics.refraction import Refraction
+from .rig import Rig
 from .stage import Stage
 
 __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
@@ -300,6 +301,8 @@ class Network(Display):
     stage : Stage, optional
         Stage that moved the field between images with the same exterior orientation; requires the datum
         ``control``.
+    rig : Rig, optional
+        Images that were taken at once by cameras fixed to each other; cannot be combined with a stage.
     refraction : Refraction, optional
         Windows and media that the rays pass; without it, and for images without a path, all is in air.
 
@@ -335,6 +338,7 @@ class Network(Display):
     unit: str = "mm"
     datum_chosen: bool = False
     stage: Stage | None = None
+    rig: Rig | None = None
     refraction: Refraction | None = None
 
     def __post_init__(self) -> None:
@@ -353,6 +357,12 @@ class Network(Display):
             raise UsageError("columns differ in length", where="Network")
         if self.stage is not None and (self.datum != "control" or len(self.stage.pose) != m):
             raise UsageError("requires the datum `control` and a pose for each image", where="Network.stage")
+        if self.rig is not None and not np.array_equal(self.rig.camera, self.camera_of):
+            raise UsageError(
+                "requires an exposure, or −1, for each image of each camera", where="Network.rig"
+            )
+        if self.rig is not None and self.stage is not None:
+            raise UsageError("cannot be combined with a stage", where="Network.rig")
         if self.refraction is not None:
             self._check_refraction(self.refraction)
 
@@ -424,6 +434,7 @@ class Network(Display):
             files=images.file or (None,) * len(images.id),
             unit=document.unit,
             datum_chosen=document.datum_points is not None,
+            rig=_rig(images.exposure, _rows(images.camera, camera_row)),
             refraction=None if document.refraction is None
             else document.refraction.refraction(images.id, images.camera),
         )  # fmt: skip
@@ -588,6 +599,14 @@ def _camera(entry: CameraEntry | CalibratedCameraEntry, calibrated: Mapping[str,
             do="read the file with reseau.exchange.read_network",
         )
     return Camera.from_entry(entry)
+
+
+def _rig(exposures: Sequence[str | None] | None, camera_of: Rows) -> Rig | None:
+    """Rig of images with exposures, by name."""
+    if exposures is None or not any(exposures):
+        return None
+    names = {name: k for k, name in enumerate(dict.fromkeys(name for name in exposures if name))}
+    return Rig(camera_of, np.array([names[name] if name else -1 for name in exposures], dtype=np.intp))
 
 
 def _rows(names: Sequence[str], rows: dict[str, int]) -> Rows:

@@ -221,6 +221,8 @@ def network_document(network: Network) -> Network1:
             rotation=_triples(network.rotation),
             file=network.files if any(network.files) else None,
             group=network.groups if any(network.groups) else None,
+            exposure=None if network.rig is None
+            else tuple(str(e) if e >= 0 else None for e in network.rig.exposure.tolist()),
         ),
         points=PointColumns(
             id=network.points,

@@ -43,6 +43,7 @@ class Similarity(NamedTuple):
             x0=self.scale * values.x0 @ self.turn.T + self.shift,
             xyz=self.scale * values.xyz @ self.turn.T + self.shift,
             stage=None if values.stage is None else values.stage.turned(self.turn),
+            rig=None if values.rig is None else values.rig.scaled(self.scale),
         )
 
     def about(self, origin: Array) -> Similarity:

@@ -19,6 +19,7 @@ from .compiled import in_parallel
 from .datum import Freedom, held_for
 from .normal import SEGMENTS, posterior
 from .rank import PARALLEL
+from .rig_constraints import RigConstraints
 from .stage_constraints import StageConstraints
 from .system import Linear, Normal
 
@@ -181,7 +182,8 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     still = system.unknowns.kept[ends, None] + np.arange(3)
     held[still[system.movable[ends] == 0]] = True
     if system.constraints is not None:
-        z, points, seen, others = _with_stage(linear, normal, system.constraints, held, taking_part)
+        inner = freedom if datum is not None and freedom.defect else None
+        z, points, seen, others = _constrained(linear, normal, system.constraints, held, taking_part, inner)
     else:
         if datum is not None:
             held[held_for(freedom, system.unknowns, diagonal)] = True
@@ -233,24 +235,32 @@ def _marginal(
     return found
 
 
-def _with_stage(
-    linear: Linear, normal: Normal, stage: StageConstraints, columns: Mask, taking_part: Mask
+def _constrained(
+    linear: Linear,
+    normal: Normal,
+    constraints: StageConstraints | RigConstraints,
+    columns: Mask,
+    taking_part: Mask,
+    inner: Freedom | None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Compute the same cofactors with a stage.
+    """Compute the same cofactors with a stage or a rig, of which `inner` is the freedom without a datum.
 
     Raises
     ------
     Singular
         When the observations do not determine the unknowns.
     """
-    held = stage.held(columns)
-    own = normal.constrained(stage, held)
+    held = constraints.held(columns)
+    if isinstance(constraints, RigConstraints) and inner is not None:
+        free = normal.constrained(constraints)
+        held[constraints.held_for(inner, free.back, np.diag(free.matrix))] = True
+    own = normal.constrained(constraints, held)
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
     found = _with_inverse(linear, normal, own.back @ q @ own.back.T, columns, taking_part)
-    slopes = normal.stage_slopes(stage)
-    found[3][-len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
+    slopes = normal.stage_slopes(constraints)
+    found[3][len(found[3]) - len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
     if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _STAGED:
         raise Singular

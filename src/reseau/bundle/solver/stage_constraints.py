@@ -19,7 +19,7 @@ from ..network import Stage
 from ..network.stage import StageValues, perpendicular
 from .unknowns import Unknowns
 
-__all__ = ["Constrained", "StageConstraints"]
+__all__ = ["Constrained", "StageConstraints", "eliminated"]
 
 
 class Constrained(NamedTuple):
@@ -33,6 +33,15 @@ class Constrained(NamedTuple):
     matrix: Array
     own: Array
     gradient: Array
+
+
+def eliminated(t: Array, matrix: Array, own: Array, gradient: Array, held: Mask | None) -> Constrained:
+    """Normal equations of independent unknowns with T (u, size), some of them held (size,)."""
+    if held is not None:
+        matrix[held], matrix[:, held] = 0.0, 0.0
+        matrix[held, held] = 1.0
+        gradient = np.where(held, 0.0, gradient)
+    return Constrained(t, matrix, own, gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +127,7 @@ class StageConstraints:
         """
         assert moved is not None
         t, own = self.matrix(moved), slopes.T @ misfits
-        matrix = t.T @ s @ t + slopes.T @ slopes
-        if held is not None:
-            matrix[held], matrix[:, held] = 0.0, 0.0
-            matrix[held, held] = 1.0
-        return Constrained(t, matrix, own, t.T @ gradient + own)
+        return eliminated(t, t.T @ s @ t + slopes.T @ slopes, own, t.T @ gradient + own, held)
 
     def slopes(self, moved: StageValues | None, nominal: Array, root: Array) -> Array:
         """Derivatives (a + 2, size) of readings and axis angles, times roots (a + 2,) of weights."""

@@ -16,7 +16,8 @@ from .compiled import chunks_of, in_parallel
 from .imaging import Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
 from .observations import OtherObservations
-from .stage_constraints import Constrained, StageConstraints
+from .rig_constraints import RigConstraints
+from .stage_constraints import Constrained, StageConstraints, eliminated
 from .unknowns import Unknowns
 from .values import Correction, Values
 
@@ -63,7 +64,11 @@ class System:
         self.sigma_root = np.sqrt(factors) / others.sigma
         self.movable = np.where(network.held, 0.0, 1.0)
         self.pattern = unknowns.pattern
-        self.constraints = None if network.stage is None else StageConstraints(unknowns, network.stage)
+        self.constraints: StageConstraints | RigConstraints | None = None
+        if network.stage is not None:
+            self.constraints = StageConstraints(unknowns, network.stage)
+        elif network.rig is not None:
+            self.constraints = RigConstraints(unknowns, network.rig)
         self.chunks = chunks_of(unknowns.first)
         self.imaging = Imaging(network, unknowns.extra_names, origin)
 
@@ -330,15 +335,26 @@ class Normal:
         """
         return Arrow.factorise(self.sums.band, self.sums.border)
 
-    def constrained(self, stage: StageConstraints, held: Mask | None = None) -> Constrained:
+    def constrained(
+        self, constraints: StageConstraints | RigConstraints, held: Mask | None = None
+    ) -> Constrained:
         """Return the normal equations of the independent unknowns, of which some (size,) may be held."""
-        linear, slopes = self.linear, self.stage_slopes(stage)
-        matrix, last = full(self.sums.band, self.sums.border), linear.other_misfits[-len(slopes) :]
-        return stage.constrained(linear.values.stage, matrix, self.sums.reduced, slopes, last, held)
+        linear, values = self.linear, self.linear.values
+        matrix = full(self.sums.band, self.sums.border)
+        if isinstance(constraints, RigConstraints):
+            assert values.rig is not None
+            t = constraints.matrix(values.rig, values.rotation, values.x0)
+            own = np.zeros(constraints.size)
+            return eliminated(t, t.T @ matrix @ t, own, t.T @ self.sums.reduced, held)
+        slopes = self.stage_slopes(constraints)
+        last = linear.other_misfits[-len(slopes) :]
+        return constraints.constrained(values.stage, matrix, self.sums.reduced, slopes, last, held)
 
-    def stage_slopes(self, stage: StageConstraints) -> Array:
+    def stage_slopes(self, stage: StageConstraints | RigConstraints) -> Array:
         """Weighted derivatives of stage readings and axis, the last of the other observations."""
         system, others = self.linear.system, self.linear.system.others
+        if isinstance(stage, RigConstraints):
+            return np.zeros((0, stage.size))
         root = system.sigma_root[others.readings.start :]
         return stage.slopes(self.linear.values.stage, others.across, root)
 
@@ -356,7 +372,10 @@ class Normal:
             gradient = self.sums.gradient @ y
             y = self.in_parameters(y)
         else:
-            own = self.constrained(constraints)
+            held = None
+            if isinstance(constraints, RigConstraints) and self.linear.system.held.any():
+                held = constraints.held(self.linear.system.held)
+            own = self.constrained(constraints, held)
             q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
             y, by_stage = own.back @ q, float(own.own @ q)
             gradient = self.sums.gradient @ y

@@ -8,8 +8,10 @@ import numpy as np
 
 from ...core.data import Array, Rows
 from ...optics.poses import rotation_matrix
+from ..network.rig import RigValues
 from ..network.stage import StageValues
 from .imaging import Orientation
+from .rig_constraints import RigConstraints
 from .stage_constraints import StageConstraints
 from .unknowns import Unknowns
 
@@ -31,7 +33,7 @@ class Correction:
     length : float
         Length of the correction, in the metric of the damping.
     independent : ndarray, optional
-        Correction of the independent unknowns, with a stage.
+        Correction of the independent unknowns, with a stage or a rig.
     """
 
     reduced: Array
@@ -78,6 +80,8 @@ class Values:
         Readings and axis of a stage.
     refraction : ndarray (r,)
         Parameters of all windows and media.
+    rig : RigValues, optional
+        Places of the cameras on a rig.
     """
 
     rotation: Array
@@ -87,6 +91,7 @@ class Values:
     extra: Array
     stage: StageValues | None = None
     refraction: Array = field(default_factory=lambda: np.zeros(0))
+    rig: RigValues | None = None
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
@@ -116,7 +121,10 @@ class Values:
         return replace(self, xyz=xyz)
 
     def moved(
-        self, unknowns: Unknowns, step: Correction, constraints: StageConstraints | None = None
+        self,
+        unknowns: Unknowns,
+        step: Correction,
+        constraints: StageConstraints | RigConstraints | None = None,
     ) -> Values:
         """Return the values after a correction; rotations are about the camera axes."""
         y = step.reduced
@@ -134,9 +142,15 @@ class Values:
             extra[e, :count] += y[unknowns.extra[e] : unknowns.extra[e] + count]
         kept = np.flatnonzero(unknowns.kept >= 0)
         xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
-        x0, stage = self.x0 + pose[:, 3:], self.stage
-        if constraints is not None and stage is not None and step.independent is not None:
+        x0, stage, rig = self.x0 + pose[:, 3:], self.stage, self.rig
+        if isinstance(constraints, StageConstraints) and stage is not None and step.independent is not None:
             stage, x0 = constraints.stepped(stage, self.x0, y, step.independent)
+        if isinstance(constraints, RigConstraints) and rig is not None and step.independent is not None:
+            rig, turned, moved = constraints.stepped(rig, self.rotation, self.x0, step.independent)
+            rotation[constraints.images], x0[constraints.images] = (
+                turned[constraints.images],
+                moved[constraints.images],
+            )
         refraction = self.refraction.copy()
         refraction[unknowns.refracting] += y[unknowns.refraction_columns]
-        return Values(rotation, x0, xyz, cameras, extra, stage, refraction)
+        return Values(rotation, x0, xyz, cameras, extra, stage, refraction, rig)

@@ -1,0 +1,147 @@
+"""Cameras that are fixed to each other: a rig.
+
+Each exposure has one exterior orientation R_e, X_e (from object space to the rig). A camera has its place on
+the rig, a rotation R_c and a projection centre b_c in the axes of the rig, so that its image is taken from
+
+    R = R_c R_e,    X0 = X_e + R_eᵀ b_c .
+
+The rig has the axes of its first camera; where cameras never share an exposure with it, directly or by
+others, they form a rig of their own. The adjustment is described in
+:mod:`reseau.bundle.solver.rig_constraints`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from ...core.data import Array, Mask, Rows
+from ...core.errors import UsageError
+
+__all__ = ["Rig", "RigValues"]
+
+
+class RigValues(NamedTuple):
+    """Places of the cameras on a rig: rotations (c, 3, 3) and projection centres (c, 3) in its axes."""
+
+    rotation: Array
+    base: Array
+
+    def scaled(self, scale: float) -> RigValues:
+        """Return the values in another scale of object space."""
+        return RigValues(self.rotation, scale * self.base)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Which images were taken at once by cameras that are fixed to each other.
+
+    Parameters
+    ----------
+    camera : ndarray of int (m,)
+        Number of the camera of each image.
+    exposure : ndarray of int (m,)
+        Number of the exposure of each image; −1 for images that were not taken on the rig.
+
+    Raises
+    ------
+    UsageError
+        When a camera has two images of an exposure.
+
+    Examples
+    --------
+    >>> rig = Rig(np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]))
+    >>> rig.references(np.ones(4, dtype=bool))
+    array([0, 0])
+    """
+
+    camera: Rows
+    exposure: Rows
+
+    def __post_init__(self) -> None:
+        if self.camera.shape != self.exposure.shape:
+            raise UsageError("requires a camera and an exposure for every image", where="Rig")
+        on = self.exposure >= 0
+        both = np.stack([self.camera[on], self.exposure[on]], axis=1)
+        if len(np.unique(both, axis=0)) < len(both):
+            raise UsageError("a camera has two images of one exposure", where="rig")
+
+    def references(self, used: Mask) -> Rows:
+        """Camera (c,) whose axes the place of each refers to: the first that exposures lead to.
+
+        Parameters
+        ----------
+        used : ndarray of bool (m,)
+            Images that count.
+        """
+        _, label = connected_components(self._shared(used), directed=False)
+        first = [int(np.flatnonzero(label == own)[0]) for own in label]
+        return np.array(first, dtype=np.intp)
+
+    def _shared(self, known: Mask) -> coo_array:
+        """Number of exposures (c, c) that two cameras have in common, of known images."""
+        count = int(self.camera.max(initial=-1)) + 1
+        on = np.flatnonzero((self.exposure >= 0) & known)
+        seen = np.zeros((count, int(self.exposure.max(initial=-1)) + 1))
+        seen[self.camera[on], self.exposure[on]] = 1.0
+        return coo_array(seen @ seen.T)
+
+    def approximate(self, rotation: Array, x0: Array) -> tuple[RigValues, Array, Array]:
+        """Approximate values from those of the images (m, 3, 3) and (m, 3), NaN where unknown.
+
+        The relative orientation of two cameras is the median one of the exposures they share. An exposure
+        takes its orientation from its images. Images that were not oriented follow from the others.
+        """
+        known = np.isfinite(x0).all(axis=1) & (self.exposure >= 0)
+        count = int(self.camera.max()) + 1
+        values = RigValues(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
+        shared, reference = self._shared(known), self.references(known)
+        for first in np.unique(reference):
+            order, before = breadth_first_order(shared, int(first), directed=False)
+            for camera in order[1:]:
+                turn, base = self._relative(int(before[camera]), int(camera), known, rotation, x0)
+                at = int(before[camera])
+                values.rotation[camera] = turn @ values.rotation[at]
+                values.base[camera] = values.base[at] + values.rotation[at].T @ base
+        rotation, x0 = rotation.copy(), x0.copy()
+        for exposure in np.unique(self.exposure[self.exposure >= 0]):
+            rows = np.flatnonzero(self.exposure == exposure)
+            for own in np.unique(reference[self.camera[rows]]):
+                those = rows[reference[self.camera[rows]] == own]
+                seen = those[known[those]]
+                if not len(seen):
+                    continue
+                of_rig, centre = self.of_exposure(values, rotation[seen], x0[seen], self.camera[seen])
+                rotation[those], x0[those] = self.images(values, of_rig, centre, self.camera[those])
+        return values, rotation, x0
+
+    def _relative(self, one: int, other: int, known: Mask, rotation: Array, x0: Array) -> tuple[Array, Array]:
+        """Rotation (3, 3) and centre (3,) of a camera in the axes of another."""
+        rows = [np.flatnonzero((self.camera == camera) & known) for camera in (one, other)]
+        _, a, b = np.intersect1d(self.exposure[rows[0]], self.exposure[rows[1]], return_indices=True)
+        first, second = rows[0][a], rows[1][b]
+        turn = rotation[second] @ np.swapaxes(rotation[first], 1, 2)
+        base = np.einsum("nij,nj->ni", rotation[first], x0[second] - x0[first])
+        return _mean_rotation(np.median(turn, axis=0)), np.asarray(np.median(base, axis=0))
+
+    @staticmethod
+    def of_exposure(values: RigValues, rotation: Array, x0: Array, camera: Rows) -> tuple[Array, Array]:
+        """Orientation (3, 3) and (3,) of an exposure from images (k, 3, 3) and (k, 3) of it: their mean."""
+        turn = _mean_rotation((np.swapaxes(values.rotation[camera], 1, 2) @ rotation).mean(axis=0))
+        return turn, np.asarray((x0 - values.base[camera] @ turn).mean(axis=0))
+
+    @staticmethod
+    def images(values: RigValues, turn: Array, at: Array, camera: Rows) -> tuple[Array, Array]:
+        """Rotations (k, 3, 3) and centres (k, 3) of images of exposures (…, 3, 3) and (…, 3)."""
+        base = (values.base[camera][:, None, :] @ turn)[:, 0]
+        return np.asarray(values.rotation[camera] @ turn), np.asarray(at + base)
+
+
+def _mean_rotation(matrix: Array) -> Array:
+    """Rotation next to a mean of rotations."""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)

@@ -1,0 +1,187 @@
+"""Normal equations with a rig: images of an exposure are taken by cameras that are fixed to each other.
+
+With small rotations ω about the axes of a camera (or of the rig), an image R = R_c R_e, X0 = X_e + R_eᵀ b_c
+has the corrections
+
+    ω = ω_c + R_c ω_e,    dX0 = dX_e + R_eᵀ ([b_c]× ω_e + db_c),
+
+linear in the independent unknowns q of exposures and cameras: y = T q, and the normal equations that have
+been formed with a separate orientation for every image become Tᵀ S T q = −Tᵀ s, as with a stage
+(:mod:`reseau.bundle.solver.stage_constraints`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from ...core.data import Array, Mask, Rows
+from ...optics.poses import rotation_matrix
+from ..network.rig import Rig, RigValues
+from .unknowns import Unknowns
+
+if TYPE_CHECKING:
+    from .datum import Freedom
+
+__all__ = ["RigConstraints"]
+
+
+@dataclass(frozen=True, eq=False)
+class RigConstraints:
+    """Reduced unknowns of images as functions of the independent unknowns of exposures and cameras.
+
+    The independent unknowns are, in this order: all that belong to no image of the rig, six for each
+    exposure, and six for each camera that is not a reference.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+        Columns of the reduced normal equations, with an orientation for each image.
+    rig : Rig
+        The rig.
+    """
+
+    unknowns: Unknowns
+    rig: Rig
+
+    @cached_property
+    def images(self) -> Rows:
+        """Adjusted images (a,) of the rig."""
+        return np.flatnonzero((self.unknowns.pose >= 0) & (self.rig.exposure >= 0)).astype(np.intp)
+
+    @cached_property
+    def others(self) -> Rows:
+        """Reduced unknowns that belong to no image of the rig."""
+        own = np.ones(self.unknowns.size, dtype=bool)
+        own[self._rows] = False
+        return np.flatnonzero(own).astype(np.intp)
+
+    @cached_property
+    def _rows(self) -> Rows:
+        """Reduced unknowns (a, 6) of the images."""
+        return np.asarray(self.unknowns.pose[self.images, None] + np.arange(6), dtype=np.intp)
+
+    @cached_property
+    def _numbers(self) -> tuple[Rows, Rows]:
+        """Number of the exposure (a,) of each image, and the first image of each exposure.
+
+        Cameras that are not connected with each other have exposures of their own.
+        """
+        reference = self.references[self.rig.camera[self.images]]
+        key = np.stack([self.rig.exposure[self.images], reference], axis=1)
+        _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        return np.asarray(number.ravel(), dtype=np.intp), np.asarray(first, dtype=np.intp)
+
+    @cached_property
+    def references(self) -> Rows:
+        """Camera (c,) whose axes the place of each refers to."""
+        return self.rig.references(self.unknowns.pose >= 0)
+
+    @cached_property
+    def cameras(self) -> Rows:
+        """Cameras with unknown places: those of adjusted images that are no reference."""
+        used = np.unique(self.rig.camera[self.images])
+        return np.asarray(used[self.references[used] != used], dtype=np.intp)
+
+    @cached_property
+    def _camera_column(self) -> Rows:
+        """First column of the place of the camera of each image (a,); −1 for a reference."""
+        number = np.full(int(self.rig.camera.max()) + 1, -1, dtype=np.intp)
+        exposures = len(self._numbers[1])
+        number[self.cameras] = len(self.others) + 6 * (exposures + np.arange(len(self.cameras)))
+        return np.asarray(number[self.rig.camera[self.images]], dtype=np.intp)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of independent unknowns."""
+        return len(self.others) + 6 * (len(self._numbers[1]) + len(self.cameras))
+
+    def _exposures(self, places: RigValues, rotation: Array, x0: Array) -> tuple[Array, Array]:
+        """Orientations (e, 3, 3) and (e, 3) of the exposures, from their first images."""
+        first = self.images[self._numbers[1]]
+        camera = self.rig.camera[first]
+        turn = np.swapaxes(places.rotation[camera], 1, 2) @ rotation[first]
+        base = (places.base[camera][:, None, :] @ turn)[:, 0]
+        return np.asarray(turn), np.asarray(x0[first] - base)
+
+    def matrix(self, places: RigValues, rotation: Array, x0: Array) -> Array:
+        """Compute T (u, size) at given values."""
+        t = np.zeros((self.unknowns.size, self.size))
+        t[self.others, np.arange(len(self.others))] = 1.0
+        turn, _ = self._exposures(places, rotation, x0)
+        number, camera = self._numbers[0], self.rig.camera[self.images]
+        back = np.swapaxes(turn[number], 1, 2)
+        at = len(self.others) + 6 * number[:, None] + np.arange(6)
+        row = self._rows
+        t[row[:, :3, None], at[:, None, :3]] = places.rotation[camera]
+        t[row[:, 3:, None], at[:, None, :3]] = back @ _cross(places.base[camera])
+        t[row[:, 3:], at[:, 3:]] = 1.0
+        moving = self._camera_column >= 0
+        at = self._camera_column[moving, None] + np.arange(6)
+        t[row[moving, :3], at[:, :3]] = 1.0
+        t[row[moving, 3:, None], at[:, None, 3:]] = back[moving]
+        return t
+
+    def stepped(
+        self, places: RigValues, rotation: Array, x0: Array, q: Array
+    ) -> tuple[RigValues, Array, Array]:
+        """Return places, rotations and projection centres (m, …) after a correction."""
+        turn, at = self._exposures(places, rotation, x0)
+        step = q[len(self.others) :].reshape(-1, 6)
+        count = len(turn)
+        by_base = step[count:, 3:]
+        new = RigValues(places.rotation.copy(), places.base.copy())
+        new.rotation[self.cameras] = rotation_matrix(step[count:, :3]) @ places.rotation[self.cameras]
+        new.base[self.cameras] += by_base
+        turn, at = rotation_matrix(step[:count, :3]) @ turn, at + step[:count, 3:]
+        rotation, x0 = rotation.copy(), x0.copy()
+        number, camera = self._numbers[0], self.rig.camera[self.images]
+        rotation[self.images], x0[self.images] = self.rig.images(new, turn[number], at[number], camera)
+        return new, rotation, x0
+
+    def held(self, columns: Mask) -> Mask:
+        """Return the held independent unknowns (size,) from the held reduced unknowns (u,)."""
+        held = np.zeros(self.size, dtype=bool)
+        held[: len(self.others)] = columns[self.others]
+        own = columns[self._rows]
+        at = len(self.others) + 6 * self._numbers[0][:, None] + np.arange(6)
+        held[at[own]] = True
+        return held
+
+    def held_for(self, freedom: Freedom, t: Array, diagonal: Array) -> Rows:
+        """Choose well-conditioned independent unknowns that fix the datum when they are held.
+
+        Parameters
+        ----------
+        freedom : Freedom
+            Changes of the reduced unknowns that no observation determines.
+        t : ndarray (u, size)
+            See :meth:`matrix`.
+        diagonal : ndarray (size,)
+            Diagonal of the normal equations, to compare unknowns with different units.
+        """
+        changes = np.linalg.lstsq(t, freedom.reduced, rcond=None)[0] * np.sqrt(diagonal)[:, None]
+        basis, _ = np.linalg.qr(changes / np.linalg.norm(changes, axis=0))
+        _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
+        return np.sort(order[: freedom.defect]).astype(np.intp)
+
+    def cofactors(self, t: Array, reduced: Array) -> Array:
+        """Cofactors (k, 6, k, 6) of the places of the cameras, from those of the reduced unknowns (u, u).
+
+        Rotations are about the axes of the camera, centres in those of the rig.
+        """
+        rows, count = self._rows.ravel(), len(self.cameras)
+        back = np.linalg.pinv(t[rows][:, len(self.others) :])
+        back = back[len(back) - 6 * count :]
+        return np.asarray(back @ reduced[np.ix_(rows, rows)] @ back.T).reshape(count, 6, count, 6)
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices (n, 3, 3) of the vector product with vectors (n, 3)."""
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
