@@ -125,7 +125,7 @@ class RigEstimate(Display):
     >>> base, cov = np.array([[120.0, 0.0, 5.0]]), 1e-4 * np.eye(6)[None]
     >>> rig = RigEstimate(("right",), ("left",), np.eye(3)[None], base, cov, "mm")
     >>> rig
-    <RigEstimate: right from left: base 120.104 ± 0.010 mm>
+    <RigEstimate: right from left base 120.104 ± 0.010 mm>
     >>> rig.length.round(3), rig.length_sigma
     (array([120.104]), array([0.01]))
     """
