@@ -253,7 +253,7 @@ def _constrained(
     held = constraints.held(columns)
     if isinstance(constraints, RigConstraints) and inner is not None:
         free = normal.constrained(constraints)
-        held[constraints.held_for(inner, free.back, np.diag(free.matrix))] = True
+        held[constraints.held_for(inner.reduced, free.back, np.diag(free.matrix))] = True
     own = normal.constrained(constraints, held)
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -23,9 +22,6 @@ from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
 from ..network.rig import Rig, RigValues
 from .unknowns import Unknowns
-
-if TYPE_CHECKING:
-    from .datum import Freedom
 
 __all__ = ["RigConstraints"]
 
@@ -152,22 +148,22 @@ class RigConstraints:
         held[at[own]] = True
         return held
 
-    def held_for(self, freedom: Freedom, t: Array, diagonal: Array) -> Rows:
+    def held_for(self, freedom: Array, t: Array, diagonal: Array) -> Rows:
         """Choose well-conditioned independent unknowns that fix the datum when they are held.
 
         Parameters
         ----------
-        freedom : Freedom
+        freedom : ndarray (u, d)
             Changes of the reduced unknowns that no observation determines.
         t : ndarray (u, size)
             See :meth:`matrix`.
         diagonal : ndarray (size,)
             Diagonal of the normal equations, to compare unknowns with different units.
         """
-        changes = np.linalg.lstsq(t, freedom.reduced, rcond=None)[0] * np.sqrt(diagonal)[:, None]
+        changes = np.linalg.lstsq(t, freedom, rcond=None)[0] * np.sqrt(diagonal)[:, None]
         basis, _ = np.linalg.qr(changes / np.linalg.norm(changes, axis=0))
         _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
-        return np.sort(order[: freedom.defect]).astype(np.intp)
+        return np.sort(order[: freedom.shape[1]]).astype(np.intp)
 
     def cofactors(self, t: Array, reduced: Array) -> Array:
         """Cofactors (k, 6, k, 6) of the places of the cameras, from those of the reduced unknowns (u, u).
