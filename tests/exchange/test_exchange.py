@@ -148,6 +148,6 @@ def test_a_truncated_export_is_refused(reference_data: Find, tmp_path: Path) -> 
     short.write_text("\n".join(lines[:9]))
     with pytest.raises(FormatError):
         read_foreign(short)
-    short.write_text("\n".join([*lines[:300], "  0  nothing 1.0 2.0 0.1 0.1"]))
+    short.write_text("\n".join([*lines[:300], "  99  1  1.0 2.0 0.1 0.1"]))
     with pytest.raises(FormatError, match="line 301"):
         read_foreign(short)

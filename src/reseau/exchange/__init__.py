@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .bal import read_bal
+from .bundler import read_bundler
 from .codev import read_codev
 from .colmap import read_colmap
 from .control import read_control
@@ -18,6 +19,7 @@ __all__ = [
     "calibration_files",
     "metashape_script",
     "read_bal",
+    "read_bundler",
     "read_codev",
     "read_colmap",
     "read_control",

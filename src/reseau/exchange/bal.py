@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import Camera, Network
+from ..core.data import Array, Rows
 from ..core.errors import FormatError
 from ..io import read_text
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from .lines import network_of
 
-__all__ = ["read_bal"]
+__all__ = ["centred_network", "read_bal"]
 
 _VIEW = np.diag([1.0, -1.0, -1.0])
 
@@ -63,19 +64,50 @@ def read_bal(path: Path | str) -> Network:
     image, point = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
     if not (0 <= image.min() <= image.max() < cameras and 0 <= point.min() <= point.max() < points):
         raise FormatError("has an observation of an undefined camera or point", where=path)
-    half = int(np.ceil(np.abs(table[:, 2:]).max()))
-    matrices = rotation_matrix(poses[:, :3])
-    entries = tuple(_camera(str(i), 2 * half + 1, *row) for i, row in enumerate(poses[:, 6:]))
-    xy = np.column_stack([table[:, 2] + half, half - table[:, 3]])
-    return network_of(
-        entries,
-        tuple(str(i) for i in range(cameras)),
-        np.arange(cameras),
-        matrix_to_vector(_VIEW @ matrices),
-        -np.einsum("mji,mj->mi", matrices, poses[:, 3:6]),
-        tuple(str(j) for j in range(points)),
+    return centred_network(
+        rotation_matrix(poses[:, :3]),
+        poses[:, 3:6],
+        poses[:, 6:],
         values[4 * observations + 9 * cameras :].reshape(-1, 3),
+        (image, point, table[:, 2:]),
+        tuple(str(i) for i in range(cameras)),
+    )
+
+
+def centred_network(
+    matrices: Array,
+    shifts: Array,
+    interior: Array,
+    xyz: Array,
+    seen: tuple[Rows, Rows, Array],
+    images: tuple[str, ...],
+    files: tuple[str | None, ...] | None = None,
+) -> Network:
+    """Network of cameras that look along −z, with image coordinates from the centre of the image, y up.
+
+    Parameters
+    ----------
+    matrices, shifts : ndarray (m, 3, 3), (m, 3)
+        From object space to the camera.
+    interior : ndarray (m, 3)
+        f, k1, k2 of each image, which has a camera of its own.
+    xyz : ndarray (p, 3)
+    seen : tuple
+        Rows of images and of points (n,), coordinates (n, 2).
+    """
+    image, point, table = seen
+    half = int(np.ceil(np.abs(table).max()))
+    xy = np.column_stack([table[:, 0] + half, half - table[:, 1]])
+    return network_of(
+        tuple(_camera(str(i), 2 * half + 1, *row) for i, row in enumerate(interior)),
+        images,
+        np.arange(len(images)),
+        matrix_to_vector(_VIEW @ matrices),
+        -np.einsum("mji,mj->mi", matrices, shifts),
+        tuple(str(j) for j in range(len(xyz))),
+        xyz,
         (image, point, xy, np.ones(xy.shape)),
+        files=files,
     )
 
 

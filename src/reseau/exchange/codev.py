@@ -12,7 +12,8 @@ import numpy as np
 
 from ..core.errors import FormatError
 from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
-from .prescribed import Opening, catalogue_glass, far, finite, kind_behind, read_bytes, with_stop, within
+from .lines import read_bytes
+from .prescribed import MOST_MB, Opening, catalogue_glass, far, finite, kind_behind, with_stop, within
 
 __all__ = ["read_codev"]
 
@@ -85,7 +86,7 @@ def read_codev(path: Path | str) -> Prescription:
     (5.0, array([1.    , 1.5168, 1.    , 1.    ]))
     """
     path = Path(path)
-    text = read_bytes(path).decode("latin-1")
+    text = read_bytes(path, MOST_MB).decode("latin-1")
     return within(path, lambda: _lens(list(_commands(text)), path.stem))
 
 

@@ -1,4 +1,4 @@
-"""COLMAP's text files: ``cameras.txt``, ``images.txt``, ``points3D.txt`` in one folder.
+"""COLMAP's files: ``cameras``, ``images`` and ``points3D`` in one folder, as text or binary.
 
 COLMAP's pixel coordinates have their origin at the corner of the top-left pixel, ours at its centre: half a
 pixel is subtracted. Poses are quaternions (scalar first) and translations, x_c = R X + t.
@@ -6,10 +6,13 @@ pixel is subtracted. Poses are quaternions (scalar first) and translations, x_c 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bundle import Camera, Network
 from ..core.data import Array
@@ -17,7 +20,7 @@ from ..core.errors import FormatError
 from ..io import read_text
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, numbers
+from .lines import network_of, numbers, read_bytes
 
 __all__ = ["read_colmap"]
 
@@ -28,12 +31,15 @@ _MODELS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+# Their numbers in binary files.
+_NUMBERS = dict(enumerate(_MODELS))
 
 
 def read_colmap(folder: Path | str) -> Network:
-    r"""Read a network from a folder of COLMAP's text files.
+    r"""Read a network from a folder of COLMAP's files, text (``.txt``) or binary (``.bin``).
 
     Principal distance and distortion are free and the principal point is held, as in COLMAP by default; image
     coordinates have a standard deviation of one pixel.
@@ -48,7 +54,7 @@ def read_colmap(folder: Path | str) -> Network:
     InputError
         When a file cannot be read.
     FormatError
-        When a line is invalid; the message names it.
+        When a line is invalid, which the message names, or a binary file ends too early.
 
     Examples
     --------
@@ -63,73 +69,147 @@ def read_colmap(folder: Path | str) -> Network:
     (('c', 'K1'), np.float64(-5.0), array([[320., 240.]]))
     """
     folder = Path(folder)
-    cameras: dict[str, Camera] = {}
-    path = folder / "cameras.txt"
-    for number, words in _lines(path):
-        camera = _camera(words, path, number)
-        cameras[camera.id] = camera
-    points: dict[str, list[float]] = {}
-    path = folder / "points3D.txt"
-    for number, words in _lines(path):
-        points[words[0]] = numbers(words[1:4], 3, path, number)
-    rows = {name: j for j, name in enumerate(points)}
-    cameras_of, poses, names = list[int](), list[list[float]](), list[str]()
-    seen = _Seen(folder / "images.txt", rows)
-    order = {name: c for c, name in enumerate(cameras)}
-    for number, words in _lines(seen.path, every=True):
-        if len(names) == len(seen.done):
-            if not words:
-                continue
-            if len(words) < 10 or words[8] not in order:
-                raise FormatError(f"line {number}: not an image of a camera in cameras.txt", where=seen.path)
-            poses.append(numbers(words[1:8], 7, seen.path, number))
-            cameras_of.append(order[words[8]])
-            names.append(" ".join(words[9:]))
-        else:
-            seen.take(words, number)
-    if not names or not points:
+    binary = not (folder / "cameras.txt").exists() and (folder / "cameras.bin").exists()
+    cameras, points, images = _binary(folder) if binary else _text(folder)
+    if not images or not points:
         raise FormatError("contains no images or no points", where=folder)
-    table = np.array(poses)
-    matrices = _rotations(table[:, :4])
-    if len(seen.image) == 0:
-        raise FormatError("contains no observations of points", where=seen.path)
-    xy = np.array(seen.xy) - 0.5
+    rows, order = {name: j for j, name in enumerate(points)}, {name: c for c, name in enumerate(cameras)}
+    image_of, point_of, xy = list[int](), list[int](), list[Array]()
+    for i, image in enumerate(images):
+        known = set[str]()
+        for at, name in zip(image.xy, image.points, strict=True):
+            # A point with two observations in an image is a wrong match: only the first is used; features
+            # without a point are not.
+            if name in rows and name not in known:
+                known.add(name)
+                image_of.append(i)
+                point_of.append(rows[name])
+                xy.append(at)
+    if not xy:
+        raise FormatError("contains no observations of points", where=folder)
+    table, names = np.array([image.pose for image in images]), tuple(image.name for image in images)
+    matrices, pixels = _rotations(table[:, :4]), np.array(xy) - 0.5
     return network_of(
         tuple(cameras.values()),
-        tuple(names),
-        np.array(cameras_of, dtype=np.intp),
+        names,
+        np.array([order[image.camera] for image in images], dtype=np.intp),
         matrix_to_vector(matrices),
         -np.einsum("mji,mj->mi", matrices, table[:, 4:]),
         tuple(points),
         np.array(list(points.values())),
-        (np.array(seen.image, np.intp), np.array(seen.point, np.intp), xy, np.ones(xy.shape)),
-        files=tuple(names),
+        (np.array(image_of, np.intp), np.array(point_of, np.intp), pixels, np.ones(pixels.shape)),
+        files=names,
     )
 
 
-class _Seen:
-    """Observations of the images, in order."""
+class _Image(NamedTuple):
+    """An image: quaternion and translation (7), and its features (k, 2) with the names of their points."""
 
-    def __init__(self, path: Path, rows: dict[str, int]) -> None:
-        self.path, self.rows = path, rows
-        self.image: list[int] = []
-        self.point: list[int] = []
-        self.xy: list[list[float]] = []
-        self.done: list[int] = []
+    name: str
+    camera: str
+    pose: Sequence[float]
+    xy: Array
+    points: Sequence[str]
 
-    def take(self, words: list[str], number: int) -> None:
-        """Read the observations of an image from its line; features without a point are ignored."""
-        if len(words) % 3:
-            raise FormatError(f"line {number}: not triples of x, y, point", where=self.path)
-        known: set[str] = set()
-        for x, y, name in zip(words[::3], words[1::3], words[2::3], strict=True):
-            # A point with two observations in an image is a wrong match: only the first is used.
-            if name in self.rows and name not in known:
-                known.add(name)
-                self.image.append(len(self.done))
-                self.point.append(self.rows[name])
-                self.xy.append(numbers([x, y], 2, self.path, number))
-        self.done.append(number)
+
+_Content = tuple[dict[str, Camera], dict[str, Sequence[float]], list[_Image]]
+
+
+def _text(folder: Path) -> _Content:
+    """Cameras and points by name, and images, of text files."""
+    cameras: dict[str, Camera] = {}
+    path = folder / "cameras.txt"
+    for number, words in _lines(path):
+        if len(words) < 4 or words[1] not in _MODELS:
+            known = ", ".join(_MODELS)
+            raise FormatError(f"line {number}: not a camera of a known model: {known}", where=path)
+        width, height, *values = numbers(words[2:], 2 + len(_MODELS[words[1]]), path, number)
+        cameras[words[0]] = _camera(words[0], words[1], (int(width), int(height)), values)
+    points: dict[str, Sequence[float]] = {}
+    path = folder / "points3D.txt"
+    for number, words in _lines(path):
+        points[words[0]] = numbers(words[1:4], 3, path, number)
+    images, path, head = list[_Image](), folder / "images.txt", list[str]()
+    for number, words in _lines(path, every=True):
+        if not head:
+            if words and (len(words) < 10 or words[8] not in cameras):
+                raise FormatError(f"line {number}: not an image of a camera in cameras.txt", where=path)
+            head, pose = words, numbers(words[1:8], 7, path, number) if words else []
+        else:
+            if len(words) % 3:
+                raise FormatError(f"line {number}: not triples of x, y, point", where=path)
+            xy = numbers([w for k, w in enumerate(words) if k % 3 < 2], len(words) // 3 * 2, path, number)
+            images.append(_Image(" ".join(head[9:]), head[8], pose, np.array(xy).reshape(-1, 2), words[2::3]))
+            head = []
+    return cameras, points, images
+
+
+def _binary(folder: Path) -> _Content:
+    """Cameras and points by name, and images, of binary files."""
+    file = _Binary(folder / "cameras.bin")
+    cameras: dict[str, Camera] = {}
+    for _ in range(file.count):
+        number, kind, width, height = file.take("<iiQQ")
+        model = _NUMBERS.get(kind)
+        if model is None:
+            known = ", ".join(_MODELS)
+            raise FormatError(
+                f"camera {number} has the model number {kind}; known are {known}", where=file.path
+            )
+        values = file.take(f"<{len(_MODELS[model])}d")
+        cameras[str(number)] = _camera(str(number), model, (width, height), values)
+    file = _Binary(folder / "points3D.bin")
+    points: dict[str, Sequence[float]] = {}
+    for _ in range(file.count):
+        number, *xyz = file.take("<Q3d")
+        points[str(number)] = xyz
+        (length,) = file.take("<3xdQ")[1:]
+        file.skip(8 * length)
+    file, images = _Binary(folder / "images.bin"), []
+    for _ in range(file.count):
+        _, *pose, camera = file.take("<i7di")
+        name = file.text()
+        (length,) = file.take("<Q")
+        table = file.table(length, np.dtype([("xy", "<f8", 2), ("point", "<i8")]))
+        if str(camera) not in cameras:
+            raise FormatError(f"image {name} has a camera that is not in cameras.bin", where=file.path)
+        images.append(_Image(name, str(camera), pose, table["xy"], [str(p) for p in table["point"].tolist()]))
+    return cameras, points, images
+
+
+class _Binary:
+    """A binary file, read from its beginning; `count` is its number of entries."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._content, self._at = path, read_bytes(path, 1000), 0
+        (self.count,) = self.take("<Q")
+
+    def _next(self, size: int) -> int:
+        start, self._at = self._at, self._at + size
+        if self._at > len(self._content):
+            raise FormatError("ends too early", where=self.path, do="write it again")
+        return start
+
+    def skip(self, size: int) -> None:
+        """Leave out bytes."""
+        self._next(size)
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        """Values in the form of :mod:`struct`."""
+        return struct.unpack_from(form, self._content, self._next(struct.calcsize(form)))
+
+    def table(self, length: int, kind: np.dtype[Any]) -> NDArray[Any]:
+        """Rows of a structured array."""
+        start = self._next(length * kind.itemsize)
+        return np.frombuffer(self._content, kind, length, start)
+
+    def text(self) -> str:
+        """Text up to a zero byte."""
+        end = self._content.find(b"\0", self._at)
+        if end < 0:
+            raise FormatError("ends within a name", where=self.path, do="write it again")
+        start = self._next(end + 1 - self._at)
+        return self._content[start:end].decode("utf-8", "replace")
 
 
 def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]]:
@@ -140,17 +220,11 @@ def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]
             yield number, words
 
 
-def _camera(words: list[str], path: Path, number: int) -> Camera:
-    if len(words) < 4 or words[1] not in _MODELS:
-        known = ", ".join(_MODELS)
-        raise FormatError(f"line {number}: not a camera of a known model: {known}", where=path)
-    name, model = words[:2]
-    names = _MODELS[model]
-    width, height, *values = numbers(words[2:], 2 + len(names), path, number)
+def _camera(name: str, model: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
+    names, (width, height) = _MODELS[model], size
     given = dict(zip(names, values, strict=True))
     for key in ("cx", "cy"):
         given[key] -= 0.5
-    size = int(width), int(height)
     if "f" in given:
         f = given["f"]
         # One principal distance for both axes: Brown's model with a pitch of one.
@@ -159,10 +233,11 @@ def _camera(words: list[str], path: Path, number: int) -> Camera:
         free = ("c", *(f"K{k}" for k in (1, 2) if f"k{k}" in given))
         all_values = np.array([*brown, *radial, *5 * [0.0]])
         return Camera(name, *size, (1.0, 1.0), "brown", all_values, free)
-    full = camera_model("opencv")
-    opencv = np.array([given.get(key, 0.0) for key in full.names])
+    kind = "fisheye" if model.endswith("FISHEYE") else "opencv"
+    full = camera_model(kind)
+    parameters = np.array([given.get(key, 0.0) for key in full.names])
     free = tuple(key for key in full.of_role("scale", "distortion") if key in given)
-    return Camera(name, *size, (1.0, 1.0), "opencv", opencv, free)
+    return Camera(name, *size, (1.0, 1.0), kind, parameters, free)
 
 
 def _rotations(quaternions: Array) -> Array:

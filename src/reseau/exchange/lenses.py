@@ -10,7 +10,8 @@ from ..core.errors import FormatError
 from ..io import LensDocument, LensSensor
 from ..optics.lenses import Prescription
 from .codev import read_codev
-from .prescribed import read_bytes
+from .lines import read_bytes
+from .prescribed import MOST_MB
 from .zemax import read_zemax
 
 __all__ = ["Lens", "read_lens"]
@@ -61,7 +62,7 @@ def read_lens(path: Path | str) -> Lens:
     ('singlet', None)
     """
     path = Path(path)
-    text = read_bytes(path)[:1_000_000].replace(b"\0", b"").decode("latin-1")
+    text = read_bytes(path, MOST_MB)[:1_000_000].replace(b"\0", b"").decode("latin-1")
     if re.search(r"^\s*schema\s*=", text, re.MULTILINE) or path.suffix.lower() == ".toml":
         document = LensDocument.read(path)
         return Lens(document.prescription(), document.sensor)

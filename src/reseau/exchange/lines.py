@@ -9,9 +9,9 @@ import numpy as np
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Rows
-from ..core.errors import FormatError
+from ..core.errors import FormatError, InputError
 
-__all__ = ["network_of", "numbers"]
+__all__ = ["network_of", "numbers", "read_bytes"]
 
 
 def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
@@ -30,6 +30,22 @@ def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[flo
         shown = " ".join(words)[:60]
         raise FormatError(f"line {line}: `{shown}` is not {count} numbers", where=path) from None
     return values
+
+
+def read_bytes(path: Path, most_mb: int) -> bytes:
+    """Content of a file of at most `most_mb` megabytes.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or is larger.
+    """
+    try:
+        if path.stat().st_size > most_mb * 1_000_000:
+            raise InputError(f"is larger than {most_mb} MB", where=path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def network_of(

@@ -12,6 +12,7 @@ from ..core.errors import FormatError, InputError, UsageError
 from ..io import FrameOrientation, read_text
 from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from .bal import read_bal
+from .bundler import is_bundler, read_bundler
 from .colmap import read_colmap
 from .photomodeler import read_photomodeler
 
@@ -126,7 +127,7 @@ def read_foreign(path: Path | str) -> Network:
     Parameters
     ----------
     path : Path or str
-        Text export of PhotoModeler, BAL file, or folder with COLMAP's text files.
+        Text export of PhotoModeler, BAL or Bundler file, or folder with COLMAP's text or binary files.
 
     Raises
     ------
@@ -151,6 +152,8 @@ def read_foreign(path: Path | str) -> Network:
         raise InputError("does not exist", where=path)
     lines = read_text(path).splitlines()
     first = lines[0].split() if lines else []
+    if lines and is_bundler(lines[0]):
+        return read_bundler(path)
     if len(first) == 3 and all(word.isdigit() for word in first):
         return read_bal(path)
     if len(lines) > 4 and len(lines[1].split()) == 4 and len(lines[3].split()) == 10:
@@ -158,5 +161,5 @@ def read_foreign(path: Path | str) -> Network:
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1, PhotoModeler, BAL or COLMAP",
+        do="use reseau-network/1, PhotoModeler, BAL, Bundler or COLMAP",
     )

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
 
-from ..core.errors import FormatError, InputError, UsageError
+from ..core.errors import FormatError, UsageError
 from ..optics.lenses import Medium, Prescription, Rays, Tracer, glass
 from ..optics.lenses.paraxial import Paraxial
 
-__all__ = ["Opening", "catalogue_glass", "far", "finite", "kind_behind", "read_bytes", "with_stop", "within"]
+__all__ = ["MOST_MB", "Opening", "catalogue_glass", "far", "finite", "kind_behind", "with_stop", "within"]
+
+MOST_MB = 10
+"""Largest size of a file with a prescription."""
 
 T = TypeVar("T")
 
@@ -135,19 +137,3 @@ def with_stop(lens: Prescription, opening: Opening) -> Prescription:
             raise UsageError("the ray at the edge of its beam does not reach the stop")
         radius = float(traced.xy[0, 1])
     return replace(lens, stop_radius=abs(radius))
-
-
-def read_bytes(path: Path) -> bytes:
-    """Content of a file of at most 10 MB.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or is larger.
-    """
-    try:
-        if path.stat().st_size > 10_000_000:
-            raise InputError("is larger than 10 MB, which no prescription is", where=path)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..core.errors import FormatError
 from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
-from .prescribed import Opening, catalogue_glass, far, finite, kind_behind, read_bytes, with_stop, within
+from .lines import read_bytes
+from .prescribed import MOST_MB, Opening, catalogue_glass, far, finite, kind_behind, with_stop, within
 
 __all__ = ["read_zemax"]
 
@@ -106,7 +107,7 @@ def read_zemax(path: Path | str) -> Prescription:
     >>> lens.stop_radius, lens.indices(587.5618).round(4)
     (5.0, array([1.    , 1.5168, 1.    , 1.    ]))
     """
-    header, listed = _parsed(_decoded(read_bytes(Path(path))))
+    header, listed = _parsed(_decoded(read_bytes(Path(path), MOST_MB)))
     if len(listed) < 3 or ("MODE" in header and header["MODE"][:1] != ["SEQ"]):
         raise FormatError("is not a sequential lens of Zemax", where=path)
     return within(path, lambda: _lens(header, listed, Path(path).stem))

@@ -85,7 +85,9 @@ class ReseauOptions:
     nominal_within_px : float, optional
         Uncertainty of the nominal positions; by default any smooth distortion and a shift of up to one pitch.
     mirrored : bool, optional
-        See :class:`reseau.measure.reseau.placement.GridOptions`.
+        Whether the design, with y up, and the image, with y down, have opposite handedness: True for a design
+        seen from the front, False for one seen from behind. By default the design tells, if it is not
+        symmetric.
     max_rotation_deg : float, optional
         Largest rotation of the design in the image, used without nominal positions. By default any; if a
         symmetric design fits in several ways, it is taken as upright, with a note.
