@@ -260,11 +260,10 @@ class Result(Display):
         if rig is None or places is None or not isinstance(constraints, RigConstraints):
             return None
         at, names = constraints.cameras, [camera.id for camera in self.network.cameras]
-        t = constraints.matrix(places, linear.values.rotation, linear.values.x0)
-        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced) * self.fit.variance
+        cofactors = constraints.cofactors(linear.transformation, self.fit.cofactors.reduced)
         each = np.arange(len(at))
         cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
-        cov = cofactors[each, :, each]
+        cov = cofactors[each, :, each] * self.fit.variance
         return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
 
     def _partners(self, columns: Rows) -> tuple[tuple[str, float], ...]:

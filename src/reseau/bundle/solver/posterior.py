@@ -252,14 +252,14 @@ def _constrained(
     """
     held = constraints.held(columns)
     if isinstance(constraints, RigConstraints) and inner is not None:
-        free = normal.constrained(constraints)
+        free = normal.constrained()
         held[constraints.held_for(inner.reduced, free.back, np.diag(free.matrix))] = True
-    own = normal.constrained(constraints, held)
+    own = normal.constrained(held)
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
     found = _with_inverse(linear, normal, own.back @ q @ own.back.T, columns, taking_part)
-    slopes = normal.stage_slopes(constraints)
+    slopes = linear.stage_slopes
     found[3][len(found[3]) - len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
     if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _STAGED:

@@ -19,7 +19,7 @@ from ..network import Stage
 from ..network.stage import StageValues, perpendicular
 from .unknowns import Unknowns
 
-__all__ = ["Constrained", "StageConstraints", "eliminated"]
+__all__ = ["Constrained", "StageConstraints"]
 
 
 class Constrained(NamedTuple):
@@ -33,15 +33,6 @@ class Constrained(NamedTuple):
     matrix: Array
     own: Array
     gradient: Array
-
-
-def eliminated(t: Array, matrix: Array, own: Array, gradient: Array, held: Mask | None) -> Constrained:
-    """Normal equations of independent unknowns with T (u, size), some of them held (size,)."""
-    if held is not None:
-        matrix[held], matrix[:, held] = 0.0, 0.0
-        matrix[held, held] = 1.0
-        gradient = np.where(held, 0.0, gradient)
-    return Constrained(t, matrix, own, gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,37 +92,8 @@ class StageConstraints:
         t[row[:, 3:, None], self.size - 2 + np.arange(2)] = bends
         return t
 
-    def constrained(
-        self,
-        moved: StageValues | None,
-        s: Array,
-        gradient: Array,
-        slopes: Array,
-        misfits: Array,
-        held: Mask | None,
-    ) -> Constrained:
-        """Compute the normal equations of the independent unknowns.
-
-        Parameters
-        ----------
-        moved : StageValues
-            Values of the stage.
-        s, gradient : ndarray (u, u), (u,)
-            Reduced normal equations with a separate orientation for each image.
-        slopes : ndarray (a + 2, size)
-            Weighted derivatives of readings and axis angles, see :meth:`slopes`.
-        misfits : ndarray (a + 2,)
-            Their weighted misfits.
-        held : ndarray of bool (size,), optional
-            Held unknowns.
-        """
-        assert moved is not None
-        t, own = self.matrix(moved), slopes.T @ misfits
-        return eliminated(t, t.T @ s @ t + slopes.T @ slopes, own, t.T @ gradient + own, held)
-
-    def slopes(self, moved: StageValues | None, nominal: Array, root: Array) -> Array:
+    def slopes(self, moved: StageValues, nominal: Array, root: Array) -> Array:
         """Derivatives (a + 2, size) of readings and axis angles, times roots (a + 2,) of weights."""
-        assert moved is not None
         slopes, a = np.zeros((len(root), self.size)), len(self.images)
         slopes[np.arange(a), self.readings] = 1.0
         slopes[a:, -2:] = nominal.T @ perpendicular(moved.axis)

@@ -17,7 +17,7 @@ from .imaging import Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
 from .observations import OtherObservations
 from .rig_constraints import RigConstraints
-from .stage_constraints import Constrained, StageConstraints, eliminated
+from .stage_constraints import Constrained, StageConstraints
 from .unknowns import Unknowns
 from .values import Correction, Values
 
@@ -187,6 +187,27 @@ class Linear:
         return float((self.misfits**2).sum() + self.other_misfits @ self.other_misfits)
 
     @cached_property
+    def transformation(self) -> Array:
+        """T (u, size): reduced unknowns from the independent ones, with a stage or a rig."""
+        constraints, values = self.system.constraints, self.values
+        if isinstance(constraints, StageConstraints) and values.stage is not None:
+            return constraints.matrix(values.stage)
+        if isinstance(constraints, RigConstraints) and values.rig is not None:
+            return constraints.matrix(values.rig, values.rotation, values.x0)
+        return np.eye(self.system.unknowns.size)
+
+    @cached_property
+    def stage_slopes(self) -> Array:
+        """Weighted derivatives (a + 2, size) of stage readings and axis, the last of the other observations.
+
+        Without a stage there are none, (0, size).
+        """
+        constraints, others, stage = self.system.constraints, self.system.others, self.values.stage
+        if isinstance(constraints, StageConstraints) and stage is not None:
+            return constraints.slopes(stage, others.across, self.system.sigma_root[others.readings.start :])
+        return np.zeros((0, self.transformation.shape[1]))
+
+    @cached_property
     def prior(self) -> Array:
         """Weights of observed coordinates of eliminated points, and weighted misfits (p, 3, 2)."""
         network, others = self.system.unknowns.network, self.system.others
@@ -335,28 +356,18 @@ class Normal:
         """
         return Arrow.factorise(self.sums.band, self.sums.border)
 
-    def constrained(
-        self, constraints: StageConstraints | RigConstraints, held: Mask | None = None
-    ) -> Constrained:
+    def constrained(self, held: Mask | None = None) -> Constrained:
         """Return the normal equations of the independent unknowns, of which some (size,) may be held."""
-        linear, values = self.linear, self.linear.values
-        matrix = full(self.sums.band, self.sums.border)
-        if isinstance(constraints, RigConstraints):
-            assert values.rig is not None
-            t = constraints.matrix(values.rig, values.rotation, values.x0)
-            own = np.zeros(constraints.size)
-            return eliminated(t, t.T @ matrix @ t, own, t.T @ self.sums.reduced, held)
-        slopes = self.stage_slopes(constraints)
-        last = linear.other_misfits[-len(slopes) :]
-        return constraints.constrained(values.stage, matrix, self.sums.reduced, slopes, last, held)
-
-    def stage_slopes(self, stage: StageConstraints | RigConstraints) -> Array:
-        """Weighted derivatives of stage readings and axis, the last of the other observations."""
-        system, others = self.linear.system, self.linear.system.others
-        if isinstance(stage, RigConstraints):
-            return np.zeros((0, stage.size))
-        root = system.sigma_root[others.readings.start :]
-        return stage.slopes(self.linear.values.stage, others.across, root)
+        linear = self.linear
+        t, slopes = linear.transformation, linear.stage_slopes
+        own = slopes.T @ linear.other_misfits[len(linear.other_misfits) - len(slopes) :]
+        matrix = t.T @ full(self.sums.band, self.sums.border) @ t + slopes.T @ slopes
+        gradient = t.T @ self.sums.reduced + own
+        if held is not None:
+            matrix[held], matrix[:, held] = 0.0, 0.0
+            matrix[held, held] = 1.0
+            gradient = np.where(held, 0.0, gradient)
+        return Constrained(t, matrix, own, gradient)
 
     def correction(self) -> Correction:
         """Solve for the correction.
@@ -372,10 +383,8 @@ class Normal:
             gradient = self.sums.gradient @ y
             y = self.in_parameters(y)
         else:
-            held = None
-            if isinstance(constraints, RigConstraints) and self.linear.system.held.any():
-                held = constraints.held(self.linear.system.held)
-            own = self.constrained(constraints, held)
+            columns = self.linear.system.held
+            own = self.constrained(constraints.held(columns) if columns.any() else None)
             q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
             y, by_stage = own.back @ q, float(own.own @ q)
             gradient = self.sums.gradient @ y
