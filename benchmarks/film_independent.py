@@ -34,6 +34,11 @@ _REAL = ("lex1.jpg", "kino_1267.jpg")
 """Real scans without a truth: every answer is printed to be looked at."""
 
 
+def far_off(error: Array, sigma: Array) -> bool:
+    """Whether a corner (n, 2) is off by more than 1 px and 5 sigma; NaN is not."""
+    return bool(((np.abs(error) > MOST_PX) & (np.abs(error) > MOST_SIGMAS * sigma)).any())
+
+
 @dataclass(frozen=True)
 class Answer:
     """What was said of one frame: status, reason, errors and sigmas of its corners (n, 2)."""
@@ -49,7 +54,7 @@ class Answer:
     @property
     def wrong(self) -> bool:
         """Whether a corner is off by more than 1 px and 5 sigma."""
-        return bool(((np.abs(self.error) > MOST_PX) & (np.abs(self.error) > MOST_SIGMAS * self.sigma)).any())
+        return far_off(self.error, self.sigma)
 
     @property
     def answered(self) -> bool:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from film_independent import far_off
 from worlds.film import KINDS, World, frame
 
 from reseau.core.data import Array
@@ -26,8 +27,6 @@ from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
 from reseau.procedures.film_frame import FrameOptions, FrameResult, orient_scan
 
-MOST_PX, MOST_SIGMAS = 1.0, 5.0
-"""A corner is wrong if it is off by more than both."""
 UNSTATED = ("unstated curve", "negative, density")
 """Kinds whose file does not state that grey values are not proportional to the light."""
 BY_THE_FILM = ("penumbra", "halation")
@@ -48,7 +47,7 @@ class Row(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Whether a corner is off by more than 1 px and 5 sigma."""
-        return bool(((np.abs(self.error) > MOST_PX) & (np.abs(self.error) > MOST_SIGMAS * self.sigma)).any())
+        return far_off(self.error, self.sigma)
 
 
 def _curve(kind: str, world: World) -> ToneCurve | None:
