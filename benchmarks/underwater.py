@@ -1,26 +1,30 @@
 """The underwater project of Meid (1992, section 4): residuals and object points by three measurements.
 
-Run from the checkout: ``python benchmarks/underwater.py [--strength NAME] [--seeds N]``; needs
-batoid. Three photographs of 28 targets on a frame, behind a plane window of 25 mm, are drawn with rays that
-share nothing with the project (``benchmarks/worlds/underwater.py``; lens, window and focus are fixed there).
-The network is adjusted with centres of gravity, with ellipses through the edges, and with the procedure of
-``reseau blurred``; six targets are control points, principal distance and radial distortion are free, and the
-window is known.
+Run from the checkout: ``python benchmarks/underwater.py [--strength NAME] [--seeds N] [--keep FOLDER]``;
+needs batoid. Three photographs of 28 targets on a frame, behind a plane window of 25 mm, are drawn with rays
+that share nothing with the project (``benchmarks/worlds/underwater.py``; lens, window and focus are fixed
+there). The network is adjusted with centres of gravity, with ellipses through the edges, and with the
+procedure of ``reseau blurred``; six targets are control points, the camera has two focal lengths and four
+radial coefficients (three leave 0.0025 px of this lens), and the window is known.
 
-For each strength of the blur: rms of the residuals outside the sharp centre of the middle photograph (pixels
-and µm), rms and mean error of the object points that are not control (mm), the mean shift of the coordinates,
-errors over sigmas of the object points, the standard deviations of the coordinates (pixels; those by rays
-attain the Cramér–Rao bound, ``benchmarks/blurred.py``), and all of it for sharp photographs with the same
-noise.
-With `--assumed`: the same with a wrong design of the lens.
+For each strength of the blur: rms of the residuals outside the sharp centre of the middle photograph (pixels,
+with its interval of 95 %, and µm), the rms that the standard deviations of the coordinates and the redundancy
+numbers predict, rms of the errors of the object points that are not control and of their means over all seeds
+(mm), the mean shift of the coordinates, errors over sigmas of the object points with their interval, the
+standard deviations of the coordinates (pixels; those by rays attain the Cramér–Rao bound,
+``benchmarks/blurred.py``), and all of it for sharp photographs with the same noise. With `--assumed`: the
+same with a wrong design of the lens. With `--keep`, the figures of each seed are kept in a file, and those
+there are not computed again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,10 +42,11 @@ from worlds.underwater import (
     project,
 )
 
-from reseau.bundle import Camera, Network
+from reseau.bundle import Camera, Network, Result, adjust_network
 from reseau.core.data import Frame
 from reseau.io.targets import SpaceTargets, TargetColumns
 from reseau.measure.blurred import BlurredOptions
+from reseau.measure.ordinary import ordinary_coordinates
 from reseau.optics.lenses import AIR, LensCamera, Paraxial, Prescription, SensorPlane, glass, in_order
 from reseau.optics.poses import matrix_to_vector
 from reseau.optics.refraction import Refraction, RefractiveIndex, Window
@@ -52,15 +57,20 @@ CENTRE_PX = 350.0
 CONTROL = 6
 SIGMA_PX = 0.05
 """Of ordinary coordinates."""
+FREE = ("fx", "fy", "k1", "k2", "k3", "k4")
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What one way of measuring gives for one project."""
+    """What one way of measuring gives for one project.
+
+    Residuals outside the sharp centre and what their sigmas predict, errors of the object points that are not
+    control, mean shift of the coordinates, errors over sigmas, sigmas of the coordinates.
+    """
 
     residuals_px: float
-    points_mm: float
-    mean_mm: float
+    predicted_px: float
+    errors_mm: list[list[float]]
     shift_px: float
     over_sigma: float
     sigma_px: float
@@ -85,7 +95,7 @@ def network_of(drawn: Project, camera: LensCamera) -> Network:
     images, m, p = tuple(drawn.images), len(drawn.images), len(drawn.points)
     image_of, point_of = np.repeat(np.arange(m), p), np.tile(np.arange(p), m)
     near = camera.corresponding(np.array([[0.0, 0.0, 1e5], [1e3, 0.0, 1e5]]))
-    c = float(near[1, 0] - near[0, 0]) * PITCH * 100.0
+    f = float(near[1, 0] - near[0, 0]) * 100.0
     held = np.full((p, 3), np.nan)
     held[np.linspace(0, 19, CONTROL).astype(int)] = 0.0
     port = Window(
@@ -102,8 +112,7 @@ def network_of(drawn: Project, camera: LensCamera) -> Network:
     true = np.concatenate([drawn.corresponding[name] for name in images])
     return Network(
         cameras=(
-            Camera("cam", *SIZE, (PITCH, PITCH), "brown", np.array([c, *9 * [0.0]]), ("c", "K1", "K2", "K3"),
-                   {"side": "object"}),
+            Camera("cam", *SIZE, (PITCH, PITCH), "opencv", np.array([f, f, *PRINCIPAL, *8 * [0.0]]), FREE),
         ),
         images=images, camera_of=np.zeros(m, np.intp),
         x0=np.array([drawn.centres[name] for name in images]),
@@ -139,38 +148,45 @@ def measured(drawn: Project, camera: LensCamera, initial: str) -> BlurredNetwork
     return found
 
 
-def figures(drawn: Project, found: BlurredNetwork, number: int) -> Figures:
-    """Residuals and errors of one round; 0 is that of the ordinary coordinates."""
-    entry = found.rounds[number]
-    network = entry.result.network
+def ordinary(drawn: Project, camera: LensCamera, method: str) -> Result:
+    """The network adjusted with ordinary coordinates of a kind alone."""
+    network = network_of(drawn, camera)
+    xy = network.xy.copy()
+    for i, (name, pixels) in enumerate(drawn.images.items()):
+        rows = network.image_of == i
+        frame = Frame(pixels, 255.0, name)
+        found = ordinary_coordinates(frame, xy[rows], polarity="dark", method=method)  # type: ignore[arg-type]
+        xy[rows] = np.where(np.isfinite(found), found, xy[rows])
+    result = adjust_network(replace(network, xy=xy))
+    assert isinstance(result, Result), str(result)
+    return result
+
+
+def figures(drawn: Project, result: Result, shift_px: float = 0.0) -> Figures:
+    """Residuals and errors of an adjustment."""
+    network = result.network
     outside = np.hypot(*(network.xy - PRINCIPAL).T) > CENTRE_PX
-    middle = network.image_of == list(drawn.images).index("middle")
+    rows = outside & (network.image_of == list(drawn.images).index("middle"))
     free = np.array([role == "tie" for role in network.role])
-    off = entry.result.points.xyz[free] - drawn.xyz[free]
+    off = result.points.xyz[free] - drawn.xyz[free]
     known = np.isfinite(off).all(axis=1)
-    inverse = np.linalg.inv(entry.result.points.cov[free][known])
+    inverse = np.linalg.inv(result.points.cov[free][known])
     over = np.einsum("pi,pij,pj->p", off[known], inverse, off[known]).mean() / 3
+    variances = np.einsum("nii->ni", network.cov)
     return Figures(
-        entry.rms_px(outside & middle),
-        float(np.sqrt((off[known] ** 2).mean())),
-        float(np.linalg.norm(off[known].mean(axis=0))),
-        entry.shift_px,
+        float(np.sqrt(np.nanmean(result.residuals[rows] ** 2))),
+        float(np.sqrt(np.nanmean((result.redundancy_numbers * variances)[rows]))),
+        off.tolist(),
+        shift_px,
         float(np.sqrt(over)),
-        float(np.sqrt(np.einsum("nii->ni", network.cov[outside & middle]).mean())),
+        float(np.sqrt(variances[rows].mean())),
     )
 
 
-def sharp_residuals(strength: str, seed: int) -> Figures:
-    """The same network and noise, imaged by principal rays alone."""
-    drawn = project(strength, seed, sharp=True)
-    camera = camera_of(
-        strength,
-        lambda lens: replace(
-            lens, stop_radius=0.2, wavelengths_nm=(WAVELENGTHS[1],), weights=(1.0,), reference=0
-        ),
-    )
+def by_rays(drawn: Project, camera: LensCamera) -> Figures:
+    """Figures of the procedure."""
     found = measured(drawn, camera, "centroid")
-    return figures(drawn, found, found.chosen)
+    return figures(drawn, found.result, found.rounds[found.chosen].shift_px)
 
 
 TRIPLET = (
@@ -212,16 +228,65 @@ ASSUMED: dict[str, Callable[[Prescription], Prescription]] = {
 }
 
 
-def _row(text: str, rows: list[Figures]) -> str:
-    mean = {
-        name: float(np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows])))
-        for name in ("residuals_px", "points_mm", "mean_mm", "shift_px", "over_sigma", "sigma_px")
+def blurred_figures(strength: str, seed: int) -> dict[str, Figures]:
+    """Figures of one seed by the way of measuring."""
+    drawn, camera = project(strength, seed), camera_of(strength)
+    return {
+        "ellipses through edges": figures(drawn, ordinary(drawn, camera, "edge")),
+        "centres of gravity": figures(drawn, ordinary(drawn, camera, "centroid")),
+        "by rays (reseau blurred)": by_rays(drawn, camera),
     }
-    spread = float(np.std([row.residuals_px for row in rows])) / max(1, len(rows)) ** 0.5
+
+
+def assumed_figures(strength: str, seed: int) -> dict[str, Figures]:
+    """Figures of one seed with wrong designs of the lens."""
+    drawn = project(strength, seed)
+    return {text: by_rays(drawn, camera_of(strength, change)) for text, change in ASSUMED.items()}
+
+
+def sharp_figures(strength: str, seed: int) -> dict[str, Figures]:
+    """The same network and noise, imaged by principal rays alone."""
+    camera = camera_of(
+        strength,
+        lambda lens: replace(
+            lens, stop_radius=0.2, wavelengths_nm=(WAVELENGTHS[1],), weights=(1.0,), reference=0
+        ),
+    )
+    return {"sharp photographs": by_rays(project(strength, seed, sharp=True), camera)}
+
+
+def kept(path: Path | None, compute: Callable[[], dict[str, Figures]]) -> dict[str, Figures]:
+    """Figures, read from a file if it is there, or computed and written to it."""
+    if path is None:
+        return compute()
+    if not path.exists():
+        found = {text: asdict(row) for text, row in compute().items()}
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(found))
+        part.replace(path)
+    return {text: Figures(**row) for text, row in json.loads(path.read_text()).items()}
+
+
+def _rms(values: Array) -> tuple[float, float]:
+    """Root mean square of values of all seeds, and half of its interval of 95 %."""
+    square = values**2
+    rms = float(np.sqrt(square.mean()))
+    error = float(square.std(ddof=1)) / np.sqrt(len(square)) if len(square) > 1 else np.nan
+    return rms, 1.96 * error / (2 * rms) if rms > 0 else 0.0
+
+
+def _row(text: str, rows: list[Figures]) -> str:
+    def column(name: str) -> Array:
+        return np.array([getattr(row, name) for row in rows])
+
+    errors = column("errors_mm").astype(float)
+    bias = np.nanmean(errors, axis=0)
+    residuals, over = _rms(column("residuals_px")), _rms(column("over_sigma"))
     return (
-        f"  {text:<26}{mean['residuals_px']:>10.4f} ± {spread:.4f}{1e3 * PITCH * mean['residuals_px']:>8.2f}"
-        f"{mean['points_mm']:>10.4f}{mean['mean_mm']:>9.4f}{mean['shift_px']:>9.3f}{mean['over_sigma']:>8.2f}"
-        f"{mean['sigma_px']:>9.4f}"
+        f"  {text:<26}{residuals[0]:>8.4f} ± {residuals[1]:.4f}{1e3 * PITCH * residuals[0]:>6.2f}"
+        f"{_rms(column('predicted_px'))[0]:>10.4f}{np.sqrt(np.nanmean(errors**2)):>8.4f}"
+        f"{np.sqrt(np.nanmean(bias**2)):>8.4f}{_rms(column('shift_px'))[0]:>8.3f}"
+        f"{over[0]:>7.2f} ± {over[1]:.2f}{_rms(column('sigma_px'))[0]:>9.4f}"
     )
 
 
@@ -230,34 +295,40 @@ def main() -> None:
     parser.add_argument("--strength", choices=tuple(STRENGTHS))
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--assumed", action="store_true", help="with wrong designs of the lens as well")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the figures of each seed here")
     parser.add_argument("--report", type=Path, help="report of the first seed to write, HTML")
     chosen = parser.parse_args()
-    print(
-        f"{'':<28}{'residuals, px':>19}{'µm':>8}{'mm rms':>10}{'mm mean':>9}{'shift':>9}{'e/σ':>8}"
-        f"{'σ, px':>9}"
-    )
-    for strength in [chosen.strength] if chosen.strength else STRENGTHS:
-        rows: dict[str, list[Figures]] = {}
-        begin = time.process_time()
-        for seed in range(chosen.seeds):
-            drawn = project(strength, seed)
-            for initial in ("edge", "centroid"):
-                found = measured(drawn, camera_of(strength), initial)
-                rows.setdefault(initial, []).append(figures(drawn, found, 0))
-            rows.setdefault("by rays (reseau blurred)", []).append(figures(drawn, found, found.chosen))
-            rows.setdefault("sharp photographs", []).append(sharp_residuals(strength, seed))
-            if chosen.assumed:
-                for text, change in ASSUMED.items():
-                    other = measured(drawn, camera_of(strength, change), "centroid")
-                    rows.setdefault(text, []).append(figures(drawn, other, other.chosen))
-            if seed == 0 and chosen.report is not None:
-                from reseau.report.blurred_network import blurred_network_report
+    if chosen.keep is not None:
+        chosen.keep.mkdir(parents=True, exist_ok=True)
+    strengths = [chosen.strength] if chosen.strength else list(STRENGTHS)
+    if chosen.report is not None:
+        from reseau.report.blurred_network import blurred_network_report
 
-                chosen.report.write_text(blurred_network_report(found, title=f"underwater, {strength}"))
-        blur: Array = np.concatenate(list(drawn.blur.values()))
-        each = (time.process_time() - begin) / chosen.seeds
-        print(f"{strength}: blur to {blur.max():.1f} px; {chosen.seeds} seeds, {each:.0f} s each")
-        for text, entries in rows.items():
+        found = measured(project(strengths[0], 0), camera_of(strengths[0]), "centroid")
+        chosen.report.write_text(blurred_network_report(found, title=f"underwater, {strengths[0]}"))
+    print(
+        f"{'':<28}{'residuals, px':>17}{'µm':>6}{'predicted':>10}{'mm rms':>8}{'bias':>8}{'shift':>8}"
+        f"{'e/σ':>14}{'σ, px':>9}"
+    )
+    # Seed by seed, so that what is kept after a stop is of all strengths.
+    rows: dict[str, dict[str, list[Figures]]] = {name: {} for name in ("sharp", *strengths)}
+    begin = time.process_time()
+    for seed in range(chosen.seeds):
+        # Nothing of a sharp photograph but the place of the sensor depends on the strength.
+        jobs = [("sharp", partial(sharp_figures, "medium", seed))]
+        for strength in strengths:
+            jobs.append((strength, partial(blurred_figures, strength, seed)))
+            if chosen.assumed:
+                jobs.append((f"{strength}-assumed", partial(assumed_figures, strength, seed)))
+        for name, compute in jobs:
+            path = chosen.keep / f"{name}-{seed:03d}.json" if chosen.keep is not None else None
+            for text, row in kept(path, compute).items():
+                rows[name.removesuffix("-assumed")].setdefault(text, []).append(row)
+    each = (time.process_time() - begin) / chosen.seeds / len(strengths)
+    for strength in strengths:
+        blur: Array = np.concatenate(list(project(strength, 0).blur.values()))
+        print(f"{strength}: blur to {blur.max():.1f} px; {chosen.seeds} seeds, {each:.1f} s each")
+        for text, entries in (rows[strength] | rows["sharp"]).items():
             print(_row(text, entries))
 
 

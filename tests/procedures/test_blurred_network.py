@@ -159,3 +159,18 @@ def test_what_are_no_targets_is_refused_in_one_line(change: dict[str, Any], word
     with pytest.raises(Exception, match=words) as error:
         SpaceTargets.parse(json.dumps(content), where="targets.json")
     assert "\n" not in str(error.value)
+
+
+def test_a_camera_that_cannot_follow_the_lens_is_named() -> None:
+    """With one radial coefficient, the distortion of the design is left by more than the sigmas."""
+    project = drawn()
+    camera = project.network.cameras[0]
+    run = _Run(project.network, {}, project.targets, underwater.CAMERA, NetworkOptions())
+    result = measured().result
+    assert run._unfollowed(result) == ()
+    cov = np.full_like(result.network.cov, 0.0) + 1e-4**2 * np.eye(2)
+    sure = replace(result, network=replace(result.network, cov=cov))
+    few = replace(project.network, cameras=(replace(camera, free=("c",)),))
+    (note,) = _Run(few, {}, project.targets, underwater.CAMERA, NetworkOptions())._unfollowed(sure)
+    assert note.code == "unmodelled"
+    assert "(c) follow the distortion" in note.text

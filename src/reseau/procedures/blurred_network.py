@@ -8,7 +8,7 @@ its ordinary coordinates are as certain and do not differ significantly, these a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from ..bundle import Network, Result, adjust_network
 from ..bundle import Options as BundleOptions
-from ..core.data import Array, Frame, Mask
+from ..core.data import Array, Frame, Mask, Rows
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
@@ -37,6 +37,10 @@ _SHARP_PX = 1.0
 """Blur (rms radius) up to which ordinary coordinates may be kept."""
 _FAR_MM = 1e6
 """Distance of a far point."""
+_FOLLOWED = 0.5
+"""Part of the sigmas to which the camera of the network must follow the distortion of the lens."""
+_FITS = 4
+"""Corrections of its parameters: images are linear in most of them."""
 _FALLS = 0.99
 """Another round must lower sigma0 to less than this part."""
 
@@ -237,7 +241,8 @@ def measure_blurred_network(
         if number > 1 and found.result.sigma0 >= _FALLS * rounds[-2].result.sigma0:
             break
     sigma0 = [entry.result.sigma0 for entry in rounds[1:]]
-    return BlurredNetwork(tuple(rounds), 1 + int(np.argmin(sigma0)), run.notes(rounds))
+    best = 1 + int(np.argmin(sigma0))
+    return BlurredNetwork(tuple(rounds), best, run.notes(rounds, best))
 
 
 def _ordinary(
@@ -255,6 +260,11 @@ def _ordinary(
             )
             xy[rows] = np.where(np.isfinite(found), found, xy[rows])
     return replace(network, xy=xy)
+
+
+def _far(uv: Array) -> Array:
+    """Far points (n, 3) in directions (n, 2)."""
+    return _FAR_MM * np.column_stack([uv, np.ones(len(uv))])
 
 
 def _rows_of(network: Network, image: int, named: Collection[str]) -> list[int]:
@@ -334,13 +344,13 @@ class _Run:
         network, values = self.network, last.fit.values
         _, camera = self._camera(last, i)
         rotation, x0 = values.rotation[i], values.x0[i]
-        names, planes = [], []
-        for own in rows:
-            j = network.point_of[own]
-            k = self.row[network.points[j]]
-            centre = self.unit_mm * (rotation @ (self.xyz[j] - x0))
-            axes = rotation @ self.targets.axes(k)
-            scale = float(image_scale(camera, centre[None], axes[None])[0]) * self.targets.unit_mm
+        points = network.point_of[rows]
+        named = [self.row[network.points[j]] for j in points]
+        centres = self.unit_mm * (self.xyz[points] - x0) @ rotation.T
+        axes = rotation @ np.array([self.targets.axes(k) for k in named])
+        scales = image_scale(camera, centres, axes) * self.targets.unit_mm
+        planes = []
+        for k, centre, across, scale in zip(named, centres, axes, scales, strict=True):
             # A target that is predicted too near, by a bad orientation, has no more nodes than others; one
             # out of the field of the lens will not be measured.
             least = self.targets.targets.size[k] / _NODES
@@ -351,8 +361,8 @@ class _Run:
                 xy=self.targets.unit_mm * outline.xy,
                 dxy=self.targets.unit_mm * outline.dxy,
             )
-            names.append(network.points[j])
-            planes.append(PlaneTarget(centre, axes, scaled))
+            planes.append(PlaneTarget(centre, across, scaled))
+        names = [network.points[j] for j in points]
         return measure_blurred(self.frames[network.images[i]], camera, names, planes, self.matching)
 
     def _reduction(self, last: Result) -> Array:
@@ -363,14 +373,20 @@ class _Run:
         point and that of a far point in the direction of the ray through the projection centre is taken from
         the image coordinates; what is left depends on that direction only, as in the bundle.
         """
+        reduction = np.zeros((len(self.network.xy), 2))
+        for i, rows, x, uv in self._seen(last):
+            lens, wet = self._camera(last, i)
+            reduction[rows] = wet.corresponding(self.unit_mm * x) - lens.corresponding(_far(uv))
+        return reduction
+
+    def _seen(self, last: Result) -> Iterator[tuple[int, Rows, Array, Array]]:
+        """Each image, its rows, their points (n, 3) in camera axes, and directions (n, 2) before windows."""
         network, values = self.network, last.fit.values
-        reduction = np.zeros((len(network.xy), 2))
         known: Mask = np.asarray(np.isfinite(self.xyz).all(axis=1))
         for i in np.flatnonzero(last.fit.usable.images).tolist():
             rows = np.flatnonzero((network.image_of == i) & known[network.point_of])
             if not len(rows):
                 continue
-            lens, wet = self._camera(last, i)
             rotation, x0 = values.rotation[i], values.x0[i]
             xyz = self.xyz[network.point_of[rows]]
             x = (xyz - x0) @ rotation.T
@@ -381,9 +397,41 @@ class _Run:
                     xyz, np.zeros(len(rows), np.intp), np.arange(len(rows)),
                 )  # fmt: skip
                 uv = rays.uv
-            far = _FAR_MM * np.column_stack([uv, np.ones(len(rows))])
-            reduction[rows] = wet.corresponding(self.unit_mm * x) - lens.corresponding(far)
-        return reduction
+            yield i, rows, x, uv
+
+    def _unfollowed(self, last: Result) -> tuple[Remark, ...]:
+        """Say which cameras of the network cannot follow the distortion of their lenses.
+
+        The images of far points in the directions of all targets, by the design, are fitted with the free
+        parameters of the camera. What is left goes into residuals and object points.
+        """
+        found, seen = list[Remark](), list(self._seen(last))
+        for c, entry in enumerate(self.network.cameras):
+            mine = [(self._camera(last, i)[0], uv) for i, _, _, uv in seen if self.network.camera_of[i] == c]
+            if not (mine and entry.free):
+                continue
+            uv = np.concatenate([uv for _, uv in mine])
+            wanted = np.concatenate([lens.corresponding(_far(uv)) for lens, uv in mine])
+            good = np.isfinite(uv).all(axis=1) & np.isfinite(wanted).all(axis=1)
+            columns = [entry.names.index(name) for name in entry.free]
+            values = last.fit.values.cameras[c, : len(entry.names)].copy()
+            for _ in range(_FITS):
+                at = entry.bare_mapping(values).derivatives(uv[good])
+                off, by = (wanted[good] - at.value).ravel(), at.d_parameters[:, :, columns]
+                by = by.reshape(len(off), -1)
+                scale = np.linalg.norm(by, axis=0) + 1e-300
+                values[columns] += np.linalg.lstsq(by / scale, off, rcond=None)[0] / scale
+            left = float(np.sqrt(np.mean((wanted[good] - entry.bare_mapping(values)(uv[good])) ** 2)))
+            own = self.network.camera_of[last.network.image_of] == c
+            sigma = float(np.sqrt(np.einsum("nii->ni", last.network.cov[own]).mean()))
+            if left > _FOLLOWED * sigma:
+                text = (
+                    f"{entry.label}: its free parameters ({', '.join(entry.free)}) follow the distortion "
+                    f"of the lens to {left:.2g} px (rms), where sigmas are {sigma:.2g} px: object points are "
+                    "worse than their sigmas; use more coefficients of distortion"
+                )
+                found.append(Remark(text, Code.UNMODELLED))
+        return tuple(found)
 
     def _camera(self, last: Result, i: int) -> tuple[LensCamera, LensCamera]:
         """Lens of an image, and the same behind its windows, with the principal point of the adjustment."""
@@ -414,9 +462,9 @@ class _Run:
         both = found.cov[k] + self.network.cov[own]
         return bool(difference @ np.linalg.solve(both, difference) <= _DIFFERS)
 
-    def notes(self, rounds: list[BlurredRound]) -> tuple[Remark, ...]:
+    def notes(self, rounds: list[BlurredRound], best: int) -> tuple[Remark, ...]:
         """Return what a user should know."""
-        last, found = rounds[-1], list[Remark]()
+        last, found = rounds[-1], list(self._unfollowed(rounds[best].result))
         missing = [name for name in self.network.images if name not in self.frames]
         if missing:
             found.append(

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
-from ...core.failure import Code, Remark
+from ...core.failure import Code, Failure, Remark
 from ...optics.formation import Outline, PixelResponse
-from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image
+from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image, ray_images
 from ..matching import Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Measured, Reason
 from ..screening import screen
@@ -354,12 +354,14 @@ class Run:
             reduced = normal[common, common] - factor @ normal[local, common]
             yield int(row), reduced, right[common] - factor @ right[local], cost, int(valid.sum()) - 7
 
-    def _imaged(self, k: int, elements: PupilElements) -> RayImage | None:
-        """Image of a target by rays; None, with the reason, where there is none in the frame."""
-        try:
-            image = ray_image(self.camera, self.targets[k], elements)
-        except UsageError as error:
-            self.why[k] = Reason(error.what, Code.OUTSIDE)
+    def _imaged(self, rows: Sequence[int], elements: PupilElements) -> list[RayImage | None]:
+        """Images of targets by rays; None, with the reason, where there is none in the frame."""
+        images = ray_images(self.camera, [self.targets[k] for k in rows], elements)
+        return [self._inside(k, image) for k, image in zip(rows, images, strict=True)]
+
+    def _inside(self, k: int, image: RayImage | Failure) -> RayImage | None:
+        if isinstance(image, Failure):
+            self.why[k] = Reason(image.reason, image.code)
             return None
         self.predicted[k] = image.point
         low, high = (image.point + end(image.outline.xy, axis=0) for end in (np.min, np.max))
@@ -525,7 +527,7 @@ class Run:
         """
 
         def images(elements: PupilElements) -> list[RayImage | None]:
-            return [self._imaged(k, elements) for k in range(len(self.ids))]
+            return self._imaged(range(len(self.ids)), elements)
 
         if isinstance(self.camera, RaySurrogate):
             return 0, self.camera.elements, images(self.camera.elements)
@@ -542,8 +544,7 @@ class Run:
         formed = {k: self._formed(image, *windows[k]) for k, image in seen[:_CRITICAL]}
         for few, many in pairwise(RINGS):
             rings, settled = few, True
-            for k in critical:
-                finer = self._imaged(k, PupilElements.gauss(many))
+            for k, finer in zip(critical, self._imaged(critical, PupilElements.gauss(many)), strict=True):
                 if finer is not None:
                     coarser, formed[k] = formed[k], self._formed(finer, *windows[k])
                     settled &= self._alike(coarser, formed[k])

@@ -1,6 +1,6 @@
 """Lenses: prescriptions, media, rays through them, and the images that rays form."""
 
-from .images import PlaneTarget, RayImage, counted_image, image_scale, ray_image
+from .images import PlaneTarget, RayImage, counted_image, image_scale, ray_image, ray_images
 from .media import (
     AIR,
     Air,
@@ -65,4 +65,5 @@ __all__ = [
     "labels",
     "model_glass",
     "ray_image",
+    "ray_images",
 ]
