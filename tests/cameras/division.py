@@ -88,7 +88,7 @@ def build(values: Array, grid: PixelGrid, options: Mapping[str, Any]) -> Divisio
 
 
 MODEL = CameraModel(
-    "division",
+    "fitzgibbon",
     PARAMETERS,
     build,
     lambda f, grid: {"focal": f * grid.pitch_mm[0]},

@@ -51,7 +51,7 @@ class Case(NamedTuple):
         ).max(0)
         for k, parameter in enumerate(self.model.parameters):
             if parameter.role == "distortion":
-                values[k] = (-1) ** k * bend / effect[k] / (1 + k)
+                values[k] += (-1) ** k * bend / effect[k] / (1 + k)
             elif parameter.role == "centre":
                 values[k] += 2.0 / effect[k]
         return values

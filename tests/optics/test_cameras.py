@@ -106,7 +106,7 @@ def test_a_camera_without_exact_equivalent_is_converted_with_its_residual(camera
 
 
 def test_an_impossible_conversion_is_refused() -> None:
-    with pytest.raises(UsageError, match="use one of brown, opencv"):
+    with pytest.raises(UsageError, match="use one of brown, brown_higher, opencv"):
         convert(Brown(BROWN, "object", 0.0, GRID), GRID, "pinhole")
     with pytest.raises(UsageError, match="K1: is not one of fx"):
         convert(Brown(BROWN, "object", 0.0, GRID), GRID, "opencv", free=("K1",))

@@ -80,7 +80,7 @@ def _freed(camera: Camera, level: int) -> tuple[str, ...]:
     model = camera.registered
     if model is None or level == 2:
         return camera.free
-    bent = [name for name in model.of_role("distortion") if name in camera.free]
+    bent = [name for name in model.of_role("shape", "distortion") if name in camera.free]
     usual = {*model.of_role("scale"), *bent[:_LEADING]}
     if level == 1:
         usual = {*model.usual, *model.of_role("scale", "centre"), *bent[:2]}

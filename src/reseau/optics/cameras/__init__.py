@@ -12,7 +12,15 @@ registry.
 # The order of the imports is the order of the registry.
 from .brown import Brown, BrownDistortion, BrownWithAdditional  # isort: skip
 from .opencv import OpenCV  # isort: skip
-from .fisheye import Fisheye  # isort: skip
+from .projections import (  # isort: skip
+    Division,
+    DoubleSphere,
+    Equisolid,
+    Fisheye,
+    Omni,
+    Orthographic,
+    Stereographic,
+)
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -39,12 +47,18 @@ __all__ = [
     "BrownWithAdditional",
     "CameraModel",
     "Converted",
+    "Division",
+    "DoubleSphere",
     "EbnerCorrection",
+    "Equisolid",
     "Fisheye",
+    "Omni",
     "OpenCV",
     "Option",
+    "Orthographic",
     "Parameter",
     "PixelGrid",
+    "Stereographic",
     "additional_model",
     "additional_models",
     "camera_model",

@@ -1,10 +1,10 @@
-"""Brown's camera model, ``brown``: distortion, mapping, kernel and registration."""
+"""Brown's camera model, ``brown``, and with higher radial terms, ``brown_higher``: mapping and kernel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping as Named
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -33,9 +33,10 @@ PARAMETERS = (
     Parameter("B1"),
     Parameter("B2"),
 )
-C, X0, Y0, K1, K2, K3, P1, P2, B1, B2 = range(len(PARAMETERS))
-# Constants of the kernel: one for the image side, and powers of the balance radius.
-SIDE, BALANCE2, BALANCE4, BALANCE6 = range(4)
+HIGHER_PARAMETERS = (*PARAMETERS, Parameter("K4", "mm^-8"), Parameter("K5", "mm^-10"))
+C, X0, Y0, K1, K2, K3, P1, P2, B1, B2, K4, K5 = range(len(HIGHER_PARAMETERS))
+# Constants of the kernel: one for the image side, powers of the balance radius, and one for higher terms.
+SIDE, BALANCE2, BALANCE4, BALANCE6, BALANCE8, BALANCE10, IS_HIGHER = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +50,13 @@ class BrownDistortion(Radial):
 
     Radial and decentering terms after Brown (1971), Close-range camera calibration, Photogrammetric
     Engineering 37(8); the balance radius R0, where the radial distortion vanishes, and the affinity as in
-    Luhmann et al., Close-Range Photogrammetry and 3D Imaging.
+    Luhmann et al., Close-Range Photogrammetry and 3D Imaging. With nine values the radial terms go on with
+    K4(r⁸−R0⁸) + K5(r¹⁰−R0¹⁰).
 
     Parameters
     ----------
-    values : array_like (7,)
-        K1 (mm⁻²), K2 (mm⁻⁴), K3 (mm⁻⁶), P1, P2 (mm⁻¹), B1, B2.
+    values : array_like (7,) or (9,)
+        K1 (mm⁻²), K2 (mm⁻⁴), K3 (mm⁻⁶), P1, P2 (mm⁻¹), B1, B2; then K4 (mm⁻⁸), K5 (mm⁻¹⁰).
     balance_radius_mm : float
         R0.
 
@@ -64,33 +66,49 @@ class BrownDistortion(Radial):
     array([[2.008, 0.   ]])
     """
 
-    names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PARAMETERS[K1:])
+    ALL_NAMES: ClassVar[tuple[str, ...]] = tuple(p.name for p in HIGHER_PARAMETERS[K1:])
     values: Array = field(default_factory=lambda: np.zeros(7))
     balance_radius_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", as_values(self.names, self.values))
+        count = len(self.ALL_NAMES) - 2 * (np.size(self.values) != len(self.ALL_NAMES))
+        object.__setattr__(self, "values", as_values(self.ALL_NAMES[:count], self.values))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The seven names, or nine with higher terms."""
+        return self.ALL_NAMES[: len(self.values)]
+
+    @cached_property
+    def radial(self) -> Array:
+        """K1, K2, K3, and with higher terms K4, K5."""
+        radial: Array = np.concatenate([self.values[:3], self.values[7:]])
+        return radial
 
     @cached_property
     def balance(self) -> Array:
-        """R0², R0⁴, R0⁶, (3,)."""
-        balance: Array = self.balance_radius_mm ** np.array([2.0, 4.0, 6.0])
+        """R0², R0⁴, R0⁶ …, one for each radial term."""
+        balance: Array = self.balance_radius_mm ** np.array([2.0, 4.0, 6.0, 8.0, 10.0])[: len(self.radial)]
         return balance
 
     @cached_property
     def fold(self) -> float:
         """See :class:`~reseau.optics.cameras.radial.Radial`."""
-        k = self.values[:3]
+        k = self.radial
         at_centre = 1 - float(k @ self.balance)
         # d/dr of r·(1 + …) in powers of r².
-        return first_root([at_centre, 3 * k[0], 5 * k[1], 7 * k[2]]) if at_centre > 0 else 0.0
+        growth = [at_centre, *((2 * np.arange(len(k)) + 3) * k)]
+        return first_root(growth) if at_centre > 0 else 0.0
 
     def _slope(self, xy: Array) -> tuple[Array, Array]:
-        k1, k2, k3, p1, p2, b1, b2 = self.values
+        k1, k2, k3, p1, p2, b1, b2, *more = self.values
         x, y = xy[:, 0], xy[:, 1]
         s = x * x + y * y
-        radial = 1 - self.values[:3] @ self.balance + s * (k1 + s * (k2 + s * k3))
+        radial = 1 - self.radial @ self.balance + s * (k1 + s * (k2 + s * k3))
         by_s = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
+        if more:
+            k4, k5 = more
+            radial, by_s = radial + s**4 * (k4 + s * k5), by_s + 2 * s**3 * (4 * k4 + s * 5 * k5)
         value = np.stack(
             [
                 x * radial + p1 * (s + 2 * x * x) + 2 * p2 * x * y + b1 * x + b2 * y,
@@ -112,8 +130,10 @@ class BrownDistortion(Radial):
         value, d_xy = self._slope(points)
         x, y = points[:, 0], points[:, 1]
         s = x * x + y * y
-        d = np.zeros((len(points), 2, 7))
-        d[:, :, :3] = points[:, :, None] * (np.stack([s, s**2, s**3], axis=1) - self.balance)[:, None, :]
+        d = np.zeros((len(points), 2, len(self.values)))
+        powers = np.stack([s, s**2, s**3, s**4, s**5][: len(self.radial)], axis=1) - self.balance
+        d[:, :, :3] = points[:, :, None] * powers[:, None, :3]
+        d[:, :, 7:] = points[:, :, None] * powers[:, None, 3:]
         d[:, 0, 3], d[:, 1, 3] = s + 2 * x * x, 2 * x * y
         d[:, 0, 4], d[:, 1, 4] = 2 * x * y, s + 2 * y * y
         d[:, 0, 5], d[:, 0, 6] = x, y
@@ -134,7 +154,7 @@ class Brown(PlaneMapping):
 
     Parameters
     ----------
-    values : array_like (10,)
+    values : array_like (10,) or (12,)
         c, x0, y0 (mm), then the parameters of the distortion. Default: c = 1, all others zero.
     side : {"object", "image"}
         Coordinates of which the distortion is a function: the ideal ones, or those in the image.
@@ -150,16 +170,22 @@ class Brown(PlaneMapping):
     array([[399.551, 239.5  ]])
     """
 
-    names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PARAMETERS)
+    ALL_NAMES: ClassVar[tuple[str, ...]] = tuple(p.name for p in HIGHER_PARAMETERS)
     values: Array = field(default_factory=lambda: np.array([1.0] + 9 * [0.0]))
     side: Literal["image", "object"] = "object"
     balance_radius_mm: float = 0.0
     grid: PixelGrid | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", as_values(self.names, self.values))
+        count = len(self.ALL_NAMES) - 2 * (np.size(self.values) != len(self.ALL_NAMES))
+        object.__setattr__(self, "values", as_values(self.ALL_NAMES[:count], self.values))
         if self.side not in ("image", "object"):
             raise UsageError(f"is {self.side!r}", where="side of a camera", do="write `image` or `object`")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The ten names, or twelve with higher terms."""
+        return self.ALL_NAMES[: len(self.values)]
 
     @cached_property
     def distortion(self) -> BrownDistortion:
@@ -191,7 +217,7 @@ class Brown(PlaneMapping):
         points = as_points(xy)
         photo, d_xy, d_lens = self._lens.derivatives(points * self._ideal)
         scale = np.ones(2) if self.grid is None else self.grid.pixels_per_mm
-        d = np.empty((len(points), 2, 10))
+        d = np.empty((len(points), 2, len(self.values)))
         d[:, :, 0] = (d_xy @ (points * [1.0, -1.0])[:, :, None])[:, :, 0]
         d[:, :, 1:3] = np.eye(2)
         d[:, :, 3:] = d_lens
@@ -307,6 +333,13 @@ def _brown(
     )
     radial = p[c, K1] * q1 + p[c, K2] * q2 + p[c, K3] * q3
     by_s = 2.0 * (p[c, K1] + s * (2.0 * p[c, K2] + 3.0 * p[c, K3] * s))
+    if constants[c, IS_HIGHER] == 1.0:
+        s3 = s * s * s
+        q4, q5 = s3 * s - constants[c, BALANCE8], s3 * s * s - constants[c, BALANCE10]
+        radial += p[c, K4] * q4 + p[c, K5] * q5
+        by_s += 2.0 * s3 * (4.0 * p[c, K4] + 5.0 * p[c, K5] * s)
+        d[0, K4], d[1, K4] = sign * px * x * q4, sign * py * y * q4
+        d[0, K5], d[1, K5] = sign * px * x * q5, sign * py * y * q5
     xx, yy, xy2 = s + 2.0 * x * x, s + 2.0 * y * y, 2.0 * x * y
     dx = x * radial + p[c, P1] * xx + p[c, P2] * xy2 + p[c, B1] * x + p[c, B2] * y
     dy = y * radial + p[c, P2] * yy + p[c, P1] * xy2
@@ -369,21 +402,22 @@ def _combine(camera: Brown, extra: PlaneMapping) -> BrownWithAdditional | None:
     return None if camera.side == "image" else BrownWithAdditional(camera, extra)
 
 
-def _constants(options: Named[str, Any]) -> list[float]:
-    radius = np.array([options["balance_radius_mm"]])[:, None] ** [2.0, 4.0, 6.0]
-    return [float(options["side"] == "image"), *radius[0].tolist()]
+def _constants(options: Named[str, Any], higher: bool) -> list[float]:
+    radius = float(options["balance_radius_mm"]) ** np.array([2.0, 4.0, 6.0, 8.0, 10.0])
+    return [float(options["side"] == "image"), *radius.tolist(), float(higher)]
 
 
-register_camera(
-    CameraModel(
-        "brown",
-        PARAMETERS,
-        _build,
-        _start,
-        (Option("side", "object", ("object", "image"), required=True), Option("balance_radius_mm", 0.0)),
-        needs_pitch=True,
-        combine=_combine,
-        kernel=_brown,
-        constants=_constants,
+for _name, _parameters in (("brown", PARAMETERS), ("brown_higher", HIGHER_PARAMETERS)):
+    register_camera(
+        CameraModel(
+            _name,
+            _parameters,
+            _build,
+            _start,
+            (Option("side", "object", ("object", "image"), required=True), Option("balance_radius_mm", 0.0)),
+            needs_pitch=True,
+            combine=_combine,
+            kernel=_brown,
+            constants=partial(_constants, higher=_parameters is HIGHER_PARAMETERS),
+        )
     )
-)

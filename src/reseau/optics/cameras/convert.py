@@ -17,7 +17,8 @@ __all__ = ["Converted", "convert"]
 
 # Points along the longer side of the image.
 _POINTS = 41
-_ITERATIONS = 30
+# Greatest number of steps, and damping of the first one (columns have unit length).
+_ITERATIONS, _DAMPING = 200, 1e-3
 
 
 class Converted(NamedTuple):
@@ -113,28 +114,34 @@ def convert(
 
 
 def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> PlaneMapping:
-    """Gauss–Newton with halved steps; undetermined corrections have least norm."""
-    cost = _cost(mapping, uv, target)
+    """Levenberg–Marquardt in columns of unit length; undetermined corrections have least norm."""
+    cost, damping, slow = _cost(mapping, uv, target), _DAMPING, 0
     for _ in range(_ITERATIONS):
         seen = mapping.derivatives(uv)
         design = seen.d_parameters[:, :, at].reshape(2 * len(uv), -1)
         size = np.linalg.norm(design, axis=0)
         size[size == 0] = 1.0
-        full = np.zeros(len(at))
-        full[at] = np.linalg.lstsq(design / size, (target - seen.value).ravel(), rcond=1e-13)[0] / size
-        for part in (1.0, 0.5, 0.25, 0.125, 0.0):
-            trial = mapping.with_values(mapping.values + part * full)
+        left, values, right = np.linalg.svd(design / size, full_matrices=False)
+        along = np.where(values > 1e-13 * values[0], left.T @ (target - seen.value).ravel(), 0.0)
+        before = cost
+        while True:
+            full = np.zeros(len(at))
+            full[at] = right.T @ (along * values / (values**2 + damping)) / size
+            trial = mapping.with_values(mapping.values + full)
             after = _cost(trial, uv, target)
             if after < cost:
+                mapping, cost, damping = trial, after, max(damping / 10, 1e-24)
                 break
-        if not after < cost:
-            break
-        mapping, before, cost = trial, cost, after
-        if before - cost < 1e-12 * before:
+            damping *= 10
+            if damping > 1e6:
+                return mapping
+        slow = slow + 1 if before - cost < 1e-9 * before else 0
+        if slow == 3:
             break
     return mapping
 
 
 def _cost(mapping: PlaneMapping, uv: Array, target: Array) -> float:
-    cost = float(((mapping(uv) - target) ** 2).sum())
+    with np.errstate(all="ignore"):
+        cost = float(((mapping(uv) - target) ** 2).sum())
     return cost if np.isfinite(cost) else np.inf

@@ -1,10 +1,10 @@
-"""OpenCV's camera model, ``opencv``: mapping, kernel and registration."""
+"""OpenCV's camera model, ``opencv``, and with thin prism and tilt, ``opencv_full``: mapping and kernel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping as Named
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -35,7 +35,15 @@ PARAMETERS = (
     Parameter("k5"),
     Parameter("k6"),
 )
-FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 = range(len(PARAMETERS))
+FULL_PARAMETERS = (
+    *PARAMETERS,
+    *(Parameter(f"s{i}") for i in range(1, 5)),
+    Parameter("tau_x", "rad"),
+    Parameter("tau_y", "rad"),
+)
+FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6, S1, S2, S3, S4, TAU_X, TAU_Y = range(len(FULL_PARAMETERS))
+# Number of values of the plain model, the rational one, and that with thin prism and tilt.
+_PLAIN, _RATIONAL, _FULL = 9, len(PARAMETERS), len(FULL_PARAMETERS)
 # Radial terms of numerator and denominator, by ascending powers of r².
 _RADIAL = ((K1, K4), (K2, K5), (K3, K6))
 
@@ -49,13 +57,21 @@ class OpenCV(Radial):
         u'' = u·q + 2·p1·uv + p2(r²+2u²),  q = (1 + k1r² + k2r⁴ + k3r⁶)/(1 + k4r² + k5r⁴ + k6r⁶)
         v'' = v·q + p1(r²+2v²) + 2·p2·uv,  x = fx·u'' + cx,  y = fy·v'' + cy
 
-    As defined in OpenCV's documentation of its module calib3d.
+    A thin prism adds s1r² + s2r⁴ and s3r² + s4r⁴ to (u'', v'') = (x, y). A sensor that is tilted by τx
+    about x and then by τy about y has its point at::
+
+        cos τx·x/w,  (cos τy·y − sin τx·sin τy·x)/w
+        w = sin τy·x − cos τy·sin τx·y + cos τy·cos τx
+
+    As defined in OpenCV's documentation of its module calib3d, with the product of the matrices of the tilt
+    written out; the tilt is that of Louhichi, Fournel, Lavest & Ben Aissia (2007), Self-calibration of
+    Scheimpflug cameras: an easy protocol, Meas. Sci. Technol. 18.
 
     Parameters
     ----------
-    values : array_like (9,) or (12,)
-        fx, fy, cx, cy (px), k1, k2, p1, p2, k3; in the rational model k4, k5, k6 too.
-        Default: fx = fy = 1, all others zero.
+    values : array_like (9,), (12,) or (18,)
+        fx, fy, cx, cy (px), k1, k2, p1, p2, k3; in the rational model k4, k5, k6 too; with thin prism and
+        tilt also s1, s2, s3, s4, τx, τy (rad). Default: fx = fy = 1, all others zero.
 
     Examples
     --------
@@ -65,20 +81,20 @@ class OpenCV(Radial):
 
     values: Array = field(default_factory=lambda: np.array([1.0, 1.0] + 7 * [0.0]))
 
-    ALL_NAMES: ClassVar[tuple[str, ...]] = tuple(p.name for p in PARAMETERS)
+    ALL_NAMES: ClassVar[tuple[str, ...]] = tuple(p.name for p in FULL_PARAMETERS)
 
     def __post_init__(self) -> None:
-        count = 12 if np.size(self.values) == 12 else 9
+        count = np.size(self.values) if np.size(self.values) in (_RATIONAL, _FULL) else _PLAIN
         object.__setattr__(self, "values", as_values(self.ALL_NAMES[:count], self.values))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The nine names, or twelve in the rational model."""
+        """The nine names, twelve in the rational model, or all eighteen."""
         return self.ALL_NAMES[: len(self.values)]
 
     @classmethod
     def from_parameters(cls, parameters: Named[str, float]) -> Self:
-        """A camera from named parameters, the others zero; rational when it has one of k4, k5, k6.
+        """A camera from named parameters, the others zero; rational or full when it has one of these.
 
         Raises
         ------
@@ -88,13 +104,14 @@ class OpenCV(Radial):
         missing = [name for name in ("fx", "fy") if name not in parameters]
         if missing:
             raise UsageError("is missing", where=f"parameter {missing[0]} of an OpenCV camera")
-        rational = any(name in parameters for name in cls.ALL_NAMES[9:])
-        return cls(np.zeros(12 if rational else 9)).with_values(parameters)
+        last = max((cls.ALL_NAMES.index(name) for name in parameters if name in cls.ALL_NAMES), default=0)
+        count = next(count for count in (_PLAIN, _RATIONAL, _FULL) if last < count)
+        return cls(np.zeros(count)).with_values(parameters)
 
     @cached_property
     def _quotient(self) -> tuple[Array, Array]:
         """Numerator and denominator of q as coefficients by powers of r²."""
-        _, _, _, _, k1, k2, _, _, k3, *rest = self.values
+        _, _, _, _, k1, k2, _, _, k3, *rest = self.values[:_RATIONAL]
         return np.array([1.0, k1, k2, k3]), np.array([1.0, *(rest or 3 * [0.0])])
 
     @cached_property
@@ -127,10 +144,33 @@ class OpenCV(Radial):
         d_xy[:, 0, 0] = q + u * u * by_s + 2 * p1 * v + 6 * p2 * u
         d_xy[:, 0, 1] = d_xy[:, 1, 0] = u * v * by_s + 2 * p1 * u + 2 * p2 * v
         d_xy[:, 1, 1] = q + v * v * by_s + 6 * p1 * v + 2 * p2 * u
+        if len(self.values) == _FULL:
+            s1, s2, s3, s4 = self.values[S1:TAU_X]
+            value += np.stack([s * (s1 + s * s2), s * (s3 + s * s4)], axis=1)
+            by = 2 * np.stack([s1 + 2 * s * s2, s3 + 2 * s * s4], axis=1)
+            d_xy += by[:, :, None] * xy[:, None, :]
         return value, d_xy, one_by_m, q
+
+    def _tilted(self, xy: Array) -> tuple[Array, Array, Array]:
+        """Points on the tilted sensor, and their derivatives by the point and by the angles."""
+        sx, sy = np.sin(self.values[TAU_X:])
+        cx, cy = np.cos(self.values[TAU_X:])
+        x, y = xy.T
+        w = sy * x - cy * sx * y + cy * cx
+        w = np.where(w > 0, w, np.nan)[:, None]
+        value = np.stack([cx * x, cy * y - sx * sy * x], axis=1) / w
+        top = np.array([[cx, 0.0], [-sx * sy, cy]])
+        by_xy = (top - value[:, :, None] * [sy, -cy * sx]) / w[:, :, None]
+        by_first = np.stack([-sx * x, -cx * sy * x], axis=1) + value * (cy * (cx * y + sx))[:, None]
+        by_second = np.stack([0 * x, -sx * cy * x - sy * y], axis=1)
+        by_second -= value * (cy * x + sy * (sx * y - cx))[:, None]
+        return value, by_xy, np.stack([by_first, by_second], axis=2) / w[:, :, None]
 
     def _slope(self, xy: Array) -> tuple[Array, Array]:
         value, d_xy, *_ = self._distorted(xy)
+        if len(self.values) == _FULL:
+            value, by_xy, _ = self._tilted(value)
+            d_xy = by_xy @ d_xy
         focal = self.values[:2]
         return value * focal + self.values[2:4], d_xy * focal[:, None]
 
@@ -142,19 +182,77 @@ class OpenCV(Radial):
         u, v = points[:, 0], points[:, 1]
         s = u * u + v * v
         d = np.zeros((len(points), 2, len(self.values)))
-        d[:, [0, 1], [0, 1]] = value
-        d[:, [0, 1], [2, 3]] = 1.0
         powers = points[:, :, None] * (np.stack([s, s**2, s**3], axis=1) * one_by_m[:, None])[:, None, :]
         d[:, :, [4, 5, 8]] = powers * focal[:, None]
         d[:, 0, 6], d[:, 1, 6] = focal[0] * 2 * u * v, focal[1] * (s + 2 * v * v)
         d[:, 0, 7], d[:, 1, 7] = focal[0] * (s + 2 * u * u), focal[1] * 2 * u * v
-        if len(self.values) == 12:
-            d[:, :, 9:] = -powers * q[:, None, None] * focal[:, None]
+        if len(self.values) > _PLAIN:
+            d[:, :, 9:12] = -powers * q[:, None, None] * focal[:, None]
+        if len(self.values) == _FULL:
+            d[:, 0, S1], d[:, 0, S2] = focal[0] * s, focal[0] * s * s
+            d[:, 1, S3], d[:, 1, S4] = focal[1] * s, focal[1] * s * s
+            value, by_xy, by_angles = self._tilted(value)
+            d_xy = by_xy @ d_xy
+            # The derivatives are those of pixels: the focal lengths go around the tilt.
+            d = (by_xy * focal[:, None] / focal) @ d
+            d[:, :, TAU_X:] = by_angles * focal[:, None]
+        d[:, [0, 1], [0, 1]] = value
+        d[:, [0, 1], [2, 3]] = 1.0
         return Derivatives(value * focal + self.values[2:4], d_xy * focal[:, None], d)
 
     def _start(self, xy: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.within((xy - self.values[2:4]) / self.values[:2])
+
+
+# Constant of the kernel.
+IS_FULL = 0
+
+
+@kernel
+def _sensor(
+    k: int, c: int, u: float, v: float, s: float, q: float, m: float, x: float, y: float, xu: float,
+    cross: float, yv: float, xy: Array, cameras: CameraColumns, by_uv: Array, d: Array, off: Array,
+) -> None:  # fmt: skip
+    """Add thin prism and tilt to the distorted direction x, y, and write all results."""
+    p = cameras.values
+    x += s * (p[c, S1] + s * p[c, S2])
+    y += s * (p[c, S3] + s * p[c, S4])
+    to_x, to_y = 2.0 * (p[c, S1] + 2.0 * s * p[c, S2]), 2.0 * (p[c, S3] + 2.0 * s * p[c, S4])
+    xu, xv, yu, yv = xu + to_x * u, cross + to_x * v, cross + to_y * u, yv + to_y * v
+    sx, sy, cx, cy = 0.0, 0.0, 1.0, 1.0
+    if p[c, TAU_X] != 0.0 or p[c, TAU_Y] != 0.0:
+        sx, cx = np.sin(p[c, TAU_X]), np.cos(p[c, TAU_X])
+        sy, cy = np.sin(p[c, TAU_Y]), np.cos(p[c, TAU_Y])
+    w = sy * x - cy * sx * y + cy * cx
+    w = 1.0 / w if w > 0.0 else np.nan
+    px, py = cx * x * w, (cy * y - sx * sy * x) * w
+    fx, fy = p[c, FX], p[c, FY]
+    ax, ay = fx * (cx - px * sy) * w, fx * px * cy * sx * w
+    bx, by = fy * (-sx * sy - py * sy) * w, fy * (cy + py * cy * sx) * w
+    by_uv[0, 0], by_uv[0, 1] = ax * xu + ay * yu, ax * xv + ay * yv
+    by_uv[1, 0], by_uv[1, 1] = bx * xu + by * yu, bx * xv + by * yv
+    d[:, :] = 0.0
+    d[0, FX], d[1, FY], d[0, CX], d[1, CY] = px, py, 1.0, 1.0
+    along, across = ax * u + ay * v, bx * u + by * v
+    power = 1.0 / m
+    for i, j in _RADIAL:
+        power *= s
+        d[0, i], d[1, i] = along * power, across * power
+        d[0, j], d[1, j] = -q * d[0, i], -q * d[1, i]
+    uu, vv, uv = s + 2.0 * u * u, s + 2.0 * v * v, 2.0 * u * v
+    d[0, P1], d[1, P1] = ax * uv + ay * vv, bx * uv + by * vv
+    d[0, P2], d[1, P2] = ax * uu + ay * uv, bx * uu + by * uv
+    d[0, S1], d[1, S1], d[0, S2], d[1, S2] = ax * s, bx * s, ax * s * s, bx * s * s
+    d[0, S3], d[1, S3], d[0, S4], d[1, S4] = ay * s, by * s, ay * s * s, by * s * s
+    turn = cy * (cx * y + sx)
+    d[0, TAU_X] = fx * (px * turn - sx * x) * w
+    d[1, TAU_X] = fy * (py * turn - cx * sy * x) * w
+    turn = cy * x + sy * (sx * y - cx)
+    d[0, TAU_Y] = -fx * px * turn * w
+    d[1, TAU_Y] = fy * (-sx * cy * x - sy * y - py * turn) * w
+    off[0] = fx * px + p[c, CX] - xy[k, 0]
+    off[1] = fy * py + p[c, CY] - xy[k, 1]
 
 
 @kernel
@@ -181,10 +279,13 @@ def _opencv(
     x = u * q + p[c, P1] * uv + p[c, P2] * uu
     y = v * q + p[c, P1] * vv + p[c, P2] * uv
     cross = u * v * by_s + 2.0 * p[c, P1] * u + 2.0 * p[c, P2] * v
-    by_uv[0, 0] = p[c, FX] * (q + u * u * by_s + 2.0 * p[c, P1] * v + 6.0 * p[c, P2] * u)
-    by_uv[0, 1] = p[c, FX] * cross
-    by_uv[1, 0] = p[c, FY] * cross
-    by_uv[1, 1] = p[c, FY] * (q + v * v * by_s + 6.0 * p[c, P1] * v + 2.0 * p[c, P2] * u)
+    xu = q + u * u * by_s + 2.0 * p[c, P1] * v + 6.0 * p[c, P2] * u
+    yv = q + v * v * by_s + 6.0 * p[c, P1] * v + 2.0 * p[c, P2] * u
+    if cameras.constants[c, IS_FULL] == 1.0:
+        _sensor(k, c, u, v, s, q, m, x, y, xu, cross, yv, xy, cameras, by_uv, d, off)
+        return
+    by_uv[0, 0], by_uv[0, 1] = p[c, FX] * xu, p[c, FX] * cross
+    by_uv[1, 0], by_uv[1, 1] = p[c, FY] * cross, p[c, FY] * yv
     d[:, :] = 0.0
     d[0, FX], d[1, FY], d[0, CX], d[1, CY] = x, y, 1.0, 1.0
     power = 1.0 / m
@@ -206,4 +307,18 @@ def _start(f: float, grid: PixelGrid) -> dict[str, float]:
     return {"fx": f, "fy": f, "cx": (grid.width - 1) / 2, "cy": (grid.height - 1) / 2}
 
 
-register_camera(CameraModel("opencv", PARAMETERS, _build, _start, kernel=_opencv))
+def _constants(options: Named[str, Any], full: bool) -> list[float]:
+    return [float(full)]
+
+
+for _name, _parameters in (("opencv", PARAMETERS), ("opencv_full", FULL_PARAMETERS)):
+    register_camera(
+        CameraModel(
+            _name,
+            _parameters,
+            _build,
+            _start,
+            kernel=_opencv,
+            constants=partial(_constants, full=_parameters is FULL_PARAMETERS),
+        )
+    )

@@ -50,8 +50,9 @@ class Parameter:
         As in files.
     unit : str
         As in files: ``mm``, ``px``, ``mm^-2``; empty for none.
-    role : {"scale", "centre", "distortion"}
-        Principal distance or focal length, principal point, or distortion. A scale is above zero.
+    role : {"scale", "centre", "shape", "distortion"}
+        Principal distance or focal length, principal point, shape of the projection (which is not dropped
+        where it is not significant), or distortion. A scale is above zero.
     usual : bool
         Whether a calibration estimates it by default.
     required : bool
@@ -65,7 +66,7 @@ class Parameter:
 
     name: str
     unit: str = ""
-    role: Literal["scale", "centre", "distortion"] = "distortion"
+    role: Literal["scale", "centre", "shape", "distortion"] = "distortion"
     usual: bool = False
     required: bool = False
 
@@ -186,7 +187,7 @@ class CameraModel:
         return {p.name: p.unit for p in self.parameters}
 
     def of_role(self, *roles: str) -> tuple[str, ...]:
-        """Parameters of some roles: ``scale``, ``centre``, ``distortion``."""
+        """Parameters of some roles: ``scale``, ``centre``, ``shape``, ``distortion``."""
         return tuple(p.name for p in self.parameters if p.role in roles)
 
     def checked_options(self, given: Options | None = None) -> dict[str, str | float]:
@@ -255,8 +256,14 @@ class CameraModel:
 
     def rescaled(self, values: ArrayLike, f: float, grid: PixelGrid) -> Array:
         """The same values with the scale parameters for a focal length of f pixels."""
-        scale = [p.role == "scale" for p in self.parameters]
-        return np.where(scale, self.start_values(f, grid), np.asarray(values, dtype=np.float64))
+        scale = np.array([p.role == "scale" for p in self.parameters])
+        given = np.where(scale, self.start_values(f, grid), np.asarray(values, dtype=np.float64))
+        if not self.of_role("shape"):
+            return given
+        # The focal length on the axis depends on the shape too.
+        plain = self.mapping(self.undistorted(given), grid)
+        slope = float(plain.derivatives([[0.0, 0.0]]).d_xy[0, 0, 0])
+        return np.where(scale, given * (f / slope), given) if 0 < slope < np.inf else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +347,7 @@ def camera_models() -> tuple[CameraModel, ...]:
     Examples
     --------
     >>> [model.name for model in camera_models()][:2]
-    ['brown', 'opencv']
+    ['brown', 'brown_higher']
     """
     return tuple(_CAMERAS.values())
 
@@ -368,7 +375,7 @@ def camera_model(name: str) -> CameraModel:
     --------
     >>> camera_model("pinhole")
     Traceback (most recent call last):
-    reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, opencv...
+    reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, brown_higher...
     """
     return _found(_CAMERAS, name, "camera model")
 
@@ -406,7 +413,7 @@ def default_camera_model(pitch_known: bool) -> CameraModel:
 
 
 def distortion_names(names: Iterable[str], model: str = "mapping") -> tuple[str, ...]:
-    """Names of parameters that do not belong to the interior orientation (scale and centre).
+    """Names of parameters that do not belong to the interior orientation (scale, centre and shape).
 
     Parameters
     ----------
@@ -421,7 +428,7 @@ def distortion_names(names: Iterable[str], model: str = "mapping") -> tuple[str,
     ('K1', 'b3')
     """
     models = [_CAMERAS[model]] if model in _CAMERAS else camera_models()
-    interior = {name for each in models for name in each.of_role("scale", "centre")}
+    interior = {name for each in models for name in each.of_role("scale", "centre", "shape")}
     return tuple(name for name in names if name not in interior)
 
 

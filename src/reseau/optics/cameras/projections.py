@@ -1,0 +1,499 @@
+"""Wide-angle cameras: a projection that is symmetric about the axis, then distortion of its plane.
+
+One family: ``fisheye`` (the equidistant projection, OpenCV's fisheye), ``equisolid``, ``orthographic``,
+``stereographic``, ``omni`` (the unified sphere of Mei, OpenCV's omnidir), ``double_sphere`` and ``division``;
+mappings, kernel and registrations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Mapping as Named
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.data import Array
+from ..mapping import Derivatives, as_points, as_values
+from .grid import PixelGrid
+from .kernels import CameraColumns, kernel
+from .radial import Radial, first_root
+from .registry import CameraModel, Parameter, register_camera
+
+__all__ = [
+    "Division",
+    "DoubleSphere",
+    "Equisolid",
+    "Fisheye",
+    "Omni",
+    "Orthographic",
+    "Projected",
+    "Stereographic",
+]
+
+# Kinds of projection; the first constant of the kernel. The second is the number of parameters of the shape.
+EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, SPHERE, TWO_SPHERES, DIVISION = range(7)
+KIND, SHAPES = 0, 1
+FX, FY, CX, CY, SHAPE = range(5)
+# Parameters of the plane, after those of the shape.
+K1, K2, K3, K4, P1, P2, SX1, SY1 = range(8)
+PLANE: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1")
+# Below this s the quotient θ/r is a series, which loses no digits.
+_SMALL = 1e-4
+# Tangent of the largest angle at which the inverse starts.
+_WIDEST = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Projected(Radial):
+    """Base of the family: from the ideal direction to pixels.
+
+    With s = u² + v², a projection g(s), and the distorted plane (m = g·(u, v), t = |m|²)::
+
+        x' = mx·L + 2·p1·mx·my + p2(t + 2mx²) + sx1·t,   L = 1 + k1t + k2t² + k3t³ + k4t⁴
+        y' = my·L + p1(t + 2my²) + 2·p2·mx·my + sy1·t,   x = fx·x' + cx,  y = fy·y' + cy
+
+    A direction outside the domain of the projection has no image: NaN. Rays at 90° from the axis and beyond
+    have no ideal direction.
+
+    Parameters
+    ----------
+    values : array_like
+        fx, fy, cx, cy (px), the parameters of the shape, k1 … k4, p1, p2, sx1, sy1; those that are missing at
+        the end are zero. Default: fx = fy = 1, no distortion.
+    """
+
+    values: Array = field(default_factory=lambda: np.zeros(0))
+
+    kind: ClassVar[int]
+    names: ClassVar[tuple[str, ...]]
+    shape_start: ClassVar[tuple[float, ...]] = ()
+    """Shape of a camera of which nothing is known."""
+
+    def __post_init__(self) -> None:
+        given = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
+        if not given.size:
+            given = np.array([1.0, 1.0, 0.0, 0.0, *self.shape_start])
+        if SHAPE + len(self.shape_start) <= len(given) < len(self.names):
+            given = np.concatenate([given, np.zeros(len(self.names) - len(given))])
+        object.__setattr__(self, "values", as_values(self.names, given))
+
+    @property
+    def _shape(self) -> Array:
+        return self.values[SHAPE : SHAPE + len(self.shape_start)]
+
+    @property
+    def _plane(self) -> Array:
+        return self.values[SHAPE + len(self.shape_start) :]
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        """g (n,), dg/ds (n,) and the derivatives of g by the shape (n, k); see :meth:`derivatives`."""
+        raise NotImplementedError
+
+    def _tangent(self, size: Array) -> Array:
+        """Tangents of the angles from the axis at radii (n,) of the plane; NaN where there are none."""
+        raise NotImplementedError
+
+    def _limit(self) -> float:
+        """Square of the tangent at which the domain of the projection ends."""
+        return np.inf
+
+    @cached_property
+    def fold(self) -> float:
+        """See :class:`~reseau.optics.cameras.radial.Radial`."""
+        t = first_root([1.0, *(self._plane[:4] * [3, 5, 7, 9])])
+        if not np.isfinite(t):
+            return self._limit()
+        with np.errstate(all="ignore"):
+            r = float(self._tangent(np.array([np.sqrt(t)]))[0])
+        return min(r * r, self._limit()) if np.isfinite(r) else self._limit()
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        uv = as_points(xy)
+        s = (uv**2).sum(axis=1)
+        with np.errstate(all="ignore"):
+            g, by_s, by_shape = self._projection(np.where(s < self._limit(), s, np.nan))
+        m = uv * g[:, None]
+        x, y = m.T
+        t = x * x + y * y
+        k1, k2, k3, k4, p1, p2, sx1, sy1 = self._plane
+        bend = 1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
+        by_t = 2 * (k1 + t * (2 * k2 + t * (3 * k3 + t * 4 * k4)))
+        xx, yy, xy2 = t + 2 * x * x, t + 2 * y * y, 2 * x * y
+        image = np.stack(
+            [x * bend + p1 * xy2 + p2 * xx + sx1 * t, y * bend + p1 * yy + p2 * xy2 + sy1 * t], 1
+        )
+        by_m = np.empty((len(uv), 2, 2))
+        cross = x * y * by_t + 2 * p1 * x + 2 * p2 * y
+        by_m[:, 0, 0] = bend + x * x * by_t + 2 * p1 * y + 6 * p2 * x + 2 * sx1 * x
+        by_m[:, 0, 1] = cross + 2 * sx1 * y
+        by_m[:, 1, 0] = cross + 2 * sy1 * x
+        by_m[:, 1, 1] = bend + y * y * by_t + 6 * p1 * y + 2 * p2 * x + 2 * sy1 * y
+        by_uv = g[:, None, None] * np.eye(2) + 2 * by_s[:, None, None] * uv[:, :, None] * uv[:, None, :]
+        focal, count = self.values[:2], len(self.shape_start)
+        d = np.zeros((len(uv), 2, len(self.values)))
+        d[:, [0, 1], [FX, FY]] = image
+        d[:, [0, 1], [CX, CY]] = 1.0
+        along = (by_m @ uv[:, :, None])[:, :, 0] * focal
+        d[:, :, SHAPE : SHAPE + count] = along[:, :, None] * by_shape[:, None, :]
+        plane = d[:, :, SHAPE + count :]
+        plane[:, :, :P1] = (focal * m)[:, :, None] * (t[:, None] ** np.arange(1, 5))[:, None, :]
+        plane[:, 0, P1], plane[:, 1, P1] = focal[0] * xy2, focal[1] * yy
+        plane[:, 0, P2], plane[:, 1, P2] = focal[0] * xx, focal[1] * xy2
+        plane[:, 0, SX1], plane[:, 1, SY1] = focal[0] * t, focal[1] * t
+        return Derivatives(image * focal + self.values[2:4], (by_m @ by_uv) * focal[:, None], d)
+
+    def _start(self, xy: Array) -> Array:
+        image = (xy - self.values[2:4]) / self.values[:2]
+        size = np.hypot(image[:, 0], image[:, 1])
+        k = self._plane[:4]
+        with np.errstate(all="ignore"):
+            most = np.sqrt(first_root([1.0, *(k * [3, 5, 7, 9])]))
+            m = np.fmin(size, 0.95 * most)
+            for _ in range(8):
+                powers = (m * m)[:, None] ** np.arange(1, 5)
+                step = (m * (1 + powers @ k) - size) / (1 + powers @ (k * [3, 5, 7, 9]))
+                m = np.clip(m - np.clip(step, -0.3, 0.3), 0.0, 0.98 * most)
+            r = self._tangent(m)
+            r = np.where(r >= 0, np.fmin(r, _WIDEST), _WIDEST)
+            part = np.where(size > 0, r / size, 1.0)
+        return self.within(image * part[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Fisheye(Projected):
+    """The equidistant projection with a polynomial, OpenCV's fisheye: m = θ·(u, v)/r.
+
+    ::
+
+        θd = θ (1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸),  θ = arctan r,  r² = u² + v²
+        x = fx·u·θd/r + cx,  y = fy·v·θd/r + cy
+
+    Kannala, J. & Brandt, S. (2006), A generic camera model and calibration method for conventional,
+    wide-angle, and fish-eye lenses, PAMI 28(8), in the form of OpenCV's module calib3d/fisheye; with p1, p2,
+    sx1, sy1 of :class:`Projected` it is COLMAP's ``THIN_PRISM_FISHEYE``.
+
+    Examples
+    --------
+    >>> Fisheye([800.0, 800.0, 319.5, 239.5])([[np.tan(0.5), 0.0]]).round(3)
+    array([[719.5, 239.5]])
+    """
+
+    kind: ClassVar[int] = EQUIDISTANT
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        near = s < _SMALL
+        r = np.sqrt(np.where(near, 1.0, s))
+        full = np.arctan(r) / r
+        g = np.where(near, 1 - s * (1 / 3 - s * (0.2 - s / 7)), full)
+        by_s = np.where(near, -1 / 3 + s * (0.4 - s * 3 / 7), (1 / (1 + r * r) - full) / (2 * r * r))
+        return g, by_s, np.zeros((len(s), 0))
+
+    def _tangent(self, size: Array) -> Array:
+        return np.where(size < np.pi / 2, np.tan(size), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Equisolid(Projected):
+    """The equisolid-angle projection with a polynomial: m = 2 sin(θ/2)·(u, v)/r.
+
+    Projection and corrections in its plane after Schneider, D., Schwalbe, E. & Maas, H.-G. (2009), Validation
+    of geometric models for fisheye lenses, ISPRS J. Photogrammetry and Remote Sensing 64(3), eq. (9).
+
+    Examples
+    --------
+    >>> Equisolid([800.0, 800.0, 319.5, 239.5])([[np.tan(0.5), 0.0]]).round(3)
+    array([[715.346, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = EQUISOLID
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        h = np.sqrt(1 + s)
+        g = np.sqrt(2 / (h * (h + 1)))
+        return g, -(2 * h + 1) / (2 * h * g * (h * h + h) ** 2), np.zeros((len(s), 0))
+
+    def _tangent(self, size: Array) -> Array:
+        return np.where(size < np.sqrt(2), np.tan(2 * np.arcsin(size / 2)), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Orthographic(Projected):
+    """The orthographic projection of the sphere of directions, with a polynomial: m = sin θ·(u, v)/r.
+
+    Source as for :class:`Equisolid`. A camera of rays that are parallel is not this one.
+
+    Examples
+    --------
+    >>> Orthographic([800.0, 800.0, 319.5, 239.5])([[np.tan(0.5), 0.0]]).round(3)
+    array([[703.04, 239.5 ]])
+    """
+
+    kind: ClassVar[int] = ORTHOGRAPHIC
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        g = 1 / np.sqrt(1 + s)
+        return g, -0.5 * g**3, np.zeros((len(s), 0))
+
+    def _tangent(self, size: Array) -> Array:
+        return size / np.sqrt(1 - size * size)
+
+
+@dataclass(frozen=True, eq=False)
+class Stereographic(Projected):
+    """The stereographic projection with a polynomial: m = 2 tan(θ/2)·(u, v)/r.
+
+    Source as for :class:`Equisolid`.
+
+    Examples
+    --------
+    >>> Stereographic([800.0, 800.0, 319.5, 239.5])([[np.tan(0.5), 0.0]]).round(3)
+    array([[728.047, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = STEREOGRAPHIC
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        h = np.sqrt(1 + s)
+        g = 2 / (1 + h)
+        return g, -1 / (h * (1 + h) ** 2), np.zeros((len(s), 0))
+
+    def _tangent(self, size: Array) -> Array:
+        return np.where(size < 2, np.tan(2 * np.arctan(size / 2)), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Omni(Projected):
+    """The unified sphere with distortion, OpenCV's omnidir without skew: m = (u, v)/(1 + ξ√(1 + r²)).
+
+    Mei, C. & Rives, P. (2007), Single view point omnidirectional camera calibration from planar grids, ICRA,
+    eq. (1)–(4). fx and fy are those of the publication: the focal length on the axis is fx/(1 + ξ).
+
+    Examples
+    --------
+    >>> Omni([1600.0, 1600.0, 319.5, 239.5, 1.0])([[np.tan(0.5), 0.0]]).round(3)
+    array([[728.047, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = SPHERE
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "xi", *PLANE)
+    shape_start: ClassVar[tuple[float, ...]] = (0.6,)
+
+    def _limit(self) -> float:
+        xi = self._shape[0]
+        return float(1 / xi**2 - 1) if -1 < xi < 0 else np.inf if xi >= 0 else 0.0
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        xi, h = self._shape[0], np.sqrt(1 + s)
+        g = 1 / (1 + xi * h)
+        return g, -xi * g * g / (2 * h), (-h * g * g)[:, None]
+
+    def _tangent(self, size: Array) -> Array:
+        xi, t = self._shape[0], size * size
+        k = (xi + np.sqrt(1 + (1 - xi * xi) * t)) / (1 + t)
+        return _positive(size * k, k - xi)
+
+
+@dataclass(frozen=True, eq=False)
+class DoubleSphere(Projected):
+    """Two spheres with distortion: with h = √(1 + r²), w = 1 + ξh, m = (u, v)/(α√(r² + w²) + (1 − α)w).
+
+    Usenko, V., Demmel, N. & Cremers, D. (2018), The double sphere camera model, 3DV, eq. (40)–(52). With
+    ξ = 0 focal length and α act alike: α and ξ are those of a wide lens at the start. The focal length on the
+    axis is fx/(1 + ξ).
+
+    Examples
+    --------
+    >>> DoubleSphere([800.0, 800.0, 319.5, 239.5, 0.0, 0.5])([[np.tan(0.5), 0.0]]).round(3)
+    array([[728.047, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = TWO_SPHERES
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "xi", "alpha", *PLANE)
+    shape_start: ClassVar[tuple[float, ...]] = (-0.2, 0.55)
+
+    def _limit(self) -> float:
+        xi, alpha = self._shape
+        if not (0 <= alpha <= 1 and xi > -1):
+            return 0.0
+        w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+        w2 = (w1 + xi) / np.sqrt(2 * w1 * xi + xi * xi + 1)
+        return float(1 / w2**2 - 1) if w2 < 0 else np.inf
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        xi, alpha = self._shape
+        h = np.sqrt(1 + s)
+        w = 1 + xi * h
+        far = np.sqrt(s + w * w)
+        g = 1 / (alpha * far + (1 - alpha) * w)
+        by_h = xi / (2 * h)
+        by_s = alpha * (1 + 2 * w * by_h) / (2 * far) + (1 - alpha) * by_h
+        by_xi = h * (alpha * w / far + 1 - alpha)
+        return g, -by_s * g * g, np.stack([-by_xi * g * g, (w - far) * g * g], axis=1)
+
+    def _tangent(self, size: Array) -> Array:
+        xi, alpha = self._shape
+        t = size * size
+        z = (1 - alpha * alpha * t) / (alpha * np.sqrt(1 - (2 * alpha - 1) * t) + 1 - alpha)
+        k = (z * xi + np.sqrt(z * z + (1 - xi * xi) * t)) / (z * z + t)
+        return _positive(size * k, k * z - xi)
+
+
+@dataclass(frozen=True, eq=False)
+class Division(Projected):
+    """The division model with distortion: r = |m|/(1 + λ|m|²), so that m = 2(u, v)/(1 + √(1 − 4λr²)).
+
+    Fitzgibbon, A. (2001), Simultaneous linear estimation of multiple view geometry and lens distortion, CVPR;
+    with fx, fy and λ it is COLMAP's ``DIVISION``.
+
+    Examples
+    --------
+    >>> Division([800.0, 800.0, 319.5, 239.5, -0.25])([[np.tan(0.5), 0.0]]).round(3)
+    array([[728.047, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = DIVISION
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "lambda", *PLANE)
+    shape_start: ClassVar[tuple[float, ...]] = (0.0,)
+
+    def _limit(self) -> float:
+        bend = self._shape[0]
+        return float(1 / (4 * bend)) if bend > 0 else np.inf
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        bend = self._shape[0]
+        root = np.sqrt(1 - 4 * bend * s)
+        q = 4 / (root * (1 + root) ** 2)
+        return 2 / (1 + root), bend * q, (s * q)[:, None]
+
+    def _tangent(self, size: Array) -> Array:
+        return _positive(size, 1 + self._shape[0] * size * size)
+
+
+def _positive(above: Array, below: Array) -> Array:
+    """Quotient (n,), NaN where the denominator is not above zero."""
+    return np.where(below > 0, above / below, np.nan)
+
+
+@kernel
+def _projected(
+    k: int, c: int, e: int, u: float, v: float, xy: Array, cameras: CameraColumns, by_uv: Array, d: Array,
+    more: Array, off: Array,
+) -> None:  # fmt: skip
+    """See :mod:`reseau.optics.cameras.kernels`."""
+    p, kind = cameras.values, cameras.constants[c, KIND]
+    first = SHAPE + int(cameras.constants[c, SHAPES])
+    s = u * u + v * v
+    h = np.sqrt(1.0 + s)
+    g, by_s, by_a, by_b = 1.0, 0.0, 0.0, 0.0
+    if kind == EQUIDISTANT:
+        if s < _SMALL:
+            g = 1.0 - s * (1.0 / 3.0 - s * (0.2 - s / 7.0))
+            by_s = -1.0 / 3.0 + s * (0.4 - s * 3.0 / 7.0)
+        else:
+            r = np.sqrt(s)
+            g = np.arctan(r) / r
+            by_s = (1.0 / (1.0 + s) - g) / (2.0 * s)
+    elif kind == EQUISOLID:
+        g = np.sqrt(2.0 / (h * (h + 1.0)))
+        by_s = -(2.0 * h + 1.0) / (2.0 * h * g * (h * h + h) ** 2)
+    elif kind == ORTHOGRAPHIC:
+        g = 1.0 / h
+        by_s = -0.5 * g * g * g
+    elif kind == STEREOGRAPHIC:
+        g = 2.0 / (1.0 + h)
+        by_s = -0.25 * g * g / h
+    elif kind == SPHERE:
+        a = p[c, SHAPE]
+        below = 1.0 + a * h
+        g = 1.0 / below if below > 0.0 else np.nan
+        by_s, by_a = -a * g * g / (2.0 * h), -h * g * g
+    elif kind == TWO_SPHERES:
+        a, b = p[c, SHAPE], p[c, SHAPE + 1]
+        w = 1.0 + a * h
+        far = np.sqrt(s + w * w)
+        below = b * far + (1.0 - b) * w
+        g = 1.0 / below if below > 0.0 else np.nan
+        by_h = a / (2.0 * h)
+        by_s = -(b * (1.0 + 2.0 * w * by_h) / (2.0 * far) + (1.0 - b) * by_h) * g * g
+        by_a, by_b = -h * (b * w / far + 1.0 - b) * g * g, (w - far) * g * g
+    else:
+        a = p[c, SHAPE]
+        inside = 1.0 - 4.0 * a * s
+        root = np.sqrt(inside) if inside > 0.0 else np.nan
+        g = 2.0 / (1.0 + root)
+        by_s, by_a = a * g * g / root, s * g * g / root
+    x, y = u * g, v * g
+    t = x * x + y * y
+    k1, k2, k3, k4 = p[c, first + K1], p[c, first + K2], p[c, first + K3], p[c, first + K4]
+    p1, p2, sx1, sy1 = p[c, first + P1], p[c, first + P2], p[c, first + SX1], p[c, first + SY1]
+    bend = 1.0 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
+    by_t = 2.0 * (k1 + t * (2.0 * k2 + t * (3.0 * k3 + t * 4.0 * k4)))
+    xx, yy, xy2 = t + 2.0 * x * x, t + 2.0 * y * y, 2.0 * x * y
+    fx, fy = p[c, FX], p[c, FY]
+    image_x = x * bend + p1 * xy2 + p2 * xx + sx1 * t
+    image_y = y * bend + p1 * yy + p2 * xy2 + sy1 * t
+    cross = x * y * by_t + 2.0 * p1 * x + 2.0 * p2 * y
+    mxx = fx * (bend + x * x * by_t + 2.0 * p1 * y + 6.0 * p2 * x + 2.0 * sx1 * x)
+    mxy = fx * (cross + 2.0 * sx1 * y)
+    myx = fy * (cross + 2.0 * sy1 * x)
+    myy = fy * (bend + y * y * by_t + 6.0 * p1 * y + 2.0 * p2 * x + 2.0 * sy1 * y)
+    along_x, along_y = mxx * u + mxy * v, myx * u + myy * v
+    by_uv[0, 0], by_uv[0, 1] = mxx * g + 2.0 * by_s * u * along_x, mxy * g + 2.0 * by_s * v * along_x
+    by_uv[1, 0], by_uv[1, 1] = myx * g + 2.0 * by_s * u * along_y, myy * g + 2.0 * by_s * v * along_y
+    d[:, :] = 0.0
+    d[0, FX], d[1, FY], d[0, CX], d[1, CY] = image_x, image_y, 1.0, 1.0
+    if first > SHAPE:
+        d[0, SHAPE], d[1, SHAPE] = along_x * by_a, along_y * by_a
+    if first > SHAPE + 1:
+        d[0, SHAPE + 1], d[1, SHAPE + 1] = along_x * by_b, along_y * by_b
+    power = 1.0
+    for i in range(first, first + P1):
+        power *= t
+        d[0, i], d[1, i] = fx * x * power, fy * y * power
+    d[0, first + P1], d[1, first + P1] = fx * xy2, fy * yy
+    d[0, first + P2], d[1, first + P2] = fx * xx, fy * xy2
+    d[0, first + SX1], d[1, first + SY1] = fx * t, fy * t
+    off[0] = fx * image_x + p[c, CX] - xy[k, 0]
+    off[1] = fy * image_y + p[c, CY] - xy[k, 1]
+
+
+def _register(name: str, camera: type[Projected], usual: tuple[str, ...], *, bends: bool = False) -> None:
+    """Register one of the family; `bends` where the shape is zero without distortion."""
+    count = len(camera.shape_start)
+    scale = 1.0 if bends or not count else 1.0 + camera.shape_start[0]
+
+    def build(values: Array, grid: PixelGrid, options: Named[str, Any]) -> Projected:
+        return camera(values)
+
+    def start(f: float, grid: PixelGrid) -> dict[str, float]:
+        shape = dict(zip(camera.names[SHAPE:], camera.shape_start, strict=False))
+        centre = {"cx": (grid.width - 1) / 2, "cy": (grid.height - 1) / 2}
+        return {"fx": f * scale, "fy": f * scale, **centre, **shape}
+
+    constants: Callable[[Named[str, Any]], list[float]] = lambda options: [camera.kind, count]  # noqa: E731
+    parameters = [Parameter(each, "px", "scale", True, True) for each in ("fx", "fy")]
+    parameters += [Parameter(each, "px", "centre", True, True) for each in ("cx", "cy")]
+    for each in camera.names[SHAPE : SHAPE + count]:
+        parameters.append(Parameter(each, "", "distortion" if bends else "shape", True, required=not bends))
+    parameters += [Parameter(each, usual=each in usual) for each in PLANE]
+    register_camera(
+        CameraModel(name, tuple(parameters), build, start, kernel=_projected, constants=constants)
+    )
+
+
+_register("fisheye", Fisheye, ("k1", "k2", "k3", "k4"))
+_register("equisolid", Equisolid, ("k1", "k2"))
+_register("orthographic", Orthographic, ("k1", "k2"))
+_register("stereographic", Stereographic, ("k1", "k2"))
+_register("omni", Omni, ("p1", "p2"))
+_register("double_sphere", DoubleSphere, ())
+_register("division", Division, ("p1", "p2"), bends=True)
