@@ -90,14 +90,14 @@ def test_opencv_and_the_bundle_give_the_same_camera(seen: dict[str, Array]) -> N
 def test_the_bad_corners_of_left02_are_among_the_rejected(seen: dict[str, Array]) -> None:
     result = adjust_network(network(seen), Options(outliers="reject"))
     assert isinstance(result, Result)
-    images, points = result.rejected_names()
-    bad = {name for image, name in zip(images, points, strict=True) if image == "left02"}
+    bad = {point for image, point, *_ in result.rejected_points() if image == "left02"}
     # The first column, which the classic detector puts 1.7 to 6.3 px off.
     assert {f"{row}:0" for row in range(6)} <= bad
     assert result.rejected.sum() < 0.05 * len(result.rejected)
     # Every rejection is listed with its test value, those of the blunder the largest.
     table = ResultDocument.of(result).to_dict()["left_out"]
-    assert list(zip(table["image"], table["point"], strict=True)) == list(zip(images, points, strict=True))
+    listed = [(image, point) for image, point, *_ in result.rejected_points()]
+    assert list(zip(table["image"], table["point"], strict=True)) == listed
     assert all(value > critical for value, critical in zip(table["w"], table["critical"], strict=True))
     worst = sorted(zip(table["w"], table["image"], table["point"], strict=True), reverse=True)[:4]
     assert {image for _, image, _ in worst} == {"left02"}

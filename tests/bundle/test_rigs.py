@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Network, Result, adjust_network
+from reseau.bundle import Camera, Network, Options, Result, adjust_network
 from reseau.bundle.network import Rig, network_document
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
+from reseau.core.failure import Failure
 from reseau.io.network import CameraEntry
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 
@@ -118,6 +119,34 @@ def test_a_rig_is_a_column_of_the_document() -> None:
     assert (again.rig.exposure == network.rig.exposure).all()  # type: ignore[union-attr]
     one, other = (adjust_network(each).required().rig for each in (network, again))
     assert np.abs(one.base - other.base).max() < 1e-9  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("cold", [False, True])
+def test_an_image_that_was_not_taken_at_once_is_named_and_left_out_of_the_rig(cold: bool) -> None:
+    network = drawn(cameras=3, control=True)
+    odd, later = network.images.index("1-3"), network.images.index("1-6")
+    # Camera 1 was late: in exposure 3 it has the image of exposure 6, which is not used itself.
+    images = np.array([odd if i == later else -1 if i == odd else i for i in range(len(network.images))])
+    at = images[network.image_of]
+    x0, rotation = network.x0.copy(), network.rotation.copy()
+    x0[odd], rotation[odd] = x0[later], rotation[later]
+    if cold:
+        x0[:], rotation[:] = np.nan, np.nan
+    moved = replace(network.select(at >= 0), image_of=at[at >= 0], x0=x0, rotation=rotation)
+    result = adjust_network(moved, Options(outliers="reject")).required()
+    said = "images 1-3 were not taken at once with the others of their exposure; adjusted apart from the rig"
+    assert said in [str(warning) for warning in result.warnings]
+    assert result.rig is not None
+    assert np.abs(result.rig.base[0] - PLACES[1][1]).max() < 5 * result.rig.sigma[0, 3:].max()
+    assert result.sigma0 == pytest.approx(1.0, abs=0.15)
+
+
+def test_exposures_that_are_all_shifted_are_no_rig() -> None:
+    network = drawn()
+    rig = Rig(network.camera_of, (np.arange(len(network.images)) // 2 + network.camera_of) % 8)
+    result = adjust_network(replace(network, rig=rig))
+    said = result.reason if isinstance(result, Failure) else " ".join(map(str, result.warnings))
+    assert "were the images of an exposure taken at once?" in said
 
 
 def interior(matrix: Array, distortion: Array) -> Array:

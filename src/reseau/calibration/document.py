@@ -28,6 +28,7 @@ __all__ = [
     "FilmFrameModel",
     "Kind",
     "OscilloscopeModel",
+    "Place",
     "Quantity",
     "SensorModel",
     "readable_as",
@@ -69,6 +70,27 @@ class Covariance(Strict):
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
+
+
+class Place(Strict):
+    """Place of a camera on a rig, in the axes of the `reference` camera.
+
+    `rotation` is the vector of the rotation from these axes to those of the camera, rad; `base` its
+    projection centre in them, in `unit`. `covariance` (6, 6) is that of a small rotation about the axes of
+    the camera and of the base.
+
+    Examples
+    --------
+    >>> Place(reference="left", rotation=(0.0, 0.1, 0.0), base=(120.0, 0.0, 0.0), unit="mm",
+    ...       covariance=((1e-8,) * 6,) * 6).reference
+    'left'
+    """
+
+    reference: str
+    rotation: tuple[float, float, float]
+    base: tuple[float, float, float]
+    unit: str
+    covariance: tuple[tuple[float, ...], ...]
 
 
 @with_config(_STRICT)
@@ -190,9 +212,9 @@ class Calibration(Document):
     """A calibration: parameters with full covariance, the tests they passed, and where they hold.
 
     `kind` says what was calibrated, `model` what the parameters belong to; :meth:`mapping` gives both as a
-    mapping of points, images or frames. `times` alone holds clock times: without it, the same inputs give the
-    same bytes. Files of earlier versions are read too: the kind of a sensor was ``camera``, that of a film
-    frame ``frame``.
+    mapping of points, images or frames. `place` is that of a camera on a rig.
+    `times` alone holds clock times: without it, the same inputs give the same bytes. Files of earlier
+    versions are read too: the kind of a sensor was ``camera``, that of a film frame ``frame``.
 
     Examples
     --------
@@ -214,6 +236,7 @@ class Calibration(Document):
     covariance: Covariance
     sigma0: float | None
     redundancy: int
+    place: Place | None = None
     tests: tuple[dict[str, Any], ...] = ()
     validity: dict[str, Any] = Field(default_factory=dict)
     provenance: dict[str, Any] = Field(default_factory=dict)

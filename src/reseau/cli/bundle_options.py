@@ -173,10 +173,7 @@ def say_rig(found: RigEstimate) -> None:
 
 def say_left_out(result: Result) -> None:
     """Print the image points that data snooping rejected, with their test values."""
-    import numpy as np
-
-    tests = result.rejected_tests[np.flatnonzero(result.rejected)]
-    for image, point, (value, critical) in zip(*result.rejected_names(), tests, strict=True):
+    for image, point, value, critical in result.rejected_points():
         say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
 
 

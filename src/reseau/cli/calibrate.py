@@ -1,13 +1,15 @@
-"""`reseau calibrate`: calibrate a camera from photographs of a target."""
+"""`reseau calibrate`: calibrate a camera, or a rig of cameras, from photographs of a target."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core.errors import UsageError
 from .bundle_compare import read_lens
 from .bundle_options import (
     ComponentsOf,
@@ -23,6 +25,7 @@ from .bundle_options import (
     say_model,
     say_parameters,
     say_refraction,
+    say_rig,
 )
 from .common import (
     AsJson,
@@ -39,11 +42,11 @@ from .measure import Channel
 
 if TYPE_CHECKING:
     from ..bundle import Kind
-    from ..calibration import CameraMapping, FieldDifference
-    from ..calibration.document import Calibration
+    from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
+    from ..procedures.exposures import Taken
 
 __all__ = ["calibrate"]
 
@@ -65,10 +68,20 @@ LeaveOut = Annotated[
 
 
 def calibrate(
-    images: Annotated[
-        list[Path], typer.Argument(help="Photographs of the target, or files of measured image coordinates.")
-    ],
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
+    images: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Photographs of the target, or files of measured image coordinates."),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILES",
+            help="Photographs of one of several cameras that are fixed to each other, in place of IMAGES: a "
+            "folder or a pattern, e.g. 'left=left/*.png'; repeatable. Files with the same name, or the same "
+            "last number in it, were taken at once.",
+        ),
+    ] = None,
     out: Out = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     overlay: Annotated[
@@ -117,47 +130,85 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target."""
-    workers = _processes(images, jobs)
+    photographs, taken = _photographs(images or [], camera or [])
+    files = list(photographs.values())
+    workers = _processes(files, jobs)
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..procedures.target_measurement import drawing_overlays
 
     outputs(out, report)
-    drawn = {} if overlay is None else overlay_files(overlay, images)
+    drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
     target, kind = parse_design(read_text(design), design), component_kind(components)
     others = {path.name: read_lens(path) for path in against or []}
+    if others and taken:
+        raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     level = level_of(eliminate, "--eliminate")
     options = _options(sigma, control, refraction, leave_out or [], reject, kind, level, workers)
-    camera = _camera(model, pitch, side, model_option or [], free)
+    lens = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
-    measure = drawing_overlays(measure, {path.name: file for path, file in drawn.items()})
-    with progress("measuring", len(images)) as step:
-        frames = _frames(images, channel, sensor, step)
-        done = required(calibrate_camera(frames, target, measure, _size(size), camera, options), design)
+    measure = drawing_overlays(
+        measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
+    )
+    with progress("measuring", len(files)) as step:
+        frames = _frames(photographs, channel, sensor, step)
+        found = calibrate_camera(frames, target, measure, _size(size), lens, options, taken or None)
+        done = required(found, design)
+    inputs = {path.name: path for path in (design, control, refraction, sensor) if path} | photographs
     provenance = _provenance(
-        [design, *images, *(path for path in (control, refraction, sensor) if path)],
-        model=camera.model, pitch=pitch, options=dict(camera.options), free=free, sigma=sigma,
+        inputs,
+        model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
         leave_out=list(leave_out or []), components=kind,
     )  # fmt: skip
     differences = _differences(done, others)
-    calibration = _calibration(done, target.name, provenance)
+    calibrations = [
+        done.calibration(target.name, provenance.to_dict(), entry.id) for entry in done.result.network.cameras
+    ]
     if report is not None:
         _write_report(report, done, f"Calibration with {target.name}", provenance, differences, distance)
     if out is not None:
-        calibration.write(out)
+        for calibration, path in zip(calibrations, done.files(out).values(), strict=True):
+            calibration.write(path)
     if as_json:
-        say(calibration.to_json())
+        say("".join(calibration.to_json() for calibration in calibrations))
     else:
         _say(done, differences, distance or [])
 
 
-def _provenance(inputs: list[Path], **settings: Any) -> Provenance:
+def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path], dict[str, Taken]]:
+    """Photographs by their names; with several cameras also when each was taken."""
+    if not cameras:
+        if not images:
+            raise UsageError(
+                "are missing", where="photographs", do="name IMAGES, or --camera for each camera"
+            )
+        named = {path.name: path for path in images}
+        if len(named) < len(images):
+            names = [path.name for path in images]
+            twice = next(name for name in named if names.count(name) > 1)
+            raise UsageError("two photographs have this name", where=twice)
+        return named, {}
+    from ..procedures.exposures import exposures_of_files, files_of
+
+    if images:
+        raise UsageError("cannot be combined with --camera", where=images[0])
+    files: dict[str, list[Path]] = {}
+    for text in cameras:
+        name, equals, pattern = text.partition("=")
+        if not equals or not name or not pattern or name in files:
+            raise UsageError(f"is {text!r}", where="--camera", do="write name=files, each name once")
+        files[name] = files_of(pattern)
+    found = exposures_of_files(files)
+    return {name: path for name, (path, _) in found.items()}, {name: at for name, (_, at) in found.items()}
+
+
+def _provenance(inputs: Mapping[str, Path], **settings: Any) -> Provenance:
     from ..core.provenance import Provenance, sha256_of
 
-    return Provenance({path.name: sha256_of(path) for path in inputs}, settings)
+    return Provenance({name: sha256_of(path) for name, path in inputs.items()}, settings)
 
 
 def _options(
@@ -172,7 +223,6 @@ def _options(
 ) -> CalibrationOptions:
     """Options of the procedure, from the options of the command."""
     from ..bundle import Options
-    from ..core.errors import UsageError
     from ..exchange import read_control
     from ..io.refraction import RefractionFile
     from ..procedures.calibration import CalibrationOptions
@@ -201,11 +251,6 @@ def _processes(images: list[Path], jobs: int | None) -> int:
     return count
 
 
-def _calibration(done: Calibrated, name: str, provenance: Provenance) -> Calibration:
-    """The calibration, with the entries of the model search."""
-    return done.calibration(name, provenance.to_dict())
-
-
 def _write_report(
     path: Path,
     done: Calibrated,
@@ -224,22 +269,21 @@ def _write_report(
 
 
 def _frames(
-    paths: list[Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
+    photographs: Mapping[str, Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Frame | tuple[str, ImagePoints]]:
     """Photographs, or measured image coordinates, in order."""
     from ..io import is_points, read_measurement
 
-    for path in paths:
-        step(f"measuring {path.name}")
+    for name, path in photographs.items():
+        step(f"measuring {name}")
         if is_points(path):
-            yield path.name, read_measurement(path).image_points()
+            yield name, read_measurement(path).image_points()
         else:
-            yield corrected(read_frame(path, channel.value), sensor)
+            yield replace(corrected(read_frame(path, channel.value), sensor), name=name)
 
 
 def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:
     """Camera model and parameters from the options of the command."""
-    from ..core.errors import UsageError
     from ..procedures.calibration import CameraOptions
 
     options: dict[str, str | float] = {} if side is None else {"side": side}
@@ -253,7 +297,6 @@ def _camera(model: str, pitch: float | None, side: str | None, more: list[str], 
 
 
 def _size(text: str) -> tuple[int, int] | None:
-    from ..core.errors import UsageError
 
     if not text:
         return None
@@ -272,6 +315,16 @@ def _differences(done: Calibrated, others: dict[str, CameraMapping]) -> dict[str
     }
 
 
+def _uncertainty(field: ProjectionField) -> str:
+    """The uncertainty over the image, px; an unusable model has none."""
+    import numpy as np
+
+    sigma = field.sigma[np.isfinite(field.sigma)]
+    if not len(sigma):
+        return "unknown"
+    return f"median {np.median(sigma):.2g} px, at most {sigma.max():.2g} px"
+
+
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
     import numpy as np
 
@@ -285,17 +338,21 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     v = result.residuals[~result.rejected]
     v = v[np.isfinite(v).all(axis=1)]
     say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
-    say_parameters(result.camera(0), sigma_between_images(result, 0))
+    for c, entry in enumerate(result.network.cameras):
+        if len(result.network.cameras) > 1:
+            say(f"camera {entry.id}\n")
+        say_parameters(result.camera(c), sigma_between_images(result, c))
+        field = _uncertainty(projection_field(camera_mapping(result, c)))
+        say(f"uncertainty of the projection: {field.replace(',', ' over the image,')}\n")
+        for away in distances:
+            say(
+                f"  at {away:g} {result.network.unit}: {_uncertainty(projection_field_at(result, c, away))}\n"
+            )
+    if result.rig is not None:
+        say_rig(result.rig)
     if result.refraction is not None:
         say("windows and media\n")
         say_refraction(result.refraction)
-    sigma = projection_field(camera_mapping(result, 0)).sigma
-    middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
-    say(f"uncertainty of the projection: median {middle:.2g} px over the image, at most {worst:.2g} px\n")
-    for away in distances:
-        sigma = projection_field_at(result, 0, away).sigma
-        middle, worst = np.nanmedian(sigma), np.nanmax(sigma)
-        say(f"  at {away:g} {result.network.unit}: median {middle:.2g} px, at most {worst:.2g} px\n")
     say_model(done.result)
     for name, found in differences.items():
         say_difference(name, found)

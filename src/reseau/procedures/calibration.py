@@ -1,4 +1,4 @@
-"""Calibration of a camera from photographs of a target.
+"""Calibration of a camera, or of several fixed to each other, from photographs of a target.
 
 The coordinates of the design are only approximate values: all points of the target are unknowns, and the
 network has inner constraints over them (a free network). Scale and datum are those of the design on average
@@ -26,6 +26,7 @@ from ..bundle import (
     Options,
     PointEstimates,
     Result,
+    Rig,
     calibration_of,
     camera_mapping,
     model_search_entries,
@@ -40,6 +41,7 @@ from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
 from ..optics.refraction import RefractedRays, Refraction
+from .exposures import Taken
 from .target_measurement import Measurer, measured_in_order, measurer_of
 from .z_stage import Heights
 
@@ -59,6 +61,8 @@ __all__ = [
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
+_CAMERA = "camera"
+"""Name of a camera that is alone."""
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
 _NARROW = 1e-3
@@ -158,9 +162,10 @@ class CalibrationOptions:
     heights : Heights, optional
         Heights of the target on a z-stage.
     refraction : RefractionEntry, optional
-        Windows and media between the camera, whose name is ``camera``, and the target. The calibration is
-        that of the camera in air. Without control points the diagonals of the target are distances of the
-        design, known to a ten-thousandth: windows have dimensions, and the scale is not free.
+        Windows and media between the camera, whose name is ``camera`` if it is alone, and the target. The
+        calibration is that of the camera in air. Without control points the diagonals of the target are
+        distances of the design, known to a ten-thousandth: windows have dimensions, and the scale is not
+        free.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -181,7 +186,7 @@ class Calibrated(Display):
     Parameters
     ----------
     result : Result
-        Result of the adjustment; its network has one camera, `camera`.
+        Result of the adjustment; a camera that is alone has the name ``camera``.
     measured : dict
         Measured image points, by image.
     declined : dict
@@ -211,7 +216,7 @@ class Calibrated(Display):
 
     @property
     def cameras(self) -> dict[str, CameraEstimate]:
-        """Estimated parameters of the camera, by its name ``camera``."""
+        """Estimated parameters of the cameras, by their names; one that is alone is called ``camera``."""
         return self.result.cameras
 
     @property
@@ -224,8 +229,13 @@ class Calibrated(Display):
         """Points of the target."""
         return self.result.points
 
-    def calibration(self, name: str = "camera", provenance: Mapping[str, Any] | None = None) -> Calibration:
-        """Return the calibration of the camera as a document, with how its model was found.
+    def calibration(
+        self,
+        name: str = "camera",
+        provenance: Mapping[str, Any] | None = None,
+        camera: str | None = None,
+    ) -> Calibration:
+        """Return the calibration of a camera as a document, with how its model was found.
 
         Parameters
         ----------
@@ -233,20 +243,38 @@ class Calibrated(Display):
             Name of the calibration.
         provenance : mapping, optional
             Inputs and options, see :class:`reseau.core.provenance.Provenance`.
+        camera : str, optional
+            Name of the camera; required with several.
+
+        Raises
+        ------
+        UsageError
+            When there is no such camera.
         """
-        found = calibration_of(self.result, "camera", name=name, provenance=provenance)
+        found = calibration_of(self.result, camera or _CAMERA, name=name, provenance=provenance)
         more = model_search_entries(self.result)
         return found.model_copy(update={"validity": found.validity | more}) if more else found
 
     def write(self, path: Path | str) -> None:
-        """Write the calibration, ``reseau-calibration/1``.
+        """Write the calibration, ``reseau-calibration/1``; of several cameras one file each.
+
+        With several cameras their names are appended to that of the file: ``rig.json`` becomes
+        ``rig-left.json`` and ``rig-right.json``.
 
         Raises
         ------
         InputError
-            When the file cannot be written.
+            When a file cannot be written.
         """
-        self.calibration(Path(path).stem).write(path)
+        for camera, file in self.files(Path(path)).items():
+            self.calibration(file.stem, camera=camera).write(file)
+
+    def files(self, path: Path) -> dict[str, Path]:
+        """Return the file of each camera, for the path given to all; see :meth:`write`."""
+        names = [entry.id for entry in self.result.network.cameras]
+        if len(names) == 1:
+            return {names[0]: path}
+        return {name: path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names}
 
     def plot(self, photo: Frame | None = None) -> Sequence[Axes]:
         """Draw residuals over the image and the uncertainty of the projection side by side, with matplotlib.
@@ -259,13 +287,14 @@ class Calibrated(Display):
         Returns
         -------
         sequence of matplotlib Axes
-            Of the two or three panels.
+            Of the panels: one for each camera, one or two before them.
         """
         import matplotlib.pyplot as plt
 
         from ..core.figures import BLUE
 
-        count = 2 if photo is None else 3
+        cameras = len(self.cameras)
+        count = cameras + (1 if photo is None else 2)
         _, row = plt.subplots(1, count, figsize=(4.6 * count, 3.9), layout="constrained")
         panels = list(row)
         if photo is not None:
@@ -274,23 +303,28 @@ class Calibrated(Display):
             if points is not None:
                 panels[0].plot(*points.xy.T, "o", color=BLUE, markerfacecolor="none", markersize=4)
                 panels[0].set_title(f"{photo.name}: {len(points)} points", loc="left")
-        self.result.plot(panels[-2])
-        camera_mapping(self.result, 0).plot(panels[-1])
+        self.result.plot(panels[-1 - cameras])
+        for c, axes in enumerate(panels[-cameras:]):
+            camera_mapping(self.result, c).plot(axes)
         return panels
 
     def _facts(self) -> list[tuple[str, str]]:
-        camera = self.cameras["camera"]
         count = sum(len(points) for points in self.measured.values())
         return [
             (f"{len(self.measured)} images", ""),
             (f"{count} image points", ""),
             (f"{len(self.declined)} declined", ""),
             ("sigma0", f"{self.sigma0:.3f}"),
-            *camera._facts()[1:],
+            *(fact for camera in self.cameras.values() for fact in camera._facts()[len(self.cameras) == 1 :]),
         ]
 
     def _columns(self) -> dict[str, list[object]]:
-        return self.cameras["camera"]._columns()
+        each = [camera._columns() for camera in self.cameras.values()]
+        columns = {key: [value for one in each for value in one[key]] for key in each[0]}
+        if len(each) == 1:
+            return columns
+        names = [name for name, one in zip(self.cameras, each, strict=True) for _ in next(iter(one.values()))]
+        return {"camera": [*names], **columns}
 
 
 def calibrate_camera(
@@ -300,13 +334,14 @@ def calibrate_camera(
     size: tuple[int, int] | None = None,
     model: CameraOptions | None = None,
     options: CalibrationOptions | None = None,
+    taken: Mapping[str, Taken] | None = None,
 ) -> Calibrated | Failure:
-    """Calibrate a camera from photographs of a target.
+    """Calibrate a camera, or several that are fixed to each other, from photographs of a target.
 
     Parameters
     ----------
     frames : iterable of Frame, or of (name, ImagePoints)
-        Photographs of one size, or measured image points.
+        Photographs, of one size for each camera, or measured image points.
     design : PlaneDesign
         The target.
     measure : callable
@@ -318,11 +353,14 @@ def calibrate_camera(
         Camera model and parameters to estimate.
     options : CalibrationOptions, optional
         Options of the calibration.
+    taken : mapping of str to Taken, optional
+        Camera and exposure of each photograph, by its name, of cameras that are fixed to each other; see
+        :func:`~reseau.procedures.exposures.exposures_of_files`. By default all are of one camera.
 
     Returns
     -------
     Calibrated or Failure
-        A failure when fewer than three images show the target, or the adjustment fails.
+        A failure when fewer than three images of a camera show the target, or the adjustment fails.
 
     Raises
     ------
@@ -331,22 +369,33 @@ def calibrate_camera(
         out was not measured, or windows and media contradict each other.
     """
     options = options or CalibrationOptions()
-    measured, declined, size = _measured(frames, measure, size, options.workers)
+    measured, declined, sizes = _measured(frames, measure, size, taken, options.workers)
     measured = _without(measured, options.without)
-    if len(measured) < _LEAST_IMAGES:
-        why = "".join(f"; {name}: {reason}" for name, reason in declined.items())
-        return Failure(
-            f"{len(measured)} images show the target, {_LEAST_IMAGES} are needed{why}", Code.TOO_FEW_IMAGES
-        )
-    if size is None:
+    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
+    of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
+    for c, name in enumerate(cameras):
+        if of.count(c) < _LEAST_IMAGES:
+            which = f" of camera {name}" if taken else ""
+            why = "".join(f"; {image}: {reason}" for image, reason in declined.items())
+            return Failure(
+                f"{of.count(c)} images{which} show the target, {_LEAST_IMAGES} are needed{why}",
+                Code.TOO_FEW_IMAGES,
+            )
+    if not all(name in sizes for name in cameras):
         raise UsageError(
             "is not known without a photograph", where="size of the images", do="give width and height"
         )
     refraction = None
     if options.refraction is not None:
-        refraction = options.refraction.refraction(tuple(measured), ("camera",) * len(measured))
-    camera = first_camera(measured, design, size, model or CameraOptions(), _magnification(refraction))
-    network = replace(network_of(measured, design, camera), refraction=refraction)
+        refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
+    model, larger = model or CameraOptions(), _magnification(refraction)
+    entries = []
+    for c, name in enumerate(cameras):
+        own = {image: points for (image, points), at in zip(measured.items(), of, strict=True) if at == c}
+        entries.append(replace(first_camera(own, design, sizes[name], model, larger), id=name))
+    network = replace(network_of(measured, design, entries[0]), refraction=refraction)
+    if taken:
+        network = _fixed_to_each_other(network, entries, of, [taken[name].exposure for name in measured])
     if options.heights is not None:
         network = options.heights.lifted(network)
     if options.control is not None:
@@ -359,26 +408,42 @@ def calibrate_camera(
     return found if isinstance(found, Failure) else Calibrated(found, measured, declined)
 
 
+def _fixed_to_each_other(
+    network: Network, cameras: Sequence[Camera], of: Sequence[int], exposures: Sequence[str]
+) -> Network:
+    """Return the network with several cameras, which are fixed to each other."""
+    number = {name: k for k, name in enumerate(dict.fromkeys(exposures))}
+    camera_of = np.array(of, dtype=np.intp)
+    rig = Rig(camera_of, np.array([number[name] for name in exposures], dtype=np.intp))
+    return replace(network, cameras=tuple(cameras), camera_of=camera_of, rig=rig)
+
+
 def _measured(
     frames: Iterable[Frame | tuple[str, ImagePoints]],
     measure: Measurer,
     size: tuple[int, int] | None,
+    taken: Mapping[str, Taken] | None,
     workers: int,
-) -> tuple[dict[str, ImagePoints], dict[str, str], tuple[int, int] | None]:
-    """Return the image points of each photograph, the reasons of declined ones, and the image size."""
+) -> tuple[dict[str, ImagePoints], dict[str, str], dict[str, tuple[int, int]]]:
+    """Return the image points of each photograph, reasons of declined ones, and image sizes by camera."""
     names = set[str]()
+    every = {each.camera for each in taken.values()} if taken else {_CAMERA}
+    sizes = {} if size is None else dict.fromkeys(every, size)
 
     def checked() -> Iterator[Frame | tuple[str, ImagePoints]]:
-        nonlocal size
         for frame in frames:
             name = frame.name if isinstance(frame, Frame) else frame[0]
             if name in names:
                 raise UsageError("two photographs have this name", where=name)
+            if taken is not None and name not in taken:
+                raise UsageError("is of no known camera and exposure", where=name)
             names.add(name)
             if isinstance(frame, Frame):
-                if size is not None and size != (frame.width, frame.height):
-                    raise UsageError(f"is not {size[0]}×{size[1]} pixels like the others", where=name)
-                size = (frame.width, frame.height)
+                known = sizes.setdefault(
+                    taken[name].camera if taken else _CAMERA, (frame.width, frame.height)
+                )
+                if known != (frame.width, frame.height):
+                    raise UsageError(f"is not {known[0]}×{known[1]} pixels like the others", where=name)
             yield frame
 
     measured: dict[str, ImagePoints] = {}
@@ -390,7 +455,7 @@ def _measured(
             declined[name] = f"{len(found)} points are too few"
         else:
             measured[name] = found
-    return measured, declined, size
+    return measured, declined, sizes
 
 
 def _without(
@@ -524,4 +589,4 @@ def first_camera(
     f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
-    return Camera("camera", *size, pitch, model.model, values, model.chosen, model.options)
+    return Camera(_CAMERA, *size, pitch, model.model, values, model.chosen, model.options)

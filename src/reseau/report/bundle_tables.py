@@ -71,10 +71,9 @@ def worst_points(result: Result) -> list[tuple[str, ...]]:
 
 def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
     """Return the image points rejected by data snooping: image, point, test value, bound."""
-    tests = result.rejected_tests[np.flatnonzero(result.rejected)]
     return [
         (image, point, f"{value:.1f}", f"{critical:.1f}")
-        for image, point, (value, critical) in zip(*result.rejected_names(), tests, strict=True)
+        for image, point, value, critical in result.rejected_points()
     ]
 
 

@@ -17,7 +17,7 @@ from .image_scatter import sigma_between_images
 from .patterns import by_place, common_pattern
 from .result import Result
 
-__all__ = ["LISTED", "checks", "gaps", "listed"]
+__all__ = ["LISTED", "checks", "listed"]
 
 LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
@@ -41,8 +41,12 @@ def listed(names: Iterable[object]) -> str:
     return ", ".join(every[:LISTED]) + more
 
 
-def gaps(network: Network, fit: BundleFit) -> list[Remark]:
-    """Return remarks on points, images and cameras that were left out, with the reasons."""
+def _gaps(result: Result) -> list[Remark]:
+    """Return remarks on points, images and cameras that were left out, with the reasons.
+
+    Images whose points data snooping rejected are told where that was decided.
+    """
+    network, fit = result.network, result.fit
     found = []
     part, rays = fit.usable.points, network.rays
     lost = ~part & ~network.held.all(axis=1)
@@ -83,7 +87,8 @@ def gaps(network: Network, fit: BundleFit) -> list[Remark]:
                 Code.NOT_IDENTIFIED,
             )
         )
-    images = np.flatnonzero(~fit.usable.images)
+    kept = np.bincount(network.image_of[~result.rejected], minlength=len(network.images))
+    images = np.flatnonzero(~fit.usable.images & ((kept > 0) | (network.seen == 0)))
     for i in images[:LISTED]:
         name, seen = network.images[i], int(network.seen[i])
         why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
@@ -124,7 +129,7 @@ def checks(result: Result) -> list[Remark]:
     """
     network, fit = result.network, result.fit
     return [
-        *gaps(network, fit),
+        *_gaps(result),
         *_not_converged(result),
         *_global(result),
         *_large(result),

@@ -492,11 +492,17 @@ class Result(Display):
         """
         return _factors(*self.scatter)
 
-    def rejected_names(self) -> tuple[list[str], list[str]]:
-        """Return images and points of the image points that data snooping rejected."""
-        rows = np.flatnonzero(self.rejected)
-        images = [self.network.images[i] for i in self.network.image_of[rows]]
-        return images, [self.network.points[j] for j in self.network.point_of[rows]]
+    def rejected_points(self) -> list[tuple[str, str, float, float]]:
+        """Return image, point, test value and critical value of the image points that data snooping rejected.
+
+        Points of images that were left out as a whole are not among them.
+        """
+        network = self.network
+        rows = np.flatnonzero(self.rejected & self.fit.usable.images[network.image_of])
+        return [
+            (network.images[network.image_of[k]], network.points[network.point_of[k]], *map(float, test))
+            for k, test in zip(rows, self.rejected_tests[rows], strict=True)
+        ]
 
     @cached_property
     def rejected_tests(self) -> Array:

@@ -35,6 +35,8 @@ _WEAK = 3e-3
 _DEEP = 0.02
 # Iterations of an adjustment with values that are not plausible.
 _FEW = 30
+# Median angle (rad) between the orientations of an exposure by its images that were not taken at once.
+_NOT_AT_ONCE = 0.05
 # Part of the points of an image above which it is left out as a whole.
 _MOSTLY = 0.5
 # Failures after which cameras are freed in steps.
@@ -98,16 +100,26 @@ def problem_of(network: Network, options: Options | None = None) -> tuple[Bundle
     >>> problem, notes
     (<BundleProblem: 8 images, 20 points, 320 observations>, ())
     """
-    return _begun(network, options or Options(), settle=True)
+    problem, notes, doubts = _begun(network, options or Options(), settle=True)
+    return problem, (*notes, *doubts)
 
 
-def _begun(network: Network, options: Options, *, settle: bool) -> tuple[BundleProblem, tuple[Remark, ...]]:
-    found = approximate(network)
+def _begun(
+    network: Network, options: Options, *, settle: bool
+) -> tuple[BundleProblem, tuple[Remark, ...], tuple[Remark, ...]]:
+    """Return the problem, what approximate values tell, and what is doubtful about the network."""
+    found, doubts = approximate(network), tuple[Remark, ...]()
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
     if network.stage is not None:
         moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
+    if network.rig is not None:
+        if not finite(network.x0[network.rig.exposure >= 0]).all():
+            start = _without_rig(network, options, start)
+        odd, typical = network.rig.apart(start.rotation, start.x0)
+        if len(odd) or typical > _NOT_AT_ONCE:
+            network, doubts = _not_at_once(network, odd, typical, apart=options.outliers == "reject")
     if network.rig is not None:
         places, rotation, x0 = network.rig.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, rig=places)
@@ -115,10 +127,39 @@ def _begun(network: Network, options: Options, *, settle: bool) -> tuple[BundleP
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )
     if not settle:
-        return replace(problem, rounds=LAST_ROUND), found.notes
+        return replace(problem, rounds=LAST_ROUND), found.notes, doubts
     if len(lost_images(network, start.x0, start.xyz)):
         problem = settled(problem)
-    return problem, found.notes
+    return problem, found.notes, doubts
+
+
+def _without_rig(network: Network, options: Options, start: Values) -> Values:
+    """Return the values of an adjustment in which every image has an orientation of its own.
+
+    Orientations by approximate cameras would make a poor rig, and not show which images do not belong
+    together. Where there is no such adjustment, the values remain.
+    """
+    problem = _begun(replace(network, rig=None), options, settle=True)[0]
+    fit = _plain(problem)
+    return start if isinstance(fit, Failure) else fit.values
+
+
+def _not_at_once(
+    network: Network, odd: Rows, typical: float, *, apart: bool
+) -> tuple[Network, tuple[Remark, ...]]:
+    """Return what to say of images that were not taken at once, and the network with them apart."""
+    if typical > _NOT_AT_ONCE:
+        text = (
+            f"the relative orientation of the cameras differs from exposure to exposure, in the median by "
+            f"{np.degrees(typical):.2g} deg: were the images of an exposure taken at once?"
+        )
+        return network, (Remark(text, Code.INCONSISTENT),)
+    names = listed(network.images[i] for i in odd)
+    done = "; adjusted apart from the rig" if apart else ""
+    text = f"images {names} were not taken at once with the others of their exposure{done}"
+    if apart and network.rig is not None:
+        network = replace(network, rig=network.rig.without(odd))
+    return network, (Remark(text, Code.INCONSISTENT),)
 
 
 def adjust_network(network: Network, options: Options | None = None) -> Result | Failure:
@@ -156,7 +197,9 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     if grave:
         # Far from any solution many iterations lead nowhere.
         options = replace(options, max_iterations=min(options.max_iterations, _FEW))
-    problem, notes = _begun(network, options, settle=not grave)
+    problem, notes, doubts = _begun(network, options, settle=not grave)
+    network = problem.network
+    found += doubts
     problem, false_bars = without_false_bars(problem)
     found += false_bars
     found += given_poses_that_do_not_fit(network, _misfits_px(problem))

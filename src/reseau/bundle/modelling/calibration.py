@@ -7,9 +7,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...calibration.document import Calibration, CameraModel, Covariance, Quantity
+from ...calibration.document import Calibration, CameraModel, Covariance, Place, Quantity
 from ...core.errors import UsageError
 from ...optics.cameras import unit_of
+from ...optics.poses import matrix_to_vector
 from ..diagnostics import Result, sigma_between_images
 from ..network import Camera
 
@@ -24,7 +25,7 @@ def calibration_of(
     provenance: Mapping[str, Any] | None = None,
     times: Mapping[str, str] | None = None,
 ) -> Calibration:
-    """Create the calibration of one camera, ``reseau-calibration/1``.
+    """Create the calibration of one camera, ``reseau-calibration/1``, with its place on a rig.
 
     Parameters
     ----------
@@ -72,6 +73,8 @@ def calibration_of(
     between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
+    place = _place(result, camera)
+    more = {} if place is None else {"place": place}
     return Calibration(
         kind="camera",
         name=name,
@@ -87,7 +90,23 @@ def calibration_of(
                   "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),
         times=dict(times or {}),
+        **more,
     )  # fmt: skip
+
+
+def _place(result: Result, camera: str) -> Place | None:
+    """Return the place of a camera on a rig; None for the reference, and without a rig."""
+    rig = result.rig
+    if rig is None or camera not in rig.cameras:
+        return None
+    k = rig.cameras.index(camera)
+    return Place(
+        reference=rig.references[k],
+        rotation=tuple(matrix_to_vector(rig.rotation[k]).tolist()),
+        base=tuple(rig.base[k].tolist()),
+        unit=rig.unit,
+        covariance=tuple(tuple(row) for row in rig.cov[k].tolist()),
+    )
 
 
 def _model(camera: Camera) -> CameraModel:

@@ -24,6 +24,10 @@ from ...core.errors import UsageError
 
 __all__ = ["Rig", "RigValues"]
 
+# An image was not taken at once with the others of its exposure: the difference of its orientation in the
+# median difference, and at least this angle (rad) or this part of the extent of the projection centres.
+_FACTOR, _TURNED, _SHIFTED = 8.0, 0.02, 0.1
+
 
 class RigValues(NamedTuple):
     """Places of the cameras on a rig: rotations (c, 3, 3) and projection centres (c, 3) in its axes."""
@@ -118,6 +122,54 @@ class Rig:
                 of_rig, centre = self.of_exposure(values, rotation[seen], x0[seen], self.camera[seen])
                 rotation[those], x0[those] = self.images(values, of_rig, centre, self.camera[those])
         return values, rotation, x0
+
+    def apart(self, rotation: Array, x0: Array) -> tuple[Rows, float]:
+        """Find images that were not taken at once with the others of their exposure.
+
+        Parameters
+        ----------
+        rotation, x0 : ndarray (m, 3, 3) and (m, 3)
+            Orientation of each image by itself; NaN where unknown.
+
+        Returns
+        -------
+        ndarray of int (k,)
+            Images whose orientation is not that of their exposure; of two images both.
+        float
+            Median angle (rad) between the orientations of an exposure that its images give.
+        """
+        values, *_ = self.approximate(rotation, x0)
+        known = np.isfinite(x0).all(axis=1) & (self.exposure >= 0)
+        reference = self.references(known)[self.camera]
+        angle, away = np.full(len(known), np.nan), np.full(len(known), np.nan)
+        for exposure in np.unique(self.exposure[known]):
+            rows = np.flatnonzero(known & (self.exposure == exposure))
+            for own in np.unique(reference[rows]):
+                those = rows[reference[rows] == own]
+                if len(those) < 2:
+                    continue
+                of_camera = self.camera[those]
+                turn = np.swapaxes(values.rotation[of_camera], 1, 2) @ rotation[those]
+                at = x0[those] - (values.base[of_camera][:, None, :] @ turn)[:, 0]
+                off = turn @ _mean_rotation(np.median(turn, axis=0)).T
+                cosine = (np.trace(off, axis1=1, axis2=2) - 1) / 2
+                angle[those] = np.arccos(np.clip(cosine, -1.0, 1.0))
+                away[those] = np.linalg.norm(at - np.median(at, axis=0), axis=1)
+        compared = np.isfinite(angle)
+        if not compared.any():
+            return np.zeros(0, dtype=np.intp), 0.0
+        typical, usual = float(np.median(angle[compared])), float(np.median(away[compared]))
+        spread = np.linalg.norm(x0[known] - np.median(x0[known], axis=0), axis=1)
+        far = max(_FACTOR * usual, _SHIFTED * float(np.median(spread)))
+        with np.errstate(invalid="ignore"):
+            odd = (angle > max(_FACTOR * typical, _TURNED)) | (away > far)
+        return np.flatnonzero(odd).astype(np.intp), typical
+
+    def without(self, images: Rows) -> Rig:
+        """Return the rig with orientations of their own for some images."""
+        exposure = self.exposure.copy()
+        exposure[images] = -1
+        return Rig(self.camera, exposure)
 
     def _relative(self, one: int, other: int, known: Mask, rotation: Array, x0: Array) -> tuple[Array, Array]:
         """Rotation (3, 3) and centre (3,) of a camera in the axes of another."""

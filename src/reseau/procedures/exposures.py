@@ -1,0 +1,110 @@
+"""Photographs of cameras that are fixed to each other: which were taken at once."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from glob import glob
+from pathlib import Path
+from typing import NamedTuple
+
+from ..core.errors import InputError, UsageError
+
+__all__ = ["Taken", "exposures_of_files", "files_of"]
+
+_NUMBER = re.compile(r"\d+(?=\D*$)")
+
+
+class Taken(NamedTuple):
+    """The camera and the exposure of a photograph."""
+
+    camera: str
+    exposure: str
+
+
+def files_of(pattern: str) -> list[Path]:
+    """Files of a folder, or that match a pattern such as ``left/*.png``, in the order of their names.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    Examples
+    --------
+    >>> files_of("no/such/folder/*.png")
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.InputError: no/such/folder/*.png: matches no file
+    """
+    folder = Path(pattern)
+    paths = folder.iterdir() if folder.is_dir() else map(Path, glob(pattern))
+    found = sorted(path for path in paths if path.is_file() and not path.name.startswith("."))
+    if not found:
+        raise InputError("has no file" if folder.is_dir() else "matches no file", where=pattern)
+    return found
+
+
+def exposures_of_files(files: Mapping[str, Sequence[Path]]) -> dict[str, tuple[Path, Taken]]:
+    """Tell which files of several cameras were taken at once.
+
+    Files with the same name, without its suffix, belong to one exposure (``left/0001.png`` and
+    ``right/0001.png``). Where no camera shares a name with another, the last number in the name counts
+    (``left01.jpg`` and ``right01.jpg``). An exposure needs no image of every camera.
+
+    Parameters
+    ----------
+    files : mapping of str to sequence of Path
+        Files of each camera.
+
+    Returns
+    -------
+    dict
+        For each photograph, by its name ``camera/file``: the file, its camera and exposure.
+
+    Raises
+    ------
+    UsageError
+        With fewer than two cameras, or when the names of files do not tell which were taken at once.
+
+    Examples
+    --------
+    >>> found = exposures_of_files({"left": [Path("l1.png"), Path("l2.png")], "right": [Path("r02.png")]})
+    >>> {name: taken.exposure for name, (_, taken) in found.items()}
+    {'left/l1.png': '1', 'left/l2.png': '2', 'right/r02.png': '2'}
+    """
+    if len(files) < 2:
+        raise UsageError(f"{len(files)} is too few: at least two are required", where="cameras of a rig")
+    same = Counter(stem for paths in files.values() for stem in {path.stem for path in paths})
+    by_name = any(count > 1 for count in same.values())
+    found: dict[str, tuple[Path, Taken]] = {}
+    for camera, paths in files.items():
+        known: dict[str, Path] = {}
+        for path in paths:
+            exposure = path.stem if by_name else _number(path)
+            if exposure in known:
+                raise UsageError(
+                    f"has {known[exposure].name} and {path.name} of one exposure", where=f"camera {camera}",
+                    do="name files that were taken at once alike, as left/0001.png and right/0001.png",
+                )  # fmt: skip
+            known[exposure] = path
+            found[f"{camera}/{path.name}"] = path, Taken(camera, exposure)
+    seen = Counter(taken.exposure for _, taken in found.values())
+    if max(seen.values(), default=0) < 2:
+        raise UsageError(
+            "no file was taken together with one of another camera", where="cameras of a rig",
+            do="name files that were taken at once alike, as left/0001.png and right/0001.png",
+        )  # fmt: skip
+    return found
+
+
+def _number(path: Path) -> str:
+    """The last number in a file's name, without leading zeros."""
+    found = _NUMBER.search(path.stem)
+    if found is None:
+        raise UsageError(
+            "has no number that tells with which others it was taken", where=path,
+            do="name files that were taken at once alike, as left/0001.png and right/0001.png",
+        )  # fmt: skip
+    return str(int(found[0]))

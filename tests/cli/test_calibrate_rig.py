@@ -1,0 +1,130 @@
+"""`reseau calibrate --camera …`: cameras that are fixed to each other."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.calibration import Calibration
+from reseau.designs import regular_reseau
+from reseau.io import Mark
+from reseau.optics import OpenCV, Pose, project
+from reseau.optics.poses import matrix_to_vector, rotation_matrix
+
+Run = Callable[..., tuple[int, str, str]]
+
+SIGMA, EXPOSURES = 0.05, 8
+TURN, BASE = np.array([0.02, 0.1, -0.01]), np.array([90.0, 2.0, -4.0])
+CAMERAS = {
+    "left": {"fx": 530.0, "fy": 531.0, "cx": 322.0, "cy": 235.0, "k1": -0.28, "k2": 0.08},
+    "right": {"fx": 545.0, "fy": 544.0, "cx": 314.0, "cy": 241.0, "k1": -0.25, "k2": 0.06},
+}
+FREE = ("--size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A design, and the coordinates that two cameras with wide lenses saw, in two folders."""
+    folder, rng = tmp_path_factory.mktemp("stereo"), np.random.default_rng(2)
+    design = regular_reseau(9, 7, 25.0, Mark(shape="disk", size=5.0), name="disks")
+    design.write(folder / "disks.json")
+    xyz = np.column_stack([design.xy, np.zeros(len(design.ids))])
+    for e in range(EXPOSURES):
+        about = 2 * np.pi * e / EXPOSURES
+        first = rotation_matrix(np.array([0.0, 0.0, 0.8 * e])) @ rotation_matrix(
+            np.array([np.pi + 0.5 * np.cos(about), 0.5 * np.sin(about), 0.0])
+        )
+        at = -first.T @ np.array([-40.0, 5.0 * np.cos(3 * about), 330.0])
+        places = {"left": (first, at), "right": (rotation_matrix(TURN) @ first, at + first.T @ BASE)}
+        for camera, (turn, centre) in places.items():
+            seen = project(OpenCV.from_parameters(CAMERAS[camera]), Pose(matrix_to_vector(turn), centre), xyz)
+            xy = seen.xy + SIGMA * rng.normal(size=seen.xy.shape)
+            inside = ((xy > 0) & (xy < [640, 480])).all(axis=1)
+            rows = [
+                f"{name},{x!r},{y!r},{SIGMA},{SIGMA}"
+                for name, (x, y), ok in zip(design.ids, xy.tolist(), inside, strict=True)
+                if ok
+            ]
+            (folder / camera).mkdir(exist_ok=True)
+            (folder / camera / f"{e:02d}.csv").write_text("id,x,y,sx,sy\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+def both(folder: Path) -> tuple[object, ...]:
+    return ("--camera", f"left={folder / 'left'}", "--camera", f"right={folder / 'right' / '*.csv'}")
+
+
+def test_each_camera_and_its_place_are_within_their_sigmas(
+    reseau: Run, measured: Path, tmp_path: Path
+) -> None:
+    files = ("-o", tmp_path / "K.json", "--report", tmp_path / "F.html")
+    status, out, err = reseau("calibrate", *both(measured), "-d", measured / "disks.json", *FREE, *files)
+    assert (status, err) == (0, "")
+    assert "camera right from left: base " in out
+    for name, true in CAMERAS.items():
+        found = Calibration.read(tmp_path / f"K-{name}.json")
+        assert found.sigma0 == pytest.approx(1.0, abs=0.1)
+        for key, value in true.items():
+            assert abs(found.parameters[key].value - value) < 4.5 * found.parameters[key].sigma
+    assert Calibration.read(tmp_path / "K-left.json").place is None
+    place = Calibration.read(tmp_path / "K-right.json").place
+    assert place is not None
+    assert place.reference == "left"
+    off = matrix_to_vector(rotation_matrix(np.array(place.rotation)) @ rotation_matrix(TURN).T)
+    error = np.concatenate([off, np.array(place.base) - BASE])
+    # Chi square of six degrees of freedom, 1e-5. The scale is that of the design.
+    assert error @ np.linalg.solve(np.array(place.covariance), error) < 33.0
+    report = (tmp_path / "F.html").read_text()
+    assert "Cameras fixed to each other" in report
+    assert "right/00.csv" in report
+
+
+@pytest.fixture
+def exchanged(measured: Path, tmp_path: Path) -> Path:
+    """The same, with two files of the right camera exchanged."""
+    folder = tmp_path / "exchanged"
+    shutil.copytree(measured, folder)
+    for name, source in (("02.csv", "05.csv"), ("05.csv", "02.csv")):
+        shutil.copy(measured / "right" / source, folder / "right" / name)
+    return folder
+
+
+def test_images_that_were_not_taken_at_once_are_named(reseau: Run, exchanged: Path, tmp_path: Path) -> None:
+    said = "images left/02.csv, left/05.csv, right/02.csv, right/05.csv were not taken at once"
+    command = ("calibrate", *both(exchanged), "-d", exchanged / "disks.json", *FREE)
+    _, out, err = reseau(*command)
+    assert said in out + err
+    status, out, err = reseau(*command, "--reject", "-o", tmp_path / "K.json")
+    assert (status, err) == (0, "")
+    assert f"{said} with the others of their exposure; adjusted apart from the rig" in out
+    place = Calibration.read(tmp_path / "K-right.json").place
+    assert place is not None
+    assert np.abs(np.array(place.base) - BASE).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "photographs: are missing"),
+        (("--camera", "left"), "--camera: is 'left'"),
+        (("--camera", "left={0}/left"), "at least two are required"),
+        (("--camera", "left={0}/left", "--camera", "left={0}/right"), "each name once"),
+        (("--camera", "left={0}/none*", "--camera", "b={0}/right"), "none*: matches no file"),
+        (
+            ("{0}/left/00.csv", "--camera", "left={0}/left", "--camera", "b={0}/right"),
+            "combined with --camera",
+        ),
+    ],
+)
+def test_cameras_that_are_not_told_apart_are_refused(
+    reseau: Run, measured: Path, arguments: tuple[str, ...], said: str
+) -> None:
+    given = [text.format(measured) for text in arguments]
+    status, _, err = reseau("calibrate", *given, "-d", measured / "disks.json")
+    assert status == 2
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
