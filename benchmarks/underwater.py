@@ -58,6 +58,8 @@ CONTROL = 6
 SIGMA_PX = 0.05
 """Of ordinary coordinates."""
 FREE = ("fx", "fy", "k1", "k2", "k3", "k4")
+SIGMA_RADIAL = 2.0
+"""Of the radial coefficients about 0: those of the numerator and the denominator are hardly separable."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ def network_of(drawn: Project, camera: LensCamera) -> Network:
     true = np.concatenate([drawn.corresponding[name] for name in images])
     return Network(
         cameras=(
-            Camera("cam", *SIZE, (PITCH, PITCH), "opencv", np.array([f, f, *PRINCIPAL, *8 * [0.0]]), FREE),
+            Camera("cam", *SIZE, (PITCH, PITCH), "opencv", np.array([f, f, *PRINCIPAL, *8 * [0.0]]), FREE,
+                   sigma=dict.fromkeys(FREE[2:], SIGMA_RADIAL)),
         ),
         images=images, camera_of=np.zeros(m, np.intp),
         x0=np.array([drawn.centres[name] for name in images]),

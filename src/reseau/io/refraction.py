@@ -66,7 +66,7 @@ class WindowEntry(Strict):
 
     id: str = Field(min_length=1)
     shape: Literal["plane", "sphere", "cylinder"]
-    on: Literal["camera", "object"]
+    on: Literal["camera", "rig", "object"]
     parameters: dict[str, float]
     media: tuple[str, ...]
     free: tuple[str, ...] = ()

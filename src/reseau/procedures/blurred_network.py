@@ -24,7 +24,7 @@ from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import LensCamera, PlaneTarget, behind_windows, image_scale
-from ..optics.refraction import RefractedRays
+from ..optics.refraction import RefractedRays, Refraction
 from .blurred import SPACING_PX
 
 __all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
@@ -390,10 +390,10 @@ class _Run:
             rotation, x0 = values.rotation[i], values.x0[i]
             xyz = self.xyz[network.point_of[rows]]
             x = (xyz - x0) @ rotation.T
-            uv, refraction = x[:, :2] / x[:, 2:], network.refraction
+            uv, refraction = x[:, :2] / x[:, 2:], self._windows(last)
             if refraction is not None and refraction.path_of[i] >= 0:
                 rays = RefractedRays.of(
-                    refraction.columns(values.refraction), refraction.path_of[[i]], rotation[None], x0[None],
+                    refraction.columns(refraction.values), refraction.path_of[[i]], rotation[None], x0[None],
                     xyz, np.zeros(len(rows), np.intp), np.arange(len(rows)),
                 )  # fmt: skip
                 uv = rays.uv
@@ -443,12 +443,20 @@ class _Run:
         middle = mapping(np.zeros((1, 2)))[0]
         sensor = replace(lens.sensor, principal_px=(float(middle[0]), float(middle[1])))
         lens = replace(lens, sensor=sensor)
-        if network.refraction is None:
+        windows = self._windows(last)
+        if windows is None:
             return lens, lens
         return lens, behind_windows(
-            lens, network.refraction.with_values(values.refraction), int(network.refraction.path_of[i]),
-            values.rotation[i], values.x0[i], unit_mm=self.unit_mm,
-        )  # fmt: skip
+            lens, windows, int(windows.path_of[i]), values.rotation[i], values.x0[i], unit_mm=self.unit_mm
+        )
+
+    def _windows(self, last: Result) -> Refraction | None:
+        """Windows and media of an adjustment; those of a rig as windows of its cameras."""
+        refraction, rig = self.network.refraction, last.fit.values.rig
+        if refraction is None:
+            return None
+        refraction = refraction.with_values(last.fit.values.refraction)
+        return refraction if rig is None else refraction.on_cameras(self.network.camera_of, *rig)
 
     def _stays(self, found: BlurredResult, k: int, own: int) -> bool:
         """Whether a target keeps its ordinary coordinates."""

@@ -286,8 +286,11 @@ class Result(Display):
         if bent is None:
             return np.zeros(0, dtype=np.intp)
         rows = np.flatnonzero(self.fit.usable.observations & (bent.path_of[network.image_of] >= 0))
+        bent = bent.with_values(values.refraction)
+        if values.rig is not None:
+            bent = bent.on_cameras(network.camera_of, *values.rig)
         rays = RefractedRays.of(
-            bent.columns(values.refraction), bent.path_of, values.rotation, values.x0, values.xyz,
+            bent.columns(bent.values), bent.path_of, values.rotation, values.x0, values.xyz,
             network.image_of[rows], network.point_of[rows],
         )  # fmt: skip
         return rows[~rays.reached].astype(np.intp)

@@ -366,9 +366,25 @@ class Network(Display):
         if self.refraction is not None:
             self._check_refraction(self.refraction)
 
+    def _check_rig_windows(self, refraction: Refraction) -> None:
+        where, through = "Network.refraction", refraction.path_of >= 0
+        images = np.flatnonzero(through & refraction.on_rig[refraction.path_of])
+        if self.rig is None or (self.rig.exposure[images] < 0).any():
+            raise UsageError(
+                "a window is on a rig, but an image that is seen through it has no `exposure`", where=where
+            )
+        cameras = np.unique(self.camera_of[images])
+        if len(np.unique(self.rig.references(np.ones(len(self.images), dtype=bool))[cameras])) > 1:
+            raise UsageError(
+                "a window is on a rig, but no exposures connect the cameras that are seen through it",
+                where=where,
+            )
+
     def _check_refraction(self, refraction: Refraction) -> None:
         if len(refraction.path_of) != len(self.images):
             raise UsageError("requires a path, or −1, for each image", where="Network.refraction")
+        if refraction.on_rig.any():
+            self._check_rig_windows(refraction)
         if self.stage is not None and any(window.on == "object" for window in refraction.windows):
             raise UsageError(
                 "a window on the object cannot be combined with a stage that moves the object",

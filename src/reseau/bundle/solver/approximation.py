@@ -95,11 +95,26 @@ def approximate(network: Network) -> Approximate:
     return _Block(network).grown()
 
 
+def _with_windows_on_cameras(network: Network) -> Network:
+    """The network with windows of a rig on each camera, where the approximate poses have it.
+
+    Without poses, the window is as far before each camera as before the first.
+    """
+    bent, rig = network.refraction, network.rig
+    if bent is None or rig is None or not bent.on_rig.any():
+        return network
+    rotation, x0 = np.tile(np.eye(3), (len(network.images), 1, 1)), np.full_like(network.x0, np.nan)
+    posed = network.posed
+    rotation[posed], x0[posed] = rotation_matrix(network.rotation[posed]), network.x0[posed]
+    places, _, _ = rig.approximate(rotation, x0)
+    return replace(network, refraction=bent.on_cameras(network.camera_of, places.rotation, places.base))
+
+
 class _Block:
     """A block to which images are added one by one."""
 
     def __init__(self, network: Network) -> None:
-        self.network = network
+        self.network = network = _with_windows_on_cameras(network)
         self.seen = directions(network)
         self.uv = self.seen
         self.known = finite(network.xyz)

@@ -100,6 +100,9 @@ def _similarity_changes(
     reduced[at, 3:6] = -values.rotation[images]
     reduced[at + 3] = moved(values.x0[images])
     reduced[unknowns.refraction_columns] = windows[unknowns.refracting]
+    for c in np.flatnonzero(unknowns.mount >= 0):
+        if values.rig is not None:
+            reduced[unknowns.mount[c] + np.arange(3, 6), 6] = values.rig.base[c]
     points = moved(values.xyz)
     points[~taking_part] = 0.0
     kept = np.flatnonzero(unknowns.kept >= 0)

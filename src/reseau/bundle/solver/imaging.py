@@ -22,7 +22,9 @@ from ...optics.cameras.kernels import CameraColumns, Kernel, camera, compiled, k
 from ...optics.cameras.registry import additional_model, camera_model
 from ...optics.poses import Pose, matrix_to_vector, project
 from ...optics.refraction import RefractedRays
+from ...optics.refraction.windows import Mounts
 from ..network.network import Network
+from ..network.rig import RigValues
 
 __all__ = ["Imaging", "Orientation", "Seen", "mapped"]
 
@@ -191,11 +193,18 @@ class Imaging:
         Camera and label of each set of additional parameters.
     origin : ndarray (3,)
         Point of object space from which the coordinates of points are counted.
+    mounts : ndarray of int (c,)
+        Number of each camera among those whose places on a rig are unknown, and move windows before it; −1
+        for the others.
     """
 
-    def __init__(self, network: Network, sets: tuple[tuple[int, str], ...], origin: Array) -> None:
-        self.refraction, self.origin = network.refraction, origin
+    def __init__(
+        self, network: Network, sets: tuple[tuple[int, str], ...], origin: Array, mounts: Rows
+    ) -> None:
+        self.refraction, self.origin, self._mounts = network.refraction, origin, mounts
         self._air = np.full(len(network.images), -1, dtype=np.intp)
+        if network.refraction is not None:
+            self._path_of, self._path, self._mounted = network.refraction.split(network.camera_of)
         kinds = [entry.compiled_kind for entry in network.cameras]
         known = list(dict.fromkeys(kind for kind in kinds if kind is not None))
         extras = [entry.additional for entry in (network.cameras[c] for c, _ in sets) if entry.additional]
@@ -219,7 +228,7 @@ class Imaging:
         return np.asarray(self.kind[camera_of] != _NO_KERNEL)
 
     def bent(
-        self, seen: Seen, at: Orientation, values: Array, *, derivatives: bool
+        self, seen: Seen, at: Orientation, values: Array, rig: RigValues | None, *, derivatives: bool
     ) -> tuple[Bent, Callable[[int, int], None]]:
         """Return room for the rays through windows, and a function that computes them for a part of `seen`.
 
@@ -231,16 +240,28 @@ class Imaging:
             Poses and points.
         values : ndarray (r,)
             Parameters of windows and media.
+        rig : RigValues, optional
+            Places of the cameras on a rig.
         derivatives : bool
             Whether derivatives are needed.
         """
         if self.refraction is None:
             return Bent(self._air, np.zeros((0, 2)), np.zeros((0, 2, 0))), lambda begin, end: None
-        columns = self.refraction.columns(values, self.origin)
+        columns = self.refraction.columns(values, self.origin, self._places(rig))
         width = 9 + columns.by_parameters.shape[3] if derivatives else 0
         rays = RefractedRays.empty(len(seen.image), width)
-        work = RefractedRays.worker(columns, self.refraction.path_of, *at, seen.image, seen.point, rays)
-        return Bent(self.refraction.path_of, rays.uv, rays.by), work
+        work = RefractedRays.worker(columns, self._path_of, *at, seen.image, seen.point, rays)
+        return Bent(self._path_of, rays.uv, rays.by), work
+
+    def _places(self, rig: RigValues | None) -> Mounts:
+        """Paths of windows by the places of their cameras; those not on a rig are anywhere."""
+        own = self._mounted
+        rotation, base = np.tile(np.eye(3), (len(own), 1, 1)), np.zeros((len(own), 3))
+        if rig is not None:
+            rotation[own >= 0], base[own >= 0] = rig.rotation[own[own >= 0]], rig.base[own[own >= 0]]
+        number = np.where(own >= 0, self._mounts[own], -1)
+        column = np.where(number >= 0, 6 * number, -1).astype(np.intp)
+        return Mounts(self._path, rotation, base, column, int(self._mounts.max(initial=-1)) + 1)
 
     def misfit(
         self, begin: int, end: int, seen: Seen, at: Orientation, bent: Bent, values: Array, extra: Array,

@@ -339,6 +339,9 @@ class _Run:
                 "no image has three points with known or computable coordinates",
                 Code.TOO_FEW_POINTS,
             )
+        astray = self._without_axes()
+        if astray is not None:
+            return astray
         start = self._start()
         freedom = freedom_of(self.system, start, self.usable.points)
         if network.datum == "control" and freedom.defect:
@@ -405,6 +408,22 @@ class _Run:
                 return left._adjusted(self.options)
             return undetermined(linear, freedom, tuple(found.costs))
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def _without_axes(self) -> Failure | None:
+        """A failure where the axes of a rig, in which a window is given, would be those of another camera."""
+        network = self.network
+        if network.rig is None or network.refraction is None or not network.refraction.on_rig.any():
+            return None
+        images, paths = self.usable.images, network.refraction.path_of
+        own = np.unique(network.camera_of[images & (paths >= 0) & network.refraction.on_rig[paths]])
+        first, used = (network.rig.references(mask)[own] for mask in (np.ones_like(images), images))
+        for camera in first[first != used]:
+            return Failure(
+                f"no oriented image of {network.cameras[camera].label} has an exposure in common with "
+                "the other cameras; the window on the rig is given in its axes",
+                Code.PREREQUISITE_MISSING,
+            )
+        return None
 
     def approach(self) -> Values | None:
         """Approximate values in the coordinate system of the network after some iterations."""

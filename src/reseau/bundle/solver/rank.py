@@ -131,7 +131,7 @@ def without_effect(linear: Linear) -> list[str]:
     if bent is None or unknowns.refraction < 0:
         return []
     count = len(unknowns.refracting)
-    at = unknowns.width - 3 - unknowns.extra_width - count
+    at = unknowns.width - 3 - unknowns.extra_width - unknowns.bent_width
     effect = np.sqrt((linear.rows[:, :, at : at + count] ** 2).sum(axis=(0, 1)))
     # A change by the size of the network, of a length; by one, of a tilt or an index.
     size = float(np.abs(linear.values.xyz - linear.values.xyz.mean(axis=0)).max())

@@ -7,7 +7,8 @@ has the corrections
 
 linear in the independent unknowns q of exposures and cameras: y = T q, and the normal equations that have
 been formed with a separate orientation for every image become Tᵀ S T q = −Tᵀ s, as with a stage
-(:mod:`reseau.bundle.solver.stage_constraints`).
+(:mod:`reseau.bundle.solver.stage_constraints`). A ray through a window on the rig depends on ω_c and db_c
+besides, by columns of its own: in T these are the same as the unknowns of the camera.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ class RigConstraints:
         """Reduced unknowns that belong to no image of the rig."""
         own = np.ones(self.unknowns.size, dtype=bool)
         own[self._rows] = False
+        own[self._mounted[0].ravel()] = False
         return np.flatnonzero(own).astype(np.intp)
 
     @cached_property
@@ -92,6 +94,13 @@ class RigConstraints:
         return np.asarray(number[self.rig.camera[self.images]], dtype=np.intp)
 
     @cached_property
+    def _mounted(self) -> tuple[Rows, Rows]:
+        """Cameras before windows on the rig: their columns (k, 6) among the reduced unknowns, and numbers."""
+        cameras = np.flatnonzero(self.unknowns.mount >= 0)
+        columns = self.unknowns.mount[cameras, None] + np.arange(6)
+        return columns.astype(np.intp), np.searchsorted(self.cameras, cameras).astype(np.intp)
+
+    @cached_property
     def size(self) -> int:
         """Number of independent unknowns."""
         return len(self.others) + 6 * (len(self._numbers[1]) + len(self.cameras))
@@ -120,6 +129,8 @@ class RigConstraints:
         at = self._camera_column[moving, None] + np.arange(6)
         t[row[moving, :3], at[:, :3]] = 1.0
         t[row[moving, 3:, None], at[:, None, 3:]] = back[moving]
+        columns, camera = self._mounted
+        t[columns, len(self.others) + 6 * (len(turn) + camera[:, None]) + np.arange(6)] = 1.0
         return t
 
     def stepped(

@@ -70,7 +70,7 @@ class System:
         elif network.rig is not None:
             self.constraints = RigConstraints(unknowns, network.rig)
         self.chunks = chunks_of(unknowns.first)
-        self.imaging = Imaging(network, unknowns.extra_names, origin)
+        self.imaging = Imaging(network, unknowns.extra_names, origin, unknowns.mounts)
 
     @cached_property
     def floor(self) -> float:
@@ -83,7 +83,7 @@ class System:
         out = np.empty((len(self.seen.image), 2))
         at, first = values.orientation, self.unknowns.first
 
-        bent, bend = self.imaging.bent(self.seen, at, values.refraction, derivatives=False)
+        bent, bend = self.imaging.bent(self.seen, at, values.refraction, values.rig, derivatives=False)
 
         def work(_: int, a: int, b: int) -> None:
             begin, end = int(first[a]), int(first[b])
@@ -111,7 +111,7 @@ class System:
         at, first = values.orientation, unknowns.first
         a_out, b_out = rows[:, :, :-3], rows[:, :, -3:]
 
-        bent, bend = self.imaging.bent(self.seen, at, values.refraction, derivatives=True)
+        bent, bend = self.imaging.bent(self.seen, at, values.refraction, values.rig, derivatives=True)
 
         def work(_: int, a: int, b: int) -> None:
             begin, end = int(first[a]), int(first[b])
@@ -463,8 +463,9 @@ def residuals(
         unit,
     )
     out, at = np.empty((len(rows), 2)), values.orientation
-    imaging = Imaging(network, unknowns.extra_names, np.zeros(3) if origin is None else origin)
-    bent, bend = imaging.bent(seen, at, values.refraction, derivatives=False)
+    at_origin = np.zeros(3) if origin is None else origin
+    imaging = Imaging(network, unknowns.extra_names, at_origin, unknowns.mounts)
+    bent, bend = imaging.bent(seen, at, values.refraction, values.rig, derivatives=False)
     bend(0, len(rows))
     imaging.misfit(0, len(rows), seen, at, bent, values.cameras, values.extra, out)
     for mapping, _, own in _mappings(network, seen.camera, values):

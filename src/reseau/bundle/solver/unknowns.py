@@ -43,6 +43,10 @@ class Unknowns:
         Camera and label of each set.
     refraction : int
         First column of the free parameters of windows and media; −1 without any.
+    mount : ndarray of int (c,)
+        First of the six columns of the place of each camera on a rig on which the rays through a window of
+        the rig depend: rotation about the axes of the camera, projection centre; −1 for the others. They
+        follow the parameters of windows and media.
     kept : ndarray of int (p,)
         First of three columns of points that are not eliminated, −1 for the others.
     size, bands, bandwidth : int
@@ -57,6 +61,7 @@ class Unknowns:
     extra_of: Rows
     extra_names: tuple[tuple[int, str], ...]
     refraction: int
+    mount: Rows
     kept: Rows
     size: int
     bands: int
@@ -97,13 +102,18 @@ class Unknowns:
             extra[e] = at
             at += widths[e]
         bent = 0 if network.refraction is None else int(network.refraction.free.sum())
-        refraction, at = at if bent else -1, at + bent
+        mounted = _mounted(network, active)
+        refraction, at = at if bent or mounted.any() else -1, at + bent
+        mount = np.full(len(users), -1)
+        for c in np.flatnonzero(mounted):
+            mount[c] = at
+            at += 6
         kept = np.full(len(network.points), -1)
         for j in np.unique(network.distance_of):
             kept[j] = at
             at += 3
         return cls(
-            network, active, pose, camera, extra, extra_of, extra_names, refraction, kept, int(at),
+            network, active, pose, camera, extra, extra_of, extra_names, refraction, mount, kept, int(at),
             int(bands), bandwidth if bands else 0,
         )  # fmt: skip
 
@@ -153,6 +163,17 @@ class Unknowns:
         """Columns of the free parameters of windows and media."""
         return slice(max(self.refraction, 0), max(self.refraction, 0) + len(self.refracting))
 
+    @property
+    def mounts(self) -> Rows:
+        """Number (c,) of each camera among those with columns of their places; −1 for the others."""
+        start = self.refraction_columns.stop
+        return np.where(self.mount >= 0, (self.mount - start) // 6, -1).astype(np.intp)
+
+    @property
+    def bent_width(self) -> int:
+        """Number of derivatives of a ray by windows, media and places of cameras before windows of a rig."""
+        return len(self.refracting) + 6 * int((self.mount >= 0).sum())
+
     @cached_property
     def dropped(self) -> Mask:
         """Mask of the columns (u,) of additional parameters held at zero."""
@@ -167,7 +188,7 @@ class Unknowns:
     @property
     def width(self) -> int:
         """Number of derivatives of a ray."""
-        return 6 + int(self.count.max()) + len(self.refracting) + self.extra_width + 3
+        return 6 + int(self.count.max()) + self.bent_width + self.extra_width + 3
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -186,8 +207,8 @@ class Unknowns:
         bent = self.network.refraction
         if bent is not None and self.refraction >= 0:
             start[:, 3] = np.where(bent.path_of[image] >= 0, self.refraction, -1)
-            width[:, 3] = np.where(start[:, 3] >= 0, len(self.refracting), 0)
-            column[:, 3] = self.width - 3 - self.extra_width - len(self.refracting)
+            width[:, 3] = np.where(start[:, 3] >= 0, self.bent_width, 0)
+            column[:, 3] = self.width - 3 - self.extra_width - self.bent_width
         start[:, 4] = self.kept[point]
         width[:, 4], column[:, 4] = np.where(start[:, 4] >= 0, 3, 0), self.width - 3
         place = np.zeros_like(start)
@@ -218,10 +239,23 @@ class Unknowns:
         if self.network.refraction is not None:
             own = [self.network.refraction.names[row] for row in self.refracting]
             names[self.refraction_columns] = own
+        for camera, at in zip(self.network.cameras, self.mount, strict=True):
+            if at >= 0:
+                names[at : at + 6] = [f"{name} of {camera.label} on the rig" for name in _POSE]
         for j in np.flatnonzero(self.kept >= 0):
             at = self.kept[j]
             names[at : at + 3] = [f"{name} of point {self.network.points[j]}" for name in _POINT]
         return tuple(names)
+
+
+def _mounted(network: Network, active: Mask) -> Mask:
+    """Return the cameras (c,) whose unknown places on a rig move the windows of the rig before them."""
+    mounted, bent, rig = np.zeros(len(network.cameras), dtype=bool), network.refraction, network.rig
+    if bent is None or rig is None or not bent.on_rig.any():
+        return mounted
+    used = np.unique(network.camera_of[active & (bent.path_of >= 0) & bent.on_rig[bent.path_of]])
+    mounted[used] = rig.references(active)[used] != used
+    return mounted
 
 
 def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, str], ...]]:

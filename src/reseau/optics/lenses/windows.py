@@ -63,7 +63,7 @@ def behind_windows(
     Raises
     ------
     UsageError
-        For a cylinder, which the tracing of lenses does not know.
+        For a cylinder, which the tracing of lenses does not know, and for a window on a rig.
 
     Examples
     --------
@@ -88,6 +88,10 @@ def behind_windows(
         window = refraction.windows[k]
         if window.shape == "cylinder":
             raise UsageError("rays of lenses are not traced through cylinders", where=f"window {window.name}")
+        if window.on == "rig":
+            raise UsageError(
+                "is on a rig", where=f"window {window.name}", do="use `Refraction.on_cameras` before"
+            )
         media = [named[name] for name in window.media]
         described = window.surfaces(refraction.of_window(k))
         for (side, row, _), near in zip(described, media, strict=False):

@@ -1,8 +1,9 @@
 """Windows and media between a camera and its object points: what they are, and their parameters in columns.
 
 A window is a pane with two parallel surfaces, or a single surface between two media. It is fixed to the
-camera (a port: *bundle-invariant* in Kotowski 1988) or to the object (the wall of a tank:
-*object-invariant*). A ray passes a *path* of windows, those of the camera first. Surfaces are
+camera (a port: *bundle-invariant* in Kotowski 1988), to a rig of cameras (the surface of water below cameras
+that are fixed to each other) or to the object (the wall of a tank: *object-invariant*). A ray passes a *path*
+of windows, those of the camera first, then those of the rig. Surfaces are
 
 - plane: m·X = d, with the unit normal m ∝ w + a·s + b·t for the nominal normal w and two directions s, t
   perpendicular to it; with a curvature κ the surface is the sphere that touches this plane at d·m and has its
@@ -29,15 +30,18 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 
-__all__ = ["Refraction", "RefractionColumns", "RefractiveIndex", "Window", "window_parameters"]
+__all__ = ["Mounts", "Refraction", "RefractionColumns", "RefractiveIndex", "Window", "window_parameters"]
 
 Shape = Literal["plane", "sphere", "cylinder"]
+On = Literal["camera", "rig", "object"]
 
 _PARAMETERS: dict[Shape, tuple[str, ...]] = {
     "plane": ("tilt_X", "tilt_Y", "distance", "curvature"),
     "sphere": ("X", "Y", "Z", "radius"),
     "cylinder": ("tilt_X", "tilt_Y", "X", "Y", "radius"),
 }
+_ORDER: tuple[On, ...] = ("camera", "rig", "object")
+"""To what the windows of a path are fixed, from the camera on."""
 _KIND: dict[Shape, int] = {"plane": 0, "sphere": 1, "cylinder": 2}
 # A surface is described by a unit vector, a point, and its curvature or radius.
 _PRIMITIVES = 7
@@ -112,9 +116,10 @@ class Window:
         Name of the window.
     shape : {"plane", "sphere", "cylinder"}
         Shape of its surfaces; see the module.
-    on : {"camera", "object"}
+    on : {"camera", "rig", "object"}
         To what it is fixed, and in whose coordinate system it is given. That of the camera has its origin in
-        the projection centre, x to the right, y down, z along the view.
+        the projection centre, x to the right, y down, z along the view; that of a rig is the one of its first
+        camera.
     values : mapping of str to float
         Parameters by name, see :func:`window_parameters`; those left out are 0. Lengths are in the unit of
         object space, tilts are tangents, and the curvature is 1/length.
@@ -139,7 +144,7 @@ class Window:
 
     name: str
     shape: Shape
-    on: Literal["camera", "object"]
+    on: On
     values: Mapping[str, float]
     media: tuple[str, ...]
     free: tuple[str, ...] = ()
@@ -149,10 +154,10 @@ class Window:
 
     def __post_init__(self) -> None:
         where = f"window {self.name}"
-        if self.shape not in _PARAMETERS or self.on not in ("camera", "object"):
+        if self.shape not in _PARAMETERS or self.on not in _ORDER:
             raise UsageError(
                 f"a {self.shape} on the {self.on} is not known; a plane, sphere or cylinder is, "
-                "on the camera or on the object",
+                "on the camera, on the rig or on the object",
                 where=where,
             )
         if len(self.media) not in (2, 3):
@@ -176,7 +181,7 @@ class Window:
                 raise UsageError(f"`sigma` of {name} must be positive, and the parameter free", where=where)
         if self.shape != "plane" and not self.values.get("radius", 0.0) > 0:
             raise UsageError("needs a `radius` above 0", where=where)
-        if self.shape == "plane" and self.on == "camera" and not self.values.get("distance", 0.0) > 0:
+        if self.shape == "plane" and self.on != "object" and not self.values.get("distance", 0.0) > 0:
             raise UsageError("needs a `distance` from the projection centre above 0", where=where)
         if not np.linalg.norm(self.direction) > 0:
             raise UsageError("`direction` must not be zero", where=where)
@@ -273,10 +278,31 @@ class Window:
     def transformed(self, values: Array, scale: float, turn: Array, shift: Array) -> Array:
         """Return the parameters after the similarity X' = scale · turn · X + shift of object space.
 
-        A window on the camera only changes its lengths.
+        A window on the camera or on a rig only changes its lengths.
         """
-        if self.on == "camera":
+        if self.on != "object":
             turn, shift = np.eye(3), np.zeros(3)
+        return self._moved(values, scale, turn, shift, self)
+
+    def on_camera(self, values: Array, turn: Array, base: Array, name: str) -> Self:
+        """Return a window on a rig as one on a camera, which has this place (3, 3), (3,) on the rig.
+
+        Parameters
+        ----------
+        values : ndarray (u,)
+            Parameters in the axes of the rig.
+        turn, base : ndarray (3, 3), (3,)
+            Rotation from the axes of the rig to those of the camera, and its projection centre.
+        name : str
+            Name of the new window.
+        """
+        x, y, z = (turn @ self.frame[0]).tolist()
+        bare = replace(self, name=name, on="object", direction=(x, y, z), free=(), sigma={})
+        moved = self._moved(values, 1.0, turn, -turn @ base, bare)
+        return replace(bare, on="camera", values=dict(zip(self.names, moved.tolist(), strict=True)))
+
+    def _moved(self, values: Array, scale: float, turn: Array, shift: Array, onto: Window) -> Array:
+        """Parameters after a similarity, with the nominal directions of another window."""
         moved = values.copy()
         u, _ = self.unit(values)
         if self.shape == "plane":
@@ -288,14 +314,14 @@ class Window:
             along = float((turn @ u) @ shift)
             excess = 2 * distance + curvature * distance**2 + 2 * grown * along / scale
             moved[2] = scale * (excess + curvature * float(shift @ shift) / scale**2) / (length + 1)
-            moved[:2], moved[3] = self._tilts(whole), curvature / scale
+            moved[:2], moved[3] = onto._tilts(whole), curvature / scale
         elif self.shape == "sphere":
             moved[:3], moved[3] = scale * turn @ values[:3] + shift, scale * values[3]
         else:
             axis = turn @ u
             at = scale * turn @ (values[2:4] @ self.frame[1:]) + shift
-            at = at - (at @ self.frame[0]) / (axis @ self.frame[0]) * axis
-            moved[:2], moved[2:4], moved[4] = self._tilts(axis), self.frame[1:] @ at, scale * values[4]
+            at = at - (at @ onto.frame[0]) / (axis @ onto.frame[0]) * axis
+            moved[:2], moved[2:4], moved[4] = onto._tilts(axis), onto.frame[1:] @ at, scale * values[4]
         if self.is_pane:
             moved[-1] = scale * values[-1]
         return moved
@@ -340,6 +366,29 @@ class Window:
         return change
 
 
+class Mounts(NamedTuple):
+    """Paths of windows split by cameras, whose places on a rig they depend on; see :meth:`Refraction.split`.
+
+    Parameters
+    ----------
+    path : ndarray of int (q,)
+        Path of the refraction.
+    rotation, base : ndarray (q, 3, 3), (q, 3)
+        Rotation of the camera from the axes of the rig, and its projection centre there.
+    column : ndarray of int (q,)
+        First of the six derivatives by the place of the camera, after those by the free parameters: by a
+        rotation about its axes and by its projection centre; −1 where the place is known.
+    unknown : int
+        Number of cameras with unknown places.
+    """
+
+    path: Rows
+    rotation: Array
+    base: Array
+    column: Rows
+    unknown: int
+
+
 class RefractionColumns(NamedTuple):
     """Paths of windows as the compiled rays receive them; padded to the longest path, of k surfaces.
 
@@ -356,7 +405,7 @@ class RefractionColumns(NamedTuple):
     primitives : ndarray (p, k, 7)
         Unit vector, point, curvature or radius.
     by_parameters : ndarray (p, k, 7, f)
-        Their derivatives by the free parameters.
+        Their derivatives by the free parameters, and by the places of cameras on a rig.
     indices : ndarray (p, k + 1)
         Refractive indices from the camera to the object.
     index_of : ndarray of int (p, k + 1)
@@ -432,9 +481,9 @@ class Refraction(Display):
                         f"begins in {other.media[0]}, but {one.name} before it ends in {one.media[-1]}",
                         where=f"window {other.name}",
                     )
-                if one.on == "object" and other.on == "camera":
+                if _ORDER.index(one.on) > _ORDER.index(other.on):
                     raise UsageError(
-                        f"is on the camera, but behind {one.name}, which is on the object",
+                        f"is on the {other.on}, but behind {one.name}, which is on the {one.on}",
                         where=f"window {other.name}",
                         do="list the windows from the camera to the object",
                     )
@@ -537,6 +586,59 @@ class Refraction(Display):
         number = np.array([kept.index(p) if p in kept else -1 for p in range(len(paths))] + [-1], np.intp)
         return replace(self, paths=tuple(paths[p] for p in kept), path_of=number[self.path_of])
 
+    @cached_property
+    def on_rig(self) -> Mask:
+        """Paths (p,) with a window that is fixed to a rig."""
+        return np.array([any(self.windows[k].on == "rig" for k in path) for path in self.paths], np.bool_)
+
+    def split(self, camera_of: Rows) -> tuple[Rows, Rows, Rows]:
+        """Split the paths with windows on a rig by cameras.
+
+        Parameters
+        ----------
+        camera_of : ndarray of int (m,)
+            Camera of each image.
+
+        Returns
+        -------
+        path_of : ndarray of int (m,)
+            Number of each image among the new paths; −1 for images in air.
+        path, camera : ndarray of int (q,)
+            Former path of each, and the camera it belongs to; −1 for all.
+        """
+        through = self.path_of >= 0
+        own = np.where(self.on_rig[self.path_of], camera_of, -1) if len(self.paths) else camera_of
+        pairs, number = np.unique(np.stack([self.path_of, own], axis=1)[through], axis=0, return_inverse=True)
+        path_of = np.full(len(self.path_of), -1, dtype=np.intp)
+        path_of[through] = number.ravel()
+        return path_of, pairs[:, 0].astype(np.intp), pairs[:, 1].astype(np.intp)
+
+    def on_cameras(self, camera_of: Rows, rotation: Array, base: Array) -> Self:
+        """Return the same with the windows on a rig as windows on each of its cameras, all held.
+
+        Parameters
+        ----------
+        camera_of : ndarray of int (m,)
+            Camera of each image.
+        rotation, base : ndarray (c, 3, 3), (c, 3)
+            Places of the cameras on the rig.
+        """
+        if not self.on_rig.any():
+            return self
+        path_of, former, cameras = self.split(camera_of)
+        windows, paths = list(self.windows), []
+        for path, camera in zip(former.tolist(), cameras.tolist(), strict=True):
+            found = []
+            for k in self.paths[path]:
+                window = self.windows[k]
+                if window.on == "rig":
+                    name = f"{window.name} before camera {camera}"
+                    windows.append(window.on_camera(self.of_window(k), rotation[camera], base[camera], name))
+                    k = len(windows) - 1
+                found.append(k)
+            paths.append(tuple(found))
+        return replace(self, windows=tuple(windows), paths=tuple(paths), path_of=path_of)
+
     def transformed(self, values: Array, scale: float, turn: Array, shift: Array) -> Array:
         """Return the parameters after the similarity X' = scale · turn · X + shift of object space."""
         moved = values.copy()
@@ -557,7 +659,9 @@ class Refraction(Display):
         found[:, 6] -= found[:, :3] @ origin
         return found
 
-    def columns(self, values: Array, origin: ArrayLike = (0.0, 0.0, 0.0)) -> RefractionColumns:
+    def columns(
+        self, values: Array, origin: ArrayLike = (0.0, 0.0, 0.0), mounts: Mounts | None = None
+    ) -> RefractionColumns:
         """Columns of the paths for :class:`~reseau.optics.refraction.RefractedRays`.
 
         Parameters
@@ -566,24 +670,35 @@ class Refraction(Display):
             Parameters.
         origin : array_like (3,)
             Point of object space from which the coordinates of object points are counted.
+        mounts : Mounts, optional
+            Places of the cameras, where windows are fixed to a rig; the columns are those of its paths.
+
+        Raises
+        ------
+        UsageError
+            When a window is fixed to a rig, and there are no places of cameras.
         """
+        if mounts is None and self.on_rig.any():
+            raise UsageError("a window is on a rig; this needs the places of its cameras", where="refraction")
+        paths = self.paths if mounts is None else [self.paths[p] for p in mounts.path]
+        more = 0 if mounts is None else 6 * mounts.unknown
         at = np.asarray(origin, dtype=np.float64)
         described = [window.surfaces(self.of_window(k, values)) for k, window in enumerate(self.windows)]
         number = np.cumsum(self.free) - 1
         media = {medium.name: self.starts[-1] + k for k, medium in enumerate(self.media)}
-        longest = max([sum(len(described[k]) for k in path) for path in self.paths], default=0)
-        shape = len(self.paths), longest
+        longest = max([sum(len(described[k]) for k in path) for path in paths], default=0)
+        shape = len(paths), longest
         columns = RefractionColumns(
-            np.zeros(len(self.paths), np.intp),
+            np.zeros(len(paths), np.intp),
             np.zeros(shape, np.intp),
             np.zeros(shape, np.bool_),
             np.ones(shape),
             np.zeros((*shape, _PRIMITIVES)),
-            np.zeros((*shape, _PRIMITIVES, int(self.free.sum()))),
-            np.ones((len(self.paths), longest + 1)),
-            np.full((len(self.paths), longest + 1), -1, np.intp),
+            np.zeros((*shape, _PRIMITIVES, int(self.free.sum()) + more)),
+            np.ones((len(paths), longest + 1)),
+            np.full((len(paths), longest + 1), -1, np.intp),
         )
-        for p, path in enumerate(self.paths):
+        for p, path in enumerate(paths):
             j = 0
             for k in path:
                 window = self.windows[k]
@@ -596,11 +711,26 @@ class Refraction(Display):
                     if window.on == "object":
                         columns.primitives[p, j, 3:6] -= at
                     columns.by_parameters[p, j][:, number[own[mine]]] = slope[:, mine]
+                    if window.on == "rig" and mounts is not None:
+                        self._mount(columns, p, j, mounts)
                     self._index(columns, p, j, media[before], values, number)
                     j += 1
                 self._index(columns, p, j, media[window.media[-1]], values, number)
             columns.surfaces[p] = j
         return columns
+
+    def _mount(self, columns: RefractionColumns, p: int, j: int, mounts: Mounts) -> None:
+        """Put a surface from the axes of the rig into those of the camera of the path."""
+        turn, base, by = mounts.rotation[p], mounts.base[p], columns.by_parameters[p, j]
+        row = columns.primitives[p, j]
+        row[:3], row[3:6] = turn @ row[:3], turn @ (row[3:6] - base)
+        by[:3], by[3:6] = turn @ by[:3], turn @ by[3:6]
+        if mounts.column[p] >= 0:
+            first = int(self.free.sum()) + mounts.column[p]
+            for axis in range(3):
+                by[:3, first + axis] = np.cross(np.eye(3)[axis], row[:3])
+                by[3:6, first + axis] = np.cross(np.eye(3)[axis], row[3:6])
+            by[3:6, first + 3 : first + 6] = -turn
 
     def _index(
         self, columns: RefractionColumns, p: int, j: int, row: int, values: Array, number: Rows
