@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Callable
+from functools import wraps
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
+from weakref import finalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,31 @@ TargetShape = Literal["square", "triangle", "cross", "circle"]
 SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
 """Shapes of targets, in the order of their numbers."""
 Positive = Annotated[float, Field(gt=0)]
+D = TypeVar("D", bound=Document)
+R = TypeVar("R")
+
+
+def _once(compute: Callable[[D], R]) -> Callable[[D], R]:
+    """Compute a column of a design once; arrays cannot be changed, for all who ask share them.
+
+    The columns lie beside the design, which remains what was read: it is compared, copied and changed by its
+    entries alone.
+    """
+    known: dict[int, R] = {}
+
+    @wraps(compute)
+    def column(design: D) -> R:
+        at = id(design)
+        if at not in known:
+            found = compute(design)
+            for part in found if isinstance(found, tuple) else (found,):
+                if isinstance(part, np.ndarray):
+                    part.setflags(write=False)
+            known[at] = found
+            finalize(design, known.pop, at, None)
+        return known[at]
+
+    return column
 
 
 class FieldLines(Strict):
@@ -165,11 +193,13 @@ class TestfieldDesign(Document):
         return self.targets.id
 
     @property
+    @_once
     def xy(self) -> Array:
         """Centroids of the targets, (n, 2)."""
         return np.stack([self.targets.x, self.targets.y], axis=1).astype(np.float64)
 
     @property
+    @_once
     def centres(self) -> Array:
         """Centres of the squares, (columns·rows, 2), in the order of their numbers."""
         x, y = (np.asarray(at) for at in (self.lines.vertical_x, self.lines.horizontal_y))
@@ -177,6 +207,7 @@ class TestfieldDesign(Document):
         return np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
 
     @property
+    @_once
     def large(self) -> NDArray[np.bool_]:
         """Which targets (n,) are of the larger of the two sizes of their shape."""
         size, shape = np.array(self.targets.size), np.array(self.targets.shape)
@@ -188,6 +219,22 @@ class TestfieldDesign(Document):
         return large
 
     @property
+    @_once
+    def sizes(self) -> Array:
+        """Sizes of the targets (n,), millimetres."""
+        return np.array(self.targets.size, dtype=np.float64)
+
+    @property
+    @_once
+    def kinds(self) -> tuple[tuple[tuple[str, float, float], ...], NDArray[np.intp]]:
+        """Kinds of targets (shape, size, angle), and which of them each target (n,) is."""
+        targets = self.targets
+        each = list(zip(targets.shape, targets.size, targets.angle, strict=True))
+        number = {kind: k for k, kind in enumerate(dict.fromkeys(each))}
+        return tuple(number), np.array([number[kind] for kind in each], dtype=np.intp)
+
+    @property
+    @_once
     def symbols(self) -> NDArray[np.intp]:
         """Symbols of the targets (n,): twice the number of the shape, plus one for large targets."""
         shape = np.array([SHAPES.index(name) for name in self.targets.shape], dtype=np.intp)

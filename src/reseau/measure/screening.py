@@ -44,7 +44,7 @@ class Screened:
     noise: float
 
 
-def screen(frame: Frame, run: int | None) -> Screened:
+def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened:
     """Find the valid pixels of a frame, level its borders, and estimate its noise.
 
     Parameters
@@ -55,6 +55,8 @@ def screen(frame: Frame, run: int | None) -> Screened:
         Minimum length in pixels of a straight run of the lowest grey value that counts as lost pixels; choose
         several times the size of a mark. None for bright marks on a black background: then no pixels are
         treated as lost, and borders are not levelled.
+    noisy : bool
+        Whether the noise is estimated; otherwise it is NaN. Needed where pixels may be lost.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def screen(frame: Frame, run: int | None) -> Screened:
     grey = pixels.astype(np.float32)
     if run is None:
         valid = np.ones(pixels.shape, dtype=bool)
-        return Screened(grey, valid, _noise(pixels, valid))
+        return Screened(grey, valid, _noise(pixels, valid) if noisy else np.nan)
     valid = ~_lost(pixels, run)
     if (share := float(np.mean(valid & (pixels > low)))) < 0.02:
         raise ImageError(
@@ -101,7 +103,7 @@ def _noise(pixels: NDArray[Any], valid: Mask) -> float:
     grey, seen = pixels[rows].astype(np.float32), valid[rows]
     usable = seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
     bend = (grey[:, 1:-1] - (grey[:, :-2] + grey[:, 2:]) / 2)[usable]
-    steps = np.diff(np.unique(pixels[:: max(1, len(pixels) // 100)].astype(np.float64)))
+    steps = np.diff(np.unique(pixels[:: max(1, len(pixels) // 100)]).astype(np.float64))
     quantisation = float(np.median(steps) / np.sqrt(12))
     if not bend.size:
         return quantisation

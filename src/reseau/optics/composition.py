@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
@@ -222,15 +223,12 @@ class Chain(PlaneMapping):
     labels: tuple[str, str] = ("", "")
 
     def __post_init__(self) -> None:
-        twice = _twice(self.names)
-        if twice is not None:
-            raise UsageError("is a parameter of both mappings", where=twice, do="give the chain labels")
+        _ = self.names
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters, each with its label."""
-        parts = zip(self.labels, (self.first, self.second), strict=True)
-        return tuple(label + name for label, part in parts for name in part.names)
+        return _labelled(self.labels, self.first.names, self.second.names)
 
     @property
     def values(self) -> Array:
@@ -264,6 +262,16 @@ class Chain(PlaneMapping):
 
     def _inverse(self, xy: Array) -> Array:
         return self.first.inverse(self.second.inverse(xy))
+
+
+@lru_cache(maxsize=64)
+def _labelled(labels: tuple[str, str], first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of both mappings with their labels; chains of the same kind are formed again and again."""
+    names = tuple(label + name for label, part in zip(labels, (first, second), strict=True) for name in part)
+    twice = _twice(names)
+    if twice is not None:
+        raise UsageError("is a parameter of both mappings", where=twice, do="give the chain labels")
+    return names
 
 
 def _twice(names: Iterable[str]) -> str | None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping as Named
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
@@ -139,6 +140,13 @@ class RationalPolynomial(PlaneMapping):
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the terms."""
         return tuple(self.terms)
+
+    def _replaced(self, values: Array) -> Self:
+        # The table of terms is kept: reading it takes longer than using it.
+        changed = copy(self)
+        changed.__dict__.pop("_coefficients", None)
+        object.__setattr__(changed, "values", as_values(self.names, values))
+        return changed
 
     @cached_property
     def _tables(self) -> _Tables:

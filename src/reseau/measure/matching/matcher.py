@@ -218,7 +218,7 @@ def _compiled(
     jitter, dark = patch.options.row_jitter_px, patch.options.polarity == "dark"
     window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
     prior = 1 / free**2
-    residuals, normal, cofactor = np.zeros((k, n)), np.zeros((k, u, u)), np.full((k, u, u), np.nan)
+    residuals, normal, cofactor = np.empty((k, n)), np.zeros((k, u, u)), np.full((k, u, u), np.nan)
     common = np.zeros((2, k if jitter > 0 else 0, n), np.float32)
     kept = np.empty((k, u, n), np.float32)
     work = residuals, kept, normal, np.zeros((k, u)), cofactor, common[0], common[1]
@@ -243,10 +243,9 @@ def _compiled(
             rows = np.flatnonzero(state == ACTIVE)
             if not len(rows):
                 break
+            around = patch.window if len(rows) == k else patch.window.select(rows)
             width, form = patch.width(trial[rows], rows), trial[rows, patch.form_at :]
-            tried = shape.image(
-                patch.xy[rows] + trial[rows, :2], width, form, rows, patch.window.select(rows)
-            )
+            tried = shape.image(patch.xy[rows] + trial[rows, :2], width, form, rows, around)
             patch.shares[rows] = tried
             rounds[rows] += 1
             advanced(
@@ -272,7 +271,7 @@ def _compiled(
         converged=~left,
         iterations=rounds,
         reasons=np.where(left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED).astype(np.int64),
-        factors=np.ones((k, n)),
+        factors=np.broadcast_to(1.0, (k, n)),
     )
     return found, np.flatnonzero(left)
 

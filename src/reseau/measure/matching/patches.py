@@ -155,10 +155,10 @@ class Patches:
             h, w = pixels.shape
             owners = owner[np.clip(rows, 0, h - 1)[:, :, None], np.clip(columns, 0, w - 1)[:, None, :]]
             self.weights *= ((owners < 0) | (owners == mine[:, None, None])).reshape(k, -1)
-        self.relative_weights = np.ones(self.grey.shape)
+        self.relative_weights: Array = np.broadcast_to(1.0, self.grey.shape)
         self.whitener: tuple[Array, Array] | None = None
         self._formed: tuple[Array, Rows, Array, Array] | None = None
-        self.shares = np.zeros(self.shape)
+        self.shares = np.empty(self.shape)
 
     def begin(self, contrast: Array, ground: Array) -> Array:
         """Approximate values (k, u) of marks whose contrast (k,) and background (k, b) are known."""

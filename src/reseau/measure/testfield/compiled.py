@@ -15,6 +15,7 @@ __all__ = [
     "bends",
     "curved",
     "distinct_lines",
+    "numberings",
     "ridges",
     "supported",
     "voted",
@@ -187,6 +188,115 @@ def distinct_lines(
             for i in rows:
                 free[i] = False
     return kept[:count].copy(), normals[:count].copy(), places[:count].copy(), ends[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _agree(one: NDArray[Any], other: NDArray[Any], none: int, alike: float) -> bool:
+    """Whether most lines have the same numbers in both (n,), except for an offset; `none` is no number."""
+    first, second, most = 0, 0, 0
+    for i in range(len(one)):
+        first, second, same = first + (one[i] != none), second + (other[i] != none), 0
+        if one[i] == none or other[i] == none:
+            continue
+        for j in range(len(one)):
+            both = one[j] != none and other[j] != none
+            same += both and one[j] - other[j] == one[i] - other[i]
+        most = max(most, same)
+    return most > 1 and most >= alike * min(first, second)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def numberings(
+    at: NDArray[Any],
+    weight: NDArray[Any],
+    limits: tuple[float, float, float, int],
+    most: tuple[int, int],
+    alike: float,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Numberings of parallel lines as projective functions n = α t / (1 + β t) of their places t.
+
+    Every function through three lines, with numbers 0, 1 to 3 and 1 to 3 more, is tried; lines that agree
+    with it count with their weights, in relation to the gaps that it leaves.
+
+    Parameters
+    ----------
+    at, weight : ndarray (n,)
+        Places of the lines, ascending, and their weights; at least three.
+    limits : tuple
+        Largest deviation of a line from its number; least distance from the vanishing line; largest logarithm
+        of the ratio of neighbouring gaps, per number; most numbers.
+    most : (int, int)
+        Most functions that are compared, the likeliest first, and most numberings.
+    alike : float
+        Share of lines with the same numbers from which two numberings are the same.
+
+    Returns
+    -------
+    ndarray of bool (m, n), ndarray of int (m, n), ndarray (m,)
+        Lines that are numbered, their numbers, and the worth of each numbering, the likeliest first.
+    """
+    n, none = len(at), -(2**40)
+    off_step, nearest, smooth, widest = limits
+    numbers, worths, tried = np.empty((144 * n, n), np.int64), np.empty(144 * n), 0
+    value = np.empty(n)
+    for one in range(n):
+        for code in range(144):  # the next two lines, at most four further each, and two gaps up to three
+            two = one + 1 + code // 36
+            three, gap = two + 1 + code // 9 % 4, 1 + code // 3 % 3
+            if three >= n:
+                continue
+            wide, near, far = gap + 1 + code % 3, at[two] - at[one], at[three] - at[one]
+            # gap (1 + β near) = α near, wide (1 + β far) = α far.
+            beta = (wide * near - gap * far) / (near * far * (gap - wide))
+            alpha = gap / near + gap * beta
+            # Gaps change slowly from one to the next in any perspective in which all can be seen.
+            if not abs(math.log((far - near) / (wide - gap) / (near / gap))) < smooth * wide:
+                continue
+            worth, count, low, high, last = 0.0, 0, 0, 0, -1
+            found = numbers[tried]
+            for i in range(n):
+                t = at[i] - at[one]
+                depth = 1 + beta * t
+                number = alpha * t / depth
+                found[i] = none
+                if not (depth > nearest and abs(number) < 1e6):
+                    continue
+                whole = np.rint(number)
+                off = number - whole
+                if not abs(off) < off_step:
+                    continue
+                found[i], value[i] = int(whole), weight[i] * (1 - (off / off_step) ** 2)
+                worth += value[i]
+                low, high = (found[i], found[i]) if count == 0 else (min(low, found[i]), max(high, found[i]))
+                count += 1
+                # Of two lines with one number the stronger one counts.
+                if last == i - 1 and last >= 0 and found[last] == found[i]:
+                    worth -= min(value[last], value[i])
+                    count -= 1
+                last = i
+            # With a sufficiently small step any lines fit; therefore gaps are penalized.
+            span = high - low + 1
+            if count >= 2 and span <= widest and math.isfinite(worth):
+                worths[tried] = worth * count / span
+                tried += 1
+    kept, made = np.empty(most[1], np.int64), 0
+    order = np.argsort(-worths[:tried], kind="mergesort")
+    for k in order[: most[0]]:
+        found = numbers[k]
+        for i in range(n):
+            for j in range(i):
+                if found[i] != none and found[i] == found[j]:
+                    found[j if weight[i] > weight[j] else i] = none
+        new = True
+        for j in range(made):
+            new = new and not _agree(found, numbers[kept[j]], none, alike)
+        if new:
+            kept[made] = k
+            made += 1
+            if made == most[1]:
+                break
+    chosen = numbers[kept[:made]]
+    return chosen != none, chosen, worths[kept[:made]]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -70,16 +70,31 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
         np.empty((2, 2)),
         np.empty(4),
     )
-    by_u, by_uu = np.empty(2), np.empty(3)
+    by_u, by_uu, terms = np.empty(2), np.empty(3), coefficients.shape[1]
     for k in range(len(at)):
-        a, b = at[k]
+        a, b = at[k, 0], at[k, 1]
         depth = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2])
         u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) * depth
         v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) * depth
-        if order:
-            for i in range(2):
-                first[0, i] = (matrix[0, i] - u * matrix[2, i]) * depth / normal[2]
-                first[1, i] = (matrix[1, i] - v * matrix[2, i]) * depth / normal[2]
+        if not order:
+            # Powers of u and v in place, then their products, as they are needed most often.
+            p, q = (u - normal[0]) / normal[2], (v - normal[1]) / normal[2]
+            x[0, 0], y[0, 0] = 1.0, 1.0
+            for i in range(1, degree + 1):
+                x[0, i], y[0, i] = p * x[0, i - 1], q * y[0, i - 1]
+            right, down, n, j = 0.0, 0.0, 0, 0
+            for m in range(terms):
+                product = x[0, n - j] * y[0, j]
+                right += coefficients[0, m] * product
+                down += coefficients[1, m] * product
+                j += 1
+                if j > n:
+                    n, j = n + 1, 0
+            value[k, 0], value[k, 1] = right, down
+            continue
+        for i in range(2):
+            first[0, i] = (matrix[0, i] - u * matrix[2, i]) * depth / normal[2]
+            first[1, i] = (matrix[1, i] - v * matrix[2, i]) * depth / normal[2]
         _powers((u - normal[0]) / normal[2], degree, x)
         _powers((v - normal[1]) / normal[2], degree, y)
         for c in range(2):
@@ -90,17 +105,15 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
                     factor, i = coefficients[c, m], n - j
                     m += 1
                     total += factor * x[0, i] * y[0, j]
-                    if order:
-                        by_u[0] += factor * x[1, i] * y[0, j]
-                        by_u[1] += factor * x[0, i] * y[1, j]
+                    by_u[0] += factor * x[1, i] * y[0, j]
+                    by_u[1] += factor * x[0, i] * y[1, j]
                     if order > 1:
                         by_uu[0] += factor * x[2, i] * y[0, j]
                         by_uu[1] += factor * x[1, i] * y[1, j]
                         by_uu[2] += factor * x[0, i] * y[2, j]
             value[k, c] = total
-            if order:
-                for i in range(2):
-                    slope[k, c, i] = by_u[0] * first[0, i] + by_u[1] * first[1, i]
+            for i in range(2):
+                slope[k, c, i] = by_u[0] * first[0, i] + by_u[1] * first[1, i]
             if order > 1:
                 for i in range(2):
                     for j in range(2):

@@ -72,15 +72,6 @@ class _Numbering:
     number: Rows
     worth: float
 
-    def agrees(self, other: _Numbering) -> bool:
-        """Whether most of the lines have the same numbers in both, except for an offset."""
-        mine, yours = (
-            dict(zip(one.rows.tolist(), one.number.tolist(), strict=True)) for one in (self, other)
-        )
-        offsets = [mine[row] - yours[row] for row in mine.keys() & yours.keys()]
-        most = max(map(offsets.count, offsets), default=0)
-        return most > 1 and most >= _ALIKE * min(len(mine), len(yours))
-
 
 @dataclass(frozen=True, eq=False)
 class Ridges:
@@ -352,60 +343,16 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
     at = (lines.distance[rows] - lines.normal[rows] @ middle) / (lines.normal[rows] @ along)
     order = np.argsort(at, kind="stable")
     rows, at, weight = rows[order], at[order], lines.weight[rows[order]]
-    ones, twos, threes, gaps, more = (
-        v.ravel()
-        for v in np.meshgrid(
-            np.arange(len(rows)),
-            np.arange(1, 5),
-            np.arange(1, 5),
-            np.arange(1, 4),
-            np.arange(1, 4),
-            indexing="ij",
-        )
-    )
-    twos, threes = ones + twos, ones + twos + threes
-    keep = threes < len(rows)
-    if not keep.any():
-        keep, twos, threes = ones == 0, np.minimum(twos, 1), np.full(len(threes), 2)
-    ones, twos, threes, one, two = (v[keep] for v in (ones, twos, threes, gaps, gaps + more))
-    near, far = at[twos] - at[ones], at[threes] - at[ones]
-    # one (1 + β near) = α near, two (1 + β far) = α far.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        beta = (two * near - one * far) / (near * far * (one - two))
-        alpha = one / near + one * beta
-        t = at - at[ones, None]
-        depth = 1 + beta[:, None] * t
-        number = alpha[:, None] * t / depth
-        # Gaps change slowly from one to the next in any perspective in which all can be seen.
-        change = np.abs(np.log((far - near) / (two - one) / (near / one)))
-        smooth = change < 0.5 * two * np.log(_NEXT_GAP)
-    whole = np.rint(np.nan_to_num(number, posinf=1e6, neginf=-1e6).clip(-1e6, 1e6))
-    fits = (np.abs(number - whole) < _OFF_STEP) & (depth > _NEAREST) & smooth[:, None]
-    # Of two lines with one number the stronger one counts.
-    same = fits[:, 1:] & fits[:, :-1] & (whole[:, 1:] == whole[:, :-1])
-    off = np.where(fits, number - whole, 0.0)
-    value = np.where(fits, weight * (1 - (off / _OFF_STEP) ** 2), 0.0)
-    worth = value.sum(axis=1) - (same * np.minimum(value[:, 1:], value[:, :-1])).sum(axis=1)
-    count = fits.sum(axis=1) - same.sum(axis=1)
-    span = np.where(fits, whole, -np.inf).max(axis=1) - np.where(fits, whole, np.inf).min(axis=1) + 1
-    # With a sufficiently small step any lines fit; therefore gaps are penalized.
-    possible = np.isfinite(worth) & (count >= 2) & (span <= _WIDEST)
-    worth = np.where(possible, worth * count / np.maximum(span, 1), -np.inf)
-    found: list[_Numbering] = []
-    for k in np.argsort(-worth, kind="stable")[:_MOST_TRIED]:
-        if not np.isfinite(worth[k]):
-            break
-        kept: dict[int, int] = {}
-        for line in np.flatnonzero(fits[k]):
-            n = int(whole[k, line])
-            if n not in kept or weight[line] > weight[kept[n]]:
-                kept[n] = int(line)
-        numbers = np.array(sorted(kept), dtype=np.intp)
-        numbering = _Numbering(rows[[kept[int(n)] for n in numbers]], numbers, float(worth[k]))
-        if not any(numbering.agrees(other) for other in found):
-            found.append(numbering)
-        if len(found) == _NUMBERINGS:
-            break
+    from .compiled import numberings  # takes half a second to import; not every command needs it
+
+    limits = _OFF_STEP, _NEAREST, 0.5 * float(np.log(_NEXT_GAP)), _WIDEST
+    given = at, weight, limits, (_MOST_TRIED, _NUMBERINGS), _ALIKE
+    found = []
+    for there, numbers, worth in zip(*numberings(*given), strict=True):
+        lines_found = np.flatnonzero(there)
+        order = np.argsort(numbers[lines_found])
+        lines_found = lines_found[order]
+        found.append(_Numbering(rows[lines_found], numbers[lines_found], float(worth)))
     # The two strongest may be the only ones.
     pair = np.sort(np.argsort(-weight, kind="stable")[:2])
     found.append(_Numbering(rows[pair], np.arange(2), float(weight[pair].sum())))

@@ -248,6 +248,7 @@ def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -
     on, each = at.copy(), np.arange(len(at))
     on[each, axis] = np.rint(on[each, axis])
     matrix, coefficients, middle = numbers_of(mapping)
+    matrix = matrix.copy()
     scale = float(middle[2])
     curved = of_degree(mapping, _DEGREE)
     # x³ of the image is the seventh of the monomials.

@@ -55,21 +55,21 @@ def of_degree(mapping: Chain, degree: int) -> Chain:
 
 def with_coefficients(mapping: Chain, added: Array) -> Chain:
     """The mapping with values (2, m) added to the coefficients of its polynomial."""
-    curved = mapping.second
-    assert isinstance(curved, RationalPolynomial)
-    return Chain(mapping.first, replace(curved, values=curved.values + added.ravel()))
+    return Chain(mapping.first, mapping.second.with_values(mapping.second.values + added.ravel()))
 
 
+@lru_cache(maxsize=16)
 def numbers_of(mapping: Chain) -> tuple[Array, Array, Array]:
     """Projectivity (3, 3), coefficients (2, m) of the polynomial, and offset and scale (3,) of its arguments.
 
     The monomials are 1, u, v, u², u v, v², … as :meth:`reseau.optics.RationalPolynomial.polynomial` orders
-    them.
+    them. The arrays are kept for the next call: copy them to change them.
     """
     curved = mapping.second
     assert isinstance(curved, RationalPolynomial)
-    normal = np.array([*curved.offset, curved.scale])
-    return np.append(mapping.first.values, 1.0).reshape(3, 3), curved.values.reshape(2, -1), normal
+    matrix, normal = np.ones((3, 3)), np.array([*curved.offset, curved.scale])
+    matrix.reshape(-1)[:8] = mapping.first.values
+    return matrix, curved.values.reshape(2, -1), normal
 
 
 def degree_of(mapping: Chain) -> int:
@@ -130,7 +130,7 @@ def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
 
     numbers = numbers_of(mapping)
     zero = of_degree(mapping, degree_of(mapping)).second
-    bent = not np.array_equal(mapping.second.values, zero.values)
+    bent = bool((mapping.second.values != zero.values).any())
     back = np.linalg.inv(numbers[0])
     return np.asarray(inverted(numbers, back, bent, np.ascontiguousarray(xy), _LONGEST))
 
@@ -139,9 +139,8 @@ def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:
     """A mapping to an enlarged image as one to the original; the point x is at factor · x + shift there."""
     curved = mapping.second
     assert isinstance(curved, RationalPolynomial)
-    matrix, coefficients, _ = numbers_of(mapping)
+    matrix, coefficients = (numbers.copy() for numbers in numbers_of(mapping)[:2])
     matrix[:2] = (matrix[:2] - np.outer(shift, matrix[2])) / factor
-    coefficients = coefficients.copy()
     coefficients[:, 0] -= shift
     offset = (np.array(curved.offset) - shift) / factor
     moved = replace(

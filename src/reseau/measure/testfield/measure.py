@@ -208,7 +208,7 @@ def measure_testfield(
 
 
 def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) -> TestfieldResult | Failure:
-    screened = screen(frame, None)
+    screened = screen(frame, None, noisy=False)
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     seen, read = original, original.read()
@@ -311,7 +311,7 @@ class _Measurement:
         self.rows = np.flatnonzero(((self.predicted > -wide) & (self.predicted < size + wide)).all(axis=1))
         self.rows = self.rows[self._unfolded(self.at[self.rows])]
         slope = slope_of(scene.mapping, self.at[self.rows]) @ scene.frame
-        reach = np.abs(slope).sum(axis=2) * (np.array(scene.design.targets.size) * 0.6)[self.rows, None]
+        reach = np.abs(slope).sum(axis=2) * 0.6 * scene.design.sizes[self.rows, None]
         xy = self.predicted[self.rows]
         near = ((xy > -reach - margin) & (xy < size - 1 + reach + margin)).all(axis=1)
         self.rows, reach, xy = self.rows[near], reach[near], xy[near]
@@ -395,7 +395,7 @@ class _Measurement:
         scene, at = self.scene, self.at[wanted]
         mapping = refit(scene.mapping, at[good], found.xy[good], _UNMODELLED_PX)
         change = (slope_of(mapping, at) - slope_of(scene.mapping, at)) @ scene.frame
-        size = np.array(scene.design.targets.size)[wanted]
+        size = scene.design.sizes[wanted]
         displaced = stretches(change)[0] * _REACH * size > _RESHAPED_PX
         if not displaced.any():
             return found, why, predicted
@@ -461,7 +461,8 @@ class _Measurement:
             if len(candidates) < _LEAST_FIRST:
                 continue
             most = max(_MOST_FIRST, int(_FIRST_SHARE * self.inside.sum()))
-            targets = self.rows[candidates[:: max(1, len(candidates) // most)]]
+            each = np.linspace(0, len(candidates) - 1, min(most, len(candidates))).astype(np.intp)
+            targets = self.rows[candidates[each]]
             predicted = self.predicted
             for _ in range(_MOVES):
                 self._learn(np.isin(self.rows, targets) & self.inside)

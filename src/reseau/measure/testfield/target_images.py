@@ -17,7 +17,7 @@ from .lattice_mapping import second_order, stretches
 
 __all__ = ["flat_outline", "form_targets", "stacked"]
 
-_SPACING = 1.1
+_SPACING = 1.3
 """Distance of nodes on an outline in widths of the point-spread function; accurate to 1e-4 of the light."""
 
 
@@ -57,12 +57,10 @@ def form_targets(
     value, slope, bend = second_order(mapping, at)
     # The spacing of nodes is determined where a millimetre is largest in the image.
     scale = float(stretches(slope @ frame)[0].max())
-    targets = design.targets
-    keys = [(targets.shape[k], targets.size[k], targets.angle[k]) for k in rows]
-    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    kind = np.array([number[key] for key in keys], dtype=np.intp)
+    kinds, each = design.kinds
+    there, kind = np.unique(each[rows], return_inverse=True)
     spacing = float(f"{_SPACING * psf_px / scale:.2g}")
-    flat = stacked([flat_outline(*key, spacing) for key in number])
+    flat = stacked([flat_outline(*kinds[k], spacing) for k in there])
     # F(s + d) − F(s) = J d + ½ d H d with d = frame · (x, y), as polynomials of each target.
     slope = np.swapaxes(slope @ frame, 1, 2)
     bend = frame.T @ bend @ frame / 2

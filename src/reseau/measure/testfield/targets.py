@@ -52,11 +52,17 @@ class Light:
         design = _quadratic(xy, size)
         found = []
         for values in (level, contrast):
-            keep = np.isfinite(values)
+            finite = keep = np.isfinite(values)
             for _ in range(3):
-                fitted: Array = np.linalg.lstsq(design[keep], values[keep], rcond=1e-6)[0].astype(np.float64)
+                some = design[keep]
+                # A few points, or points on a line, do not determine all coefficients.
+                normal, right = some.T @ some, some.T @ values[keep]
+                normal.flat[::7] += _UNDETERMINED * (1.0 + np.trace(normal))
+                fitted: Array = np.linalg.solve(normal, right).astype(np.float64)
                 off = np.abs(values - design @ fitted)
-                keep = np.isfinite(values) & (off <= 4 * np.nanmedian(off[keep]) + 1e-9)
+                before, keep = keep, finite & (off <= 4 * np.median(off[keep]) + 1e-9)
+                if (keep == before).all():
+                    break
             found.append(fitted)
         return cls(found[0], found[1], size)
 
@@ -67,12 +73,19 @@ class Light:
 
 
 def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
-    u, v = (2 * xy / np.array(size) - 1).T
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    u, v = xy[:, 0] * (2 / size[0]) - 1, xy[:, 1] * (2 / size[1]) - 1
+    design = np.ones((6, len(xy)))
+    design[1], design[2] = u, v
+    np.multiply(u, design[1:3], out=design[3:5])
+    np.multiply(v, v, out=design[5])
+    return design.T
 
 
-_AT_ONCE = 100
-"""Number of targets matched together; their images fit into the cache of a processor."""
+_UNDETERMINED = 1e-12
+"""Weight of the coefficients of the illumination as observations of zero, relative to that of the points."""
+_AT_ONCE = 40_000
+"""Number of pixels in the windows of targets matched together; their images fit into the cache of a
+processor."""
 _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """A pixel shows something else if it differs from the predicted image by more than this multiple of the
 noise, this share of the light, and the effect of a shift by this distance."""
@@ -229,7 +242,8 @@ class _Canvas:
                 half = np.ceil(reach[of].max(axis=0) + 2.5 * scene.psf_px + 1.0).astype(np.intp)
                 self._lay(np.flatnonzero(of & ~wanted), half)
                 mine = np.flatnonzero(of & wanted)
-                for some in np.array_split(mine, -(-len(mine) // _AT_ONCE)) if len(mine) else []:
+                parts = -(-len(mine) * int(np.prod(2 * half + 1)) // _AT_ONCE)
+                for some in np.array_split(mine, parts) if len(mine) else []:
                     self.parts.append(self._lay(some, half, wanted=True))
 
     @classmethod
@@ -345,12 +359,11 @@ class _Canvas:
             background=background,
             contrast_slope=contrast_slope,
         )
-        level, amplitude = scene.light.at(centre.astype(np.float64))
         # Slopes across half a window, in the order of the matcher's monomials: 1, v, u.
-        right, down = (
-            scene.light.at(centre + step)[0] - level
-            for step in (np.array([half[0], 0.0]), np.array([0.0, half[1]]))
-        )
+        steps = np.array([[0.0, 0.0], [half[0], 0.0], [0.0, half[1]]])
+        levels, amplitudes = scene.light.at((centre + steps[:, None]).reshape(-1, 2))
+        (level, right, down), amplitude = levels.reshape(3, -1), amplitudes[: len(centre)]
+        right, down = right - level, down - level
         dark = scene.design.polarity == "dark"
         contrast = amplitude / level if dark else amplitude
         return match(
@@ -390,24 +403,26 @@ def _line_light(scene: Scene) -> Array:
 
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
     """Matches of several parts in the order of their rows; smaller windows are padded."""
-    rows = np.concatenate(parts)
-    place = np.empty(len(rows), np.intp)
-    place[np.argsort(rows, kind="stable")] = np.arange(len(rows))
-    places = np.split(place, np.cumsum([len(part) for part in parts])[:-1])
+    order = np.argsort(np.concatenate(parts), kind="stable")
     columns: dict[str, Any] = {}
     for name in Matches.__dataclass_fields__:
         values = [getattr(matches, name) for matches in found]
-        shape = tuple(np.max([v.shape[1:] for v in values], axis=0))
-        ragged = any(v.shape[1:] != shape for v in values)
-        column = np.empty((len(rows), *shape), values[0].dtype)
-        if ragged:
-            column[:] = np.nan if name == "residuals" else 0.0
-        for at, v in zip(places, values, strict=True):
-            some: tuple[Any, ...] = (at,)
-            some += tuple(slice((m - n) // 2, (m + n) // 2) for m, n in zip(shape, v.shape[1:], strict=True))
-            column[some] = v
-        columns[name] = column
+        if len({v.shape[1:] for v in values}) > 1:
+            values = _padded(values, np.nan if name == "residuals" else 0.0)
+        columns[name] = np.concatenate(values)[order]
     return Matches(**columns)
+
+
+def _padded(values: list[Array], outside: float) -> list[Array]:
+    """Images (n, r, c) of different sizes in the middle of images of one size."""
+    shape = tuple(max(sides) for sides in zip(*(v.shape[1:] for v in values), strict=True))
+    padded = []
+    for v in values:
+        column = np.full((len(v), *shape), outside, v.dtype)
+        inner = tuple(slice((m - n) // 2, (m + n) // 2) for m, n in zip(shape, v.shape[1:], strict=True))
+        column[(slice(None), *inner)] = v
+        padded.append(column)
+    return padded
 
 
 def replaced(found: Matches, keep: Mask, others: Matches) -> Matches:
