@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Result, adjust_network, problem_of
+from reseau.bundle import Network, Options, Result, adjust_network, problem_of
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.io.refraction import RefractionEntry
@@ -151,6 +151,21 @@ def test_the_same_without_poses() -> None:
     one, other = (adjust_network(each).required() for each in (network, cold))
     assert other.refraction is not None
     assert np.abs(one.refraction.values - other.refraction.values).max() < 1e-3  # type: ignore[union-attr]
+
+
+def test_images_not_taken_at_once_are_left_out_where_the_window_is_on_the_rig() -> None:
+    """The window was somewhere else before them."""
+    network = wet(0, surface("plane", FREE))
+    x0 = network.x0.copy()
+    rows = network.image_of == 4
+    xy = network.xy.copy()
+    xy[rows] += [60.0, -40.0]
+    x0[4] = np.nan
+    odd = replace(network, xy=xy, x0=x0, rotation=np.where(np.isfinite(x0), network.rotation, np.nan))
+    result = adjust_network(odd, Options(outliers="reject")).required()
+    assert any("were not taken at once" in note.text and "left out" in note.text for note in result.warnings)
+    assert result.refraction is not None
+    assert (np.abs(result.refraction.values - [*TILTS, DISTANCE]) < 5 * result.refraction.sigma).all()
 
 
 def test_one_camera_of_the_rig_has_it_as_a_port() -> None:

@@ -137,11 +137,16 @@ def _without_rig(network: Network, options: Options, start: Values) -> Values:
     """Return the values of an adjustment in which every image has an orientation of its own.
 
     Orientations by approximate cameras would make a poor rig, and not show which images do not belong
-    together. Where there is no such adjustment, the values remain.
+    together. Where there is no such adjustment, the values remain. Windows of the rig are held before each
+    camera where the approximate values have them.
     """
-    problem = _begun(replace(network, rig=None), options, settle=True)[0]
+    bent = network.refraction
+    if bent is not None and network.rig is not None and bent.on_rig.any():
+        places, _, _ = network.rig.approximate(start.rotation, start.x0)
+        bent = bent.on_cameras(network.camera_of, *places)
+    problem = _begun(replace(network, rig=None, refraction=bent), options, settle=True)[0]
     fit = _plain(problem)
-    return start if isinstance(fit, Failure) else fit.values
+    return start if isinstance(fit, Failure) else replace(fit.values, refraction=start.refraction)
 
 
 def _not_at_once(
@@ -155,10 +160,19 @@ def _not_at_once(
         )
         return network, (Remark(text, Code.INCONSISTENT),)
     names = listed(network.images[i] for i in odd)
-    done = "; adjusted apart from the rig" if apart else ""
+    bent = network.refraction
+    through = bent is not None and bool(bent.on_rig[bent.path_of[odd]][bent.path_of[odd] >= 0].any())
+    done = "; left out" if apart and through else "; adjusted apart from the rig" if apart else ""
     text = f"images {names} were not taken at once with the others of their exposure{done}"
-    if apart and network.rig is not None:
-        network = replace(network, rig=network.rig.without(odd))
+    rig = network.rig
+    if apart and rig is not None:
+        if bent is not None and through:
+            # Where the window of the rig was, is not known.
+            path_of = bent.path_of.copy()
+            path_of[odd] = -1
+            network = network.select(~np.isin(network.image_of, odd))
+            network = replace(network, refraction=replace(bent, path_of=path_of))
+        network = replace(network, rig=rig.without(odd))
     return network, (Remark(text, Code.INCONSISTENT),)
 
 
