@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Network, Options, Result, adjust_network
+from reseau.bundle import Camera, Network, Options, Result, ResultDocument, adjust_network
 from reseau.bundle.network import Rig, network_document
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -147,6 +147,83 @@ def test_exposures_that_are_all_shifted_are_no_rig() -> None:
     result = adjust_network(replace(network, rig=rig))
     said = result.reason if isinstance(result, Failure) else " ".join(map(str, result.warnings))
     assert "were the images of an exposure taken at once?" in said
+
+
+def with_bases(network: Network, *bases: tuple[int, int, float, float]) -> Network:
+    """The network with known bases (camera, camera, error, sigma), and without the distance of its points."""
+    centres = np.array([base for _, base in PLACES])
+    true = [float(np.linalg.norm(centres[b] - centres[a])) for a, b, *_ in bases]
+    rig = replace(
+        network.rig or Rig(network.camera_of, network.camera_of),
+        base_of=np.array([(a, b) for a, b, *_ in bases]),
+        base=np.array([(length + off, sigma) for length, (*_, off, sigma) in zip(true, bases, strict=True)]),
+    )
+    return replace(network, rig=rig, distance_of=np.zeros((0, 2), np.intp), distance=np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize("cold", [False, True])
+def test_a_known_base_gives_the_scale(cold: bool) -> None:
+    """Of two cameras that share no exposure: a third connects them."""
+    apart = tuple((2, e) for e in range(4)) + tuple((0, e) for e in range(4, 8))
+    network = with_bases(drawn(cameras=3, left_out=apart), (0, 2, 0.0, 0.01))
+    if cold:
+        nothing = np.full_like(network.x0, np.nan)
+        unknown = np.full_like(network.xyz, np.nan)
+        network = replace(network, x0=nothing, rotation=nothing, xyz=unknown)
+    result = adjust_network(network).required()
+    assert result.rig is not None
+    assert result.rig.length[1] == pytest.approx(np.linalg.norm(PLACES[2][1]), abs=1e-6)
+    assert result.rig.length_sigma[1] == pytest.approx(0.01 * max(1.0, result.sigma0), rel=0.3)
+    without = Rig(network.camera_of, network.rig.exposure)  # type: ignore[union-attr]
+    free = adjust_network(replace(network, rig=without)).required()
+    assert result.redundancy == free.redundancy
+
+
+def test_errors_with_known_bases_have_their_covariances() -> None:
+    q, rng = [], np.random.default_rng(9)
+    for seed in range(25):
+        bases = [(a, b, float(0.05 * rng.normal()), 0.05) for a, b in ((0, 1), (0, 2), (1, 2))]
+        network = with_bases(drawn(seed, cameras=3, left_out=((2, 0), (0, 1), (1, 2))), *bases)
+        result = adjust_network(network).required()
+        found = result.rig
+        assert found is not None
+        for k, (vector, base) in enumerate(PLACES[1:]):
+            turn = matrix_to_vector(found.rotation[k] @ rotation_matrix(vector).T)
+            error = np.concatenate([turn, found.base[k] - base])
+            q.append(error @ np.linalg.solve(found.cov[k], error) / 6)
+    # 50 places of 6 coordinates: a mean square of 1 ± 0.08.
+    assert np.mean(q) == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_wrong_base_is_named_and_told_in_the_result() -> None:
+    network = with_bases(drawn(cameras=3, control=True), (0, 1, 2.0, 0.05), (0, 2, 0.0, 0.05))
+    result = adjust_network(network).required()
+    said = "the distance camera camera 0 to camera camera 1 (152.266 mm, by "
+    assert any(str(warning).startswith(said) for warning in result.warnings)
+    table = ResultDocument.of(result).to_dict()["bases"]
+    assert (table["from"], table["to"]) == (["camera 0", "camera 0"], ["camera 1", "camera 2"])
+    assert table["w"][0] > 5 > table["w"][1]
+
+
+def test_bases_are_part_of_the_document() -> None:
+    network = with_bases(drawn(), (0, 1, 0.0, 0.05))
+    again = Network.from_document(network_document(network))
+    assert again.rig is not None
+    assert network.rig is not None
+    assert (again.rig.base_of == network.rig.base_of).all()
+    assert (again.rig.base == network.rig.base).all()
+
+
+@pytest.mark.parametrize(
+    ("bases", "said"),
+    [
+        (((0, 0, 10.0, 0.1),), "cameras that exposures connect"),
+        (((0, 1, 10.0, 0.0),), "above zero"),
+    ],
+)
+def test_bases_that_are_none_are_refused(bases: tuple[tuple[int, int, float, float], ...], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        with_bases(drawn(), *bases)
 
 
 def interior(matrix: Array, distortion: Array) -> Array:

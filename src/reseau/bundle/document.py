@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -11,11 +11,13 @@ from pydantic import ConfigDict, Field
 
 from ..adjust.significance import CoefficientTest
 from ..core.data import Array
+from ..core.data import Rows as Indices
 from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
 from ..optics.refraction import Refraction
 from .diagnostics import Result, RigEstimate, sigma_between_images
+from .network import Rig
 from .network.network import finite
 
 __all__ = ["ResultDocument", "model_search_entries"]
@@ -161,7 +163,7 @@ class LeftOut(Strict):
 
 
 class DistancesResult(Strict):
-    """Observed distances in columns: residuals, redundancy numbers, test values."""
+    """Observed distances, or bases of a rig, in columns: residuals, redundancy numbers, test values."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -229,6 +231,7 @@ class ResultDocument(Document):
     warning_codes: tuple[str, ...] | None = None
     left_out: LeftOut | None = None
     distances: DistancesResult | None = None
+    bases: DistancesResult | None = None
     refraction: RefractionResult | None = None
     rig: RigResult | None = None
     variance_components: ComponentsResult | None = None
@@ -256,6 +259,8 @@ class ResultDocument(Document):
             more["left_out"] = _left_out(result)
         if len(result.network.distance):
             more["distances"] = _distances(result)
+        if result.network.rig is not None and len(result.network.rig.base):
+            more["bases"] = _bases(result, result.network.rig)
         if result.network.refraction is not None:
             more["refraction"] = _refraction(result, result.network.refraction)
         if result.rig is not None:
@@ -458,10 +463,20 @@ def _left_out(result: Result) -> LeftOut:
 def _distances(result: Result) -> DistancesResult:
     network, at = result.network, 2 * len(result.network.xy)
     rows = slice(at, at + len(network.distance))
+    return _lengths(result, network.distance_of, network.points, rows)
+
+
+def _bases(result: Result, rig: Rig) -> DistancesResult:
+    rows = slice(len(result.fit.residuals) - len(rig.base), len(result.fit.residuals))
+    return _lengths(result, rig.base_of, [camera.id for camera in result.network.cameras], rows)
+
+
+def _lengths(result: Result, ends: Indices, names: Sequence[str], rows: slice) -> DistancesResult:
+    """Observed lengths between named ends, which are these rows of the observations."""
     sigma0 = result.sigma0 if result.redundancy > 0 and result.sigma0 > 0 else 1.0
     return DistancesResult(
-        **{"from": tuple(network.points[j] for j in network.distance_of[:, 0])},
-        to=tuple(network.points[j] for j in network.distance_of[:, 1]),
+        **{"from": tuple(names[j] for j in ends[:, 0])},
+        to=tuple(names[j] for j in ends[:, 1]),
         v=_column(result.fit.residuals[rows]),
         r=_column(result.fit.redundancy_numbers[rows]),
         w=_column(np.abs(result.fit.w[rows]) / sigma0),

@@ -14,6 +14,7 @@ from .refraction import RefractionEntry
 
 __all__ = [
     "AdditionalParameters",
+    "BaseColumns",
     "CalibratedCameraEntry",
     "CameraEntry",
     "DistanceColumns",
@@ -251,6 +252,10 @@ class DistanceColumns(_Columns):
     sigma: tuple[float, ...]
 
 
+class BaseColumns(DistanceColumns):
+    """Known distances between the projection centres of cameras that are fixed to each other."""
+
+
 class Network1(Document):
     """``reseau-network/1``: the input of a bundle adjustment.
 
@@ -265,6 +270,7 @@ class Network1(Document):
     points: PointColumns
     observations: ObservationColumns
     distances: DistanceColumns | None = None
+    bases: BaseColumns | None = None
     datum: Literal["control", "minimal", "free"]
     datum_points: tuple[str, ...] | None = None
     refraction: RefractionEntry | None = None
@@ -285,6 +291,11 @@ class Network1(Document):
         if self.distances is not None:
             _named("distances.from", self.distances.from_, points, "points")
             _named("distances.to", self.distances.to, points, "points")
+        if self.bases is not None:
+            _named("bases.from", self.bases.from_, set(cameras), "cameras")
+            _named("bases.to", self.bases.to, set(cameras), "cameras")
+            if not any(self.images.exposure or ()):
+                raise ValueError("`bases` require the exposures of the images")
         _named("datum_points", self.datum_points or (), points, "points")
         self._check_points()
         self._check_observations()
@@ -319,14 +330,15 @@ class Network1(Document):
         twice = _twice(zip(table.image, table.point, strict=True))
         if twice is not None:
             raise ValueError(f"point {twice[1]!r} is observed twice in image {twice[0]!r}")
-        if self.distances is not None:
-            columns = self.distances
+        for columns, ends in ((self.distances, "points"), (self.bases, "cameras")):
+            if columns is None:
+                continue
             for a, b, length, sigma in zip(
                 columns.from_, columns.to, columns.length, columns.sigma, strict=True
             ):
                 if a == b or length <= 0 or sigma <= 0:
                     raise ValueError(
-                        f"the distance from {a!r} to {b!r} needs two points, a length and a sigma above zero"
+                        f"the distance from {a!r} to {b!r} needs two {ends}, a length and a sigma above zero"
                     )
 
     def _check_groups(self) -> None:

@@ -34,7 +34,7 @@ _SHARE = 0.4
 
 
 def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
-    """Find distances and observed control points that contradict the other observations.
+    """Find distances, bases and observed control points that contradict the other observations.
 
     Parameters
     ----------
@@ -50,7 +50,11 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     """
     network, others, n = problem.network, problem.others, 2 * len(problem.network.xy)
     bars, coordinates, _ = others.slices
-    element = np.concatenate([np.arange(bars.stop), bars.stop + others.coordinate[:, 0]]).astype(np.intp)
+    bases = np.arange(len(others.bases))
+    # Distances and bases are numbered first, then points.
+    lengths = bars.stop + len(bases)
+    element = np.concatenate([np.arange(bars.stop), lengths + others.coordinate[:, 0], bars.stop + bases])
+    own = n + np.concatenate([np.arange(coordinates.stop), others.base_lengths.start + bases])
     if not len(element):
         return []
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
@@ -58,7 +62,6 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     found: list[tuple[int, float, float]] = []
     current = fit
     for _ in range(_MOST):
-        own = slice(n, n + coordinates.stop)
         seen = np.abs(current.w[:n])
         seen = seen[np.isfinite(seen) & (seen > 0)]
         # Gross errors of image points must not hide those of other observations.
@@ -68,19 +71,19 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         if not w[worst] > critical:
             break
         trial = weights.copy()
-        trial[own][element == element[worst]] = 0.0
+        trial[own[element == element[worst]]] = 0.0
         again = problem.continued(current).with_weights(trial).adjusted()
         if isinstance(again, Failure):
             # The datum depends on it, so that it cannot be said which is wrong.
             found.append((int(element[worst]), float(w[worst]), np.nan))
             break
-        off = float(np.abs(again.residuals[n + worst]))
+        off = float(np.abs(again.residuals[own[worst]]))
         found.append((int(element[worst]), float(w[worst]), off))
         weights, current = trial, again
     if not found:
         return []
     unchecked = _unchecked(problem, current, weights)
-    return [*_bars(network, found, bars.stop), *_control(network, found, bars.stop, unchecked)]
+    return [*_lengths(network, found), *_control(network, found, lengths, unchecked)]
 
 
 def without_false_bars(problem: BundleProblem) -> tuple[BundleProblem, list[Remark]]:
@@ -130,14 +133,19 @@ def without_false_bars(problem: BundleProblem) -> tuple[BundleProblem, list[Rema
     ]
 
 
-def _bars(network: Network, found: list[tuple[int, float, float]], bars: int) -> list[Remark]:
+def _lengths(network: Network, found: list[tuple[int, float, float]]) -> list[Remark]:
+    """Name distances of points, and bases of a rig, by their numbers."""
+    ends = [tuple(network.points[j] for j in pair) for pair in network.distance_of]
+    length = network.distance[:, 0].tolist()
+    if network.rig is not None:
+        ends += [tuple(network.cameras[c].label for c in pair) for pair in network.rig.base_of]
+        length += network.rig.base[:, 0].tolist()
     names = []
     for k, w, off in found:
-        if k >= bars:
+        if k >= len(ends):
             continue
-        a, b = (network.points[j] for j in network.distance_of[k])
         by = "" if np.isnan(off) else f", by {off:.3g} {network.unit} from the others"
-        names.append(f"{a} to {b} ({network.distance[k, 0]:g} {network.unit}{by}, w {w:.1f})")
+        names.append(f"{ends[k][0]} to {ends[k][1]} ({length[k]:g} {network.unit}{by}, w {w:.1f})")
     if not names:
         return []
     verb = "contradicts" if len(names) == 1 else "contradict"
@@ -150,9 +158,9 @@ def _bars(network: Network, found: list[tuple[int, float, float]], bars: int) ->
 
 
 def _control(
-    network: Network, found: list[tuple[int, float, float]], bars: int, unchecked: list[str]
+    network: Network, found: list[tuple[int, float, float]], lengths: int, unchecked: list[str]
 ) -> list[Remark]:
-    names = [f"{network.points[k - bars]} (w {w:.1f})" for k, w, _ in found if k >= bars]
+    names = [f"{network.points[k - lengths]} (w {w:.1f})" for k, w, _ in found if k >= lengths]
     if not names:
         return []
     verb = "contradicts" if len(names) == 1 else "contradict"

@@ -19,7 +19,9 @@ from ..diagnostics.checks import listed
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
 from ..network import Network
 from ..network.network import finite
+from ..network.rig import RigValues
 from ..solver import BundleFit, BundleProblem, approximate
+from ..solver.datum import Similarity
 from ..solver.problem import LAST_ROUND
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
@@ -115,14 +117,19 @@ def _begun(
         moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
     if network.rig is not None:
-        if not finite(network.x0[network.rig.exposure >= 0]).all():
+        # Images that are seen through windows on the rig have no orientation without it.
+        single = network.refraction is None or not network.refraction.on_rig.any()
+        if single and not finite(network.x0[network.rig.exposure >= 0]).all():
             start = _without_rig(network, options, start)
         odd, typical = network.rig.apart(start.rotation, start.x0)
         if len(odd) or typical > _NOT_AT_ONCE:
-            network, doubts = _not_at_once(network, odd, typical, apart=options.outliers == "reject")
+            apart = single and options.outliers == "reject"
+            network, doubts = _not_at_once(network, odd, typical, apart=apart)
     if network.rig is not None:
         places, rotation, x0 = network.rig.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, rig=places)
+        scale = _scale_of_bases(network, places)
+        start, found = Similarity(scale, np.eye(3), np.zeros(3))(start), replace(found, xyz=scale * found.xyz)
     problem = BundleProblem(
         network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
     )
@@ -131,6 +138,16 @@ def _begun(
     if len(lost_images(network, start.x0, start.xyz)):
         problem = settled(problem)
     return problem, found.notes, doubts
+
+
+def _scale_of_bases(network: Network, places: RigValues) -> float:
+    """Factor that gives a network its scale by the known bases, where nothing else does; otherwise 1."""
+    rig = network.rig
+    others = len(network.distance) or network.observed.any() or network.held.any()
+    if rig is None or not len(rig.base) or others:
+        return 1.0
+    length = places.lengths(rig.base_of)
+    return float(np.median(rig.base[length > 0, 0] / length[length > 0])) if (length > 0).any() else 1.0
 
 
 def _without_rig(network: Network, options: Options, start: Values) -> Values:

@@ -450,7 +450,7 @@ class Network(Display):
             files=images.file or (None,) * len(images.id),
             unit=document.unit,
             datum_chosen=document.datum_points is not None,
-            rig=_rig(images.exposure, _rows(images.camera, camera_row)),
+            rig=_rig(document, camera_row),
             refraction=None if document.refraction is None
             else document.refraction.refraction(images.id, images.camera),
         )  # fmt: skip
@@ -617,12 +617,20 @@ def _camera(entry: CameraEntry | CalibratedCameraEntry, calibrated: Mapping[str,
     return Camera.from_entry(entry)
 
 
-def _rig(exposures: Sequence[str | None] | None, camera_of: Rows) -> Rig | None:
+def _rig(document: Network1, camera_row: dict[str, int]) -> Rig | None:
     """Rig of images with exposures, by name."""
+    exposures, bases = document.images.exposure, document.bases
     if exposures is None or not any(exposures):
         return None
     names = {name: k for k, name in enumerate(dict.fromkeys(name for name in exposures if name))}
-    return Rig(camera_of, np.array([names[name] if name else -1 for name in exposures], dtype=np.intp))
+    ends = [] if bases is None else [bases.from_, bases.to]
+    known = [] if bases is None else [bases.length, bases.sigma]
+    return Rig(
+        _rows(document.images.camera, camera_row),
+        np.array([names[name] if name else -1 for name in exposures], dtype=np.intp),
+        np.array([_rows(end, camera_row) for end in ends], dtype=np.intp).T.reshape(-1, 2),
+        np.array(known, dtype=np.float64).T.reshape(-1, 2),
+    )
 
 
 def _rows(names: Sequence[str], rows: dict[str, int]) -> Rows:

@@ -12,7 +12,7 @@ others, they form a rig of their own. The adjustment is described in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +39,11 @@ class RigValues(NamedTuple):
         """Return the values in another scale of object space."""
         return RigValues(self.rotation, scale * self.base)
 
+    def lengths(self, cameras: Rows) -> Array:
+        """Distances (b,) between the projection centres of pairs of cameras (b, 2)."""
+        a, b = cameras.T
+        return np.asarray(np.linalg.norm(self.base[b] - self.base[a], axis=1))
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -50,11 +55,15 @@ class Rig:
         Number of the camera of each image.
     exposure : ndarray of int (m,)
         Number of the exposure of each image; −1 for images that were not taken on the rig.
+    base_of : ndarray of int (b, 2)
+        Pairs of cameras whose projection centres have a known distance.
+    base : ndarray (b, 2)
+        These distances and their standard deviations.
 
     Raises
     ------
     UsageError
-        When a camera has two images of an exposure.
+        When a camera has two images of an exposure, or no exposures connect the cameras of a known base.
 
     Examples
     --------
@@ -65,14 +74,23 @@ class Rig:
 
     camera: Rows
     exposure: Rows
+    base_of: Rows = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+    base: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
+        if self.base_of.shape != (len(self.base), 2) or self.base.shape != (len(self.base_of), 2):
+            raise UsageError("requires two cameras, a length and a sigma", where="base of a rig")
+        if not (self.base > 0).all():
+            raise UsageError("requires a length and a sigma above zero", where="base of a rig")
         if self.camera.shape != self.exposure.shape:
             raise UsageError("requires a camera and an exposure for every image", where="Rig")
         on = self.exposure >= 0
         both = np.stack([self.camera[on], self.exposure[on]], axis=1)
         if len(np.unique(both, axis=0)) < len(both):
             raise UsageError("a camera has two images of one exposure", where="rig")
+        reference = self.references(on)
+        if any(a == b or reference[a] != reference[b] for a, b in self.base_of):
+            raise UsageError("requires two cameras that exposures connect", where="base of a rig")
 
     def references(self, used: Mask) -> Rows:
         """Camera (c,) whose axes the place of each refers to: the first that exposures lead to.
@@ -169,7 +187,7 @@ class Rig:
         """Return the rig with orientations of their own for some images."""
         exposure = self.exposure.copy()
         exposure[images] = -1
-        return Rig(self.camera, exposure)
+        return replace(self, exposure=exposure)
 
     def _relative(self, one: int, other: int, known: Mask, rotation: Array, x0: Array) -> tuple[Array, Array]:
         """Rotation (3, 3) and centre (3,) of a camera in the axes of another."""

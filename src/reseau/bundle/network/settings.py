@@ -11,6 +11,7 @@ import numpy as np
 from ...core.errors import UsageError
 from ...io.network import (
     AdditionalParameters,
+    BaseColumns,
     CameraEntry,
     DistanceColumns,
     ImageColumns,
@@ -246,9 +247,19 @@ def network_document(network: Network) -> Network1:
             **{"from": tuple(points[a])}, to=tuple(points[b]), length=tuple(bars[:, 0].tolist()),
             sigma=tuple(bars[:, 1].tolist()),
         ) if len(bars) else None,
+        bases=_bases(network, ids),
         datum=network.datum,
         datum_points=tuple(points[network.datum_points]) if network.datum_chosen else None,
     )  # fmt: skip
+
+
+def _bases(network: Network, ids: list[str]) -> BaseColumns | None:
+    rig = network.rig
+    if rig is None or not len(rig.base):
+        return None
+    a, b = ([ids[c] for c in end] for end in rig.base_of.T)
+    length, sigma = rig.base.T.tolist()
+    return BaseColumns(**{"from": tuple(a)}, to=tuple(b), length=tuple(length), sigma=tuple(sigma))
 
 
 def _entry(camera: Camera) -> CameraEntry:

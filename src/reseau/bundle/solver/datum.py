@@ -124,7 +124,7 @@ def _changes_of_windows(system: System, values: Values) -> Array:
 
 
 def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bool = True) -> Freedom:
-    """Find the similarity transformations not determined by coordinates, distances and stage readings.
+    """Find the similarity transformations not determined by coordinates, distances, bases and stage readings.
 
     Parameters
     ----------
@@ -152,7 +152,8 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
         known = bent.used & ~bent.free
         known[system.others.refraction[system.sigma_root[system.others.windows] > 0]] = True
         rows.append(moving[known])
-    if network.stage is not None:
+    bases = system.sigma_root[system.others.base_lengths]
+    if network.stage is not None or (bases > 0).any():
         rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
     scale = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size, 1 / size])

@@ -1,4 +1,4 @@
-"""Observations other than image coordinates: distances, coordinates, parameters, stage."""
+"""Observations other than image coordinates: distances, coordinates, parameters, stage, bases of a rig."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["OtherObservations"]
 
 @dataclass(frozen=True, eq=False)
 class OtherObservations:
-    """Observations other than image coordinates: distances, coordinates, parameters, stage.
+    """Observations other than image coordinates: distances, coordinates, parameters, stage, bases of a rig.
 
     Parameters
     ----------
@@ -40,7 +40,9 @@ class OtherObservations:
     across : ndarray (3, t)
         Two directions perpendicular to the nominal axis of a stage; the components of the axis along them are
         observed as zero. Empty without a stage.
-    value, sigma : ndarray (d + q + i + k + w + r + t,)
+    bases : ndarray of int (b, 2)
+        Cameras of the known bases of a rig.
+    value, sigma : ndarray (d + q + i + k + w + r + t + b,)
         Observed values and their standard deviations, in this order.
     """
 
@@ -52,6 +54,7 @@ class OtherObservations:
     refraction: Rows
     reading: Rows
     across: Array
+    bases: Rows
     value: Array
     sigma: Array
 
@@ -74,6 +77,7 @@ class OtherObservations:
         read = np.zeros(0) if stage is None else stage.reading
         across_axis = np.zeros((3, 0)) if stage is None else perpendicular(stage.axis)
         tilts = across_axis.shape[1]
+        known = np.zeros((0, 2)) if network.rig is None else network.rig.base
         return cls(
             network.distance_of,
             coordinate,
@@ -83,6 +87,7 @@ class OtherObservations:
             windows.astype(np.intp),
             np.arange(len(read), dtype=np.intp),
             across_axis,
+            np.zeros((0, 2), dtype=np.intp) if network.rig is None else network.rig.base_of,
             np.concatenate(
                 [
                     network.distance[:, 0],
@@ -92,6 +97,7 @@ class OtherObservations:
                     [] if bent is None else bent.values[windows],
                     read,
                     np.zeros(tilts),
+                    known[:, 0],
                 ]
             ),
             np.concatenate(
@@ -103,6 +109,7 @@ class OtherObservations:
                     [] if bent is None else bent.sigma[windows],
                     np.full(len(read), 0.0 if stage is None else stage.sigma),
                     np.full(tilts, 0.0 if stage is None else stage.axis_sigma),
+                    known[:, 1],
                 ]
             ),
         )
@@ -134,7 +141,13 @@ class OtherObservations:
     @property
     def tilts(self) -> slice:
         """Positions of the two components of the stage axis in `value`."""
-        return slice(self.readings.stop, len(self.value))
+        start = self.readings.stop
+        return slice(start, start + self.across.shape[1])
+
+    @property
+    def base_lengths(self) -> slice:
+        """Positions of the bases of a rig in `value`."""
+        return slice(self.tilts.stop, len(self.value))
 
     def computed(self, values: Values) -> Array:
         """Compute the observations from the unknowns."""
@@ -149,6 +162,7 @@ class OtherObservations:
                 values.refraction[self.refraction],
                 [] if values.stage is None else values.stage.reading[self.reading],
                 [] if values.stage is None else values.stage.axis @ self.across,
+                [] if values.rig is None else values.rig.lengths(self.bases),
             ]
         )
 

@@ -259,7 +259,7 @@ def _constrained(
     q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
     found = _with_inverse(linear, normal, own.back @ q @ own.back.T, columns, taking_part)
-    slopes = linear.stage_slopes
+    slopes = linear.constraint_slopes
     found[3][len(found[3]) - len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
     if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _STAGED:

@@ -303,7 +303,8 @@ class _Run:
         windows = np.ones(len(more.refraction), dtype=bool)
         read = self.usable.images[more.reading]
         axis = np.ones(more.across.shape[1], dtype=bool)
-        self.in_others = np.concatenate([bars, coordinate, interior, joint, windows, read, axis])
+        bases = self._connected(more.bases)
+        self.in_others = np.concatenate([bars, coordinate, interior, joint, windows, read, axis, bases])
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
@@ -321,6 +322,7 @@ class _Run:
             more.refraction,
             more.reading[read],
             more.across,
+            more.bases[bases],
             more.value[self.in_others],
             more.sigma[self.in_others],
         )
@@ -330,6 +332,17 @@ class _Run:
         factors = self.weights[2 * n :][self.in_others]
         self.system = System(
             self.unknowns, others, mine, factors, self.unknowns.dropped.copy(), problem.centre
+        )
+
+    def _connected(self, bases: Rows) -> Mask:
+        """Whether the cameras of known bases (b, 2) are connected by adjusted images."""
+        rig = self.problem.network.rig
+        if rig is None:
+            return np.zeros(0, dtype=bool)
+        seen = np.bincount(rig.camera[self.usable.images & (rig.exposure >= 0)], minlength=len(rig.camera))
+        reference = rig.references(self.usable.images)
+        return np.array(
+            [seen[a] > 0 and seen[b] > 0 and reference[a] == reference[b] for a, b in bases], dtype=bool
         )
 
     def adjust(self) -> BundleFit | Failure:

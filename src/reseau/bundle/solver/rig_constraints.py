@@ -133,6 +133,19 @@ class RigConstraints:
         t[columns, len(self.others) + 6 * (len(turn) + camera[:, None]) + np.arange(6)] = 1.0
         return t
 
+    def slopes(self, places: RigValues, cameras: Rows, root: Array) -> Array:
+        """Derivatives (b, size) of the distances of pairs of cameras (b, 2), times roots (b,) of weights."""
+        slopes = np.zeros((len(cameras), self.size))
+        start = len(self.others) + 6 * len(self._numbers[1]) + 3
+        column = {int(camera): start + 6 * k for k, camera in enumerate(self.cameras)}
+        for row, (a, b) in zip(slopes, cameras.tolist(), strict=True):
+            along = places.base[b] - places.base[a]
+            along = along / np.linalg.norm(along)
+            for camera, slope in ((a, -along), (b, along)):
+                if camera in column:
+                    row[column[camera] : column[camera] + 3] = slope
+        return slopes * root[:, None]
+
     def stepped(
         self, places: RigValues, rotation: Array, x0: Array, q: Array
     ) -> tuple[RigValues, Array, Array]:

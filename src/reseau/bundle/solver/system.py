@@ -197,14 +197,17 @@ class Linear:
         return np.eye(self.system.unknowns.size)
 
     @cached_property
-    def stage_slopes(self) -> Array:
-        """Weighted derivatives (a + 2, size) of stage readings and axis, the last of the other observations.
+    def constraint_slopes(self) -> Array:
+        """Weighted derivatives (a, size) of the last of the other observations, those of a stage or a rig.
 
-        Without a stage there are none, (0, size).
+        These are readings and axis of a stage, or the known bases of a rig.
         """
-        constraints, others, stage = self.system.constraints, self.system.others, self.values.stage
-        if isinstance(constraints, StageConstraints) and stage is not None:
-            return constraints.slopes(stage, others.across, self.system.sigma_root[others.readings.start :])
+        constraints, others, values = self.system.constraints, self.system.others, self.values
+        root = self.system.sigma_root[others.readings.start :]
+        if isinstance(constraints, StageConstraints) and values.stage is not None:
+            return constraints.slopes(values.stage, others.across, root)
+        if isinstance(constraints, RigConstraints) and values.rig is not None:
+            return constraints.slopes(values.rig, others.bases, root)
         return np.zeros((0, self.transformation.shape[1]))
 
     @cached_property
@@ -359,7 +362,7 @@ class Normal:
     def constrained(self, held: Mask | None = None) -> Constrained:
         """Return the normal equations of the independent unknowns, of which some (size,) may be held."""
         linear = self.linear
-        t, slopes = linear.transformation, linear.stage_slopes
+        t, slopes = linear.transformation, linear.constraint_slopes
         own = slopes.T @ linear.other_misfits[len(linear.other_misfits) - len(slopes) :]
         matrix = t.T @ full(self.sums.band, self.sums.border) @ t + slopes.T @ slopes
         gradient = t.T @ self.sums.reduced + own
