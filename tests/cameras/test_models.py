@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import scipy.stats
 
-from reseau.bundle import Camera, Network, adjust_network
+from reseau.bundle import Camera, Network, Result, adjust_network
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
@@ -273,6 +274,51 @@ def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
     assert float(off @ np.linalg.solve(covariance, off)) < 4 * len(names)
     tested = {test.name for test in result.camera_tests(0)}
     assert tested == set(distortion_names(names, case.model.name))
+
+
+def result_of(world: networks.World, seed: int) -> Result:
+    """The adjustment of one draw, begun at the truth."""
+    network = world.noisy(seed)
+    fit = world.problem(network).adjusted()
+    assert not isinstance(fit, Failure)
+    return Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
+
+
+def normalised_errors(case: Case, seeds: range) -> tuple[Array, Array]:
+    """Errors of the parameters over their sigmas (s, u), and their squares in the joint covariance over u.
+
+    The image is narrow: there the shape of a double sphere is determined to first order with little noise
+    only.
+    """
+    sigma_px = 0.002 if len(case.model.of_role("shape")) > 1 else 0.02
+    world = networks.world(images=6, points=30, cameras=(camera_of(case),), sigma_px=sigma_px)
+    true = world.network.cameras[0].parameters
+    single, joint = [], []
+    for seed in seeds:
+        result = result_of(world, seed)
+        names, _, values = result.camera_columns(0)
+        off = values - [true[name] for name in names]
+        covariance = result.camera_covariance(0)
+        single.append(off / np.sqrt(np.diag(covariance)))
+        joint.append(off @ np.linalg.solve(covariance, off) / len(off))
+    return np.array(single), np.array(joint)
+
+
+@EVERY
+def test_covariances_cover_the_errors(case: Case) -> None:
+    """Monte Carlo with few draws; the interval has a probability of 0.9999 for sums of this many squares."""
+    _, joint = normalised_errors(case, range(12))
+    u = len(case.model.usual)
+    low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], 12 * u) / (12 * u)
+    assert low < joint.mean() < high
+
+
+@pytest.mark.slow
+@EVERY
+def test_standard_deviations_are_right_to_five_percent(case: Case) -> None:
+    """The root mean square of all normalised errors, of 200 draws, with joint covariances."""
+    _, joint = normalised_errors(case, range(100, 300))
+    assert 0.95 < np.sqrt(joint.mean()) < 1.05
 
 
 @EVERY
