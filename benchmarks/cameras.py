@@ -1,9 +1,9 @@
-"""Camera models beside OpenCV, mrcal and COLMAP: projections, calibrations of the same corners, times.
+"""Camera models beside OpenCV, mrcal and COLMAP: projections, calibrations of the same corners, choices.
 
-Run from the checkout: ``python benchmarks/cameras.py [--part projections|calibrations|times]``. mrcal needs
-Debian's ``python3-mrcal``, COLMAP needs pycolmap (extra ``peers``); without them their rows are left out, and
-said to be. Corners are those of OpenCV in the photographs of $RESEAU_DATA/chessboard_stereo, and of boards
-drawn by OpenCV's cameras (``benchmarks/worlds/lenses.py``).
+Run from the checkout: ``python benchmarks/cameras.py [--part projections|calibrations|times|choices]``. mrcal
+needs Debian's ``python3-mrcal``, COLMAP needs pycolmap (extra ``peers``); without them their rows are left
+out, and said to be. Corners are those of OpenCV in the photographs of $RESEAU_DATA/chessboard_stereo, and of
+boards drawn by OpenCV's cameras (``benchmarks/worlds/lenses.py``).
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ import cv2
 import numpy as np
 from worlds import lenses
 
-from reseau.bundle import Network, adjust_network
+from reseau.bundle import Camera, ModelChoice, Network, adjust_network, choose_model
+from reseau.calibration.camera import by_rotation
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_models
 from reseau.optics.cameras import Division, Fisheye, OpenCV, Stereographic
 from reseau.optics.cameras.kernels import CameraColumns, camera, compiled, kernel
+from reseau.optics.poses import rotation_matrix
 
 DATA = Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MRCAL = Path(__file__).parent / "ceres" / "mrcal_cameras.py"
@@ -248,7 +250,75 @@ def least(function: Callable[..., Any], *arguments: Any) -> float:
     return min(found)
 
 
-PARTS = {"projections": projections, "calibrations": calibrations, "times": times}
+def truths() -> dict[str, lenses.Lens]:
+    """Lenses drawn by OpenCV, by the simplest candidate that contains them."""
+    matrix = np.array([[1200.0, 0, 645.0], [0, 1203.0, 475.0], [0, 0, 1]])
+
+    def lens(*k: float) -> lenses.Lens:
+        return lenses.Lens(1280, 960, matrix, np.array([*k, *np.zeros(12 - len(k))]))
+
+    rational = lens(0.3, -0.1, 5e-4, -3e-4, 0.02, 0.55, -0.05, 0.03)
+    return {
+        "opencv: no distortion": lens(),
+        "opencv: k1": lens(-0.1),
+        "opencv: k1 k2": lens(-0.2, 0.1),
+        "opencv: k1 k2 p1 p2": lens(-0.2, 0.1, 1e-3, -5e-4),
+        "opencv: k1 k2 p1 p2 k3": lens(-0.25, 0.3, 1e-3, -5e-4, -0.5),
+        "opencv: k1 k2 p1 p2 k3 k4 k5 k6": rational,
+        "fisheye: k1 k2 k3 k4": lenses.fisheye(70),
+    }
+
+
+def choices(seeds: int = 20) -> None:
+    """Which model is chosen, its parameters, and its greatest error over the observed part of the image."""
+    for truth, lens in truths().items():
+        names: dict[str, int] = {}
+        error, loss = [], []
+        for seed in range(seeds):
+            flat, true = lenses.board(8, 6, 1.0)
+            seen = lenses.views(lens, flat, true, 15, 0.2, seed)
+            f = 1.05 * float(lens.matrix[0, 0])
+            start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
+            free = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"]
+            document = lenses.document(lens, flat, seen, start, free, 0.2, "opencv")
+            content = json.loads(json.dumps(document))
+            found = choose_model(Network.from_document(Network1.from_content(content, where="drawn")))
+            if not isinstance(found, ModelChoice):
+                names[found.reason] = names.get(found.reason, 0) + 1
+                continue
+            label = found.chosen.candidate.label
+            names[label] = names.get(label, 0) + 1
+            least = min((each for each in found.compared if each.cost > 0), key=lambda each: each.cost)
+            error.append(difference(lens, found.camera, np.concatenate([xy for _, xy in seen])))
+            loss.append(len(least.candidate.free) - len(found.chosen.candidate.free))
+        said = ", ".join(f"{name} {count}" for name, count in sorted(names.items(), key=lambda e: -e[1]))
+        print(f"  {truth}: {said}")
+        print(
+            f"    rms error of the chosen camera where there are observations {np.median(error):.3f} px "
+            f"(median), at most {np.max(error):.3f} px; "
+            f"the least residuals have {np.mean(loss):.1f} parameters more"
+        )
+
+
+def difference(lens: lenses.Lens, camera: Camera, seen: np.ndarray) -> float:
+    """Root mean square difference (px) from the lens where there are observations, after a rotation."""
+    x = points(80.0, 20_000)
+    image = lens.project(x)
+    x = x[np.isfinite(image).all(axis=1)]
+    image = lens.project(x)
+    cells = {tuple(cell) for cell in (seen // 80).astype(int).tolist()}
+    inside = np.array([tuple(cell) in cells for cell in (image // 80).astype(int).tolist()])
+    x, image, mapping, turn = x[inside], image[inside], camera.plane_mapping(), np.eye(3)
+    for _ in range(5):
+        turned = x @ turn.T
+        uv = turned[:, :2] / turned[:, 2:]
+        found = mapping.derivatives(uv)
+        slope = (found.d_xy @ by_rotation(uv)).reshape(-1, 3)
+        turn = rotation_matrix(-np.linalg.lstsq(slope, (found.value - image).ravel(), rcond=None)[0]) @ turn
+    return float(np.sqrt(((found.value - image) ** 2).sum(axis=1).mean()))
+
+
+PARTS = {"projections": projections, "calibrations": calibrations, "times": times, "choices": choices}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)

@@ -100,11 +100,12 @@ def world(
     control: int = 5,
     seed: int = 0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    size: float = 1.0,
 ) -> World:
-    """Points in a box of 2 m, images on a ring around and above it; the first points are held control."""
+    """Points in a box of 2 m (times `size`), images on a ring around and above it; the first are control."""
     rng = np.random.default_rng(seed)
     cameras = cameras or (camera(),)
-    xyz = rng.uniform(-1, 1, (points, 3)) * [1.0, 1.0, 0.4]
+    xyz = size * rng.uniform(-1, 1, (points, 3)) * [1.0, 1.0, 0.4]
     angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
     x0 = np.stack([3.6 * np.cos(angle), 3.6 * np.sin(angle), 2.0 + 0.6 * np.sin(3 * angle)], axis=1)
     rotation = np.stack([looking_at(x, np.zeros(3), 0.8 * k) for k, x in enumerate(x0)])

@@ -41,7 +41,7 @@ from .common import (
 from .measure import Channel
 
 if TYPE_CHECKING:
-    from ..bundle import Kind
+    from ..bundle import Kind, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
@@ -94,7 +94,8 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="Camera model; by default brown with --pitch, otherwise opencv. An unknown name lists all.",
+            help="Camera model; by default brown with --pitch, otherwise opencv. `auto` compares models and "
+            "says why it chose one. An unknown name lists all.",
         ),
     ] = "",
     pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm; required by brown.")] = None,
@@ -332,6 +333,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     from ..calibration import projection_field
 
     result = done.result
+    if done.choice is not None:
+        _say_choice(done.choice)
     count = sum(len(points) for points in done.measured.values())
     say(f"{len(done.measured)} images, {count} image points, redundancy {result.redundancy}\n")
     say(f"sigma0 {result.sigma0:.4g}")
@@ -361,3 +364,19 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         say(f"left out: {name}: {why}\n")
     for warning in result.warnings:
         say(f"warning: {warning}\n")
+
+
+def _say_choice(choice: ModelChoice) -> None:
+    """Print the comparison of the camera models."""
+    import numpy as np
+
+    say(f"camera model {choice.chosen.candidate.label} ({choice.chosen.reason})\n")
+    say("  model                                      sigma0   length  predicted  at the corners px\n")
+    for each in choice.compared:
+        line = f"  {each.candidate.label[:40]:40}"
+        if np.isfinite(each.sigma0):
+            predicted = f"{each.predicted:9.4f}" if np.isfinite(each.predicted) else "        -"
+            corner = f"{each.corner_px:7.2g}" if np.isfinite(each.corner_px) else "no image"
+            sigma = f" ± {each.corner_sigma_px:.2g}" if np.isfinite(each.corner_sigma_px) else ""
+            line += f" {each.sigma0:8.4f} {each.length:8.1f}  {predicted}  {corner}{sigma}"
+        say(f"{line}  {each.reason}\n")

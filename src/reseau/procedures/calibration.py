@@ -22,6 +22,7 @@ from ..bundle import (
     ControlPoints,
     ImageEstimates,
     Kind,
+    ModelChoice,
     Network,
     Options,
     PointEstimates,
@@ -29,6 +30,7 @@ from ..bundle import (
     Rig,
     calibration_of,
     camera_mapping,
+    choose_model,
     model_search_entries,
     search_model,
 )
@@ -91,8 +93,9 @@ class CameraOptions:
     Parameters
     ----------
     model : str, optional
-        Name of a registered model, see :func:`reseau.optics.camera_models`. By default ``brown`` if the pixel
-        size is given, otherwise ``opencv``.
+        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen, see
+        :func:`reseau.bundle.choose_model`. By default ``brown`` if the pixel size is given, otherwise
+        ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.
     pitch_mm : (float, float), optional
@@ -120,17 +123,25 @@ class CameraOptions:
         if not self.model:
             object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
         model = self.registered
+        if self.automatic and (self.free or self.options):
+            raise UsageError("has no parameters or options of its own", where="camera model auto")
         if model.needs_pitch and self.pitch_mm is None:
             raise UsageError("requires the pixel size", where=model.name)
         unknown = [name for name in self.free if name not in model.names]
         if unknown:
             raise UsageError(f"is not one of {', '.join(model.names)}", where=unknown[0])
-        object.__setattr__(self, "options", model.checked_options(self.options))
+        if not self.automatic:
+            object.__setattr__(self, "options", model.checked_options(self.options))
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the model is to be chosen."""
+        return self.model == "auto"
 
     @property
     def registered(self) -> CameraModel:
-        """The registered model."""
-        return camera_model(self.model)
+        """The registered model; the default one where it is to be chosen."""
+        return default_camera_model(self.pitch_mm is not None) if self.automatic else camera_model(self.model)
 
     @property
     def chosen(self) -> tuple[str, ...]:
@@ -191,11 +202,14 @@ class Calibrated(Display):
         Measured image points, by image.
     declined : dict
         Reasons why images were left out, by image.
+    choice : ModelChoice, optional
+        How the camera model was chosen.
     """
 
     result: Result
     measured: dict[str, ImagePoints]
     declined: dict[str, str]
+    choice: ModelChoice | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -253,6 +267,8 @@ class Calibrated(Display):
         """
         found = calibration_of(self.result, camera or _CAMERA, name=name, provenance=provenance)
         more = model_search_entries(self.result)
+        if self.choice is not None:
+            more |= {"camera_models": self.choice.entries()}
         return found.model_copy(update={"validity": found.validity | more}) if more else found
 
     def write(self, path: Path | str) -> None:
@@ -404,8 +420,14 @@ def calibrate_camera(
         network = _scaled(network)
     if options.sigma_px is not None:
         network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
+    choice = None
+    if model is not None and model.automatic:
+        chosen = choose_model(network, options=options.adjustment)
+        if isinstance(chosen, Failure):
+            return chosen
+        choice, network = chosen, replace(network, cameras=(chosen.camera,))
     found = search_model(network, options.adjustment, options.components, options.level)
-    return found if isinstance(found, Failure) else Calibrated(found, measured, declined)
+    return found if isinstance(found, Failure) else Calibrated(found, measured, declined, choice)
 
 
 def _fixed_to_each_other(
@@ -589,4 +611,4 @@ def first_camera(
     f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
-    return Camera(_CAMERA, *size, pitch, model.model, values, model.chosen, model.options)
+    return Camera(_CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options)

@@ -2,6 +2,7 @@
 
 from .adjustment import Options, adjust_network, problem_of
 from .calibration import calibration_of
+from .choice import Candidate, Compared, ModelChoice, camera_candidates, choose_model
 from .search import (
     Kind,
     Selection,
@@ -13,11 +14,16 @@ from .search import (
 )
 
 __all__ = [
+    "Candidate",
+    "Compared",
     "Kind",
+    "ModelChoice",
     "Options",
     "Selection",
     "adjust_network",
     "calibration_of",
+    "camera_candidates",
+    "choose_model",
     "cross_validation",
     "eliminate_parameters",
     "estimate_components",

@@ -1,0 +1,585 @@
+"""Choice of a camera model: which of several describes a camera well enough, without parameters too many.
+
+Every candidate is adjusted with the same observations. The description length (Schwarz 1978, *Estimating the
+dimension of a model*, Annals of Statistics 6; Rissanen 1978, Modeling by shortest data description,
+Automatica 14) weighs residuals against the number of parameters. Those that come close are compared by
+cross-validation over images: an image that did not contribute is predicted. The difference of the image
+coordinates from those of the chosen model, after the best rotation, says what the choice matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from ...calibration.camera import CameraMapping, projection_field
+from ...calibration.compare import calibration_difference
+from ...core.data import Array, Mask
+from ...core.display import Display
+from ...core.errors import UsageError
+from ...core.failure import Code, Failure
+from ...optics import PixelGrid
+from ...optics.cameras import camera_model, convert
+from ..diagnostics import Result, camera_mapping
+from ..network import Camera, Network
+from ..network.network import finite
+from ..solver import BundleFit, BundleProblem
+from .adjustment import Options, adjust_network
+
+__all__ = ["Candidate", "Compared", "ModelChoice", "camera_candidates", "choose_model"]
+
+# Description lengths within this of the least are not worse (Kass & Raftery 1995, Bayes factors, JASA 90,
+# table on p. 777: "not worth more than a bare mention"); beyond the second no cross-validation is needed.
+_EQUAL, _HOPELESS = 2.0, 30.0
+# Candidates that are cross-validated at most, and level of the test of their differences.
+_VALIDATED, _LEVEL = 6, 0.01
+# Iterations of a candidate, which begins close to its solution, and decrease that makes a better start.
+_STEPS, _BETTER = 60, 0.02
+# Least number of images for which images can be left out, and of points by which one is predicted.
+_LEAST_IMAGES, _LEAST_POINTS = 4, 5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A camera model with the parameters that it is allowed.
+
+    Parameters
+    ----------
+    model : str
+        Name in the registry.
+    free : tuple of str
+        Parameters to estimate.
+    options : mapping
+        Options of the model.
+
+    Examples
+    --------
+    >>> Candidate("opencv", ("fx", "fy", "cx", "cy", "k1")).label
+    'opencv: k1'
+    """
+
+    model: str
+    free: tuple[str, ...]
+    options: Mapping[str, str | float] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """Model, and parameters other than those of the interior orientation."""
+        plain = camera_model(self.model).of_role("scale", "centre")
+        more = " ".join(name for name in self.free if name not in plain)
+        return f"{self.model}: {more or 'no distortion'}"
+
+    def within(self, other: Candidate) -> bool:
+        """Whether it is the other candidate without some of its parameters."""
+        same = self.model == other.model and self.options == other.options
+        return same and set(self.free) < set(other.free)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A candidate, compared with the one that was chosen.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Model and free parameters.
+    reason : str
+        Why it was not chosen, or why it was.
+    sigma0 : float
+        Standard deviation of unit weight; NaN where the adjustment failed.
+    cost : float
+        vᵀPv.
+    length : float
+        Description length −2 ln L + u ln N with the variance estimated, less that of the best candidate.
+    predicted : float
+        Root mean square of predicted image coordinates, in their standard deviations, by cross-validation
+        over images; NaN where this was not needed.
+    p : float
+        Probability of the test against the chosen model where one is a part of the other; NaN otherwise.
+    rms_px, corner_px : float
+        Difference from the chosen model over the image, and the largest one at a corner.
+    corner_sigma_px : float
+        Standard deviation there, of the model of the two with more parameters.
+    share : float
+        Part of the image where the difference is significant at 1 %.
+
+    Examples
+    --------
+    >>> Compared(Candidate("opencv", ("fx", "fy")), "chosen", 1.0, 10.0, 0.0).candidate.label
+    'opencv: no distortion'
+    """
+
+    candidate: Candidate
+    reason: str
+    sigma0: float
+    cost: float
+    length: float
+    predicted: float = np.nan
+    p: float = np.nan
+    rms_px: float = np.nan
+    corner_px: float = np.nan
+    corner_sigma_px: float = np.nan
+    share: float = np.nan
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelChoice(Display):
+    """The chosen camera model and the others; truthy.
+
+    Parameters
+    ----------
+    camera : Camera
+        The chosen camera, with its estimates as approximate values.
+    compared : tuple of Compared
+        All candidates, by description length; those that failed last.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> names = ("c", "x0", "y0")
+    >>> found = choose_model(
+    ...     example_network(), [Candidate("brown", (*names, *more)) for more in ((), ("K1",), ("K1", "K2"))]
+    ... )
+    >>> found.chosen.candidate.label
+    'brown: K1'
+    """
+
+    camera: Camera
+    compared: tuple[Compared, ...]
+
+    def __bool__(self) -> bool:
+        return True
+
+    @property
+    def chosen(self) -> Compared:
+        """The chosen candidate."""
+        return next(each for each in self.compared if each.reason.startswith("chosen"))
+
+    @property
+    def alternatives(self) -> tuple[Compared, ...]:
+        """The others."""
+        return tuple(each for each in self.compared if each is not self.chosen)
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Return the comparison as JSON values for the calibration document; unknown numbers are null."""
+
+        def number(value: float) -> float | None:
+            return value if np.isfinite(value) else None
+
+        return [
+            {
+                "model": each.candidate.model,
+                "free": list(each.candidate.free),
+                "reason": each.reason,
+                "sigma0": number(each.sigma0),
+                "length": number(each.length),
+                "predicted": number(each.predicted),
+                "p": number(each.p),
+                "rms_px": number(each.rms_px),
+                "corner_px": number(each.corner_px),
+                "corner_sigma_px": number(each.corner_sigma_px),
+                "significant_share": number(each.share),
+            }
+            for each in self.compared
+        ]
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [(self.chosen.candidate.label, ""), (f"of {len(self.compared)} candidates", "")]
+
+    def _columns(self) -> dict[str, list[object]]:
+        return {
+            "model": [each.candidate.label for each in self.compared],
+            "sigma0": [f"{each.sigma0:.4f}" for each in self.compared],
+            "length": [f"{each.length:.1f}" for each in self.compared],
+            "predicted": [f"{each.predicted:.4f}" for each in self.compared],
+            "corners / px": [f"{each.corner_px:.2g}" for each in self.compared],
+            "reason": [each.reason for each in self.compared],
+        }
+
+
+def camera_candidates(*, pitch_known: bool) -> tuple[Candidate, ...]:
+    """Return the usual candidates: from no distortion to twelve coefficients, and projections of wide lenses.
+
+    Parameters
+    ----------
+    pitch_known : bool
+        Whether the size of a pixel is known: Brown's model then takes the place of OpenCV's.
+
+    Examples
+    --------
+    >>> [candidate.label for candidate in camera_candidates(pitch_known=True)][:3]
+    ['brown: no distortion', 'brown: K1', 'brown: K1 K2']
+    """
+    if pitch_known:
+        steps = [
+            ("brown", more.split())
+            for more in ("", "K1", "K1 K2", "K1 K2 P1 P2", "K1 K2 K3 P1 P2", "K1 K2 K3 P1 P2 B1 B2")
+        ]
+        steps.append(("brown_higher", ["K1", "K2", "K3", "P1", "P2", "B1", "B2", "K4", "K5"]))
+    else:
+        radial = ("", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3", "k1 k2 p1 p2 k3 k4 k5 k6")
+        steps = [("opencv", more.split()) for more in radial]
+        steps.append(("opencv_full", f"{radial[-1]} s1 s2 s3 s4".split()))
+    steps += [
+        (name, more.split())
+        for name, several in (
+            ("fisheye", ("", "k1 k2", "k1 k2 k3 k4", "k1 k2 k3 k4 p1 p2")),
+            ("equisolid", ("k1 k2",)),
+            ("orthographic", ("k1 k2",)),
+            ("stereographic", ("k1 k2",)),
+            ("omni", ("xi", "xi k1 k2 p1 p2")),
+            ("double_sphere", ("xi alpha",)),
+            ("division", ("lambda", "lambda p1 p2")),
+        )
+        for more in several
+    ]
+    return tuple(
+        Candidate(name, (*camera_model(name).of_role("scale", "centre"), *more)) for name, more in steps
+    )
+
+
+def choose_model(
+    network: Network,
+    candidates: Sequence[Candidate] | None = None,
+    options: Options | None = None,
+    *,
+    folds: int = 5,
+    seed: int = 0,
+) -> ModelChoice | Failure:
+    """Choose the model of the only camera of a network.
+
+    Parameters
+    ----------
+    network : Network
+        Network with one camera, of any registered model.
+    candidates : sequence of Candidate, optional
+        By default :func:`camera_candidates`.
+    options : Options, optional
+        Options of the adjustments. Gross errors are rejected with the candidate of least residuals, so that
+        no good observation is rejected because a model is too simple; all are then compared without them.
+    folds : int
+        Number of parts of the images, each left out once.
+    seed : int
+        Seed of the random division.
+
+    Returns
+    -------
+    ModelChoice or Failure
+        A failure when no candidate can be adjusted.
+
+    Raises
+    ------
+    UsageError
+        For a network with several cameras, additional or observed parameters, or without candidates.
+
+    Notes
+    -----
+    Chosen is the candidate with the fewest parameters of those whose description length is within 2 of the
+    least, and which predict images not significantly worse than another. Residuals alone never decide.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> names = ("c", "x0", "y0")
+    >>> found = choose_model(
+    ...     example_network(), [Candidate("brown", (*names, *more)) for more in ((), ("K1",), ("K1", "K2"))]
+    ... )
+    >>> [(each.candidate.label, each.p < 0.01) for each in found.alternatives]
+    [('brown: K1 K2', False), ('brown: no distortion', True)]
+    """
+    if len(network.cameras) != 1 or network.cameras[0].additional is not None or network.cameras[0].sigma:
+        raise UsageError(
+            "needs a network of one camera without additional or observed parameters",
+            where="choice of a model",
+        )
+    camera = network.cameras[0]
+    if candidates is None:
+        own = camera.registered
+        candidates = camera_candidates(pitch_known=own is not None and own.needs_pitch)
+    if not candidates:
+        raise UsageError("there are none", where="candidates of the choice of a model")
+    options = options or Options()
+    first = _first(network, candidates, options)
+    if isinstance(first, Failure):
+        return first
+    fits = _adjusted(first, candidates)
+    if options.outliers == "reject" and (best := _least(fits)) is not None:
+        result = adjust_network(best.problem.network, options)
+        if isinstance(result, Failure):
+            return result
+        weights = result.fit.problem.weights
+        first = best.problem.continued(best).with_weights(weights)
+        fits = _adjusted(first, candidates)
+    best = _least(fits)
+    if best is None:
+        return Failure("no camera model can be adjusted", Code.NOT_CONVERGED)
+    return _chosen(network, candidates, fits, folds, seed)
+
+
+def _least(fits: Sequence[BundleFit | Failure]) -> BundleFit | None:
+    """The adjustment with the least residuals."""
+    good = [fit for fit in fits if isinstance(fit, BundleFit)]
+    return min(good, key=lambda fit: fit.cost, default=None)
+
+
+def _first(network: Network, candidates: Sequence[Candidate], options: Options) -> BundleProblem | Failure:
+    """The problem from the first model that can be adjusted; that of the network, then the usual ones."""
+    found: BundleFit | Failure = Failure("no candidate", Code.NOT_CONVERGED)
+    camera, plain = network.cameras[0], replace(options, outliers="keep")
+    f = float(camera.bare_mapping(distorted=False).derivatives([[0.0, 0.0]]).d_xy[0, 0, 0])
+    names = dict.fromkeys(candidate.model for candidate in candidates)
+    for model in (None, *names):
+        own = camera if model is None else _started(camera, Candidate(model, camera_model(model).usual), f)
+        result = adjust_network(replace(network, cameras=(own,)), plain)
+        if not isinstance(result, Failure):
+            return result.fit.problem.continued(result.fit)
+        found = result
+    assert isinstance(found, Failure)
+    return found
+
+
+def _started(camera: Camera, candidate: Candidate, f: float) -> Camera:
+    """A camera of the candidate's model for a focal length of f pixels."""
+    model = camera_model(candidate.model)
+    grid = PixelGrid(camera.width, camera.height, camera.pitch_mm)
+    values = model.start_values(f, grid)
+    return replace(
+        camera, model=candidate.model, values=values, free=candidate.free, options=candidate.options,
+        covariance=None,
+    )  # fmt: skip
+
+
+def _adjusted(first: BundleProblem, candidates: Sequence[Candidate]) -> list[BundleFit | Failure]:
+    """Adjust all candidates, each from the best before it, converted to its model."""
+    found: list[BundleFit | Failure] = []
+    start, least, begun = replace(first, max_iterations=_STEPS), np.inf, 0
+    for k, candidate in enumerate(candidates):
+        fit = _from(start, candidate)
+        if isinstance(fit, BundleFit) and fit.cost < (1 - _BETTER) * least:
+            start, least, begun = fit.problem.continued(fit), fit.cost, k
+        found.append(fit)
+    # The earlier ones once more from the best of all: a poor start may end in a poor minimum.
+    for k in range(begun):
+        again, before = _from(start, candidates[k]), found[k]
+        if isinstance(again, BundleFit) and (isinstance(before, Failure) or again.cost < before.cost):
+            found[k] = again
+    return found
+
+
+def _from(problem: BundleProblem, candidate: Candidate) -> BundleFit | Failure:
+    """Adjust a candidate from the estimates of another model."""
+    network = problem.network
+    old = network.cameras[0]
+    given = replace(old, values=problem.start.cameras[0, : len(old.values)])
+    try:
+        converted = convert(
+            given.plane_mapping(), given.grid, candidate.model, candidate.options, free=candidate.free
+        )
+        values = converted.mapping.values
+    except UsageError:
+        # The other model has no directions in most of the image.
+        slope = given.bare_mapping().derivatives([[0.0, 0.0]]).d_xy[0, 0, 0]
+        values = _started(given, candidate, float(slope)).values
+    full = np.zeros(len(camera_model(candidate.model).names))
+    full[: len(values)] = values
+    camera = replace(
+        given, model=candidate.model, values=full, free=candidate.free, options=candidate.options
+    )
+    start = replace(problem.start, cameras=full[None])
+    trial = replace(problem, network=replace(network, cameras=(camera,)), start=start, rounds=0)
+    fit = trial.adjusted()
+    if isinstance(fit, BundleFit):
+        return _checked(fit)
+    return fit
+
+
+def _checked(fit: BundleFit) -> BundleFit | Failure:
+    """The adjustment, unless its camera folds within the observations or is not determined."""
+    network = fit.problem.network
+    camera = replace(network.cameras[0], values=fit.values.cameras[0, : len(network.cameras[0].values)])
+    xy = network.xy[fit.usable.observations]
+    if not np.isfinite(camera.plane_mapping().inverse(xy)).all():
+        return Failure("the image folds within the observations", Code.NOT_IDENTIFIED)
+    return fit
+
+
+def _chosen(
+    network: Network,
+    candidates: Sequence[Candidate],
+    fits: Sequence[BundleFit | Failure],
+    folds: int,
+    seed: int,
+) -> ModelChoice:
+    """Compare the adjusted candidates."""
+    good = [k for k, fit in enumerate(fits) if isinstance(fit, BundleFit)]
+    length = np.full(len(fits), np.inf)
+    for k in good:
+        fit = fits[k]
+        assert isinstance(fit, BundleFit)
+        count = 2 * int(fit.usable.observations.sum())
+        length[k] = count * np.log(fit.cost / count) + len(candidates[k].free) * np.log(count)
+    length -= length.min()
+    order = sorted(range(len(fits)), key=lambda k: (length[k], k))
+    close = [k for k in order if length[k] < _HOPELESS][:_VALIDATED]
+    squares = _predicted([fits[k] for k in close], folds, seed) if len(close) > 1 else None
+    worse = _worse(squares)
+    equal = [k for row, k in enumerate(close) if length[k] <= _EQUAL and row not in worse] or close[:1]
+    best = min(equal, key=lambda k: (len(candidates[k].free), length[k], k))
+    fit = fits[best]
+    assert isinstance(fit, BundleFit)
+    found = []
+    for k in order:
+        other = fits[k]
+        if isinstance(other, Failure):
+            found.append(Compared(candidates[k], f"not adjusted: {other.reason}", np.nan, np.nan, np.nan))
+            continue
+        row = close.index(k) if k in close else None
+        predicted = np.nan if squares is None or row is None else float(np.sqrt(_mean(squares[row])))
+        one = Compared(
+            candidates[k], "", other.sigma0, other.cost, float(length[k]), predicted,
+            _test(candidates[k], other, candidates[best], fit), **_difference(fit, other),
+        )  # fmt: skip
+        found.append(replace(one, reason=_reason(one, k == best, row in worse, candidates[best], len(equal))))
+    camera = replace(fit.problem.network.cameras[0], values=fit.values.cameras[0])
+    return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found))
+
+
+def _reason(one: Compared, best: bool, worse: bool, chosen: Candidate, equal: int) -> str:
+    """Say why a candidate was chosen, or not."""
+    own = one.candidate
+    if best:
+        text = "chosen: shortest description" if one.length == 0 else "chosen: fewest parameters"
+        return text + (f" of {equal} that are as good" if equal > 1 else "")
+    if one.length <= _EQUAL:
+        if worse:
+            return "predicts images significantly worse"
+        return "as good, with more parameters" if len(own.free) > len(chosen.free) else "as good"
+    if own.within(chosen):
+        return f"too simple: the parameters that it lacks are significant, p = {one.p:.2g}"
+    if chosen.within(own):
+        size = "not " if one.p > _LEVEL else "hardly "
+        return f"too many parameters: the others are {size}significant, p = {one.p:.2g}"
+    return f"longer description by {one.length:.1f}" + (", and predicts images worse" if worse else "")
+
+
+def _test(own: Candidate, fit: BundleFit, chosen: Candidate, best: BundleFit) -> float:
+    """F test of the parameters in which one of two nested models exceeds the other."""
+    if own.within(chosen):
+        small, large = fit, best
+    elif chosen.within(own):
+        small, large = best, fit
+    else:
+        return np.nan
+    more = small.redundancy - large.redundancy
+    if more <= 0 or large.redundancy <= 0:
+        return np.nan
+    ratio = max(small.cost - large.cost, 0.0) / more / (large.cost / large.redundancy)
+    return float(scipy.stats.f.sf(ratio, more, large.redundancy))
+
+
+def _difference(best: BundleFit, other: BundleFit) -> dict[str, float]:
+    """Difference of two cameras over the image, and what it means."""
+    if best is other:
+        return {"rms_px": 0.0, "corner_px": 0.0, "share": 0.0}
+    one, two = (_mapping(fit) for fit in (best, other))
+    try:
+        field_ = calibration_difference(one, two)
+    except UsageError:
+        return {}
+    size = np.hypot(field_.difference[..., 0], field_.difference[..., 1])
+    sigma = projection_field(one if len(one.names) >= len(two.names) else two).sigma
+    corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]
+    known = [place for place in corners if np.isfinite(size[place])]
+    worst = max(known, key=lambda place: float(size[place]), default=None)
+    seen = np.isfinite(size) & np.isfinite(sigma)
+    limit = np.sqrt(scipy.stats.chi2.ppf(0.99, 2))
+    return {
+        "rms_px": float(np.sqrt(np.nanmean(size**2))),
+        "corner_px": np.nan if worst is None else float(size[worst]),
+        "corner_sigma_px": np.nan if worst is None else float(sigma[worst]),
+        "share": float((size[seen] > limit * sigma[seen]).mean()) if seen.any() else np.nan,
+    }
+
+
+def _mapping(fit: BundleFit) -> CameraMapping:
+    """The camera with its covariance."""
+    network = fit.problem.network
+    result = Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
+    return camera_mapping(result, 0)
+
+
+def _predicted(fits: Sequence[BundleFit | Failure], folds: int, seed: int) -> Array | None:
+    """Sums of squares of predicted coordinates and their number (k, m, 2), of each image left out once."""
+    first = fits[0]
+    assert isinstance(first, BundleFit)
+    images = np.flatnonzero(first.usable.images)
+    if len(images) < _LEAST_IMAGES:
+        return None
+    parts = np.full(len(first.usable.images), -1)
+    parts[images] = np.random.default_rng(seed).permutation(len(images)) % min(folds, len(images))
+    found = np.zeros((len(fits), len(parts), 2))
+    for row, fit in enumerate(fits):
+        assert isinstance(fit, BundleFit)
+        for part in range(int(parts.max()) + 1):
+            for image, square, count in _left_out(fit, parts == part):
+                found[row, image] = square, count
+    # Images that one of the models cannot predict are not compared.
+    found[:, (found[:, :, 1] == 0).any(axis=0)] = 0.0
+    return found
+
+
+def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
+    """Adjust without some images, then each of these alone with camera and points held."""
+    problem, network = fit.problem.continued(fit), fit.problem.network
+    n = len(network.xy)
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    used = np.asarray((weights[: 2 * n].reshape(n, 2) > 0).all(axis=1))
+    weights[: 2 * n][np.repeat(out[network.image_of], 2)] = 0.0
+    without = problem.with_weights(weights).adjusted()
+    if isinstance(without, Failure):
+        return
+    camera = network.cameras[0]
+    held = replace(camera, values=without.values.cameras[0, : len(camera.values)], free=())
+    known = finite(without.values.xyz)
+    mine = network.select(out[network.image_of] & used & known[network.point_of])
+    if not len(mine.xy):
+        return
+    control = replace(
+        mine, cameras=(held,), xyz=without.values.xyz,
+        sigma=np.where(known, 0.0, np.nan)[:, None] * np.ones(3),
+        datum="control", distance_of=network.distance_of[:0], distance=network.distance[:0],
+    )  # fmt: skip
+    start = replace(problem.start, cameras=held.values[None], xyz=without.values.xyz)
+    again = replace(problem, network=control, start=start, weights=None).adjusted()
+    if isinstance(again, Failure):
+        return
+    v = again.residuals[: 2 * len(mine.xy)].reshape(-1, 2) / np.sqrt(np.diagonal(mine.cov, axis1=1, axis2=2))
+    for image in np.flatnonzero(out).tolist():
+        own = v[(mine.image_of == image) & np.isfinite(v).all(axis=1)]
+        if len(own) >= _LEAST_POINTS:
+            yield image, float((own**2).sum()), 2 * len(own)
+
+
+def _mean(squares: Array) -> float:
+    """Mean square over all images."""
+    total = float(squares[:, 1].sum())
+    return float(squares[:, 0].sum()) / total if total else np.nan
+
+
+def _worse(squares: Array | None) -> set[int]:
+    """Rows that predict images significantly worse than the best, by differences of the same images."""
+    if squares is None:
+        return set()
+    seen = squares[0, :, 1] > 0
+    if seen.sum() < _LEAST_IMAGES:
+        return set()
+    each = squares[:, seen, 0]
+    best = int(each.sum(axis=1).argmin())
+    off = each - each[best]
+    spread = off.std(axis=1, ddof=1) * np.sqrt(off.shape[1])
+    limit = scipy.stats.t.ppf(1 - _LEVEL, off.shape[1] - 1)
+    return {int(row) for row in np.flatnonzero(off.sum(axis=1) > limit * spread)} - {best}

@@ -1,0 +1,120 @@
+"""The choice of a camera model, with boards drawn by OpenCV's cameras: sufficient and not excessive."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.bundle import Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
+from reseau.core.errors import UsageError
+from reseau.io.network import Network1
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+lenses = importlib.import_module("worlds.lenses")
+
+MATRIX = np.array([[1200.0, 0, 645.0], [0, 1203.0, 475.0], [0, 0, 1]])
+FRAME = ("fx", "fy", "cx", "cy")
+LADDER = [
+    Candidate("opencv", (*FRAME, *more.split()))
+    for more in ("", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3", "k1 k2 p1 p2 k3 k4 k5 k6")
+]
+WIDE = [
+    Candidate("fisheye", (*FRAME, "k1", "k2")),
+    Candidate("fisheye", (*FRAME, "k1", "k2", "k3", "k4")),
+    Candidate("division", (*FRAME, "lambda")),
+]
+
+
+def network_of(lens: lenses.Lens, seed: int = 4, gross: int = 0) -> Network:
+    """Fifteen views of a board that is held, with a rough focal length."""
+    flat, true = lenses.board(8, 6, 1.0)
+    seen = lenses.views(lens, flat, true, 15, 0.2, seed)
+    rng = np.random.default_rng(seed)
+    for _ in range(gross):
+        view = seen[rng.integers(len(seen))][1]
+        view[rng.integers(len(view))] += rng.choice([-1, 1], 2) * rng.uniform(5, 30, 2)
+    f = 1.05 * float(lens.matrix[0, 0])
+    start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
+    free = [*FRAME, "k1", "k2", "p1", "p2"]
+    document = lenses.document(lens, flat, seen, start, free, 0.2, "opencv")
+    return Network.from_document(Network1.from_content(json.loads(json.dumps(document)), where="test"))
+
+
+def lens_of(*k: float) -> lenses.Lens:
+    return lenses.Lens(1280, 960, MATRIX, np.array([*k, *np.zeros(8 - len(k))]))
+
+
+def chosen(lens: lenses.Lens, more: list[Candidate], **arguments: int) -> ModelChoice:
+    found = choose_model(network_of(lens, **arguments), [*LADDER, *more])
+    assert isinstance(found, ModelChoice)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("k", "label"),
+    [
+        ((), "opencv: no distortion"),
+        ((-0.1,), "opencv: k1"),
+        ((-0.2, 0.1, 1e-3, -5e-4), "opencv: k1 k2 p1 p2"),
+    ],
+)
+def test_the_model_of_the_lens_is_chosen(k: tuple[float, ...], label: str) -> None:
+    found = chosen(lens_of(*k), [])
+    assert found.chosen.candidate.label == label
+    by_label = {each.candidate.label: each for each in found.compared}
+    richer = by_label["opencv: k1 k2 p1 p2 k3"]
+    assert richer.cost < found.chosen.cost
+    assert richer.length > 2
+    for each in found.alternatives:
+        if each.reason.startswith("not adjusted"):
+            assert not k
+        elif each.candidate.within(found.chosen.candidate):
+            assert each.p < 0.01
+            assert each.reason.startswith("too simple")
+        elif found.chosen.candidate.within(each.candidate):
+            assert each.reason.startswith("too many")
+
+
+def test_what_the_wrong_model_costs_at_the_corners_is_what_it_costs() -> None:
+    """The reported difference of the model without k2, beside that from the lens itself."""
+    k = (-0.2, 0.1, 0.0, 0.0)
+    found = chosen(lens_of(*k), [])
+    simple = next(each for each in found.compared if each.candidate.label == "opencv: k1")
+    assert found.chosen.candidate.label == "opencv: k1 k2"
+    assert simple.corner_px > 5 * simple.corner_sigma_px
+    assert simple.share > 0.2
+
+
+def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
+    found = chosen(lenses.fisheye(70), WIDE)
+    assert found.chosen.candidate.label == "fisheye: k1 k2"
+    standard = next(each for each in found.compared if each.candidate.label == "opencv: k1 k2 p1 p2")
+    assert standard.length > 1000
+
+
+def test_gross_errors_do_not_change_the_choice() -> None:
+    lens = lens_of(-0.2, 0.1, 1e-3, -5e-4)
+    found = choose_model(network_of(lens, gross=12), LADDER, Options(outliers="reject"))
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "opencv: k1 k2 p1 p2"
+    assert found.chosen.sigma0 == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_comparison_is_written_as_json() -> None:
+    found = chosen(lens_of(-0.1), [])
+    entries = json.loads(json.dumps(found.entries()))
+    assert [entry["reason"].startswith("chosen") for entry in entries].count(True) == 1
+    assert entries[0]["length"] == 0
+    assert "reseau" not in repr(found)
+
+
+def test_candidates_are_of_the_model_that_the_pixel_size_allows() -> None:
+    assert not {"brown", "brown_higher"} & {each.model for each in camera_candidates(pitch_known=False)}
+    assert not {"opencv", "opencv_full"} & {each.model for each in camera_candidates(pitch_known=True)}
+    with pytest.raises(UsageError, match="there are none"):
+        choose_model(network_of(lens_of()), [])
