@@ -1,9 +1,9 @@
 """Camera models beside OpenCV, mrcal and COLMAP: projections, calibrations of the same corners, choices.
 
-Run from the checkout: ``python benchmarks/cameras.py [--part projections|calibrations|times|choices]``. mrcal
-needs Debian's ``python3-mrcal``, COLMAP needs pycolmap (extra ``peers``); without them their rows are left
-out, and said to be. Corners are those of OpenCV in the photographs of $RESEAU_DATA/chessboard_stereo, and of
-boards drawn by OpenCV's cameras (``benchmarks/worlds/lenses.py``).
+Run from the checkout: ``python benchmarks/cameras.py [--part projections|calibrations|times|choices]
+[--seeds N]``. mrcal needs Debian's ``python3-mrcal``, COLMAP needs pycolmap (extra ``peers``); without them
+their rows are left out, and said to be. Corners are those of OpenCV in the photographs of
+$RESEAU_DATA/chessboard_stereo, and of boards drawn by OpenCV's cameras (``benchmarks/worlds/lenses.py``).
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def choices(seeds: int = 20) -> None:
             error.append(difference(lens, found.camera, np.concatenate([xy for _, xy in seen])))
             loss.append(len(least.candidate.free) - len(found.chosen.candidate.free))
         said = ", ".join(f"{name} {count}" for name, count in sorted(names.items(), key=lambda e: -e[1]))
-        print(f"  {truth}: {said}")
+        print(f"  {truth}: {said}", flush=True)
         print(
             f"    rms error of the chosen camera where there are observations {np.median(error):.3f} px "
             f"(median), at most {np.max(error):.3f} px; "
@@ -302,7 +302,8 @@ def choices(seeds: int = 20) -> None:
 
 def difference(lens: lenses.Lens, camera: Camera, seen: np.ndarray) -> float:
     """Root mean square difference (px) from the lens where there are observations, after a rotation."""
-    x = points(80.0, 20_000)
+    # Beyond 45° the polynomials of the standard lenses turn back into the image.
+    x = points(80.0 if lens.fisheye else 45.0, 20_000)
     image = lens.project(x)
     x = x[np.isfinite(image).all(axis=1)]
     image = lens.project(x)
@@ -323,8 +324,9 @@ PARTS = {"projections": projections, "calibrations": calibrations, "times": time
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--part", choices=PARTS)
-    chosen = parser.parse_args().part
+    parser.add_argument("--seeds", type=int, default=20, help="networks of each lens, for the choices")
+    chosen, count = (given := parser.parse_args()).part, given.seeds
     for name, part in PARTS.items():
         if chosen in (None, name):
             print(name)
-            part()
+            choices(count) if part is choices else part()

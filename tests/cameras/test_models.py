@@ -196,6 +196,40 @@ def test_the_model_is_converted_to_itself_and_to_every_other_model(case: Case) -
         assert np.hypot(*off.T).max() <= 1.5 * other.greatest_px + 1e-9
 
 
+def test_the_covariance_goes_along_with_a_conversion() -> None:
+    """Against conversions of cameras with other values; to the same model it stays what it was."""
+    camera = Case(camera_model("brown"), {"side": "object", "balance_radius_mm": 0.0}).mapping()
+    names, free = ("c", "x0", "K1", "K2"), ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    found = convert(camera, GRID, "opencv", free=free)
+    assert found.greatest_px < 0.5
+    assert found.rms_px <= found.greatest_px
+    at = found.mapping(camera.inverse(found.worst_xy[None])) - found.worst_xy
+    assert np.hypot(*at[0]) == pytest.approx(found.greatest_px)
+    rows = [camera.names.index(name) for name in names]
+    step = np.array([1e-4, 1e-4, 1e-7, 1e-9])
+    columns = []
+    for row, h in zip(rows, step, strict=True):
+        shift = np.where(np.arange(len(camera.values)) == row, h, 0.0)
+        ends = [
+            convert(camera.with_values(camera.values + s * shift), GRID, "opencv", free=free) for s in (1, -1)
+        ]
+        columns.append((ends[0].mapping.values - ends[1].mapping.values) / (2 * h))
+    at_names = [list(found.mapping.names).index(name) for name in found.free]
+    numeric = np.stack(columns, axis=1)[at_names]
+    sigma = np.array([1e-3, 2e-3, 1e-5, 1e-7])
+    covariance = found.covariance(names, np.diag(sigma**2))
+    slope = found.mapping.derivatives(directions()).d_parameters[:, :, at_names]
+    predicted = slope @ covariance @ np.swapaxes(slope, 1, 2)
+    moved = slope @ (numeric * sigma)
+    expected = moved @ np.swapaxes(moved, 1, 2)
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=0.01 * expected.max())
+    same = convert(camera, GRID, "brown", free=camera.names)
+    own = np.diag(np.arange(1.0, 1 + len(camera.names)))
+    np.testing.assert_allclose(same.covariance(camera.names, own), own, atol=1e-5)
+    with pytest.raises(UsageError, match="is not one of c, x0"):
+        found.covariance(["fx"], [[1.0]])
+
+
 def camera_of(case: Case, free: tuple[str, ...] | None = None, bend: float = BEND, f: float = F) -> Camera:
     return Camera(
         "cam", GRID.width, GRID.height, GRID.pitch_mm, case.model.name, case.values(f=f, bend=bend),

@@ -1,11 +1,13 @@
-"""Conversion of a camera to another model: best fitting parameters over the image, and the differences."""
+"""Conversion of a camera to another model: best fitting parameters, their covariance, and the differences."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
@@ -21,32 +23,92 @@ _POINTS = 41
 _ITERATIONS, _DAMPING = 200, 1e-3
 
 
-class Converted(NamedTuple):
-    """A camera in another model.
+@dataclass(frozen=True, eq=False)
+class Converted:
+    """A camera in another model, and where it differs from the original.
 
     Parameters
     ----------
     mapping : PlaneMapping
         From ideal directions to pixels.
-    rms_px, greatest_px : float
-        Differences from the original over the image: root mean square, and largest.
+    xy : ndarray (n, 2)
+        Places over the image that were compared, pixels: those where the original has directions.
+    difference : ndarray (n, 2)
+        Image of the same direction by the new camera minus that by the original, px.
     share : float
         Share of the image where the original has directions; the rest was not compared.
+    free : tuple of str
+        Parameters that were estimated.
+    by_original : ndarray (free, u)
+        Derivatives of these by the parameters of the original.
+    original : tuple of str (u,)
+        Parameters of the original.
 
     Examples
     --------
     >>> from reseau.optics import Brown, PixelGrid
     >>> grid = PixelGrid(640, 480, (0.01, 0.01))
-    >>> camera = Brown(grid=grid).with_values({"c": 8.0})
-    >>> found = Converted(camera, rms_px=0.01, greatest_px=0.03, share=1.0)
-    >>> found.mapping is camera, found.greatest_px
-    (True, 0.03)
+    >>> camera = Brown(grid=grid).with_values({"c": 8.0, "K1": 1e-3, "K2": -1e-5})
+    >>> found = convert(camera, grid, "opencv", free=("fx", "fy", "cx", "cy", "k1"))
+    >>> round(found.greatest_px, 2), found.rms_px < found.greatest_px
+    (0.18, True)
+    >>> found.covariance(["c", "K1"], [[1e-6, 0.0], [0.0, 1e-10]]).shape
+    (5, 5)
     """
 
     mapping: PlaneMapping
-    rms_px: float
-    greatest_px: float
+    xy: Array
+    difference: Array
     share: float
+    free: tuple[str, ...]
+    by_original: Array
+    original: tuple[str, ...]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the differences."""
+        return float(np.sqrt((self.difference**2).sum(axis=1).mean()))
+
+    @property
+    def greatest_px(self) -> float:
+        """The largest difference."""
+        return float(np.hypot(*self.difference.T).max())
+
+    @property
+    def worst_xy(self) -> Array:
+        """Where the largest difference is (2,), pixels."""
+        worst: Array = self.xy[int(np.hypot(*self.difference.T).argmax())]
+        return worst
+
+    def covariance(self, names: Sequence[str], covariance: ArrayLike) -> Array:
+        """Covariance of the parameters that were estimated, from that of parameters of the original.
+
+        It has the rank of the original at most: a model with more parameters knows no more. The difference of
+        the models is not in it.
+
+        Parameters
+        ----------
+        names : sequence of str (k,)
+            Parameters of the original; the others are without error.
+        covariance : array_like (k, k)
+            Their covariance.
+
+        Returns
+        -------
+        ndarray (free, free)
+            In the order of `free`.
+
+        Raises
+        ------
+        UsageError
+            When a name is not a parameter of the original.
+        """
+        unknown = [name for name in names if name not in self.original]
+        if unknown:
+            raise UsageError(f"is not one of {', '.join(self.original)}", where=unknown[0])
+        by = self.by_original[:, [self.original.index(name) for name in names]]
+        found: Array = by @ np.asarray(covariance, dtype=np.float64) @ by.T
+        return found
 
 
 def convert(
@@ -109,8 +171,27 @@ def convert(
     f = float(camera.derivatives(centre if np.isfinite(centre).all() else uv[:1]).d_xy[0, 0, 0])
     at = np.array([not free or name in free for name in wanted.names])
     found = _fitted(wanted.mapping(wanted.start_values(f, grid), grid, options), uv, target, at)
-    off = np.hypot(*(found(uv) - target).T)
-    return Converted(found, float(np.sqrt((off**2).mean())), float(off.max()), float(known.mean()))
+    names = tuple(name for name, chosen in zip(wanted.names, at, strict=True) if chosen)
+    by_original = _by_original(camera, found, uv, at)
+    return Converted(
+        found, target, found(uv) - target, float(known.mean()), names, by_original, tuple(camera.names)
+    )
+
+
+def _by_original(camera: PlaneMapping, found: PlaneMapping, uv: Array, at: Array) -> Array:
+    """Derivatives of the estimates by the parameters of the original, to first order.
+
+    A change dp of the original moves the directions of fixed pixels by −D⁻¹J·dp, and their images by the new
+    camera by −D' D⁻¹J·dp; its parameters follow by least squares, J'·dp' = D' D⁻¹J·dp.
+    """
+    before, after = camera.derivatives(uv), found.derivatives(uv)
+    carried = after.d_xy @ np.linalg.solve(before.d_xy, before.d_parameters)
+    design = after.d_parameters[:, :, at].reshape(2 * len(uv), -1)
+    size = np.linalg.norm(design, axis=0)
+    size[size == 0] = 1.0
+    by = np.linalg.lstsq(design / size, carried.reshape(2 * len(uv), -1), rcond=1e-13)[0]
+    scaled: Array = by / size[:, None]
+    return scaled
 
 
 def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> PlaneMapping:
